@@ -1,0 +1,9 @@
+"""What adjust raises."""
+
+
+class AdjustmentError(Exception):
+    """A network that cannot be adjusted: contradictory, incomplete or empty.
+
+    The message says what is wrong, at which image, point or mark, what would be right and what to do. A singular
+    network is no error: it is a result whose null directions are named.
+    """

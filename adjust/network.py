@@ -1,0 +1,157 @@
+"""What is adjusted: cameras, images, object points and observations, each with what is known of it beforehand.
+
+Units: image mm, object units of the user's choice, angles rad. A standard deviation of 0 fixes a quantity,
+inf frees it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+Family = Literal["none", "torlegard", "brown", "opencv"]
+Decentering = Literal["reduced", "paper"]
+Transformation = Literal["none", "congruent", "similarity", "affine"]
+ObservationKind = Literal["target", "fiducial", "tie"]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A quantity as it is known beforehand: its value and the value's standard deviation (0 fixed, inf free)."""
+
+    value: float
+    sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.value):
+            raise ValueError(f"a value must be a finite number, not {self.value}")
+        if not self.sigma >= 0.0:
+            raise ValueError(f"a standard deviation must be 0 (fixed), positive or inf (free), not {self.sigma}")
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """A distortion family and its parameters by name; a parameter that is not named is fixed at 0."""
+
+    family: Family = "none"
+    parameters: Mapping[str, Prior] = field(default_factory=dict)
+    decentering: Decentering = "reduced"
+    r0_mm: float = 0.0
+
+
+@dataclass(frozen=True)
+class Fiducial:
+    """A fiducial mark in the camera frame: the datum observations F5 and F6."""
+
+    x_mm: Prior
+    y_mm: Prior
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Interior orientation, distortion and fiducial marks (by id), with their priors F5 to F9.
+
+    principal_distance_mm None: unknown, an approximation is found from the points. The principal point likewise; it
+    then starts at the centre of the frame, `center_mm` in the camera frame.
+    """
+
+    name: str
+    principal_distance_mm: Prior | None
+    x0_mm: Prior | None
+    y0_mm: Prior | None
+    distortion: Distortion = Distortion()
+    fiducials: Mapping[str, Fiducial] = field(default_factory=dict)
+    center_mm: tuple[float, float] = (0.0, 0.0)
+
+
+EXTERIOR_NAMES = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+
+
+@dataclass(frozen=True)
+class Exterior:
+    """An exterior orientation: X0, Y0, Z0 in object units, omega, phi, kappa in rad.
+
+    values (6,); sigmas (6,): inf for a mere approximation, else the standard deviation of an observed element, 0 fixed.
+    """
+
+    values: Array
+    sigmas: Array = field(default_factory=lambda: np.full(6, np.inf))
+
+
+@dataclass(frozen=True)
+class Image:
+    """One frame: its camera's name, its film transformation, its exterior orientation where something is known."""
+
+    name: str
+    camera: str
+    transformation: Transformation = "affine"
+    exterior: Exterior | None = None
+
+
+@dataclass(frozen=True)
+class ObjectPoint:
+    """An object point: X, Y, Z, each with its prior; None where nothing is known of the coordinate."""
+
+    id: str
+    X: Prior | None
+    Y: Prior | None
+    Z: Prior | None
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Measured comparator coordinates, one row a mark in an image.
+
+    image, point, kind: (n,) names; a fiducial's point is its id in the image's camera.
+    xy_mm (n, 2) in the comparator frame (y up); covariance_mm2 (n, 2, 2).
+    """
+
+    image: tuple[str, ...]
+    point: tuple[str, ...]
+    kind: tuple[ObservationKind, ...]
+    xy_mm: Array
+    covariance_mm2: Array
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+
+@dataclass(frozen=True)
+class Network:
+    """Everything that one adjustment knows. Names are unique; the order of things does not matter."""
+
+    cameras: tuple[Camera, ...]
+    images: tuple[Image, ...]
+    points: tuple[ObjectPoint, ...]
+    observations: Observations
+
+    @cached_property
+    def camera_by_name(self) -> dict[str, Camera]:
+        return {camera.name: camera for camera in self.cameras}
+
+    @cached_property
+    def image_by_name(self) -> dict[str, Image]:
+        return {image.name: image for image in self.images}
+
+    @cached_property
+    def point_by_id(self) -> dict[str, ObjectPoint]:
+        return {point.id: point for point in self.points}
+
+
+@dataclass(frozen=True)
+class Approximations:
+    """Where the iteration starts: by camera, image and point name, in the units of the network.
+
+    interior (c, x0', y0'); exterior (6,); transformation: the parameters of the image's kind in the order of
+    `adjust.transformation.NAMES`; points (3,).
+    """
+
+    interior: Mapping[str, Array]
+    exterior: Mapping[str, Array]
+    transformation: Mapping[str, Array]
+    points: Mapping[str, Array]

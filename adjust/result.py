@@ -1,0 +1,100 @@
+"""What an adjustment hands on."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import Network
+
+Array = NDArray[np.float64]
+
+Termination = Literal["converged", "singular", "iteration limit", "diverged"]
+
+
+@dataclass(frozen=True)
+class NullDirection:
+    """A change of the unknowns that the observations cannot see: what moves together, why, and what would remove it."""
+
+    parameters: tuple[str, ...]
+    cause: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """One row an observation of the network, in its order.
+
+    v_mm (n, 2): adjusted less observed comparator coordinates; redundancy (n, 2): redundancy numbers of x and y;
+    w (n, 2): standardised residuals v / sigma_v.
+    """
+
+    v_mm: Array
+    redundancy: Array
+    w: Array
+
+
+@dataclass(frozen=True)
+class Group:
+    """A kind of observation: its share of v'Pv over its redundancy (sigma0), rms in um per axis, redundancy.
+
+    sigma0 is 0 and means nothing where the redundancy is 0: there is no check.
+    """
+
+    sigma0: float
+    rms_x_um: float
+    rms_y_um: float
+    redundancy: float
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """The result: values, covariance, residuals, and how it came about.
+
+    names: the unknowns, in the order of values and covariance: `T.<image>.a1`, `EO.<image>.X0` (omega, phi, kappa in
+    rad), `IO.<camera>.c` / `.x0` / `.y0` / `.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`; fixed quantities included, with
+    zero rows. cofactor (n, n): a-priori covariance (sigma0 = 1); covariance is sigma0² times that.
+    """
+
+    network: Network
+    termination: Termination
+    iterations: int
+    conditions: int
+    unknowns: int
+    redundancy: int
+    vpv: float
+    names: tuple[str, ...]
+    values: Array
+    cofactor: Array
+    residuals: Residuals
+    groups: Mapping[str, Group]
+    singular: tuple[NullDirection, ...]
+    warnings: tuple[str, ...]
+    history: tuple[tuple[float, float], ...]  # (v'Pv, largest step in sigmas) per iteration
+
+    @property
+    def converged(self) -> bool:
+        return self.termination == "converged"
+
+    @property
+    def sigma0(self) -> float:
+        """Square root of the a-posteriori variance of unit weight; 1 where there is no redundancy."""
+        return float(np.sqrt(self.vpv / self.redundancy)) if self.redundancy > 0 else 1.0
+
+    def index(self, name: str) -> int:
+        return self._positions[name]
+
+    @cached_property
+    def _positions(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
+    def value(self, name: str) -> float:
+        return float(self.values[self.index(name)])
+
+    def sigma(self, name: str) -> float:
+        """A-posteriori standard deviation."""
+        i = self.index(name)
+        return self.sigma0 * float(np.sqrt(max(self.cofactor[i, i], 0.0)))

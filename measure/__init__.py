@@ -1,0 +1,1 @@
+"""A scan in, comparator coordinates out: marks and targets to a few hundredths of a pixel, with honest covariances."""

@@ -1,0 +1,9 @@
+"""What measure raises."""
+
+
+class MeasurementError(Exception):
+    """A scan that cannot be opened, or that cannot be what it is said to be.
+
+    The message says what is wrong, in which file, what would be right and what to do. A mark that cannot be measured is
+    no error: it is a measurement with a status and a reason.
+    """

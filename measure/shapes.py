@@ -1,0 +1,163 @@
+"""Fiducial marks as drawings: unions of simple shapes in mm about the point that is measured, x right and y up.
+
+The kinds are shorthands that give parts; everything after them knows parts only.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Point = tuple[float, float]
+Polarity = Literal["light", "dark", "auto"]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Disk:
+    """A filled circle."""
+
+    center_mm: Point
+    radius_mm: float
+
+
+@dataclass(frozen=True)
+class Ring:
+    """A circle drawn with a line: radius_mm is the line's middle, line_mm its width."""
+
+    center_mm: Point
+    radius_mm: float
+    line_mm: float
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A straight line with square ends at from_mm and to_mm."""
+
+    from_mm: Point
+    to_mm: Point
+    line_mm: float
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """A filled simple polygon; the last vertex joins the first."""
+
+    vertices_mm: tuple[Point, ...]
+
+
+Part = Disk | Ring | Bar | Polygon
+
+
+@dataclass(frozen=True)
+class MarkShape:
+    """A mark that is drawn. Overlapping parts count once."""
+
+    parts: tuple[Part, ...]
+    polarity: Polarity = "auto"
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise ValueError("a mark needs at least one part")
+
+
+@dataclass(frozen=True, eq=False)
+class MarkTemplate:
+    """A mark that is a chip cut from a scan.
+
+    image: (rows, columns), any scale of grey values; origin_px: (column, row) of the measured point in it.
+    """
+
+    image: Array
+    pitch_um: float
+    origin_px: Point
+    turn_deg: float = 0.0
+    polarity: Polarity = "auto"
+
+
+Mark = MarkShape | MarkTemplate
+
+
+@dataclass(frozen=True)
+class LayoutMark:
+    """A fiducial as the camera file gives it: xy_mm (2,) with standard deviations sigma_mm (2,), inf where free."""
+
+    id: str
+    xy_mm: Point
+    sigma_mm: Point
+    mark: Mark
+
+
+@dataclass(frozen=True)
+class FiducialLayout:
+    """The camera's marks and the size of its exposed frame (width, height)."""
+
+    marks: tuple[LayoutMark, ...]
+    frame_mm: Point
+
+
+def cross(arm_mm: float, line_mm: float, gap_mm: float = 0.0, angle_deg: float = 0.0) -> tuple[Part, ...]:
+    """Four arms from gap_mm to arm_mm off the centre, each line_mm wide; two whole bars where there is no gap."""
+    if gap_mm == 0.0:
+        bars: tuple[Part, ...] = (
+            Bar((-arm_mm, 0.0), (arm_mm, 0.0), line_mm),
+            Bar((0.0, -arm_mm), (0.0, arm_mm), line_mm),
+        )
+    else:
+        directions = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+        bars = tuple(Bar((gap_mm * x, gap_mm * y), (arm_mm * x, arm_mm * y), line_mm) for x, y in directions)
+    return tuple(turned_part(bar, angle_deg) for bar in bars)
+
+
+def dot(radius_mm: float) -> tuple[Part, ...]:
+    """One filled disk."""
+    return (Disk((0.0, 0.0), radius_mm),)
+
+
+def ring_cross(
+    ring_mm: float,
+    ring_line_mm: float,
+    arm_mm: float,
+    line_mm: float,
+    gap_mm: float = 0.0,
+    angle_deg: float = 0.0,
+) -> tuple[Part, ...]:
+    """A ring of mean radius ring_mm about a cross."""
+    return (Ring((0.0, 0.0), ring_mm, ring_line_mm), *cross(arm_mm, line_mm, gap_mm, angle_deg))
+
+
+def ring_dot(ring_mm: float, ring_line_mm: float, radius_mm: float) -> tuple[Part, ...]:
+    """A ring of mean radius ring_mm about a dot."""
+    return (Ring((0.0, 0.0), ring_mm, ring_line_mm), *dot(radius_mm))
+
+
+def polygon(vertices_mm: Sequence[Point]) -> tuple[Part, ...]:
+    """A wedge, a notch or a wing."""
+    return (Polygon(tuple((float(x), float(y)) for x, y in vertices_mm)),)
+
+
+def turned(mark: Mark, angle_deg: float) -> Mark:
+    """The mark turned counter-clockwise about its origin."""
+    if isinstance(mark, MarkTemplate):
+        return replace(mark, turn_deg=mark.turn_deg + angle_deg)
+    return replace(mark, parts=tuple(turned_part(part, angle_deg) for part in mark.parts))
+
+
+def turned_part(part: Part, angle_deg: float) -> Part:
+    """The part turned counter-clockwise about the mark's origin; quarter turns are exact."""
+    quarter, rest = divmod(angle_deg, 90.0)
+    if rest == 0.0:
+        c, s = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarter) % 4]
+    else:
+        c, s = float(np.cos(np.deg2rad(angle_deg))), float(np.sin(np.deg2rad(angle_deg)))
+
+    def turn(point: Point) -> Point:
+        return (c * point[0] - s * point[1], s * point[0] + c * point[1])
+
+    if isinstance(part, Polygon):
+        return Polygon(tuple(turn(vertex) for vertex in part.vertices_mm))
+    if isinstance(part, Bar):
+        return Bar(turn(part.from_mm), turn(part.to_mm), part.line_mm)
+    return replace(part, center_mm=turn(part.center_mm))

@@ -1,0 +1,1 @@
+"""A folder of scans in, everything out: the only package that knows the other three."""

@@ -1,0 +1,1 @@
+"""Scenes in, film scans and their truth out."""
