@@ -1,0 +1,161 @@
+"""camera.toml: the camera as it is given, for the measurement (its marks) and for the adjustment (its priors)."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+from adjust import network
+from measure import shapes
+from pipeline.errors import InputError
+from pipeline.mark_table import read_mark
+from pipeline.tables import Table, read_toml
+
+DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
+
+
+@dataclass(frozen=True)
+class GivenFiducial:
+    """A fiducial of the camera file; mark None: it can be adjusted but not measured."""
+
+    id: str
+    xy_mm: shapes.Point
+    sigma_mm: shapes.Point
+    mark: shapes.Mark | None
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """A camera file as read: mm, a standard deviation of 0 fixes, inf frees.
+
+    principal_distance_mm and principal_point_mm are None where the file leaves them to the points.
+    """
+
+    path: Path
+    name: str
+    frame_mm: tuple[float, float] | None
+    principal_distance_mm: float | None
+    principal_point_mm: tuple[float, float] | None
+    principal_distance_sigma_mm: float
+    principal_point_sigma_mm: tuple[float, float]
+    distortion: network.Distortion
+    fiducials: tuple[GivenFiducial, ...]
+
+    def layout(self) -> shapes.FiducialLayout:
+        """The marks to be measured. Raises InputError where one has no drawing or the frame's size is missing."""
+        if self.frame_mm is None:
+            raise InputError(f"{self.path}: frame_mm is missing: the size of the exposed frame, [width, height] in mm.")
+        marks = []
+        for fiducial in self.fiducials:
+            if fiducial.mark is None:
+                raise InputError(
+                    f"{self.path}: fiducial {fiducial.id!r} has no mark, and so cannot be found in a scan. "
+                    'Add mark = "NAME" to it and a table [mark.NAME] that draws it.'
+                )
+            marks.append(shapes.LayoutMark(fiducial.id, fiducial.xy_mm, fiducial.sigma_mm, fiducial.mark))
+        return shapes.FiducialLayout(tuple(marks), self.frame_mm)
+
+    def camera(self, center_mm: tuple[float, float] = (0.0, 0.0)) -> network.Camera:
+        """The camera for the adjustment. center_mm: where the principal point is sought when the file has none."""
+        distance, point = self.principal_distance_mm, self.principal_point_mm
+        sx, sy = self.principal_point_sigma_mm
+        return network.Camera(
+            name=self.name,
+            principal_distance_mm=None
+            if distance is None
+            else network.Prior(distance, self.principal_distance_sigma_mm),
+            x0_mm=None if point is None else network.Prior(point[0], sx),
+            y0_mm=None if point is None else network.Prior(point[1], sy),
+            distortion=self.distortion,
+            fiducials={
+                fiducial.id: network.Fiducial(
+                    network.Prior(fiducial.xy_mm[0], fiducial.sigma_mm[0]),
+                    network.Prior(fiducial.xy_mm[1], fiducial.sigma_mm[1]),
+                )
+                for fiducial in self.fiducials
+            },
+            center_mm=center_mm,
+        )
+
+
+def read_camera(path: Path) -> CameraFile:
+    """Read camera.toml. Raises InputError naming file, line and key."""
+    table = read_toml(path)
+    camera = parse_camera(table)
+    table.done()
+    return camera
+
+
+def parse_camera(table: Table) -> CameraFile:
+    """The camera that stands in a table: a whole camera file, or a part of another file in the same words."""
+    fiducials = _fiducials(table)
+    default_sigma = DEFAULT_SIGMA_MM if fiducials else math.inf
+    sigma = table.table("sigma")
+    distance = table.number("principal_distance_mm", above=0.0) if "principal_distance_mm" in table else None
+    point = table.pair("principal_point_mm") if "principal_point_mm" in table else (0.0, 0.0) if fiducials else None
+    frame = table.pair("frame_mm") if "frame_mm" in table else None
+    if frame is not None and min(frame) <= 0.0:
+        raise table.error("frame_mm", f"must be two positive lengths, [width, height], not {list(frame)}.")
+    camera = CameraFile(
+        path=table.file,
+        name=table.text("name", table.file.stem),
+        frame_mm=frame,
+        principal_distance_mm=distance,
+        principal_point_mm=point,
+        principal_distance_sigma_mm=sigma.sigma("principal_distance_mm", default_sigma),
+        principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (default_sigma, default_sigma)),
+        distortion=_distortion(table.table("distortion")),
+        fiducials=fiducials,
+    )
+    sigma.done()
+    return camera
+
+
+def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
+    marks = _marks(table.table("mark"))
+    fiducials: dict[str, GivenFiducial] = {}
+    for entry in table.tables("fiducial"):
+        id = entry.text("id")
+        if id in fiducials:
+            raise entry.error("id", f"fiducial {id!r} is given twice. Every mark has an id of its own.")
+        mark = entry.text("mark", choices=tuple(marks)) if "mark" in entry else None
+        xy = entry.pair("xy_mm")
+        sigma = entry.sigma_pair("sigma_mm", (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM))
+        fiducials[id] = GivenFiducial(id, xy, sigma, None if mark is None else _placed(*marks[mark], xy))
+        entry.done()
+    return tuple(fiducials.values())
+
+
+def _marks(table: Table) -> Mapping[str, tuple[shapes.Mark, bool]]:
+    """Every drawn mark by name, and whether it is turned with its place."""
+    marks = {}
+    for name in table.names():
+        entry = table.table(name)
+        mark = read_mark(entry, table.file.parent)
+        radial = entry.text("rotate", "none", ("none", "radial")) == "radial"
+        entry.done()
+        marks[name] = (mark, radial)
+    return marks
+
+
+def _placed(mark: shapes.Mark, radial: bool, xy_mm: shapes.Point) -> shapes.Mark:
+    """A radial mark is drawn as on the positive x' axis; elsewhere its own x axis points away from the centre."""
+    return shapes.turned(mark, math.degrees(math.atan2(xy_mm[1], xy_mm[0]))) if radial else mark
+
+
+def _distortion(table: Table) -> network.Distortion:
+    family = cast(network.Family, table.text("family", "none", tuple(network.DISTORTION_PARAMETERS)))
+    known = network.DISTORTION_PARAMETERS[family]
+    values, sigmas = table.table("value"), table.table("sigma")
+    parameters = {name: network.Prior(values.number(name, 0.0), sigmas.sigma(name, 0.0)) for name in known}
+    values.done()
+    sigmas.done()
+    distortion = network.Distortion(
+        family,
+        {name: prior for name, prior in parameters.items() if name in values or name in sigmas},
+        cast(network.Decentering, table.text("decentering", "reduced", ("reduced", "paper"))),
+        table.number("r0_mm", 0.0, least=0.0),
+    )
+    table.done()
+    return distortion

@@ -1,0 +1,86 @@
+"""Fiducial marks as the camera file draws them: `[mark.NAME]`, a kind and its sizes, to what `measure` knows."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from measure import shapes
+from measure.errors import MeasurementError
+from measure.scan import open_scan
+from pipeline.tables import Table
+
+KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template")
+
+
+def read_mark(table: Table, folder: Path) -> shapes.Mark:
+    """One mark. Raises InputError naming the key that is wrong."""
+    kind = table.text("kind", choices=KINDS)
+    polarity = cast(shapes.Polarity, table.text("polarity", "auto", ("auto", "light", "dark")))
+    if kind == "template":
+        return replace(_template(table, folder), polarity=polarity)
+    return shapes.MarkShape(_parts(kind, table), polarity)
+
+
+def _parts(kind: str, table: Table) -> tuple[shapes.Part, ...]:
+    if kind == "dot":
+        return shapes.dot(table.number("radius_mm", above=0.0))
+    if kind == "ring-dot":
+        return shapes.ring_dot(*_ring_sizes(table), table.number("radius_mm", above=0.0))
+    if kind == "polygon":
+        return shapes.polygon(_vertices(table))
+    if kind == "parts":
+        parts = tuple(_part(part) for part in table.tables("part"))
+        if not parts:
+            raise table.error("part", f"a mark of kind 'parts' needs at least one [[{table.place}.part]].")
+        return parts
+    arm, line, gap, angle = _cross_sizes(table)
+    if kind == "ring-cross":
+        return shapes.ring_cross(*_ring_sizes(table), arm, line, gap, angle)
+    return shapes.cross(arm, line, gap, angle)
+
+
+def _cross_sizes(table: Table) -> tuple[float, float, float, float]:
+    arm = table.number("arm_mm", above=0.0)
+    gap = table.number("gap_mm", 0.0, least=0.0)
+    if gap >= arm:
+        raise table.error("gap_mm", f"must be smaller than arm_mm ({arm:g}), not {gap:g}: no arm would be left.")
+    return arm, table.number("line_mm", above=0.0), gap, table.number("angle_deg", 0.0)
+
+
+def _ring_sizes(table: Table) -> tuple[float, float]:
+    return table.number("ring_mm", above=0.0), table.number("ring_line_mm", above=0.0)
+
+
+def _vertices(table: Table) -> tuple[shapes.Point, ...]:
+    vertices = table.pairs("vertices_mm")
+    if len(vertices) < 3:
+        raise table.error("vertices_mm", f"a polygon needs at least three vertices, not {len(vertices)}.")
+    return vertices
+
+
+def _part(table: Table) -> shapes.Part:
+    shape = table.text("shape", choices=("disk", "ring", "bar", "polygon"))
+    part: shapes.Part
+    if shape == "disk":
+        part = shapes.Disk(table.pair("center_mm", (0.0, 0.0)), table.number("radius_mm", above=0.0))
+    elif shape == "ring":
+        center, radius = table.pair("center_mm", (0.0, 0.0)), table.number("radius_mm", above=0.0)
+        part = shapes.Ring(center, radius, table.number("line_mm", above=0.0))
+    elif shape == "bar":
+        part = shapes.Bar(table.pair("from_mm"), table.pair("to_mm"), table.number("line_mm", above=0.0))
+    else:
+        part = shapes.Polygon(_vertices(table))
+    table.done()
+    return part
+
+
+def _template(table: Table, folder: Path) -> shapes.MarkTemplate:
+    path = folder / table.text("image")
+    try:
+        with open_scan(path) as chip:
+            image = chip.window(0, 0, chip.width_px, chip.height_px).astype(np.float64)
+    except MeasurementError as error:
+        raise table.error("image", str(error)) from error
+    return shapes.MarkTemplate(image, table.number("pitch_um", above=0.0), table.pair("origin_px"))

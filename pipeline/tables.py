@@ -1,0 +1,206 @@
+"""TOML files whose every key is checked: a wrong type, a missing key or a misspelt one gives a message that helps."""
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import InputError
+
+FREE = "free"
+
+
+def read_toml(path: Path) -> "Table":
+    """The root table of a TOML file. Raises InputError for a missing file, bytes that are no text, a syntax error."""
+    return Table(_parse(path), path, "")
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; a TOML file is needed here.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not a text file (UTF-8); a TOML file is needed here.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is not valid TOML: {error}. Mend that line.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+
+
+class Table:
+    """One table of a TOML file, with its file and its place in it ("" the root, "distortion.sigma", "fiducial[2]").
+
+    Every key that is read is remembered; `done` refuses the others.
+    """
+
+    def __init__(self, values: Mapping[str, Any], file: Path, place: str) -> None:
+        self.values = values
+        self.file = file
+        self.place = place
+        self._known: list[str] = []
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def error(self, key: str, message: str) -> InputError:
+        """An InputError that names the file, the line and the key."""
+        line = self._line_of(key)
+        at = f"{self.file}, line {line}" if line else f"{self.file}"
+        table = f"[{self.place}] " if self.place else ""
+        return InputError(f"{at}: {table}{key}: {message}")
+
+    def text(self, key: str, default: str | None = None, choices: Sequence[str] = ()) -> str:
+        value = self._get(key, default)
+        if not isinstance(value, str):
+            raise self.error(key, f'must be text in quotes, not {value!r}. Write {key} = "...".')
+        if choices and value not in choices:
+            raise self.error(key, f"is {value!r}; possible are {_listed(choices)}.{_suggestion(value, choices)}")
+        return value
+
+    def flag(self, key: str, default: bool) -> bool:
+        value = self._get(key, default)
+        if not isinstance(value, bool):
+            raise self.error(key, f"must be true or false, not {value!r}.")
+        return value
+
+    def number(
+        self, key: str, default: float | None = None, *, above: float = -math.inf, least: float = -math.inf
+    ) -> float:
+        value = self._number(key, self._get(key, default))
+        if not value > above:
+            raise self.error(key, f"must be greater than {above:g}, not {value:g}.")
+        if not value >= least:
+            raise self.error(key, f"must be at least {least:g}, not {value:g}.")
+        return value
+
+    def whole(self, key: str, default: int | None = None, *, least: int = 0) -> int:
+        value = self._get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise self.error(key, f"must be a whole number of at least {least}, not {value!r}.")
+        return value
+
+    def pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
+        value = self._get(key, default)
+        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
+            raise self.error(key, f"must be two numbers, [x, y], not {value!r}.")
+        return (self._number(key, value[0]), self._number(key, value[1]))
+
+    def number_or_pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
+        """One number for both axes, or [x, y]."""
+        value = self._get(key, default)
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            return self.pair(key)
+        number = self._number(key, value)
+        return (number, number)
+
+    def pairs(self, key: str) -> tuple[tuple[float, float], ...]:
+        value = self._get(key, None)
+        if not isinstance(value, list) or not all(isinstance(item, list) and len(item) == 2 for item in value):
+            raise self.error(key, f"must be a list of points, [[x, y], [x, y], ...], not {value!r}.")
+        return tuple((self._number(key, x), self._number(key, y)) for x, y in value)
+
+    def sigma(self, key: str, default: float | None = None) -> float:
+        """A standard deviation: 0 fixes, "free" (inf) is no prior at all."""
+        return self._sigma(key, self._get(key, default))
+
+    def sigma_pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
+        """A standard deviation for both axes, or [sx, sy]; each a number or "free"."""
+        value = self._get(key, default)
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            if len(value) != 2:
+                raise self.error(key, f"must be one standard deviation or two, [sx, sy], not {value!r}.")
+            return (self._sigma(key, value[0]), self._sigma(key, value[1]))
+        sigma = self._sigma(key, value)
+        return (sigma, sigma)
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        value = self._get(key, None)
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise self.error(key, f'must be a list of texts, ["...", "..."], not {value!r}.')
+        return tuple(value)
+
+    def table(self, key: str) -> "Table":
+        """A table inside of this one; an empty one where it is absent."""
+        value = self._get(key, {})
+        if not isinstance(value, dict):
+            raise self.error(key, f"must be a table, [{self._inside(key)}], not {value!r}.")
+        return Table(value, self.file, self._inside(key))
+
+    def tables(self, key: str) -> tuple["Table", ...]:
+        """An array of tables; empty where it is absent."""
+        value = self._get(key, [])
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            raise self.error(key, f"must be written as [[{self._inside(key)}]], once for each.")
+        return tuple(Table(item, self.file, f"{self._inside(key)}[{i}]") for i, item in enumerate(value, 1))
+
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.values)
+
+    def done(self) -> None:
+        """Refuse every key that nothing has asked for."""
+        for key in self.values:
+            if key not in self._known:
+                known = sorted(set(self._known))
+                raise self.error(
+                    key, f"is no key of this table.{_suggestion(key, known)} Known here: {_listed(known)}."
+                )
+
+    def _get(self, key: str, default: Any) -> Any:
+        self._known.append(key)
+        value = self.values.get(key, default)
+        if value is None:
+            raise self.error(key, "is missing. Add it.")
+        return value
+
+    def _number(self, key: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise self.error(key, f"must be a number, not {value!r}.")
+        return float(value)
+
+    def _sigma(self, key: str, value: Any) -> float:
+        if value == FREE or value == math.inf:
+            return math.inf
+        if isinstance(value, str):
+            raise self.error(key, f'must be a standard deviation, 0 (fixed) or "{FREE}", not {value!r}.')
+        sigma = self._number(key, value)
+        if sigma < 0.0:
+            raise self.error(
+                key, f'is a standard deviation and cannot be negative ({sigma:g}); 0 fixes, "{FREE}" frees.'
+            )
+        return sigma
+
+    def _inside(self, key: str) -> str:
+        return f"{self.place}.{key}" if self.place else key
+
+    def _line_of(self, key: str) -> int | None:
+        """The line where the key stands: the first one with that key behind this table's own header."""
+        try:
+            lines = self.file.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError):
+            return None
+        name, _, count = self.place.partition("[")
+        header = re.compile(rf"^\s*\[+\s*{re.escape(name)}\s*\]+")
+        starts = [number for number, line in enumerate(lines) if header.match(line)] if name else [-1]
+        which = int(count.rstrip("]")) - 1 if count.rstrip("]").isdigit() else 0
+        if which >= len(starts):
+            return None
+        key_line = re.compile(rf'^\s*(\[+[^\]]*\b)?"?{re.escape(key)}"?\s*(=|\])')
+        for number in range(starts[which] + 1, len(lines)):
+            if key_line.match(lines[number]):
+                return number + 1
+        return None
+
+
+def _suggestion(word: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    return f" Did you mean {close[0]!r}?" if close else ""
+
+
+def _listed(words: Sequence[str]) -> str:
+    return ", ".join(repr(word) for word in words)
