@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-Family = Literal["none", "torlegard", "brown", "opencv"]
+Family = Literal["none", "torlegard", "brown", "opencv", "juhl"]
 Decentering = Literal["reduced", "paper"]
 Transformation = Literal["none", "congruent", "similarity", "affine"]
 ObservationKind = Literal["target", "fiducial", "tie"]
@@ -155,10 +155,12 @@ class Approximations:
     """Where the iteration starts: by camera, image and point name, in the units of the network.
 
     interior (c, x0', y0'); exterior (6,); transformation: the parameters of the image's kind in the order of
-    `adjust.transformation.NAMES`; points (3,).
+    `adjust.transformation.NAMES`; points (3,). mirrored: the images whose scan is mirrored (the determinant of their
+    transformation is negative), which a congruent or similarity transformation has to be told.
     """
 
     interior: Mapping[str, Array]
     exterior: Mapping[str, Array]
     transformation: Mapping[str, Array]
     points: Mapping[str, Array]
+    mirrored: frozenset[str] = frozenset()

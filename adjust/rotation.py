@@ -1,0 +1,68 @@
+"""Attitudes: object to camera, M = R3(kappa) R2(phi) R1(omega), and small rotations on top of it.
+
+A change of attitude is a rotation vector t in the camera frame, M_new = exp([t]x) M: it has no singular attitude.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+GIMBAL_LOCK = 1e-12  # cos(phi) below which only omega + kappa or omega - kappa is defined
+
+
+def rotation_from_angles(angles_rad: Array) -> Array:
+    """The rotation matrix, object to camera: (..., 3) omega, phi, kappa to (..., 3, 3)."""
+    so, sp, sk = np.moveaxis(np.sin(angles_rad), -1, 0)
+    co, cp, ck = np.moveaxis(np.cos(angles_rad), -1, 0)
+    rows = (
+        (cp * ck, co * sk + so * sp * ck, so * sk - co * sp * ck),
+        (-cp * sk, co * ck - so * sp * sk, so * ck + co * sp * sk),
+        (sp, -so * cp, co * cp),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def angles_from_rotation(rotation: Array) -> Array:
+    """omega, phi, kappa (3,) of a rotation matrix; omega is set to 0 where phi is +-90 degrees."""
+    cos_phi = np.hypot(rotation[2, 1], rotation[2, 2])
+    phi = np.arctan2(rotation[2, 0], cos_phi)
+    if cos_phi < GIMBAL_LOCK:
+        return np.array([0.0, phi, np.arctan2(rotation[0, 1], rotation[1, 1])])
+    omega = np.arctan2(-rotation[2, 1], rotation[2, 2])
+    return np.array([omega, phi, np.arctan2(-rotation[1, 0], rotation[0, 0])])
+
+
+def angles_near(rotation: Array, reference_rad: Array) -> Array:
+    """omega, phi, kappa (3,) of a rotation matrix, of all triples that describe it the nearest to the reference."""
+    omega, phi, kappa = angles_from_rotation(rotation)
+    triples = np.array([[omega, phi, kappa], [omega + np.pi, np.pi - phi, kappa + np.pi]])
+    triples += 2.0 * np.pi * np.round((reference_rad - triples) / (2.0 * np.pi))
+    return np.asarray(triples[np.argmin(((triples - reference_rad) ** 2).sum(axis=1))])
+
+
+def rotation_from_vector(vector_rad: Array) -> Array:
+    """exp([t]x), the rotation by the vector t (Rodrigues): (..., 3) to (..., 3, 3)."""
+    angle = np.linalg.norm(vector_rad, axis=-1)[..., None, None]
+    cross = cross_matrix(vector_rad)
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
+
+
+def cross_matrix(vector: Array) -> Array:
+    """[t]x, so that [t]x u = t x u: (..., 3) to (..., 3, 3)."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def vector_by_angles(angles_rad: Array) -> Array:
+    """Derivative (..., 3, 3) of the rotation vector by omega, phi, kappa; singular where phi is +-90 degrees."""
+    omega_axis = rotation_from_angles(angles_rad)[..., 0]
+    kappa = angles_rad[..., 2]
+    zero, one = np.zeros_like(kappa), np.ones_like(kappa)
+    phi_axis = np.stack([np.sin(kappa), np.cos(kappa), zero], axis=-1)
+    kappa_axis = np.stack([zero, zero, one], axis=-1)
+    return -np.stack([omega_axis, phi_axis, kappa_axis], axis=-1)
