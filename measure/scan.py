@@ -1,45 +1,174 @@
 """A scan file, opened by windows."""
 
+from collections import OrderedDict
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.errors import MeasurementError
+from measure.picture_scan import open_picture
+from measure.radiometry import Samples
+from measure.resolution import Pitch
+from measure.segments import BAND_ROWS, Segments
+from measure.tiff_scan import open_tiff
+
 Array = NDArray[np.float32]
+
+LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
+CACHE_BYTES = 64 << 20
 
 
 class Scan:
     """An opened scan: its size, its pitch, and windows of grey values that grow with light on the scanner's sensor.
 
-    width_px, height_px; full_scale_dn: the largest grey value that the bit depth allows; pitch_um: (x, y) from the
-    file's resolution tags, None where it has none.
+    width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows; pitch_um:
+    (x, y) from the file's resolution tags, None where it has none that can be believed, and then pitch_note says why;
+    notes: what else is unusual about the file, a sentence each.
+    The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
     """
 
-    path: Path
-    name: str  # the file's name without its ending
-    width_px: int
-    height_px: int
-    full_scale_dn: float
-    pitch_um: tuple[float, float] | None
+    def __init__(self, path: Path, segments: Segments, pitch: Pitch, notes: tuple[str, ...] = ()) -> None:
+        self.path = path
+        self.name = path.stem
+        self.width_px = segments.width_px
+        self.height_px = segments.height_px
+        self.channels = segments.channels
+        self.full_scale_dn = segments.full_scale_dn
+        self.pitch_um = pitch.um
+        self.pitch_note = pitch.note
+        self.notes = notes
+        self._segments = segments
+        self._cache = SegmentCache(segments)
 
-    def window(self, col0: int, row0: int, width: int, height: int) -> Array:
-        """(height, width) float32 grey values; parts outside of the scan repeat its edge."""
-        raise NotImplementedError
+    def window(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
+        """(height, width) float32 grey values; parts outside of the scan repeat its edge.
 
-    def reduced(self, factor: int) -> Array:
+        weights: what each channel counts, (channels,); None is the grey value itself, or the luminance of a colour.
+        """
+        if width < 1 or height < 1:
+            raise ValueError(f"a window has at least one pixel, not {width} x {height}")
+        cols = np.clip(np.arange(col0, col0 + width), 0, self.width_px - 1)
+        rows = np.clip(np.arange(row0, row0 + height), 0, self.height_px - 1)
+        inner = self._grey(int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1, self._weights(weights))
+        if inner.shape == (height, width):
+            return inner
+        return inner[np.ix_(rows - rows[0], cols - cols[0])]
+
+    def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
         """The whole scan, area-averaged by an integer factor: pixel (i, j) is the mean over factor x factor pixels,
-        its centre at column factor * j + (factor - 1) / 2. The last partial row and column are dropped."""
-        raise NotImplementedError
+        its centre at column factor * j + (factor - 1) / 2. The last partial row and column are dropped.
+
+        The scan is streamed in bands of rows: memory holds the result and a band.
+        """
+        height, width = self.height_px // factor, self.width_px // factor
+        if factor < 1 or height < 1 or width < 1:
+            raise ValueError(f"{self.name}: cannot be reduced by {factor}: it is {self.width_px} x {self.height_px} px")
+        band = max(BAND_ROWS // factor, 1)
+        result = np.empty((height, width), np.float32)
+        for first in range(0, height, band):
+            last = min(first + band, height)
+            fine = self.window(0, first * factor, width * factor, (last - first) * factor, weights)
+            result[first:last] = cv2.resize(fine, (width, last - first), interpolation=cv2.INTER_AREA)
+        return result
+
+    def close(self) -> None:
+        self._segments.close()
 
     def __enter__(self) -> "Scan":
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    ) -> None:
+        self.close()
+
+    def _weights(self, weights: Sequence[float] | None) -> Array:
+        if weights is None:
+            weights = (1.0,) if self.channels == 1 else LUMINANCE
+        if len(weights) != self.channels:
+            raise ValueError(f"{self.name}: {len(weights)} weights for {self.channels} channels")
+        return np.asarray(weights, np.float32)
+
+    def _grey(self, row0: int, row1: int, col0: int, col1: int, weights: Array) -> Array:
+        """Rows row0 to row1 and columns col0 to col1 (exclusive), all inside the scan, from the segments they touch."""
+        tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
+        result = np.empty((row1 - row0, col1 - col0), np.float32)
+        for i in range(row0 // tall, (row1 - 1) // tall + 1):
+            top, bottom = max(row0, i * tall), min(row1, (i + 1) * tall)
+            for j in range(col0 // wide, (col1 - 1) // wide + 1):
+                left, right = max(col0, j * wide), min(col1, (j + 1) * wide)
+                part = self._cache.read(i, j)[top - i * tall : bottom - i * tall, left - j * wide : right - j * wide]
+                result[top - row0 : bottom - row0, left - col0 : right - col0] = weighted(part, weights)
+        return result
 
 
 def open_scan(path: Path) -> Scan:
-    """Open a scan. Raises MeasurementError, with what to do, for a file that is missing, unreadable or no picture."""
-    raise NotImplementedError
+    """Open a TIFF, BigTIFF, JPEG or PNG file, told apart by its first bytes and not by its name.
+
+    Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture.
+    """
+    path = Path(path)
+    start = first_bytes(path)
+    if start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        segments, pitch, notes = open_tiff(path)
+    else:
+        segments, pitch, notes = open_picture(path, start)
+    return Scan(path, segments, pitch, notes)
+
+
+def first_bytes(path: Path) -> bytes:
+    """The file's first 16 bytes, or why there are none."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(16)
+    except FileNotFoundError:
+        raise MeasurementError(
+            f"there is no scan {path} (looked for {path.resolve()}): check the name in `scans`; "
+            "paths are relative to the project file"
+        ) from None
+    except OSError as error:
+        raise MeasurementError(
+            f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
+        ) from error
+    if not start:
+        raise MeasurementError(f"{path} is empty (0 bytes): copy or scan it anew")
+    return start
+
+
+class SegmentCache:
+    """The segments decoded last, as many as a memory limit allows, and at least one row of the grid: reading a
+    scan from top to bottom decodes each once."""
+
+    def __init__(self, segments: Segments) -> None:
+        pixel_bytes = segments.channels * (1 if segments.full_scale_dn < 256 else 2)
+        self._limit = max(CACHE_BYTES, segments.segment_height_px * segments.width_px * pixel_bytes)
+        self._held = 0
+        self._segments = segments
+        self._decoded: OrderedDict[tuple[int, int], Samples] = OrderedDict()
+
+    def read(self, row: int, column: int) -> Samples:
+        """Segment (row, column) of the grid."""
+        key = (row, column)
+        if key in self._decoded:
+            self._decoded.move_to_end(key)
+            return self._decoded[key]
+        samples = self._segments.read(row, column)
+        self._decoded[key] = samples
+        self._held += samples.nbytes
+        while self._held > self._limit and len(self._decoded) > 1:
+            self._held -= self._decoded.popitem(last=False)[1].nbytes
+        return samples
+
+
+def weighted(samples: Samples, weights: Array) -> Array:
+    """(height, width) float32 grey values of (height, width, channels) samples."""
+    grey = samples[..., 0].astype(np.float32)
+    if weights[0] != 1.0:
+        grey *= weights[0]
+    for channel in range(1, samples.shape[-1]):
+        grey += weights[channel] * samples[..., channel]
+    return grey

@@ -1,0 +1,196 @@
+"""TIFF and BigTIFF files by tiles and strips: every compression that tifffile and imagecodecs know."""
+
+import logging
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tifffile import TiffFile, TiffFileError, TiffPage
+
+from measure.errors import MeasurementError
+from measure.radiometry import Radiometry, Samples
+from measure.resolution import NO_TAGS, TIFF_UNIT, Pitch, pitch_from_density
+from measure.segments import BAND_ROWS, Segments
+
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
+
+WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
+JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
+REDUCED_IMAGE, TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
+DECODING_ERRORS = (RuntimeError, ValueError, OSError, IndexError, TypeError, struct.error, TiffFileError)
+
+
+def open_tiff(path: Path) -> tuple[Segments, Pitch, tuple[str, ...]]:
+    """The first full-resolution picture of a TIFF file, its pitch, and notes.
+
+    Raises MeasurementError for a truncated file and for pictures that are no grey, palette or colour scan of up to
+    16 bits a sample.
+    """
+    try:
+        file = TiffFile(path)
+    except DECODING_ERRORS as error:
+        raise broken(path, str(error)) from error
+    try:
+        page, notes = main_page(file, path)
+        check_extent(page, path)
+        segments: Segments = (RawRows if is_raw(page) else TiffSegments)(file, page, path)
+        return segments, tag_pitch(page), notes
+    except BaseException:
+        file.close()
+        raise
+
+
+def broken(path: Path, what: str) -> MeasurementError:
+    return MeasurementError(
+        f"{path} is damaged or truncated ({what.rstrip('.')}): copy it anew from the original, or rescan"
+    )
+
+
+def main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
+    """The first page that is neither a thumbnail nor a mask."""
+    try:
+        pages = [page.aspage() for page in file.pages]
+    except DECODING_ERRORS as error:
+        raise broken(path, str(error)) from error
+    full = [page for page in pages if not int(page.subfiletype) & (REDUCED_IMAGE | TRANSPARENCY_MASK)]
+    full = [page for page in full if page.imagewidth > 0 and page.imagelength > 0]
+    if not full:
+        raise broken(path, "it holds no picture")
+    notes = []
+    if len(full) > 1:
+        notes.append(f"the file holds {len(full)} pictures: the first was taken")
+    orientation = int(full[0].tags.valueof(274, default=1))
+    if orientation != 1:
+        notes.append(f"the file's orientation tag ({orientation}) is not applied: columns and rows are as stored")
+    return full[0], tuple(notes)
+
+
+def check_extent(page: TiffPage, path: Path) -> None:
+    """A file whose tiles or strips lie beyond its end is truncated: better said now than at the last window."""
+    size = path.stat().st_size
+    ends = [
+        offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=False) if offset and count
+    ]
+    if not ends:
+        raise broken(path, "it says nowhere in the file where the picture's data are")
+    if max(ends) > size:
+        missing = sum(end > size for end in ends)
+        part = "tiles" if page.is_tiled else "strips"
+        raise broken(path, f"{missing} of {len(ends)} {part} lie beyond its end of {size} bytes")
+
+
+def is_raw(page: TiffPage) -> bool:
+    """Rows stand one after the other, uncompressed."""
+    return (
+        page.is_contiguous
+        and not page.is_tiled
+        and page.predictor == 1
+        and page.fillorder == 1
+        and (page.planarconfig == 1 or page.samplesperpixel == 1)
+    )
+
+
+def tag_pitch(page: TiffPage) -> Pitch:
+    """From XResolution, YResolution and ResolutionUnit (inch where it is absent, as TIFF 6.0 says)."""
+    try:
+        density = [tuple(page.tags[name].value) for name in ("XResolution", "YResolution")]
+    except KeyError:
+        return NO_TAGS
+    x, y = (numerator / denominator if denominator else 0.0 for numerator, denominator in density)
+    return pitch_from_density(x, y, TIFF_UNIT.get(int(page.tags.valueof("ResolutionUnit", default=2))))
+
+
+def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
+    """How the page's samples become grey or colour values."""
+    bits, kind, samples = page.bitspersample, int(page.photometric), page.samplesperpixel
+    if page.sampleformat != 1 or not 1 < bits <= 16:
+        number = {1: "integers", 2: "signed integers", 3: "floating-point numbers"}.get(page.sampleformat, "numbers")
+        raise unsupported(path, f"samples are {number} of {bits} bits")
+    if page.imagedepth != 1:
+        raise unsupported(path, f"it is a volume of {page.imagedepth} slices")
+    if kind == PALETTE and page.colormap is not None:
+        return Radiometry.of_palette(page.colormap)
+    is_colour = kind == RGB or (kind == YCBCR and page.compression in JPEG_COMPRESSIONS)  # its decoder gives RGB
+    if not (kind in (WHITE_IS_ZERO, BLACK_IS_ZERO) or (is_colour and samples >= 3)):
+        name = getattr(page.photometric, "name", str(page.photometric))
+        raise unsupported(path, f"its colours are {name} with {samples} samples a pixel")
+    return Radiometry(3 if is_colour else 1, float(2**bits - 1), inverted=kind == WHITE_IS_ZERO)
+
+
+def unsupported(path: Path, what: str) -> MeasurementError:
+    return MeasurementError(
+        f"{path} is a TIFF of a kind that is not read ({what}): save it as grey or RGB with 8 or 16 bits a sample"
+    )
+
+
+class TiffSegments:
+    """The tiles or strips of a TIFF page."""
+
+    def __init__(self, file: TiffFile, page: TiffPage, path: Path) -> None:
+        self._file, self._page, self._path = file, page, path
+        self._radiometry = page_radiometry(page, path)
+        self.channels, self.full_scale_dn = self._radiometry.channels, self._radiometry.full_scale_dn
+        self.height_px, self.width_px = page.imagelength, page.imagewidth
+        self.segment_height_px = page.tilelength if page.is_tiled else min(page.rowsperstrip, self.height_px)
+        self.segment_width_px = page.tilewidth if page.is_tiled else self.width_px
+        self._grid = (-(-self.height_px // self.segment_height_px), -(-self.width_px // self.segment_width_px))
+        self._planes = self._radiometry.channels if page.planarconfig == 2 else 1
+        wanted = self._planes * self._grid[0] * self._grid[1]
+        if min(len(page.dataoffsets), len(page.databytecounts)) < wanted:
+            raise broken(path, f"{len(page.dataoffsets)} of {wanted} tiles or strips are listed")
+
+    def read(self, row: int, column: int) -> Samples:
+        """Segment (row, column): the planes of a file that keeps them apart are put together."""
+        index = row * self._grid[1] + column
+        plane_step = self._grid[0] * self._grid[1]
+        planes = [self._decoded(index + plane * plane_step) for plane in range(self._planes)]
+        samples = planes[0] if len(planes) == 1 else np.concatenate(planes, axis=-1)
+        height = min(self.segment_height_px, self.height_px - row * self.segment_height_px)
+        width = min(self.segment_width_px, self.width_px - column * self.segment_width_px)
+        if samples.shape[0] < height or samples.shape[1] < width:
+            raise broken(self._path, f"tile or strip {index} is cut short")
+        return self._radiometry.apply(samples[:height, :width])
+
+    def _decoded(self, index: int) -> NDArray[np.generic]:
+        """(height, width, samples) of the stored numbers; a tile that was left out of the file is all zeros."""
+        page, handle = self._page, self._file.filehandle
+        data = None
+        if page.databytecounts[index]:
+            handle.seek(page.dataoffsets[index])
+            data = handle.read(page.databytecounts[index])
+        try:
+            decoded, _, shape = page.decode(data, index, jpegtables=page.jpegtables, jpegheader=page.jpegheader)
+        except DECODING_ERRORS as error:
+            raise broken(self._path, f"tile or strip {index}: {error}") from error
+        except NotImplementedError as error:
+            raise unsupported(self._path, str(error)) from error
+        if decoded is None:
+            return np.zeros(shape[1:], page.dtype)
+        samples: NDArray[np.generic] = np.asarray(decoded)[0]
+        return samples
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class RawRows(TiffSegments):
+    """An uncompressed file whose rows stand one after the other: any band of rows can be read, whatever its strips."""
+
+    def __init__(self, file: TiffFile, page: TiffPage, path: Path) -> None:
+        super().__init__(file, page, path)
+        self.segment_height_px = min(BAND_ROWS, self.height_px)
+        self._row_samples = self.width_px * page.samplesperpixel
+        self._dtype = np.dtype(page.dtype).newbyteorder(file.byteorder)
+
+    def read(self, row: int, column: int) -> Samples:
+        """The band of rows `row`."""
+        first = row * self.segment_height_px
+        height = min(self.segment_height_px, self.height_px - first)
+        handle = self._file.filehandle
+        handle.seek(self._page.dataoffsets[0] + first * self._row_samples * self._dtype.itemsize)
+        data = handle.read(height * self._row_samples * self._dtype.itemsize)
+        if len(data) < height * self._row_samples * self._dtype.itemsize:
+            raise broken(self._path, f"rows {first} to {first + height - 1} lie beyond its end")
+        stored = np.frombuffer(data, self._dtype).astype(self._dtype.newbyteorder("="))
+        return self._radiometry.apply(stored.reshape(height, self.width_px, -1))
