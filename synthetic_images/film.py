@@ -1,0 +1,112 @@
+"""From the camera frame through the film and the scanner to pixels."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetic_images.areas import Area
+from synthetic_images.projection import camera_from_object
+from synthetic_images.scene import Scene, SceneImage
+
+Array = NDArray[np.float64]
+
+WAVES = 6  # of the smooth deformation
+
+
+@dataclass(frozen=True, eq=False)
+class FrameGeometry:
+    """Where things of one frame come to lie in its scan.
+
+    width_px, height_px: of the scan. comparator_from_camera: (2, 3), exact where the film has no smooth deformation.
+    amplitudes_mm, waves_per_mm (WAVES, 2), phases_rad (WAVES,): the smooth deformation, a sum of sines.
+    """
+
+    scene: Scene
+    image: SceneImage
+    width_px: int
+    height_px: int
+    comparator_from_camera: Array
+    amplitudes_mm: Array
+    waves_per_mm: Array
+    phases_rad: Array
+
+    def pixel_from_camera(self, camera_mm: Array) -> Array:
+        """(n, 2) column and row of points (n, 2) of the camera frame."""
+        film = camera_mm + self.deformation_mm(camera_mm)
+        comparator = film @ self.comparator_from_camera[:, :2].T + self.comparator_from_camera[:, 2]
+        return np.asarray(comparator * self._pixel_per_mm, np.float64)
+
+    def pixel_from_object(self, points: Array) -> Array:
+        """(n, 2) column and row of object points (n, 3); nan where they cannot be imaged."""
+        return self.pixel_from_camera(camera_from_object(self.scene.camera, self.image.exterior, points))
+
+    def pixel_area(self, camera_mm: Area) -> Area:
+        return tuple(self.pixel_from_camera(outline) for outline in camera_mm)
+
+    def deformation_mm(self, camera_mm: Array) -> Array:
+        """(n, 2) how far the smooth deformation moves points of the camera frame."""
+        return np.asarray(np.sin(camera_mm @ self.waves_per_mm.T + self.phases_rad) @ self.amplitudes_mm)
+
+    @cached_property
+    def camera_from_pixel(self) -> Array:
+        """(3, 3) the camera frame from column, row, 1, without the smooth deformation."""
+        pixel_from_camera = np.eye(3)
+        pixel_from_camera[:2] = self.comparator_from_camera * self._pixel_per_mm[:, None]
+        return np.asarray(np.linalg.inv(pixel_from_camera), np.float64)
+
+    @cached_property
+    def camera_from_comparator(self) -> Array:
+        """(2, 3) the truth that an adjustment seeks."""
+        return np.linalg.inv(np.vstack([self.comparator_from_camera, [0.0, 0.0, 1.0]]))[:2]
+
+    @cached_property
+    def _pixel_per_mm(self) -> Array:
+        return np.array([1000.0, -1000.0]) / self.scene.scanner.pitch_um
+
+
+def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
+    """The geometry of one frame: the film's own transformation, then mirror, turn and place on the scanner's bed."""
+    image, film = scene.images[index], scene.images[index].film
+    width_px, height_px = _scan_size(scene, image)
+    pitch_mm = np.asarray(scene.scanner.pitch_um) / 1000
+    center = np.array([width_px - 1, -(height_px - 1)]) / 2 * pitch_mm
+    mirror = np.diag([-1.0, 1.0]) if image.pose.endswith("m") else np.eye(2)
+    bed_from_film = turn(image.turn_rad) @ quarter_turn(image.pose) @ mirror
+    film_from_camera = turn(film.rotation_rad) @ np.array([[film.scale[0], film.shear_rad], [0.0, film.scale[1]]])
+    shift = bed_from_film @ np.asarray(film.shift_mm) + center + np.asarray(image.offset_mm)
+    generator = np.random.default_rng([scene.seed, index, 1])
+    directions = generator.uniform(0, 2 * np.pi, WAVES)
+    waves = 2 * np.pi / (generator.uniform(0.6, 1.6, WAVES) * max(scene.camera.frame_mm))
+    rms_mm = scene.film.deformation_um / 1000
+    return FrameGeometry(
+        scene=scene,
+        image=image,
+        width_px=width_px,
+        height_px=height_px,
+        comparator_from_camera=np.column_stack([bed_from_film @ film_from_camera, shift]),
+        # A sine's mean square is 1/2, and the waves' squares add up.
+        amplitudes_mm=generator.normal(size=(WAVES, 2)) * rms_mm * np.sqrt(2 / WAVES),
+        waves_per_mm=np.stack([np.cos(directions), np.sin(directions)], axis=1) * waves[:, None],
+        phases_rad=generator.uniform(0, 2 * np.pi, WAVES),
+    )
+
+
+def turn(angle_rad: float) -> Array:
+    """Counter-clockwise turn."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s], [s, c]])
+
+
+def quarter_turn(pose: str) -> Array:
+    """The counter-clockwise turn that a pose names, exactly."""
+    return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), int(pose.rstrip("m")) // 90)
+
+
+def _scan_size(scene: Scene, image: SceneImage) -> tuple[int, int]:
+    size_mm = np.asarray(scene.camera.frame_mm) + 2 * scene.scanner.margin_mm
+    if int(image.pose.rstrip("m")) % 180:
+        size_mm = size_mm[::-1]
+    size_px = np.ceil(size_mm * 1000 / np.asarray(scene.scanner.pitch_um) - 1e-9).astype(int)
+    return int(size_px[0]), int(size_px[1])

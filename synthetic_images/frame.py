@@ -1,0 +1,183 @@
+"""One frame as it is painted: exposed parts, field, fiducials, damage; and the truth of where its marks lie."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetic_images.areas import Area, bounds, centroid, disk, polygon, subdivided
+from synthetic_images.damage import damage
+from synthetic_images.film import FrameGeometry, frame_geometry
+from synthetic_images.paint import AreaPaint, ChipPaint, Paint, chip_paint
+from synthetic_images.scene import BoardField, ChipMark, Scene, SceneFiducial
+from synthetic_images.targets import board_sheet, chessboard_squares, disk_outline, field_targets
+from synthetic_images.truth import FrameTruth, Position
+
+Array = NDArray[np.float64]
+
+EDGE_PIECES = 64  # of the frame's edges, which a smooth deformation bends
+TAPE_MM = 3.0  # half the edge of the tape over a covered fiducial
+BOARD_WHITE, BOARD_BLACK = 0.8, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """exposed: the parts of the scan that light has reached, as paints; paints: what lies on them, in this order."""
+
+    truth: FrameTruth
+    exposed: tuple[AreaPaint, ...]
+    paints: tuple[Paint, ...]
+
+
+def make_frame(scene: Scene, index: int) -> Frame:
+    """Everything of one frame, ready to be painted."""
+    geometry = frame_geometry(scene, index)
+    exposed = tuple(AreaPaint((geometry.pixel_area(area),), 1.0) for area in _exposed_areas(geometry))
+    fiducials = {fiducial.id: _fiducial_position(fiducial, geometry) for fiducial in scene.camera.fiducials}
+    targets = dict(_target_positions(geometry))
+    generator = np.random.default_rng([scene.seed, index, 2])
+    defects = damage(scene.film, geometry.width_px, geometry.height_px, generator)
+    paints = [*_field_paints(geometry, targets), *_fiducial_paints(geometry)]
+    paints += [AreaPaint((area,), tone) for area, tone in defects]
+    return Frame(FrameTruth(geometry, fiducials, targets), exposed, tuple(paints))
+
+
+def _exposed_areas(geometry: FrameGeometry) -> list[Area]:
+    """The exposed frame and the neighbour's, mm in this camera's frame."""
+    half = np.asarray(geometry.scene.camera.frame_mm) / 2
+    outline = subdivided(np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half, EDGE_PIECES)
+    return [(outline + shift,) for shift in _advances(geometry)]
+
+
+def _advances(geometry: FrameGeometry) -> list[Array]:
+    """Where frames lie on the film: this one, and its neighbour."""
+    image, frame_mm = geometry.image, np.asarray(geometry.scene.camera.frame_mm)
+    shifts = [np.zeros(2)]
+    if image.neighbour is not None:
+        side = {"left": (-1, 0), "right": (1, 0), "bottom": (0, -1), "top": (0, 1)}[image.neighbour]
+        shifts.append(np.array(side) * (frame_mm + image.neighbour_gap_mm))
+    return shifts
+
+
+def _fiducial_position(fiducial: SceneFiducial, geometry: FrameGeometry) -> Position:
+    center = geometry.pixel_from_camera(np.array([fiducial.xy_mm]))[0]
+    hidden = _beyond_scan(geometry, _mark_extent(fiducial, geometry))
+    if fiducial.id in geometry.image.covered:
+        hidden = "covered"
+    return Position(center, center, hidden)
+
+
+def _mark_extent(fiducial: SceneFiducial, geometry: FrameGeometry) -> tuple[int, int, int, int]:
+    """The window that the whole mark takes, its point alone where it has no drawing."""
+    paint = next(_mark_paints(fiducial, np.zeros(2), geometry), None)
+    if isinstance(paint, AreaPaint):
+        return bounds(paint.areas)
+    if isinstance(paint, ChipPaint):
+        return paint.col0, paint.row0, paint.cover.shape[1], paint.cover.shape[0]
+    return bounds(((geometry.pixel_from_camera(np.array([fiducial.xy_mm])),),))
+
+
+def _beyond_scan(geometry: FrameGeometry, window: tuple[int, int, int, int]) -> str:
+    col0, row0, width, height = window
+    if col0 >= geometry.width_px or row0 >= geometry.height_px or col0 + width <= 0 or row0 + height <= 0:
+        return "off the scan"
+    if col0 < 0 or row0 < 0 or col0 + width > geometry.width_px or row0 + height > geometry.height_px:
+        return "cut off by the scan's edge"
+    return ""
+
+
+def _target_positions(geometry: FrameGeometry) -> Iterator[tuple[str, Position]]:
+    """Positions of all targets that are imaged somewhere."""
+    station = np.asarray(geometry.image.exterior[:3])
+    for target in field_targets(geometry.scene.field):
+        outline = target.center[None] if target.radius == 0.0 else disk_outline(target, target.radius)
+        pixels = geometry.pixel_from_object(np.vstack([target.center, outline]))
+        if not np.isfinite(pixels).all():
+            continue
+        center, outline_px = pixels[0], pixels[1:]
+        figure = center if target.radius == 0.0 else centroid((outline_px,))
+        hidden = _beyond_scan(geometry, bounds(((outline_px,),)))
+        if not hidden and not _inside_frame(geometry, outline_px):
+            hidden = "not wholly inside of the exposed frame"
+        if not hidden and target.normal @ (station - target.center) <= 0.0:
+            hidden = "faces away"
+        if not hidden and _behind_a_pad(geometry, outline_px):
+            hidden = "behind a fiducial"
+        yield target.id, Position(center, figure, hidden)
+
+
+def _inside_frame(geometry: FrameGeometry, pixels: Array) -> bool:
+    camera = np.column_stack([pixels, np.ones(len(pixels))]) @ geometry.camera_from_pixel.T
+    return bool((np.abs(camera[:, :2]) < np.asarray(geometry.scene.camera.frame_mm) / 2).all())
+
+
+def _behind_a_pad(geometry: FrameGeometry, pixels: Array) -> bool:
+    scene = geometry.scene
+    reach_mm = max(scene.pad_mm, TAPE_MM * 1.5 if geometry.image.covered else 0.0)
+    if reach_mm == 0.0:
+        return False
+    camera = (np.column_stack([pixels, np.ones(len(pixels))]) @ geometry.camera_from_pixel.T)[:, :2]
+    marks = np.array([fiducial.xy_mm for fiducial in scene.camera.fiducials])
+    return bool((np.linalg.norm(camera[:, None] - marks[None], axis=2) < reach_mm).any())
+
+
+def _field_paints(geometry: FrameGeometry, positions: dict[str, Position]) -> Iterator[Paint]:
+    field, tones = geometry.scene.field, geometry.scene.tones
+    if isinstance(field, BoardField):
+        yield from _board_paints(geometry, field)
+        return
+    # What only the frame's edge or a pad hides in part is painted too: a picture shows half disks there.
+    unseen = ("faces away", "off the scan")
+    seen = [t for t in field_targets(field) if t.id in positions and positions[t.id].hidden not in unseen]
+    if field.surround:
+        for target in seen:
+            yield from _object_paint(geometry, (disk_outline(target, target.radius * field.surround),), tones.surround)
+    for target in seen:
+        yield from _object_paint(geometry, (disk_outline(target, target.radius),), tones.target)
+
+
+def _board_paints(geometry: FrameGeometry, field: BoardField) -> Iterator[Paint]:
+    yield from _object_paint(geometry, (board_sheet(field),), BOARD_WHITE)
+    if field.kind == "chessboard":
+        yield from _object_paint(geometry, chessboard_squares(field), BOARD_BLACK)
+        return
+    for target in field_targets(field):
+        yield from _object_paint(geometry, (disk_outline(target, target.radius),), BOARD_BLACK)
+
+
+def _object_paint(geometry: FrameGeometry, outlines: tuple[Array, ...], tone: float) -> Iterator[Paint]:
+    """One area of outlines (n, 3) in object space; those that reach behind the camera are not seen."""
+    pixels = tuple(geometry.pixel_from_object(outline) for outline in outlines)
+    area = tuple(outline for outline in pixels if np.isfinite(outline).all())
+    if area:
+        yield AreaPaint((area,), tone, inside_frame=True)
+
+
+def _fiducial_paints(geometry: FrameGeometry) -> Iterator[Paint]:
+    """Pads, marks (the neighbour's too), and tape."""
+    scene = geometry.scene
+    for advance in _advances(geometry):
+        for fiducial in scene.camera.fiducials:
+            if scene.pad_mm:
+                x, y = np.asarray(fiducial.xy_mm) + advance
+                pad = geometry.pixel_area(disk((x, y), scene.pad_mm))
+                yield AreaPaint((pad,), scene.tones.border)
+            yield from _mark_paints(fiducial, advance, geometry)
+    square = polygon(((-TAPE_MM, -TAPE_MM), (TAPE_MM, -TAPE_MM), (TAPE_MM, TAPE_MM), (-TAPE_MM, TAPE_MM)))
+    for fiducial in scene.camera.fiducials:
+        if fiducial.id in geometry.image.covered:
+            tape = geometry.pixel_area(tuple(outline + fiducial.xy_mm for outline in square))
+            yield AreaPaint((tape,), scene.tones.surround)
+
+
+def _mark_paints(fiducial: SceneFiducial, advance: Array, geometry: FrameGeometry) -> Iterator[Paint]:
+    mark, place = fiducial.mark, np.asarray(fiducial.xy_mm) + advance
+    if mark is None:
+        return
+    tone = geometry.scene.tones.mark if mark.light else geometry.scene.tones.dark_mark
+    if isinstance(mark, ChipMark):
+        yield chip_paint(mark, place, geometry, tone)
+    else:
+        shifted = tuple(tuple(outline + place for outline in area) for area in mark.areas)
+        yield AreaPaint(tuple(geometry.pixel_area(area) for area in shifted), tone)

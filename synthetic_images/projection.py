@@ -1,0 +1,113 @@
+"""From the object to the camera frame: central projection, then distortion. Formulas: Torlegård's functions F1, F2."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetic_images.scene import PARAMETERS, Distortion, SceneCamera
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+INVERSION_MM = 1e-13
+INVERSION_STEPS = 50
+
+
+def camera_from_object(camera: SceneCamera, exterior: tuple[float, ...], points: Array) -> Array:
+    """(n, 2) observed camera coordinates x', y' in mm of object points (n, 3); nan for points behind the camera.
+
+    nan too where the distortion has no inverse, far outside of the frame.
+    """
+    u, v, w = ((points - np.asarray(exterior[:3])) @ object_rotation(*exterior[3:]).T).T
+    depth = np.where(w < 0.0, -w, np.nan)
+    reach = np.hypot(u, v) / depth * camera.principal_distance_mm
+    tangents = np.stack([u / depth, v / depth], axis=1)
+    tangents[~(reach < np.hypot(*camera.frame_mm))] = np.nan
+    return distorted(camera, tangents)
+
+
+def object_rotation(omega: float, phi: float, kappa: float) -> Array:
+    """M = R3(kappa) R2(phi) R1(omega), object to camera; its third axis points away from the object."""
+    so, co, sp, cp, sk, ck = (
+        np.sin(omega),
+        np.cos(omega),
+        np.sin(phi),
+        np.cos(phi),
+        np.sin(kappa),
+        np.cos(kappa),
+    )
+    r1 = np.array([[1, 0, 0], [0, co, so], [0, -so, co]])
+    r2 = np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
+    r3 = np.array([[ck, sk, 0], [-sk, ck, 0], [0, 0, 1]])
+    return np.asarray(r3 @ r2 @ r1)
+
+
+def distorted(camera: SceneCamera, tangents: Array) -> Array:
+    """(n, 2) observed camera coordinates in mm of directions (U, V) / -W (n, 2)."""
+    c, point = camera.principal_distance_mm, np.asarray(camera.principal_point_mm)
+    ideal = c * tangents
+    family = camera.distortion.family
+    if family == "none":
+        return np.asarray(ideal + point)
+    if family == "opencv":
+        return np.asarray(c * _opencv_distorted(camera.distortion, tangents) + point)
+    return np.asarray(_observed(camera.distortion, ideal, point) + point)
+
+
+def _opencv_distorted(distortion: Distortion, tangents: Array) -> Array:
+    """OpenCV's own model; its y points down."""
+    down = np.array([1.0, -1.0])
+    coefficients = np.array([distortion.parameters.get(name, 0.0) for name in PARAMETERS["opencv"]])
+    seen = np.isfinite(tangents).all(axis=1)
+    result = np.full_like(tangents, np.nan)
+    if seen.any():
+        directions = np.column_stack([tangents[seen] * down, np.ones(seen.sum())])
+        projected, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
+        result[seen] = np.asarray(projected).reshape(-1, 2) * down
+    return result
+
+
+def _observed(distortion: Distortion, ideal: Array, point: Array) -> Array:
+    """The observed points, reduced to the principal point, whose correction leads to the ideal ones: Newton's method.
+
+    The correction is defined at the observed point, and therefore has to be inverted here.
+    """
+    observed = ideal.copy()
+    open_ = np.asarray(np.isfinite(ideal).all(axis=1))
+    for _ in range(INVERSION_STEPS):
+        if not open_.any():
+            return observed
+        start = observed[open_]
+        jacobian = np.empty((len(start), 2, 2))
+        for axis in (0, 1):
+            moved = start.astype(np.complex128)
+            moved[:, axis] += 1e-30j
+            jacobian[:, :, axis] = -_correction(distortion, moved, point).imag / 1e-30
+        jacobian += np.eye(2)
+        miss = start - _correction(distortion, start.astype(np.complex128), point).real - ideal[open_]
+        step = np.linalg.solve(jacobian, miss[:, :, None])[:, :, 0]
+        observed[open_] = start - step
+        open_[open_] = np.hypot(step[:, 0], step[:, 1]) > INVERSION_MM * (1 + np.hypot(start[:, 0], start[:, 1]))
+    observed[open_] = np.nan
+    return observed
+
+
+def _correction(distortion: Distortion, reduced: ComplexArray, point: Array) -> ComplexArray:
+    """(n, 2) the correction (dx, dy) in mm that is subtracted from the observed point."""
+    value = dict.fromkeys(PARAMETERS[distortion.family], 0.0) | dict(distortion.parameters)
+    x, y = reduced[:, 0], reduced[:, 1]
+    r2 = x * x + y * y
+    p1, p2 = value["p1"], value["p2"]
+    if distortion.family == "brown":
+        radial = r2 * (value["k1"] + r2 * (value["k2"] + r2 * value["k3"]))
+        dx = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y + value["b1"] * x + value["b2"] * y
+        dy = y * radial + 2 * p1 * x * y + p2 * (r2 + 2 * y * y)
+        return np.stack([dx, dy], axis=1)
+    zero2 = distortion.r0_mm**2
+    radial = value["k3"] * (r2 - zero2) + value["k5"] * (r2**2 - zero2**2) + value["k7"] * (r2**3 - zero2**3)
+    dec = 1 + value["p3"] * r2 + value["p4"] * r2**2
+    # The paper prints the decentring terms with coordinates that are not reduced to the principal point.
+    px, py = (x, y) if distortion.decentering == "reduced" else (x + point[0], y + point[1])
+    dx = x * radial + (p1 * (r2 + 2 * px * px) + 2 * p2 * px * py) * dec
+    dy = y * radial + (2 * p1 * px * py + p2 * (r2 + 2 * py * py)) * dec
+    return np.stack([dx, dy], axis=1)

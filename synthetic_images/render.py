@@ -1,0 +1,136 @@
+"""A scene rendered: scans/*.tif and truth.json.
+
+A frame is painted strip by strip, so that its size costs time but hardly memory: area coverage without error, then the
+scanner's blur, then grain and noise, then whole grey values.
+"""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetic_images.background import Background, scene_background
+from synthetic_images.frame import Frame, make_frame
+from synthetic_images.grain import grain, white_noise
+from synthetic_images.scene import Scene, SceneImage
+from synthetic_images.tiff import Grey, write_tiff
+from synthetic_images.truth import Truth, truth_json
+
+Picture = NDArray[np.float32]
+Progress = Callable[[str, int, int], None]
+
+STRIP_PX = 256
+BLUR_REACH = 5.0  # sigmas
+CHANNEL_GAINS = (1.0, 0.94, 0.8)  # a faintly warm film
+
+
+def render_scene(scene: Scene, out_dir: Path, progress: Progress | None = None) -> Truth:
+    """Write the scans of all frames and truth.json to a folder; every file whole or not at all.
+
+    progress: called with the image's name, the strips done and the strips of the whole scene. The same scene gives the
+    same bytes. Raises OSError where the folder cannot be written.
+    """
+    background = scene_background(scene)
+    frames = [make_frame(scene, index) for index in range(len(scene.images))]
+    total = sum(_strip_count(frame) for frame in frames)
+    done = 0
+    (out_dir / "scans").mkdir(parents=True, exist_ok=True)
+    for index, frame in enumerate(frames):
+        geometry = frame.truth.geometry
+
+        def counted(strips: Iterator[Grey], image: SceneImage = geometry.image) -> Iterator[Grey]:
+            nonlocal done
+            for strip in strips:
+                yield strip
+                done += 1
+                if progress is not None:
+                    progress(image.name, done, total)
+
+        path = out_dir / "scans" / f"{geometry.image.name}.tif"
+        strips = counted(grey_strips(frame, index, background))
+        with _whole(path) as temporary:
+            write_tiff(temporary, strips, geometry.width_px, geometry.height_px, STRIP_PX, scene.scanner)
+    truth = Truth(scene, tuple(frame.truth for frame in frames))
+    with _whole(out_dir / "truth.json") as temporary:
+        temporary.write_text(truth_json(truth), encoding="utf-8")
+    return truth
+
+
+def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Grey]:
+    """The scan's grey values as its file holds them, in strips of STRIP_PX rows: (rows, width) or (rows, width, 3)."""
+    geometry, scene = frame.truth.geometry, background.scene
+    for row0 in range(0, geometry.height_px, STRIP_PX):
+        height = min(STRIP_PX, geometry.height_px - row0)
+        shares = _blurred(frame, background, row0, height)
+        if scene.film.grain > 0.0:
+            seed = [scene.seed, index, 3]
+            shares = shares + scene.film.grain * grain(seed, row0, height, geometry.width_px, scene.film.grain_px)
+        yield _digitised(shares, scene, index, row0)
+
+
+def _blurred(frame: Frame, background: Background, row0: int, height: int) -> Picture:
+    """Shares of full scale after the scanner's optics."""
+    sigma = background.scene.scanner.blur_px
+    reach = int(np.ceil(BLUR_REACH * sigma))
+    painted = _painted(frame, background, row0 - reach, height + 2 * reach)
+    if reach == 0:
+        return painted
+    size = 2 * reach + 1
+    blurred = cv2.GaussianBlur(painted, (size, size), sigma, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred[reach : reach + height], np.float32)
+
+
+def _painted(frame: Frame, background: Background, row0: int, height: int) -> Picture:
+    """Shares of full scale, averaged over every pixel's area."""
+    geometry, border = frame.truth.geometry, background.scene.tones.border
+    exposed = np.zeros((height, geometry.width_px), np.float32)
+    for part in frame.exposed:
+        touched = part.rows(row0, height, geometry.width_px)
+        if touched is not None:
+            exposed[touched[0]] += touched[1]
+    picture = border + exposed * (background.rows(geometry, row0, height) - border)
+    for paint in frame.paints:
+        touched = paint.rows(row0, height, geometry.width_px)
+        if touched is not None:
+            window, cover = touched
+            if paint.inside_frame:
+                cover = cover * exposed[window]
+            picture[window] += cover * (paint.tone - picture[window])
+    return np.asarray(picture, np.float32)
+
+
+def _digitised(shares: Picture, scene: Scene, index: int, row0: int) -> Grey:
+    """Grey values: the channels, the noise of each, negative and white as zero, rounded and held within the depth."""
+    scanner = scene.scanner
+    channels = shares[:, :, None] * np.asarray(CHANNEL_GAINS, np.float32) if scanner.colour else shares[:, :, None]
+    if scanner.negative:
+        channels = 1.0 - channels
+    if scanner.noise > 0.0:
+        height, width = shares.shape
+        noise = [white_noise([scene.seed, index, 4, c], row0, height, width) for c in range(channels.shape[2])]
+        channels = channels + scanner.noise * np.stack(noise, axis=2)
+    if scanner.white_is_zero:
+        channels = 1.0 - channels
+    full_scale = 2**scanner.bit_depth - 1
+    grey = np.rint(np.clip(channels * full_scale, 0.0, full_scale))
+    grey = grey if scanner.colour else grey[:, :, 0]
+    return np.asarray(grey, np.uint16 if scanner.bit_depth == 16 else np.uint8)
+
+
+def _strip_count(frame: Frame) -> int:
+    return -(-frame.truth.geometry.height_px // STRIP_PX)
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """A temporary file that becomes `path` when the block ends well, and otherwise leaves nothing behind."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

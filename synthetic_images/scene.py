@@ -1,0 +1,291 @@
+"""A scene: everything that decides what the scans of a series of photographs look like.
+
+Lengths on the film in mm, in the object in the object's unit; grey values as shares of full scale (0 black, 1 white)
+on the positive. Axes, rotations and signs are those of the papers: camera frame x' right, y' up.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synthetic_images.areas import Area, Point
+from synthetic_images.checks import not_negative, one_of, positive, unique
+
+Array = NDArray[np.float64]
+
+Family = Literal["none", "torlegard", "brown", "opencv"]
+Side = Literal["left", "right", "top", "bottom"]
+Compression = Literal["none", "lzw", "deflate", "zstd", "jpeg"]
+Background = Literal["plain", "wall", "terrain"]
+FilmKind = Literal["similarity", "affine"]
+
+POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
+PARAMETERS: Mapping[Family, tuple[str, ...]] = {
+    "none": (),
+    "torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"),
+    "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
+    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y"),
+}
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """A distortion family, its parameters by name (absent: 0), its reference radius, and Torlegård's literal terms."""
+
+    family: Family = "none"
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    r0_mm: float = 0.0
+    decentering: Literal["reduced", "paper"] = "reduced"
+
+    def __post_init__(self) -> None:
+        one_of("distortion family", self.family, get_args(Family))
+        for name in self.parameters:
+            one_of(f"{self.family} parameter", name, PARAMETERS[self.family])
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMark:
+    """A fiducial drawn by areas about its origin, mm, x right and y up; light or dark on the positive."""
+
+    areas: tuple[Area, ...]
+    light: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class ChipMark:
+    """A fiducial that is a picture: (rows, columns) of 0 to 1, its pitch, and the (column, row) that is measured."""
+
+    image: Array
+    pitch_um: float
+    origin_px: Point
+    turn_deg: float = 0.0
+    light: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFiducial:
+    """A fiducial mark at its place in the camera frame; mark None: nothing is drawn (a corner of the frame, say)."""
+
+    id: str
+    xy_mm: Point
+    mark: DrawnMark | ChipMark | None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCamera:
+    """The true camera. frame_mm: width and height of the exposed frame, which is centred in the camera frame."""
+
+    name: str
+    frame_mm: Point
+    principal_distance_mm: float
+    principal_point_mm: Point = (0.0, 0.0)
+    distortion: Distortion = Distortion()
+    fiducials: tuple[SceneFiducial, ...] = ()
+
+    def __post_init__(self) -> None:
+        positive("frame_mm", *self.frame_mm)
+        positive("principal_distance_mm", self.principal_distance_mm)
+        unique("fiducial", [fiducial.id for fiducial in self.fiducials])
+
+
+@dataclass(frozen=True)
+class DiskTarget:
+    """A round target: its centre and the direction it faces, in the object frame."""
+
+    id: str
+    center: tuple[float, float, float]
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        positive(f"target {self.id}: length of the normal", float(np.linalg.norm(self.normal)))
+
+
+@dataclass(frozen=True)
+class DiskField:
+    """Disks of one diameter (object units), each on a surround so many times as wide (0: none)."""
+
+    targets: tuple[DiskTarget, ...]
+    diameter: float
+    surround: float = 2.0
+
+    def __post_init__(self) -> None:
+        positive("diameter of the targets", self.diameter)
+        if self.surround != 0.0 and not self.surround > 1.0:
+            raise ValueError(f"the surround is {self.surround} diameters wide; it must be above 1, or 0 for none")
+        unique("target", [target.id for target in self.targets])
+
+
+@dataclass(frozen=True)
+class BoardField:
+    """A board in the plane Z = 0: inner corner (or dot) "r{row}c{column}" at X = column · spacing, Y = -row · spacing.
+
+    A chessboard's columns and rows count inner corners. diameter: of the dots; in an asymmetric circle grid odd rows
+    stand half a spacing to the right, and rows are half a spacing apart.
+    """
+
+    kind: Literal["chessboard", "circle-grid"]
+    columns: int
+    rows: int
+    spacing: float
+    diameter: float = 0.0
+    asymmetric: bool = False
+
+    def __post_init__(self) -> None:
+        one_of("board", self.kind, ("chessboard", "circle-grid"))
+        if self.columns < 2 or self.rows < 2:
+            raise ValueError(f"a board needs at least 2 x 2 points, not {self.columns} x {self.rows}")
+        positive("spacing of the board", self.spacing)
+        if self.kind == "circle-grid" and not 0.0 < self.diameter < self.spacing:
+            raise ValueError(f"the dots' diameter must lie between 0 and the spacing, {self.spacing}: {self.diameter}")
+
+
+@dataclass(frozen=True)
+class FilmTransformation:
+    """How one frame's film has moved: film = R(rotation) [[scale_x, shear], [0, scale_y]] camera + shift."""
+
+    scale: Point = (1.0, 1.0)
+    shear_rad: float = 0.0
+    rotation_rad: float = 0.0
+    shift_mm: Point = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not all(0.9 < scale < 1.1 for scale in self.scale):
+            raise ValueError(f"a film's scales are near 1, not {self.scale}")
+
+
+@dataclass(frozen=True, eq=False)
+class SceneImage:
+    """One frame: where it was taken, what its film did, and how it lay on the scanner.
+
+    exterior: X0, Y0, Z0 in object units, omega, phi, kappa in rad. pose: as in `measure.results.Pose`; turn_rad: the
+    small turn beside it; offset_mm: of the frame's centre from the scan's centre. covered: fiducials under a piece of
+    tape; neighbour: the side of the camera frame where the next frame begins, neighbour_gap_mm away.
+    """
+
+    name: str
+    exterior: tuple[float, float, float, float, float, float]
+    pose: str = "0"
+    turn_rad: float = 0.0
+    offset_mm: Point = (0.0, 0.0)
+    film: FilmTransformation = FilmTransformation()
+    covered: tuple[str, ...] = ()
+    neighbour: Side | None = None
+    neighbour_gap_mm: float = 3.0
+
+    def __post_init__(self) -> None:
+        one_of(f"image {self.name}: pose", self.pose, POSES)
+        if self.neighbour is not None:
+            one_of(f"image {self.name}: neighbour", self.neighbour, get_args(Side))
+
+
+@dataclass(frozen=True)
+class Film:
+    """What the film adds, alike in every frame: kind names the true transformation.
+
+    deformation_um: rms of a smooth deformation; grain: its rms as a share of full scale, correlated as white noise
+    after a Gaussian of grain_px; dust, scratches, hairs: how many in a frame.
+    """
+
+    kind: FilmKind = "affine"
+    deformation_um: float = 0.0
+    grain: float = 0.0
+    grain_px: float = 1.0
+    dust: int = 0
+    scratches: int = 0
+    hairs: int = 0
+
+    def __post_init__(self) -> None:
+        one_of("film transformation", self.kind, get_args(FilmKind))
+        not_negative("deformation_um", self.deformation_um)
+        not_negative("grain", self.grain)
+        not_negative("grain_px", self.grain_px)
+        not_negative("number of defects", min(self.dust, self.scratches, self.hairs))
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """The scanner and its file.
+
+    margin_mm: how far the scan reaches beyond the frame; blur_px: Gaussian sigma of the MTF beside the pixel's own
+    area; noise: rms as a share of full scale, white; tile_px: edge of the file's tiles, 0 for strips.
+    white_is_zero: only how the file stores the same picture; negative: the picture is a negative.
+    """
+
+    pitch_um: Point
+    margin_mm: float = 5.0
+    blur_px: float = 0.7
+    noise: float = 0.0
+    bit_depth: Literal[8, 16] = 16
+    colour: bool = False
+    negative: bool = False
+    white_is_zero: bool = False
+    compression: Compression = "none"
+    tile_px: int = 256
+
+    def __post_init__(self) -> None:
+        positive("pitch_um", *self.pitch_um)
+        positive("margin_mm", self.margin_mm)
+        not_negative("blur_px", self.blur_px)
+        not_negative("noise", self.noise)
+        one_of("bit_depth", self.bit_depth, (8, 16))
+        one_of("compression", self.compression, get_args(Compression))
+        if self.compression == "jpeg" and self.bit_depth == 16:
+            raise ValueError('compression "jpeg" holds 8 bits; set bit_depth = 8 or another compression')
+        if self.colour and self.white_is_zero:
+            raise ValueError("a colour scan cannot be stored with white as zero; set one of them to false")
+        if self.tile_px < 0 or self.tile_px % 16:
+            raise ValueError(f"tile_px must be a multiple of 16, or 0 for strips, not {self.tile_px}")
+
+
+@dataclass(frozen=True)
+class Tones:
+    """Grey values of the positive, as shares of full scale; contrast: rms of the background's texture."""
+
+    border: float = 0.06
+    background: float = 0.42
+    contrast: float = 0.1
+    mark: float = 0.9
+    dark_mark: float = 0.03
+    target: float = 0.85
+    surround: float = 0.2
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"the tone {name} is a share of full scale, 0 to 1, not {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A series of photographs. pad_mm: radius of the unexposed disk behind every fiducial (0: none).
+
+    ground: height of the plane that carries the texture of a "terrain" background.
+    """
+
+    name: str
+    seed: int
+    camera: SceneCamera
+    field: DiskField | BoardField
+    images: tuple[SceneImage, ...]
+    scanner: Scanner
+    film: Film = Film()
+    tones: Tones = Tones()
+    background: Background = "plain"
+    ground: float = 0.0
+    pad_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        one_of("background", self.background, get_args(Background))
+        not_negative("pad_mm", self.pad_mm)
+        if not self.images:
+            raise ValueError("a scene needs at least one image")
+        unique("image", [image.name for image in self.images])
+        known = {fiducial.id for fiducial in self.camera.fiducials}
+        for image in self.images:
+            for id in image.covered:
+                one_of(f"image {image.name}: covered fiducial", id, tuple(sorted(known)))
+            if self.film.kind == "similarity" and (image.film.shear_rad or len(set(image.film.scale)) == 2):
+                raise ValueError(f"image {image.name}: a similarity has one scale and no shear")

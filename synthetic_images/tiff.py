@@ -1,0 +1,65 @@
+"""Strips of grey values to a TIFF file, without ever holding the whole picture."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from synthetic_images.scene import Scanner
+
+Grey = NDArray[np.unsignedinteger]
+
+JPEG_LEVEL = 92
+
+
+def write_tiff(
+    path: Path, strips: Iterator[Grey], width_px: int, height_px: int, strip_px: int, scanner: Scanner
+) -> None:
+    """Write strips of strip_px rows (the last may be lower), (rows, width) or (rows, width, 3), top to bottom.
+
+    The resolution tags hold the pitch. Raises OSError where the file cannot be written.
+    """
+    shape = (height_px, width_px, 3) if scanner.colour else (height_px, width_px)
+    photometric = "rgb" if scanner.colour else "miniswhite" if scanner.white_is_zero else "minisblack"
+    pitch_x_um, pitch_y_um = scanner.pitch_um
+    # Strips are handed to the writer as they come; tiles are cut from them.
+    layout = {"tile": (scanner.tile_px, scanner.tile_px)} if scanner.tile_px else {"rowsperstrip": strip_px}
+    chunks = _tiles(strips, scanner.tile_px) if scanner.tile_px else strips
+    tifffile.imwrite(
+        path,
+        chunks,
+        shape=shape,
+        dtype=np.uint16 if scanner.bit_depth == 16 else np.uint8,
+        photometric=photometric,
+        compression=None if scanner.compression == "none" else scanner.compression,
+        compressionargs={"level": JPEG_LEVEL} if scanner.compression == "jpeg" else None,
+        resolution=(1e4 / pitch_x_um, 1e4 / pitch_y_um),
+        resolutionunit="CENTIMETER",
+        software="reseau",
+        metadata=None,
+        maxworkers=1,
+        **layout,
+    )
+
+
+def _tiles(strips: Iterator[Grey], tile_px: int) -> Iterator[Grey]:
+    """Tiles row by row, the last of each row and column filled up with zeros."""
+    held: list[Grey] = []
+    for strip in strips:
+        held.append(strip)
+        rows = np.concatenate(held) if len(held) > 1 else strip
+        whole = len(rows) // tile_px * tile_px
+        yield from _cut(rows[:whole], tile_px)
+        held = [rows[whole:]] if whole < len(rows) else []
+    if held:
+        yield from _cut(np.concatenate(held), tile_px)
+
+
+def _cut(rows: Grey, tile_px: int) -> Iterator[Grey]:
+    fill = [(0, -len(rows) % tile_px), (0, -rows.shape[1] % tile_px), *[(0, 0)] * (rows.ndim - 2)]
+    padded = np.pad(rows, fill)
+    for row in range(0, len(padded), tile_px):
+        for column in range(0, padded.shape[1], tile_px):
+            yield np.ascontiguousarray(padded[row : row + tile_px, column : column + tile_px])
