@@ -1,0 +1,360 @@
+"""`adjustment.json`, the result with everything it came from, and `adjustment.npz`, its full covariance."""
+
+import io
+import json
+import math
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
+from adjust.projection import adjusted_image
+from adjust.result import Adjustment
+from pipeline.atomic import write_atomically
+from pipeline.errors import InputError
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+
+ANGLES = ("omega", "phi", "kappa")
+INTERIOR = ("c", "x0", "y0")
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """The a-posteriori covariance of all unknowns: names (n), values (n,), matrix (n, n); mm, object units, rad."""
+
+    names: tuple[str, ...]
+    values: Array
+    matrix: Array
+
+    def of(self, names: Iterable[str]) -> Array:
+        """The covariance (k, k) of some unknowns; one that is not listed was fixed, its row is zero."""
+        at = np.array([self._positions.get(name, -1) for name in names], dtype=int)
+        block = self.matrix[np.ix_(at, at)]
+        block[at < 0, :] = 0.0
+        block[:, at < 0] = 0.0
+        return block
+
+    @cached_property
+    def _positions(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
+
+def covariance_path(path: Path) -> Path:
+    """Where the covariance of `adjustment.json` stands."""
+    return path.with_suffix(".npz")
+
+
+def write_adjustment(adjustment: Adjustment, path: Path) -> None:
+    """Write the result to `path` and its covariance beside it, each by way of a temporary file.
+
+    Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity has
+    `given`, what was known of it beforehand, and every residual its place in the camera.
+    """
+    text = json.dumps(without_nan(adjustment_json(adjustment)), indent=1, ensure_ascii=False, allow_nan=False)
+    arrays = io.BytesIO()
+    np.savez_compressed(
+        arrays,
+        names=np.array(adjustment.names, dtype=np.str_),
+        values=adjustment.values,
+        matrix=adjustment.sigma0**2 * adjustment.cofactor,
+    )
+    write_atomically(covariance_path(path), arrays.getvalue())
+    write_atomically(path, text + "\n")
+
+
+def adjustment_json(adjustment: Adjustment) -> Json:
+    """The result as `adjustment.json` holds it; numbers that mean nothing are still NaN or infinite."""
+    network = adjustment.network
+    return {
+        "reseau": version("reseau"),
+        "converged": adjustment.converged,
+        "termination": adjustment.termination,
+        "iterations": adjustment.iterations,
+        # A prior is an observation and a condition; a measured point is two of each.
+        "observations": adjustment.conditions,
+        "conditions": adjustment.conditions,
+        "unknowns": adjustment.unknowns,
+        "redundancy": adjustment.redundancy,
+        "vpv": adjustment.vpv,
+        "sigma0": adjustment.sigma0,
+        "singular": [
+            {"parameters": list(null.parameters), "cause": null.cause, "remedy": null.remedy}
+            for null in adjustment.singular
+        ],
+        "warnings": list(adjustment.warnings),
+        "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras},
+        "images": {image.name: _image(adjustment, image) for image in network.images},
+        "points": {point.id: _point(adjustment, point) for point in network.points},
+        "residuals": _residuals(adjustment),
+        "groups": {
+            name: {
+                "sigma0": group.sigma0,
+                "rms_x_um": group.rms_x_um,
+                "rms_y_um": group.rms_y_um,
+                "redundancy": group.redundancy,
+            }
+            for name, group in adjustment.groups.items()
+        },
+        "history": [{"vpv": vpv, "largest_step_sigmas": step} for vpv, step in adjustment.history],
+    }
+
+
+def _camera(adjustment: Adjustment, camera: Camera) -> Json:
+    interior = f"IO.{camera.name}."
+    distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
+    if camera.distortion.family == "torlegard":
+        distortion["decentering"] = camera.distortion.decentering
+    for name in adjustment.names:
+        parameter = name.removeprefix(interior)
+        if name.startswith(interior) and "." not in parameter and parameter not in INTERIOR:
+            given = camera.distortion.parameters.get(parameter, Prior(0.0))
+            distortion[parameter] = _quantity(adjustment, name, given)
+    return {
+        "principal_distance_mm": _quantity(adjustment, interior + "c", camera.principal_distance_mm),
+        "principal_point_mm": {
+            "x": _quantity(adjustment, interior + "x0", camera.x0_mm),
+            "y": _quantity(adjustment, interior + "y0", camera.y0_mm),
+        },
+        "distortion": distortion,
+        "fiducials": {
+            id: {
+                "x_mm": _quantity(adjustment, f"FID.{camera.name}.{id}.x", fiducial.x_mm),
+                "y_mm": _quantity(adjustment, f"FID.{camera.name}.{id}.y", fiducial.y_mm),
+                "rho": _correlation(adjustment, f"FID.{camera.name}.{id}.x", f"FID.{camera.name}.{id}.y"),
+            }
+            for id, fiducial in camera.fiducials.items()
+        },
+    }
+
+
+def _image(adjustment: Adjustment, image: Image) -> Json:
+    start = f"T.{image.name}."
+    transformation: Json = {"kind": image.transformation, "mirrored": image.name in adjustment.mirrored}
+    for name in adjustment.names:
+        parameter = name.removeprefix(start)
+        if name.startswith(start) and "." not in parameter:
+            transformation[parameter] = _quantity(adjustment, name)
+    exterior: Json = {}
+    for i, element in enumerate(EXTERIOR_NAMES):
+        known = image.exterior
+        given = None if known is None else Prior(float(known.values[i]), float(known.sigmas[i]))
+        name = f"EO.{image.name}.{element}"
+        if element in ANGLES:
+            exterior[f"{element}_deg"] = _quantity(adjustment, name, given, 180.0 / math.pi)
+        else:
+            exterior[element] = _quantity(adjustment, name, given)
+    return {"camera": image.camera, "transformation": transformation, "exterior": exterior}
+
+
+def _point(adjustment: Adjustment, point: ObjectPoint) -> Json:
+    given = {"X": point.X, "Y": point.Y, "Z": point.Z}
+    return {axis: _quantity(adjustment, f"PT.{point.id}.{axis}", prior) for axis, prior in given.items()}
+
+
+def _quantity(adjustment: Adjustment, name: str, given: Prior | None = None, scale: float = 1.0) -> Json:
+    """Value and a-posteriori sigma, and what was given: null where nothing was, its sigma null where it was free."""
+    quantity: Json = {"value": scale * adjustment.value(name), "sigma": scale * _sigma(adjustment, name)}
+    if given is not None:
+        quantity["given"] = {"value": scale * given.value, "sigma": scale * given.sigma}
+    return quantity
+
+
+def _sigma(adjustment: Adjustment, name: str) -> float:
+    """NaN where there is no solution: a zero would say that the quantity was fixed."""
+    return adjustment.sigma(name) if _has_solution(adjustment) else math.nan
+
+
+def _correlation(adjustment: Adjustment, name_x: str, name_y: str) -> float:
+    x, y = adjustment.index(name_x), adjustment.index(name_y)
+    q = adjustment.cofactor
+    product = q[x, x] * q[y, y]
+    return float(q[x, y] / math.sqrt(product)) if product > 0.0 and _has_solution(adjustment) else 0.0
+
+
+def _has_solution(adjustment: Adjustment) -> bool:
+    return adjustment.termination in ("converged", "iteration limit")
+
+
+def _residuals(adjustment: Adjustment) -> list[Json]:
+    observations, residuals = adjustment.network.observations, adjustment.residuals
+    sigma_um = 1e3 * np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2))
+    v_um = 1e3 * residuals.v_mm
+    camera_mm = _in_camera(adjustment, observations.xy_mm)
+    v_camera_um = 1e3 * (_in_camera(adjustment, observations.xy_mm + residuals.v_mm) - camera_mm)
+    return [
+        {
+            "image": observations.image[i],
+            "point": observations.point[i],
+            "kind": observations.kind[i],
+            "vx_um": float(v_um[i, 0]),
+            "vy_um": float(v_um[i, 1]),
+            "redundancy_x": float(residuals.redundancy[i, 0]),
+            "redundancy_y": float(residuals.redundancy[i, 1]),
+            "w": float(_larger(residuals.w[i])),
+            "w_x": float(residuals.w[i, 0]),
+            "w_y": float(residuals.w[i, 1]),
+            "sx_um": float(sigma_um[i, 0]),
+            "sy_um": float(sigma_um[i, 1]),
+            "x_mm": float(observations.xy_mm[i, 0]),
+            "y_mm": float(observations.xy_mm[i, 1]),
+            "camera_x_mm": float(camera_mm[i, 0]),
+            "camera_y_mm": float(camera_mm[i, 1]),
+            "camera_vx_um": float(v_camera_um[i, 0]),
+            "camera_vy_um": float(v_camera_um[i, 1]),
+        }
+        for i in range(len(observations))
+    ]
+
+
+def _in_camera(adjustment: Adjustment, xy_mm: Array) -> Array:
+    """Every observation's comparator coordinates (n, 2) in its own camera, mm."""
+    images = np.array(adjustment.network.observations.image)
+    camera_mm = np.empty_like(xy_mm)
+    for name in sorted(set(images)):
+        rows = images == name
+        camera_mm[rows] = adjusted_image(adjustment, name).camera_from_comparator(xy_mm[rows])
+    return camera_mm
+
+
+def _larger(w: Array) -> float:
+    """The standardised residual of the axis that fits worse; NaN where neither axis is checked."""
+    known = w[np.isfinite(w)]
+    return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
+
+
+def without_nan(value: Any) -> Any:
+    """The same with null for every number that is not finite: JSON knows no others."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(item) for item in value]
+    return value
+
+
+def read_adjustment(path: Path) -> Json:
+    """The contents of `adjustment.json`, checked as far as readers rely on it.
+
+    Raises InputError for a file that is missing, no JSON, or lacks a key or has a wrong value at one.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file. Run `reseau adjust` first.") from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: is not valid JSON ({error}). {_AGAIN}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    _check(content, _ADJUSTMENT, path, "")
+    return dict(content)
+
+
+def read_covariance(path: Path) -> Covariance:
+    """The covariance beside the `adjustment.json` at `path`. Raises InputError where it is missing or broken."""
+    file = covariance_path(path)
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            names, values, matrix = arrays["names"], arrays["values"], arrays["matrix"]
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file; it belongs to {path.name}. {_AGAIN}") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file}: is not a covariance file ({error}). {_AGAIN}") from None
+    if values.shape != names.shape or matrix.shape != (*names.shape, *names.shape):
+        raise InputError(f"{file}: {names.size} names do not fit a matrix of shape {matrix.shape}. {_AGAIN}")
+    return Covariance(tuple(str(name) for name in names), values, matrix)
+
+
+_AGAIN = "Run `reseau adjust` again; it writes both files."
+
+
+@dataclass(frozen=True)
+class _Each:
+    """A table from names, or a list, whose every entry has the same form."""
+
+    container: type
+    form: object
+
+
+_NUMBER = (float, int, type(None))  # null: a number that has no meaning here
+_QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
+_ADJUSTMENT = {
+    "reseau": str,
+    "converged": bool,
+    "iterations": int,
+    "observations": int,
+    "conditions": int,
+    "unknowns": int,
+    "redundancy": int,
+    "sigma0": _NUMBER,
+    "singular": _Each(list, {"parameters": list, "cause": str, "remedy": str}),
+    "cameras": _Each(
+        dict,
+        {
+            "principal_distance_mm": _QUANTITY,
+            "principal_point_mm": {"x": _QUANTITY, "y": _QUANTITY},
+            "distortion": {"family": str},
+            "fiducials": _Each(dict, {"x_mm": _QUANTITY, "y_mm": _QUANTITY, "rho": _NUMBER}),
+        },
+    ),
+    "images": _Each(
+        dict,
+        {
+            "transformation": {"kind": str},
+            "exterior": dict.fromkeys(("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"), _QUANTITY),
+        },
+    ),
+    "points": _Each(dict, {"X": _QUANTITY, "Y": _QUANTITY, "Z": _QUANTITY}),
+    "residuals": _Each(
+        list,
+        {
+            "image": str,
+            "point": str,
+            "kind": str,
+            "vx_um": _NUMBER,
+            "vy_um": _NUMBER,
+            "redundancy_x": _NUMBER,
+            "redundancy_y": _NUMBER,
+            "w": _NUMBER,
+        },
+    ),
+    "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),
+}
+
+
+def _check(content: Any, form: Any, path: Path, place: str) -> None:
+    """Refuse content that has not the form; keys beyond it are welcome."""
+    if isinstance(form, _Each):
+        _check(content, form.container, path, place)
+        entries = content.items() if isinstance(content, dict) else enumerate(content)
+        for key, item in entries:
+            _check(item, form.form, path, f"{place}[{key!r}]")
+    elif isinstance(form, dict):
+        _check(content, dict, path, place)
+        for key, inner in form.items():
+            if key not in content:
+                raise InputError(f"{path}: {place or 'the file'} has no key {key!r}. {_AGAIN}")
+            _check(content[key], inner, path, f"{place}.{key}" if place else key)
+    elif not isinstance(content, form) or (isinstance(content, bool) and form is not bool):
+        expected = " or ".join(_JSON_NAMES[kind] for kind in (form if isinstance(form, tuple) else (form,)))
+        raise InputError(f"{path}: {place or 'the file'} is {content!r:.40}; it should be {expected}. {_AGAIN}")
+
+
+_JSON_NAMES = {
+    dict: "a table",
+    list: "a list",
+    str: "a text",
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    type(None): "null",
+}

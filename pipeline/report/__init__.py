@@ -1,0 +1,7 @@
+"""report.html: the verdict, the problems, every mark, and what each number means."""
+
+from pipeline.report.data import Problem, ReportData, Thumbnail
+from pipeline.report.page import render_report, write_report
+from pipeline.report.verdict import Verdict, judge
+
+__all__ = ["Problem", "ReportData", "Thumbnail", "Verdict", "judge", "render_report", "write_report"]

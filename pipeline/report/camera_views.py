@@ -1,0 +1,175 @@
+"""What the report shows of each camera: its parameters, its distortion, its fiducial marks, its residuals, its check."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+
+from adjust.distortion import PARAMETERS
+from pipeline.report import fiducials, lens, vectors
+from pipeline.report.data import Json, ReportData
+from pipeline.report.frame_views import camera_of, residuals_by_image
+from pipeline.report.numbers import fixed, value_and_sigma
+from pipeline.report.parameters import ParameterRow, high_correlations, parameter_rows
+
+PLOT_PX = 560.0
+LONGEST_VECTOR_PX = 60.0
+CURVE_TABLE_ROWS = 6
+
+
+@dataclass(frozen=True)
+class CurveRow:
+    """The distortion at a radius, each value with its sigma, ready to print."""
+
+    radius_mm: str
+    radial: tuple[str, str]
+    asymmetric: tuple[str, str]
+
+
+@dataclass(frozen=True)
+class FiducialRow:
+    """A fiducial: estimated coordinates with sigmas, less the given ones in um, and the change of form in um."""
+
+    id: str
+    x: tuple[str, str]
+    y: tuple[str, str]
+    moved_um: tuple[str, str]
+    form_um: tuple[str, str]
+    form_sigma_um: tuple[str, str]
+
+
+@dataclass(frozen=True)
+class CheckRow:
+    """A parameter in both calibrations."""
+
+    name: str
+    unit: str
+    reseau: tuple[str, str]
+    opencv: tuple[str, str]
+    difference_sigmas: str
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """A camera, ready to print; None or empty where the files do not hold what is needed."""
+
+    name: str
+    images: int
+    radius_mm: float
+    parameters: list[ParameterRow]
+    correlations: list[tuple[str, str, float]]
+    curves: Markup | None
+    curve_rows: list[CurveRow]
+    fiducials: list[FiducialRow]
+    figure: Markup | None
+    vectors: Markup | None
+    check: Json | None
+    check_rows: list[CheckRow]
+
+
+def camera_views(data: ReportData) -> list[CameraView]:
+    """All cameras of the adjustment; none where there is no adjustment."""
+    return [_view(data, name, camera) for name, camera in data.adjustment["cameras"].items()] if data.adjustment else []
+
+
+def _view(data: ReportData, name: str, camera: Json) -> CameraView:
+    stored: Json = data.adjustment or {}
+    images = [image for image in stored["images"] if camera_of(data, image) == name]
+    by_image = residuals_by_image(data)
+    rows = [row for image in images for row in by_image.get(image, [])]
+    radius_mm = _observed_radius_mm(camera, rows)
+    form = (
+        fiducials.figure(name, camera["fiducials"], data.covariance) if _is_solved(data) and data.covariance else None
+    )
+    curve = _curves(data, name, camera, radius_mm)
+    check: Json | None = data.check["cameras"].get(name) if data.check else None
+    return CameraView(
+        name=name,
+        images=len(images),
+        radius_mm=radius_mm,
+        parameters=parameter_rows(name, camera, stored["sigma0"] or 1.0, radius_mm),
+        correlations=high_correlations(name, camera, data.covariance) if _is_solved(data) and data.covariance else [],
+        curves=lens.curves_plot(curve, radius_mm) if curve else None,
+        curve_rows=_curve_rows(curve) if curve else [],
+        fiducials=[_fiducial_row(id, fiducial, form) for id, fiducial in camera["fiducials"].items()],
+        figure=fiducials.figure_plot(form) if form else None,
+        vectors=_vectors(rows, data.frame_mm.get(name)),
+        check=check,
+        check_rows=[_check_row(row) for row in check.get("rows", ())] if check else [],
+    )
+
+
+def _is_solved(data: ReportData) -> bool:
+    return bool(data.adjustment and data.adjustment["converged"])
+
+
+def _observed_radius_mm(camera: Json, rows: list[Json]) -> float:
+    """From the principal point to the outermost target."""
+    targets = [row for row in rows if row["kind"] != "fiducial"]
+    if not targets:
+        return 0.0
+    point = camera["principal_point_mm"]
+    offsets = vectors.places_mm(targets) - (point["x"]["value"], point["y"]["value"])
+    return float(np.hypot(*offsets.T).max())
+
+
+def _curves(data: ReportData, name: str, camera: Json, radius_mm: float) -> lens.Curves | None:
+    """Out to the frame's corner where its size is known, else to the outermost target."""
+    if not PARAMETERS[camera["distortion"]["family"]] or data.covariance is None or not _is_solved(data):
+        return None
+    frame_mm = data.frame_mm.get(name)
+    corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
+    largest = max(radius_mm, corner_mm)
+    return lens.curves(lens.lens(name, camera), data.covariance, largest) if largest > 0.0 else None
+
+
+def _curve_rows(curve: lens.Curves) -> list[CurveRow]:
+    at = np.linspace(0, len(curve.radius_mm) - 1, CURVE_TABLE_ROWS + 1).round().astype(int)[1:]
+    return [
+        CurveRow(
+            radius_mm=fixed(curve.radius_mm[i], 1),
+            radial=value_and_sigma(float(curve.radial_um[i]), float(curve.radial_sigma_um[i])),
+            asymmetric=value_and_sigma(float(curve.asymmetric_um[i]), float(curve.asymmetric_sigma_um[i])),
+        )
+        for i in at
+    ]
+
+
+def _fiducial_row(id: str, fiducial: Json, form: fiducials.Figure | None) -> FiducialRow:
+    x, y = fiducial["x_mm"], fiducial["y_mm"]
+    changed = changed_sigma = (fixed(None), fixed(None))
+    if form and id in form.ids:
+        at = form.ids.index(id)
+        change, sigma = form.change_um[at], np.sqrt(np.maximum(np.diag(form.covariance_um2[at]), 0.0))
+        changed = (fixed(change[0], 1, sign=True), fixed(change[1], 1, sign=True))
+        changed_sigma = (fixed(sigma[0], 1), fixed(sigma[1], 1))
+    return FiducialRow(
+        id=id,
+        x=value_and_sigma(x["value"], x["sigma"]),
+        y=value_and_sigma(y["value"], y["sigma"]),
+        moved_um=(_moved_um(x), _moved_um(y)),
+        form_um=changed,
+        form_sigma_um=changed_sigma,
+    )
+
+
+def _moved_um(quantity: Json) -> str:
+    given = quantity.get("given")
+    return fixed(1e3 * (quantity["value"] - given["value"]) if given else None, 1, sign=True)
+
+
+def _vectors(rows: list[Json], frame_mm: tuple[float, float] | None) -> Markup | None:
+    if not rows:
+        return None
+    scale = vectors.vector_scale(rows, LONGEST_VECTOR_PX)
+    return vectors.all_images_plot(rows, vectors.plane(rows, frame_mm, PLOT_PX), scale)
+
+
+def _check_row(row: Json) -> CheckRow:
+    return CheckRow(
+        name=row["name"],
+        unit=row.get("unit") or "–",
+        reseau=value_and_sigma(row["reseau"]["value"], row["reseau"]["sigma"]),
+        opencv=value_and_sigma(row["opencv"]["value"], row["opencv"]["sigma"]),
+        difference_sigmas=fixed(row["difference_sigmas"], 2, sign=True),
+    )

@@ -1,0 +1,61 @@
+"""What the report is made from: the files of the stages, any of which may be missing."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.adjustment_file import Covariance
+from pipeline.comparator_file import ComparatorPoint
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Thumbnail:
+    """A mark cut from its scan.
+
+    pixels (rows, columns): grey values on any scale; origin_px: column and row, in the scan, of the centre of its
+    top-left pixel; step_px: scan pixels to a thumbnail pixel, above 1 where it was reduced.
+    """
+
+    pixels: NDArray[np.generic]
+    origin_px: tuple[float, float]
+    step_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 2 or 0 in self.pixels.shape:
+            raise ValueError(f"a thumbnail has rows and columns of grey values, not the shape {self.pixels.shape}")
+        if not self.step_px > 0.0:
+            raise ValueError(f"step_px must be positive, not {self.step_px}")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that needs a look: what it is, and what to do about it."""
+
+    what: str
+    next_step: str = ""
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """Everything a report can show.
+
+    comparator: the rows of comparator.csv. measurement, adjustment, check: the contents of measurement.json,
+    adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed frame by
+    camera name. thumbnail: from the names of image and point to the mark's picture. problems: what the caller has to
+    say beyond the files.
+    """
+
+    project: str
+    comparator: Sequence[ComparatorPoint] = ()
+    measurement: Json | None = None
+    adjustment: Json | None = None
+    covariance: Covariance | None = None
+    check: Json | None = None
+    frame_mm: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    thumbnail: Callable[[str, str], Thumbnail | None] | None = None
+    problems: tuple[Problem, ...] = ()

@@ -1,0 +1,43 @@
+"""Fractional parts of measured pixel positions: marks prefer no place within a pixel, biased methods do."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+BINS = 10
+LEAST_MARKS = 50  # five a bin, below which the chi-square test means nothing
+
+
+@dataclass(frozen=True)
+class FractionTest:
+    """Counts (BINS,) of the fractional parts over [-0.5, 0.5) of a pixel, about its centre.
+
+    probability: how often chance alone gives counts as uneven as these; None where there are too few marks to say.
+    """
+
+    counts: NDArray[np.int64]
+    probability: float | None
+
+    @property
+    def is_locked(self) -> bool:
+        """Whether the positions prefer parts of a pixel beyond what chance explains once in a thousand."""
+        return self.probability is not None and self.probability < 1e-3
+
+
+def fraction_test(position_px: Array) -> FractionTest:
+    """Test one coordinate (n,) of measured positions: chi-square against equal counts."""
+    fractions = position_px - np.floor(position_px + 0.5)
+    counts, _ = np.histogram(fractions, bins=BINS, range=(-0.5, 0.5))
+    if len(position_px) < LEAST_MARKS:
+        return FractionTest(counts, None)
+    return FractionTest(counts, float(stats.chisquare(counts).pvalue))
+
+
+def expected_range(total: int) -> tuple[float, float]:
+    """Where 99 % of all counts of a bin lie when the marks prefer no place."""
+    low, high = stats.binom.ppf([0.005, 0.995], total, 1.0 / BINS)
+    return float(low), float(high)

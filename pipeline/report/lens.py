@@ -1,0 +1,168 @@
+"""The distortion of a camera as curves over the radius, with their standard deviations from the full covariance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from adjust.distortion import PARAMETERS, image_equations
+from adjust.network import Distortion
+from adjust.projection import ideal_from_observed
+from pipeline.adjustment_file import Covariance
+from pipeline.report import svg
+from pipeline.report.data import Json
+
+Array = NDArray[np.float64]
+
+RADII = 80
+DIRECTIONS = 36
+BAND = 1.959964  # sigmas to a probability of 95 %
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera's interior orientation as estimated: c, x0', y0' (3,) in mm, and the parameters (k,) of its family."""
+
+    name: str
+    distortion: Distortion
+    interior: Array
+    parameters: Array
+
+    @property
+    def unknowns(self) -> tuple[str, ...]:
+        """The names of c and of the parameters, on which a displacement about the principal point depends."""
+        return tuple(f"IO.{self.name}.{name}" for name in ("c", *PARAMETERS[self.distortion.family]))
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Observed less ideal point (n, 2) in um, and its derivatives (n, 2, 1 + k) by c and the parameters."""
+
+    value_um: Array
+    by_unknowns_um: Array
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Over the radius (n,) in mm, in um.
+
+    radial: the mean over all directions of the outward displacement; asymmetric: the largest displacement, over all
+    directions, that is left when the radial part is taken out (decentering and affinity); each with its sigma.
+    """
+
+    radius_mm: Array
+    radial_um: Array
+    radial_sigma_um: Array
+    asymmetric_um: Array
+    asymmetric_sigma_um: Array
+
+
+def lens(name: str, camera: Json) -> Lens:
+    """From a camera's entry in adjustment.json."""
+    stored = camera["distortion"]
+    distortion = Distortion(
+        stored["family"], decentering=stored.get("decentering", "reduced"), r0_mm=stored.get("r0_mm", 0.0)
+    )
+    point = camera["principal_point_mm"]
+    interior = [camera["principal_distance_mm"]["value"], point["x"]["value"], point["y"]["value"]]
+    values = [stored.get(parameter, {"value": 0.0})["value"] for parameter in PARAMETERS[distortion.family]]
+    return Lens(name, distortion, np.array(interior, dtype=float), np.array(values, dtype=float))
+
+
+def displacement(of: Lens, from_principal_point_mm: Array) -> Displacement:
+    """What the lens does at observed points (n, 2), counted from the principal point.
+
+    By the implicit function theorem: F(point, ray, unknowns) = 0 gives the ray's derivatives.
+    """
+    c, principal_point = of.interior[0], of.interior[1:]
+    xy = principal_point + from_principal_point_mm
+    ideal, _ = ideal_from_observed(of.distortion, of.interior, of.parameters, xy)
+    ray = (ideal - principal_point) / c
+    equations = image_equations(of.distortion, of.interior, of.parameters, xy, ray)
+    by_unknowns = np.concatenate([equations.by_interior[:, :, :1], equations.by_parameters], axis=2)
+    derivatives = c * np.linalg.solve(equations.by_ray, by_unknowns)
+    derivatives[:, :, 0] -= ray
+    return Displacement(1e3 * (xy - ideal), 1e3 * derivatives)
+
+
+def curves(of: Lens, covariance: Covariance, largest_radius_mm: float) -> Curves:
+    """The curves from the principal point out to a radius."""
+    radius = np.linspace(0.0, largest_radius_mm, RADII)[1:]
+    outward = _directions()
+    moved = displacement(of, (radius[:, None, None] * outward).reshape(-1, 2))
+    value = moved.value_um.reshape(len(radius), DIRECTIONS, 2)
+    by = moved.by_unknowns_um.reshape(len(radius), DIRECTIONS, 2, -1)
+    cofactor = covariance.of(of.unknowns)
+
+    radial = np.einsum("rdi,di->r", value, outward) / DIRECTIONS
+    radial_by = np.einsum("rdik,di->rk", by, outward) / DIRECTIONS
+    rest = value - radial[:, None, None] * outward
+    rest_by = by - radial_by[:, None, None, :] * outward[:, :, None]
+    size = np.hypot(rest[..., 0], rest[..., 1])
+    worst = size.argmax(axis=1)
+    at = np.arange(len(radius))
+    largest = size[at, worst]
+    unit = rest[at, worst] / np.maximum(largest, 1e-12)[:, None]
+    return Curves(
+        radius_mm=radius,
+        radial_um=radial,
+        radial_sigma_um=_sigma(radial_by, cofactor),
+        asymmetric_um=largest,
+        asymmetric_sigma_um=_sigma(np.einsum("rik,ri->rk", rest_by[at, worst], unit), cofactor),
+    )
+
+
+def largest_effects_um(of: Lens, radius_mm: float) -> dict[str, float]:
+    """By parameter: the largest displacement at a radius that a change of 1 of the parameter makes."""
+    moved = displacement(of, radius_mm * _directions())
+    sizes = np.hypot(moved.by_unknowns_um[:, 0, 1:], moved.by_unknowns_um[:, 1, 1:]).max(axis=0)
+    return dict(zip(PARAMETERS[of.distortion.family], sizes.tolist(), strict=True))
+
+
+def curves_plot(drawn: Curves, observed_radius_mm: float) -> Markup:
+    """Both curves with their 95 % bands; grey beyond the outermost target, where nothing was observed."""
+    band = BAND * drawn.radial_sigma_um
+    has_asymmetric = bool(np.any(drawn.asymmetric_um > 1e-6))
+    asymmetric_band = BAND * drawn.asymmetric_sigma_um
+    low = float(np.min(drawn.radial_um - band, initial=0.0))
+    high = float(np.max([*(drawn.radial_um + band), *(drawn.asymmetric_um + asymmetric_band), 0.0]))
+    room = 0.06 * max(high - low, 1e-3)
+    axes = svg.Axes((0.0, float(drawn.radius_mm[-1])), (low - room, high + room), height=320.0)
+    x = axes.x(drawn.radius_mm)
+    content = [
+        _extrapolation(axes, observed_radius_mm),
+        axes.drawn("radius from the principal point (mm)", "displacement (µm)"),
+    ]
+    if has_asymmetric:
+        content.append(_band(x, axes, drawn.asymmetric_um, asymmetric_band, "band second"))
+        content.append(svg.line(x, axes.y(drawn.asymmetric_um), "curve second"))
+    content.append(_band(x, axes, drawn.radial_um, band, "band first"))
+    content.append(_band(x, axes, drawn.radial_um, drawn.radial_sigma_um, "band first"))
+    content.append(svg.line(x, axes.y(drawn.radial_um), "curve first"))
+    return svg.picture(axes.width, axes.height, "Distortion over the radius with its 95 % band", *content)
+
+
+def _directions() -> Array:
+    angles = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def _sigma(by: Array, cofactor: Array) -> Array:
+    return np.sqrt(np.maximum(np.einsum("rk,kl,rl->r", by, cofactor, by), 0.0))
+
+
+def _band(x: Array, axes: svg.Axes, middle: Array, half: Array, class_: str) -> Markup:
+    edge = np.concatenate([axes.y(middle + half), axes.y(middle - half)[::-1]])
+    return svg.line(np.concatenate([x, x[::-1]]), edge, class_, closed=True)
+
+
+def _extrapolation(axes: svg.Axes, observed_radius_mm: float) -> Markup:
+    start, end = float(axes.x(min(observed_radius_mm, axes.x_range[1]))), axes.width - axes.right
+    if end - start < 1.0:
+        return Markup("")
+    height = axes.height - axes.bottom - axes.top
+    label = (
+        svg.words(end - 6.0, axes.top + 14.0, "no targets here", "tick", "end") if end - start > 90.0 else Markup("")
+    )
+    return svg.tag("rect", x=start, y=axes.top, width=end - start, height=height, class_="beyond") + label

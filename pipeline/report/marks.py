@@ -1,0 +1,113 @@
+"""Every mark of every frame: what the scan, the comparator file and the adjustment say of it, joined by their names."""
+
+import re
+from collections import defaultdict
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.status import Status
+from pipeline.comparator_file import ComparatorPoint
+from pipeline.report.data import Json, ReportData
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One mark of one frame.
+
+    center_px (2,), covariance_px2 (2, 2) in the scan, sigma_um (2,) along x and y: None where nothing was fitted.
+    residual: its row of adjustment.json; None where it was no observation of the adjustment.
+    """
+
+    image: str
+    point: str
+    kind: str
+    status: Status
+    reason: str
+    center_px: Array | None
+    covariance_px2: Array | None
+    sigma_um: Array | None
+    residual: Json | None
+
+    @property
+    def is_fiducial(self) -> bool:
+        return self.kind == "fiducial"
+
+    @property
+    def w(self) -> float | None:
+        """The standardised residual; None where nothing checks the mark."""
+        return self.residual["w"] if self.residual else None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image: its marks, fiducials first; scan: its entry of measurement.json, empty where it was not measured."""
+
+    image: str
+    marks: tuple[Mark, ...]
+    scan: Json = field(default_factory=dict)
+
+    def count(self, *statuses: Status) -> int:
+        return sum(mark.status in statuses for mark in self.marks)
+
+
+def frames(data: ReportData) -> list[Frame]:
+    """Every image that any of the files names, in the order of their names."""
+    scans: dict[str, Json] = data.measurement["images"] if data.measurement else {}
+    marks: dict[str, dict[tuple[bool, str], Mark]] = defaultdict(dict)
+    for mark in _marks(data, scans):
+        marks[mark.image][mark.is_fiducial, mark.point] = mark
+    names = {*scans, *marks, *(data.adjustment["images"] if data.adjustment else {})}
+    return [
+        Frame(name, tuple(sorted(marks[name].values(), key=_order)), scans.get(name, {}))
+        for name in sorted(names, key=natural)
+    ]
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """The key that sorts "f2" before "f10"."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _marks(data: ReportData, scans: dict[str, Json]) -> list[Mark]:
+    measured = {
+        (image, mark["kind"] == "fiducial", mark["point"]): mark
+        for image, scan in scans.items()
+        for mark in scan.get("marks", ())
+    }
+    residuals = {
+        (row["image"], row["kind"] == "fiducial", row["point"]): row
+        for row in (data.adjustment["residuals"] if data.adjustment else ())
+    }
+    given = {(row.image, row.kind == "fiducial", row.point): row for row in data.comparator}
+    return [_mark(key, measured.get(key), given.get(key), residuals.get(key)) for key in {**measured, **given}]
+
+
+def _mark(key: tuple[str, bool, str], pixel: Json | None, row: ComparatorPoint | None, residual: Json | None) -> Mark:
+    image, _, point = key
+    known: Json = pixel or {}
+    return Mark(
+        image=image,
+        point=point,
+        kind=row.kind if row else known["kind"],
+        status=row.status if row else Status(known["status"]),
+        reason=row.reason if row else known["reason"],
+        center_px=None if known.get("col_px") is None else np.array([known["col_px"], known["row_px"]]),
+        covariance_px2=None if known.get("covariance_px2") is None else np.array(known["covariance_px2"]),
+        sigma_um=_sigma_um(residual, row),
+        residual=residual,
+    )
+
+
+def _sigma_um(residual: Json | None, row: ComparatorPoint | None) -> Array | None:
+    """As the adjustment took it, the film's share included, or else as it was measured."""
+    if residual:
+        return np.array([residual["sx_um"], residual["sy_um"]])
+    return 1e3 * row.sigma_mm if row and row.sigma_mm is not None else None
+
+
+def _order(mark: Mark) -> tuple[bool, list[tuple[int, str]]]:
+    return (not mark.is_fiducial, natural(mark.point))

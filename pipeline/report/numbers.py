@@ -1,0 +1,57 @@
+"""Numbers as a report prints them: true minus signs, and no digit that the standard deviation does not support."""
+
+import math
+
+NONE = "–"
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def fixed(value: float | None, decimals: int = 2, sign: bool = False) -> str:
+    """A number with so many decimals; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    text = f"{value:+.{decimals}f}" if sign else f"{value:.{decimals}f}"
+    return text.replace("-", "−")
+
+
+def value_and_sigma(value: float | None, sigma: float | None) -> tuple[str, str]:
+    """The value to the last digit that its sigma supports, and the sigma to two digits.
+
+    >>> value_and_sigma(153.66401, 0.00412)
+    ('153.6640', '0.0041')
+    >>> value_and_sigma(1.7427e-07, 3.1e-09)
+    ('1.743 × 10⁻⁷', '0.031 × 10⁻⁷')
+    >>> value_and_sigma(153.664, 0.0)
+    ('153.664', 'fixed')
+    """
+    if value is None or not math.isfinite(value):
+        return NONE, NONE
+    if sigma is None or not math.isfinite(sigma):
+        return significant(value, 6), NONE
+    if sigma == 0.0:
+        return significant(value, 8), "fixed"
+    power = _power(max(abs(value), sigma))
+    scale = 10.0**power
+    decimals = min(max(1 - math.floor(math.log10(sigma / scale)), 0), 12)
+    return _scaled(value / scale, decimals, power), _scaled(sigma / scale, decimals, power)
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """A number to so many digits."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    power = _power(abs(value))
+    return f"{value / 10.0**power:.{digits}g}".replace("-", "−") + _times(power)
+
+
+def _power(size: float) -> int:
+    """The power of ten to set apart: none for sizes that are read easily."""
+    return 0 if size == 0.0 or 1e-3 <= size < 1e7 else math.floor(math.log10(size))
+
+
+def _scaled(value: float, decimals: int, power: int) -> str:
+    return f"{value:.{decimals}f}".replace("-", "−") + _times(power)
+
+
+def _times(power: int) -> str:
+    return f" × 10{str(power).translate(_SUPERSCRIPT)}" if power else ""

@@ -1,0 +1,90 @@
+"""report.html: one file, no network, readable without scripts and on paper."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from measure.status import MEANING
+from pipeline.atomic import write_atomically
+from pipeline.report.camera_views import camera_views
+from pipeline.report.charts import fraction_plot
+from pipeline.report.data import Json, ReportData
+from pipeline.report.fractions import LEAST_MARKS, FractionTest, fraction_test
+from pipeline.report.frame_views import frame_views, thumbnail_scale
+from pipeline.report.marks import Frame, frames
+from pipeline.report.numbers import fixed, significant, value_and_sigma
+from pipeline.report.svg import round_step
+from pipeline.report.verdict import critical_w, judge, sigma0_bounds
+
+LIST_LIMIT = 200  # rows of a long table
+
+
+def write_report(data: ReportData, path: Path) -> None:
+    """Write the report. Raises InputError where the file cannot be written; an earlier one then stays as it was."""
+    write_atomically(path, render_report(data))
+
+
+def render_report(data: ReportData) -> str:
+    """The report as HTML."""
+    environment = Environment(
+        loader=PackageLoader("pipeline.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["quantity"] = lambda entry: value_and_sigma(entry["value"], entry["sigma"])
+    environment.filters |= {"fixed": fixed, "significant": significant}
+    return environment.get_template("report.html.j2").render(_context(data))
+
+
+def _context(data: ReportData) -> dict[str, Any]:
+    shots = frames(data)
+    adjustment = data.adjustment
+    return {
+        "project": data.project,
+        "verdict": judge(data),
+        "adjustment": adjustment,
+        "check": data.check,
+        "frames": frame_views(data, shots),
+        "cameras": camera_views(data),
+        "fractions": list(_fractions(shots)),
+        "least_marks": LEAST_MARKS,
+        "meaning": MEANING,
+        "arrow_bar": _arrow_bar(shots),
+        "sigma0_bounds": sigma0_bounds(adjustment["redundancy"]) if adjustment and adjustment["redundancy"] else None,
+        "critical_w": critical_w(2 * len(adjustment["residuals"])) if adjustment else 0.0,
+        "points": _points(adjustment) if adjustment else [],
+        "list_limit": LIST_LIMIT,
+    }
+
+
+def _fractions(shots: list[Frame]) -> Iterator[tuple[str, FractionTest, Markup]]:
+    """By axis: the test of the fractional parts and its drawing; nothing where no pixel positions are known."""
+    centers = [
+        mark.center_px
+        for frame in shots
+        for mark in frame.marks
+        if mark.status.is_observation and mark.center_px is not None
+    ]
+    if centers:
+        for axis, positions in zip(("column", "row"), np.array(centers).T, strict=True):
+            test = fraction_test(positions)
+            yield axis, test, fraction_plot(axis, test)
+
+
+def _arrow_bar(shots: list[Frame]) -> tuple[float, float]:
+    """A round length in um for the legend of the marks' pictures, and its page pixels."""
+    px_per_um = thumbnail_scale(shots)
+    um = round_step(40.0 / px_per_um)
+    return um, um * px_per_um
+
+
+def _points(adjustment: Json) -> list[tuple[str, Json]]:
+    """Object points that were estimated, the least certain first."""
+    free = [(id, point) for id, point in adjustment["points"].items() if any(q["sigma"] != 0.0 for q in point.values())]
+    return sorted(free, key=lambda item: -max(q["sigma"] or 0.0 for q in item[1].values()))

@@ -1,0 +1,117 @@
+"""The table of a camera's parameters: value, standard deviation, what was given, and what that says."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adjust.distortion import PARAMETERS
+from pipeline.adjustment_file import Covariance
+from pipeline.report.data import Json
+from pipeline.report.lens import largest_effects_um, lens
+from pipeline.report.numbers import fixed, significant, value_and_sigma
+
+SIGNIFICANT = 2.576  # sigmas: chance alone exceeds it once in a hundred times
+MOSTLY_PRIOR = 0.9  # of the prior's sigma is left: the data have told little
+HIGH_CORRELATION = 0.9
+
+UNITS = {
+    "torlegard": dict(zip(("k3", "k5", "k7", "p1", "p2", "p3", "p4"), (-2, -4, -6, -1, -1, -2, -4), strict=True)),
+    "brown": dict(zip(("k1", "k2", "k3", "p1", "p2", "b1", "b2"), (-2, -4, -6, -1, -1, 0, 0), strict=True)),
+}
+JUHL_UNIT = "µm at 1 dm"
+_POWERS = {0: "–", -1: "mm⁻¹", -2: "mm⁻²", -4: "mm⁻⁴", -6: "mm⁻⁶"}
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """A row in words and numbers ready to print. effect: at the outermost target, in um."""
+
+    symbol: str
+    unit: str
+    value: str
+    sigma: str
+    given: str
+    effect: str
+    meaning: str
+
+
+def parameter_rows(name: str, camera: Json, sigma0: float, radius_mm: float) -> list[ParameterRow]:
+    """Principal distance, principal point and distortion. radius_mm: where the distortion's effect is stated."""
+    point, distance = camera["principal_point_mm"], camera["principal_distance_mm"]
+    interior = [("c", distance), ("x₀′", point["x"]), ("y₀′", point["y"])]
+    family = camera["distortion"]["family"]
+    effects = largest_effects_um(lens(name, camera), radius_mm) if PARAMETERS[family] else {}
+    rows = [_row(symbol, "mm", quantity, "", _origin(quantity, sigma0)) for symbol, quantity in interior]
+    for parameter in PARAMETERS[family]:
+        quantity = camera["distortion"].get(parameter)
+        if quantity is not None and (quantity["value"] != 0.0 or quantity["sigma"] != 0.0):
+            effect = _effect(quantity, effects[parameter])
+            rows.append(_row(parameter, _unit(family, parameter), quantity, effect, _significance(quantity)))
+    return rows
+
+
+def high_correlations(name: str, camera: Json, covariance: Covariance) -> list[tuple[str, str, float]]:
+    """Pairs of parameters that the observations hardly tell apart, the highest correlation first."""
+    parameters = ["c", "x0", "y0", *PARAMETERS[camera["distortion"]["family"]]]
+    block = covariance.of(f"IO.{name}.{parameter}" for parameter in parameters)
+    sigma = np.sqrt(np.maximum(np.diag(block), 0.0))
+    free = np.flatnonzero(sigma > 0.0)
+    correlation = block[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
+    pairs = [
+        (parameters[free[i]], parameters[free[j]], float(correlation[i, j]))
+        for i, j in zip(*np.triu_indices(len(free), 1), strict=True)
+        if abs(correlation[i, j]) > HIGH_CORRELATION
+    ]
+    return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+def _row(symbol: str, unit: str, quantity: Json, effect: str, meaning: str) -> ParameterRow:
+    value, sigma = value_and_sigma(quantity["value"], quantity["sigma"])
+    return ParameterRow(symbol, unit, value, sigma, _given(quantity), effect, meaning)
+
+
+def _given(quantity: Json) -> str:
+    given = quantity.get("given")
+    if given is None:
+        return "nothing"
+    if given["sigma"] is None:
+        return f"{significant(given['value'], 6)}, free"
+    if given["sigma"] == 0.0:
+        return f"{significant(given['value'], 8)}, fixed"
+    value, sigma = value_and_sigma(given["value"], given["sigma"])
+    return f"{value} ± {sigma}"
+
+
+def _origin(quantity: Json, sigma0: float) -> str:
+    """How far the value moved from the given one, and whether data or prior determined it."""
+    given, sigma = quantity.get("given"), quantity["sigma"]
+    if sigma is None:
+        return "not determined"
+    if sigma == 0.0:
+        return "held at the given value"
+    if given is None or not given["sigma"]:
+        return "determined by the observations alone"
+    moved = f"moved by {fixed(1e3 * (quantity['value'] - given['value']), 0, sign=True)} µm"
+    left = sigma / (sigma0 * given["sigma"])
+    if left > MOSTLY_PRIOR:
+        return f"{moved}; known from the given value, hardly from the observations"
+    return f"{moved}; {100.0 * (1.0 - left**2):.0f} % of what is known comes from the observations"
+
+
+def _significance(quantity: Json) -> str:
+    if quantity["sigma"] is None:
+        return "not determined"
+    if quantity["sigma"] == 0.0:
+        return "held at the given value"
+    size = abs(quantity["value"]) / quantity["sigma"]
+    times = f"{size:.1f}" if size < 100.0 else f"{size:.0f}"
+    return f"significant ({times} σ)" if size > SIGNIFICANT else f"not significant ({times} σ)"
+
+
+def _effect(quantity: Json, um_per_unit: float) -> str:
+    value, sigma = value_and_sigma(um_per_unit * quantity["value"], um_per_unit * (quantity["sigma"] or 0.0))
+    return f"{value} ± {sigma}" if quantity["sigma"] else significant(um_per_unit * quantity["value"], 3)
+
+
+def _unit(family: str, parameter: str) -> str:
+    return JUHL_UNIT if family == "juhl" else _POWERS[UNITS.get(family, {}).get(parameter, 0)]

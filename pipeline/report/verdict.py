@@ -1,0 +1,207 @@
+"""The verdict on a calibration, and what needs a look."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from measure.status import Status
+from pipeline.report.data import Json, Problem, ReportData
+from pipeline.report.fractions import fraction_test
+from pipeline.report.marks import Frame, frames
+from pipeline.report.numbers import fixed, value_and_sigma
+
+Level = Literal["good", "look", "failed"]
+
+CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
+MANY = 8  # so many names are listed; the rest are counted
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One sentence, and the problems behind it. good: exit code 0; look: 1; failed: 1, there is no usable result."""
+
+    level: Level
+    sentence: str
+    problems: tuple[Problem, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def exit_code(self) -> int:
+        return 0 if self.level == "good" else 1
+
+
+def judge(data: ReportData) -> Verdict:
+    """Judge what is there: the measurement, the adjustment, the check against OpenCV."""
+    shots = frames(data)
+    fatal = tuple(_no_solution(data.adjustment)) if data.adjustment else ()
+    problems = (
+        *fatal,
+        *data.problems,
+        *(problem for frame in shots for problem in _frame_problems(frame)),
+        *(_locking(shots)),
+        *(_adjustment_problems(data.adjustment) if data.adjustment and not fatal else ()),
+        *(_check_problems(data.check) if data.check else ()),
+    )
+    nothing = not any(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
+    level: Level = "failed" if fatal or nothing else "look" if problems else "good"
+    return Verdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
+
+
+def sigma0_bounds(redundancy: int) -> tuple[float, float]:
+    """Where sigma0 lies, with a probability of 99 %, when the a-priori standard deviations are right."""
+    low, high = stats.chi2.ppf([0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)], redundancy)
+    return float(np.sqrt(low / redundancy)), float(np.sqrt(high / redundancy))
+
+
+def critical_w(tests: int) -> float:
+    """The standardised residual that one of so many good observations exceeds once in a hundred adjustments."""
+    return float(stats.norm.isf(0.5 * (1.0 - CONFIDENCE) / max(tests, 1)))
+
+
+def suspects(adjustment: Json) -> list[Json]:
+    """Observations whose standardised residual is beyond chance, the worst first.
+
+    With sigma0 above 1 it is measured against that: all residuals are larger then, and none is singled out by it.
+    """
+    rows = [row for row in adjustment["residuals"] if row["w"] is not None]
+    limit = critical_w(2 * len(rows)) * max(1.0, adjustment["sigma0"] or 1.0)
+    return sorted((row for row in rows if abs(row["w"]) > limit), key=lambda row: -abs(row["w"]))
+
+
+def _no_solution(adjustment: Json) -> Iterator[Problem]:
+    for null in adjustment["singular"]:
+        moved = _listed(null["parameters"])
+        yield Problem(f"The observations cannot tell these unknowns apart: {moved}. {null['cause']}", null["remedy"])
+    if not adjustment["converged"] and not adjustment["singular"]:
+        how = adjustment.get("termination", "not converged")
+        yield Problem(
+            f"The iteration did not come to rest ({how}, {adjustment['iterations']} iterations).",
+            "Look for wrong point numbers and gross errors among the largest residuals, and at the approximate "
+            "orientations.",
+        )
+
+
+def _frame_problems(frame: Frame) -> Iterator[Problem]:
+    pose = frame.scan.get("pose")
+    if pose and not pose["decided"]:
+        reason = " ".join(pose.get("evidence", ()))
+        yield Problem(
+            f"{frame.image}: pose assumed ({pose['name']}). {reason}",
+            'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
+        )
+    for problem in frame.scan.get("problems", ()):
+        yield Problem(f"{frame.image}: {problem}")
+    lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
+    if lost:
+        names = "; ".join(f"{mark.point} {mark.status}: {mark.reason.rstrip('.')}" for mark in lost[:MANY])
+        found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
+        yield Problem(
+            f"{frame.image}: {_count(len(lost), 'fiducial mark')} not measured, {found} measured ({names}).",
+            "Look at their pictures below. The frame is used with the others; its film transformation is less certain.",
+        )
+    targets = [mark for mark in frame.marks if not mark.is_fiducial]
+    if targets and not any(mark.status.is_observation for mark in targets):
+        yield Problem(
+            f"{frame.image}: none of its {len(targets)} targets was measured.",
+            "Look at their reasons below: an approximate orientation, a pose or a diameter that is wrong misses all.",
+        )
+
+
+def _locking(shots: list[Frame]) -> Iterator[Problem]:
+    centers = [m.center_px for f in shots for m in f.marks if m.status.is_observation and m.center_px is not None]
+    for axis, positions in zip(("column", "row"), np.reshape(centers, (-1, 2)).T, strict=True):
+        if fraction_test(positions).is_locked:
+            yield Problem(
+                f"The {axis} positions of the marks prefer parts of a pixel: the measurement is biased (pixel locking).",
+                "Look at the histogram of fractional parts; scan with a finer pitch or in 16 bit.",
+            )
+
+
+def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
+    yield from (Problem(warning) for warning in adjustment.get("warnings", ()))
+    if adjustment["redundancy"] > 0:
+        yield from _global_test(adjustment["sigma0"], adjustment["redundancy"])
+    else:
+        yield Problem(
+            "Nothing checks the result: there are as many unknowns as observations.",
+            "Add points or frames; until then no standard deviation here has been confirmed by the data.",
+        )
+    bad = suspects(adjustment)
+    if bad:
+        names = ", ".join(f"{row['image']}/{row['point']} (w = {fixed(row['w'], 1)})" for row in bad[:MANY])
+        more = f" and {len(bad) - MANY} more" if len(bad) > MANY else ""
+        yield Problem(
+            f"{_count(len(bad), 'observation')} beyond chance: {names}{more}.",
+            "Look at the picture: a wrong point number or a disturbed mark is rejected in comparator.csv "
+            "(status rejected), and the adjustment run again.",
+        )
+
+
+def _global_test(sigma0: float, redundancy: int) -> Iterator[Problem]:
+    low, high = sigma0_bounds(redundancy)
+    if sigma0 > high:
+        yield Problem(
+            f"σ₀ = {sigma0:.2f} is above {high:.2f}: the residuals are larger than the standard deviations given.",
+            "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
+            "film_sigma_um or add distortion parameters. The sigmas below are already multiplied by σ₀.",
+        )
+    elif sigma0 < low:
+        yield Problem(
+            f"σ₀ = {sigma0:.2f} is below {low:.2f}: the marks fit better than the standard deviations given.",
+            "Lower sigma_target_um, sigma_fiducial_um or film_sigma_um. The sigmas below are already multiplied by σ₀.",
+        )
+
+
+def _check_problems(check: Json) -> Iterator[Problem]:
+    if check["verdict"] == "differs":
+        yield Problem(
+            f"OpenCV's calibration of the same observations differs. {check['reason']}",
+            "See the table of the check: a parameter that differs by many sigmas points to the cause.",
+        )
+
+
+def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
+    """What is worth knowing and needs no action."""
+    if not data.comparator and not data.measurement:
+        yield "No measurement was handed to this report."
+    if not data.adjustment:
+        yield "There is no adjustment yet: run `reseau adjust`."
+    elif not data.check:
+        yield "There is no check against OpenCV yet: run `reseau check`."
+    elif data.check["verdict"] == "not possible":
+        yield f"OpenCV cannot check this calibration. {data.check['reason']}"
+    for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
+        number = sum(mark.status is status and not mark.is_fiducial for frame in shots for mark in frame.marks)
+        if number:
+            yield f"{_count(number, 'target')} {status} (their reasons stand with the marks)."
+
+
+def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int) -> str:
+    marks = sum(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
+    found = f"{_count(marks, 'mark')} in {_count(len(shots), 'frame')}"
+    look = {"good": ".", "look": f", but {_count(problems, 'thing needs', 'things need')} a look.", "failed": "."}[
+        level
+    ]
+    if not data.adjustment:
+        return f"Measured: {found}{look}" if marks else "No mark was measured."
+    if level == "failed":
+        why = "the network is singular" if data.adjustment["singular"] else "the iteration did not come to rest"
+        return f"There is no calibration: {why if marks or data.adjustment['residuals'] else 'nothing was measured'}."
+    constants = "; ".join(
+        f"{name} has c = {value} ± {sigma} mm" if sigma != "fixed" else f"{name} has c = {value} mm, fixed"
+        for name, camera in data.adjustment["cameras"].items()
+        for value, sigma in [value_and_sigma(*(camera["principal_distance_mm"][key] for key in ("value", "sigma")))]
+    )
+    return f"Calibrated from {found}: {constants}{look}"
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - MANY} more" if len(names) > MANY else ""
+    return ", ".join(names[:MANY]) + more
+
+
+def _count(number: int, one: str, many: str = "") -> str:
+    return f"{number} {one if number == 1 else many or one + 's'}"
