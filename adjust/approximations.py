@@ -1,0 +1,158 @@
+"""Initial values for an adjustment, from the network alone: nobody has to supply approximations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.distortion import PARAMETERS, image_equations
+from adjust.errors import AdjustmentError
+from adjust.fiducial_fit import FEWEST_MARKS, fit_transformation
+from adjust.network import Approximations, Camera, Image, Network
+from adjust.orientation import orient
+from adjust.principal_distance import KnownField, find_principal_distance
+from adjust.resection import Pose
+from adjust.rotation import angles_from_rotation, angles_near
+from adjust.sight import Sight
+from adjust.transformation import affine_from_parameters, apply_affine
+
+Array = NDArray[np.float64]
+
+NEWTON_STEPS = 6
+
+
+def approximate(network: Network) -> Approximations:
+    """Where the adjustment starts: film transformations, interior and exterior orientations, unknown object points.
+
+    Film transformations from the fiducial marks; a principal distance nobody knows from resections of the known
+    points; exterior orientations as given, or by resection (gross errors tolerated), image after image, with points
+    intersected from the images already oriented; where too little is known to begin with, from a model of the images
+    themselves. Independent of the order of images, points and observations.
+    Raises AdjustmentError, naming the image, camera or point, where something cannot be found, and what would help.
+    """
+    rows = _rows_by_image(network)
+    fits = {image.name: _film_transformation(network, image, rows[image.name]) for image in network.images}
+    frames = {image.name: _frame(network, image, rows[image.name], fits[image.name]) for image in network.images}
+    interior = {camera.name: _interior(network, camera, frames) for camera in network.cameras}
+    sights = {
+        image.name: _sight(network.camera_by_name[image.camera], frames[image.name], interior[image.camera])
+        for image in network.images
+    }
+    poses, points = orient(network, sights)
+    return Approximations(
+        interior=interior,
+        exterior={image.name: _exterior(image, poses[image.name]) for image in network.images},
+        transformation={name: parameters for name, (parameters, _) in fits.items()},
+        points=points,
+        mirrored=frozenset(name for name, (_, mirrored) in fits.items() if mirrored),
+    )
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """The object points of one image in the camera frame: ids in order, xy_mm (n, 2), their typical sigma."""
+
+    points: tuple[str, ...]
+    xy_mm: Array
+    sigma_mm: float
+
+
+def _rows_by_image(network: Network) -> dict[str, list[int]]:
+    """The rows of each image's observations in the order of kind and point."""
+    rows: dict[str, list[int]] = {image.name: [] for image in network.images}
+    observations = network.observations
+    for row, image in enumerate(observations.image):
+        if image not in rows:
+            raise AdjustmentError(
+                f"point {observations.point[row]} is observed in image {image}, which the network does not hold"
+            )
+        rows[image].append(row)
+    for image in rows:
+        rows[image].sort(key=lambda row: (observations.kind[row], observations.point[row]))
+    return rows
+
+
+def _film_transformation(network: Network, image: Image, rows: list[int]) -> tuple[Array, bool]:
+    """Parameters and whether mirrored."""
+    observations, given = network.observations, network.camera_by_name[image.camera].fiducials
+    marks = [row for row in rows if observations.kind[row] == "fiducial" and observations.point[row] in given]
+    fewest = FEWEST_MARKS[image.transformation]
+    if len(marks) < fewest:
+        raise AdjustmentError(
+            f"image {image.name} shows {len(marks)} fiducial marks of camera {image.camera}; the transformation "
+            f"{image.transformation} needs {fewest}: measure more marks, or choose a simpler transformation"
+        )
+    fiducials = [given[observations.point[row]] for row in marks]
+    camera_mm = np.array([[mark.x_mm.value, mark.y_mm.value] for mark in fiducials]).reshape(-1, 2)
+    return fit_transformation(image.transformation, observations.xy_mm[marks], camera_mm)
+
+
+def _frame(network: Network, image: Image, rows: list[int], fit: tuple[Array, bool]) -> _Frame:
+    observations = network.observations
+    targets = [row for row in rows if observations.kind[row] != "fiducial"]
+    variances = np.trace(observations.covariance_mm2[targets], axis1=1, axis2=2) / 2
+    return _Frame(
+        tuple(observations.point[row] for row in targets),
+        apply_affine(affine_from_parameters(image.transformation, *fit), observations.xy_mm[targets]),
+        float(np.sqrt(np.median(variances))) if targets else 0.0,
+    )
+
+
+def _interior(network: Network, camera: Camera, frames: Mapping[str, _Frame]) -> Array:
+    """c, x0', y0' (3,) in mm."""
+    x0, y0 = (
+        center if prior is None else prior.value
+        for prior, center in zip((camera.x0_mm, camera.y0_mm), camera.center_mm, strict=True)
+    )
+    if camera.principal_distance_mm is not None:
+        return np.array([camera.principal_distance_mm.value, x0, y0])
+    fields = [
+        _known_field(network, frames[image.name], x0, y0)
+        for image in sorted(network.images, key=lambda i: i.name)
+        if image.camera == camera.name
+    ]
+    found = find_principal_distance(fields)
+    if found is None:
+        raise AdjustmentError(
+            f"the principal distance of camera {camera.name} cannot be found from its images: they see too few known "
+            "points, or only a plane parallel to the image; give an approximate principal_distance_mm"
+        )
+    return np.array([found, x0, y0])
+
+
+def _known_field(network: Network, frame: _Frame, x0: float, y0: float) -> KnownField:
+    """The points of one image whose coordinates are all known."""
+    listed = [network.point_by_id.get(name) for name in frame.points]
+    known = [
+        (i, [point.X.value, point.Y.value, point.Z.value])
+        for i, point in enumerate(listed)
+        if point is not None and point.X is not None and point.Y is not None and point.Z is not None
+    ]
+    xyz = np.array([coordinates for _, coordinates in known]).reshape(-1, 3)
+    return KnownField(xyz, frame.xy_mm[[i for i, _ in known]] - [x0, y0], frame.sigma_mm)
+
+
+def _sight(camera: Camera, frame: _Frame, interior: Array) -> Sight:
+    c = float(interior[0])
+    return Sight(frame.points, c * _ideal_rays(camera, interior, frame.xy_mm), c, frame.sigma_mm)
+
+
+def _ideal_rays(camera: Camera, interior: Array, xy_mm: Array) -> Array:
+    """-U/W, -V/W (n, 2) with the distortion as it is known beforehand, by Newton's method on the image equations."""
+    known = camera.distortion.parameters
+    parameters = np.array(
+        [known[name].value if name in known else 0.0 for name in PARAMETERS[camera.distortion.family]]
+    )
+    rays: Array = (xy_mm - interior[1:]) / interior[0]
+    for _ in range(NEWTON_STEPS):
+        equations = image_equations(camera.distortion, interior, parameters, xy_mm, rays)
+        rays = rays - np.linalg.solve(equations.by_ray, equations.value[..., None])[..., 0]
+    return rays
+
+
+def _exterior(image: Image, pose: Pose) -> Array:
+    """X0, Y0, Z0, omega, phi, kappa (6,); the angles as near as can be to those given."""
+    if image.exterior is None:
+        return np.concatenate([pose.center, angles_from_rotation(pose.rotation)])
+    return np.concatenate([pose.center, angles_near(pose.rotation, image.exterior.values[3:])])

@@ -1,0 +1,62 @@
+"""Intersection: object points from the rays of images whose exterior orientation is known."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+ITERATIONS = 10
+WEAKEST = 1e-8  # smallest eigenvalue of the normal matrix that still gives a point: rays 0.01 degrees apart
+
+
+def intersect(centers: Array, directions: Array, point: Index, known: Array) -> tuple[Array, Array]:
+    """Points nearest to their rays in the sum of angles, so that one gross error among several rays does no harm.
+
+    centers, directions (m, 3): a row a ray, directions of any length, pointing away from the camera; point (m,) says
+    which point each belongs to; known (p, 3) holds coordinates that are given, nan where they are sought.
+    Returns the points (p, 3), nan where the rays give none, and the determination (p,): the smallest eigenvalue of the
+    normal matrix of unit rays, about half the squared angle between two rays; 0 where there is no point.
+    """
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    sought: NDArray[np.bool_] = np.isnan(known)
+    determination = _smallest_eigenvalue(across, point, sought)
+    usable: NDArray[np.bool_] = determination > WEAKEST
+    weights = np.ones(len(point))
+    for _ in range(ITERATIONS):
+        points = _nearest(across * weights[:, None, None], centers, point, known, usable)
+        offset = points[point] - centers
+        distance = np.linalg.norm(offset, axis=1)
+        angle = np.linalg.norm(np.einsum("mij,mj->mi", across, offset), axis=1) / distance
+        typical = np.nanmedian(angle) if usable.any() else 1.0
+        weights = np.nan_to_num(1.0 / (distance**2 * np.maximum(angle, 0.1 * typical + 1e-12)), nan=0.0)
+        weights /= np.max(weights, initial=np.finfo(float).tiny)
+    in_front = np.einsum("mi,mi->m", points[point] - centers, directions) > 0
+    majority = np.bincount(point, np.where(in_front, 1.0, -1.0), len(known)) > 0
+    good = np.logical_and(usable, majority)
+    return np.where(good[:, None], points, np.nan), np.where(good, determination, 0.0)
+
+
+def _smallest_eigenvalue(across: Array, point: Index, sought: NDArray[np.bool_]) -> Array:
+    normal = np.zeros((len(sought), 3, 3))
+    np.add.at(normal, point, across)
+    normal = np.where(sought[:, :, None] & sought[:, None, :], normal, 0.0)
+    normal += np.where(sought, 0.0, 1e6)[:, :, None] * np.eye(3)  # a given coordinate is no unknown
+    return np.asarray(np.linalg.eigvalsh(normal)[:, 0], dtype=np.float64)
+
+
+def _nearest(across: Array, centers: Array, point: Index, known: Array, usable: NDArray[np.bool_]) -> Array:
+    """Weighted least-squares points (p, 3), given coordinates kept; nan where not usable."""
+    normal, right = np.zeros((len(known), 3, 3)), np.zeros((len(known), 3))
+    np.add.at(normal, point, across)
+    np.add.at(right, point, np.einsum("mij,mj->mi", across, centers))
+    given = ~np.isnan(known)
+    values = np.where(given, known, 0.0)
+    right = np.where(given, values, right - np.einsum("pij,pj->pi", normal, values))
+    either = given[:, :, None] | given[:, None, :]
+    normal = np.where(either, np.eye(3), normal)
+    points = np.full(known.shape, np.nan)
+    if usable.any():
+        points[usable] = np.linalg.solve(normal[usable], right[usable][..., None])[..., 0]
+    return points

@@ -1,0 +1,399 @@
+"""Initial values without any approximation from the user: against OpenCV's projections and the reference cases."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from adjust.approximations import approximate
+from adjust.errors import AdjustmentError
+from adjust.network import (
+    Approximations,
+    Camera,
+    Distortion,
+    Exterior,
+    Fiducial,
+    Image,
+    Network,
+    ObjectPoint,
+    ObservationKind,
+    Observations,
+    Prior,
+    Transformation,
+)
+
+Array = NDArray[np.float64]
+
+CASES = Path(__file__).parents[3] / "shared" / "cases"
+C_MM, X0_MM, Y0_MM = 152.0, 0.05, -0.03
+MARKS_MM = {
+    str(i + 1): 106.0 * np.array(xy) for i, xy in enumerate([(1, -1), (-1, -1), (-1, 1), (1, 1), (-1, 0), (1, 0)])
+}
+
+
+@dataclass(frozen=True)
+class Truth:
+    network: Network
+    rotations: dict[str, Array]
+    centers: dict[str, Array]
+    points: dict[str, Array]
+
+
+def simulated(
+    xyz: Array,
+    stations: Sequence[tuple[float, float, float, float, float, float]],
+    *,
+    kind: Transformation = "affine",
+    mirrored: bool = False,
+    noise_mm: float = 0.005,
+    outliers: float = 0.0,
+    distortion: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    seed: int = 1,
+) -> Truth:
+    """A network of known points as OpenCV projects them, scanned with any turn; all points within 115 mm are seen."""
+    rng = np.random.default_rng(seed)
+    rows: list[tuple[str, str, ObservationKind, Array]] = []
+    rotations, centers = {}, {}
+    for number, station in enumerate(stations):
+        image = f"f{number + 1}"
+        rotation = Rotation.from_euler("XYZ", station[3:]).as_matrix().T
+        rotations[image], centers[image] = rotation, np.array(station[:3])
+        seen = camera_coordinates(xyz, rotation, centers[image], distortion)
+        marks = np.array(list(MARKS_MM.values()))
+        scan = scan_from_camera(kind, mirrored, rng)
+        inside = np.flatnonzero((np.abs(seen) < 115.0).all(axis=1))
+        targets = seen[inside] @ scan[0].T + scan[1] + rng.normal(0.0, noise_mm, (len(inside), 2))
+        wrong = rng.random(len(inside)) < outliers
+        targets[wrong] += rng.uniform(-40.0, 40.0, (int(wrong.sum()), 2))
+        fiducials = marks @ scan[0].T + scan[1] + rng.normal(0.0, noise_mm, marks.shape)
+        rows += [(image, f"t{k}", "target", xy) for k, xy in zip(inside, targets, strict=True)]
+        if kind != "none":
+            rows += [(image, name, "fiducial", xy) for name, xy in zip(MARKS_MM, fiducials, strict=True)]
+    names = [f"k{i}" for i in (1, 2)] + ["p1", "p2"]
+    camera = Camera(
+        "rc20",
+        Prior(C_MM, 1.0),
+        Prior(X0_MM, 1.0),
+        Prior(Y0_MM, 1.0),
+        Distortion("opencv", {name: Prior(value) for name, value in zip(names, distortion, strict=True)}),
+        {name: Fiducial(Prior(x, 1.0), Prior(y, 1.0)) for name, (x, y) in MARKS_MM.items()} if kind != "none" else {},
+    )
+    points = tuple(ObjectPoint(f"t{k}", *(Prior(float(v)) for v in row)) for k, row in enumerate(xyz))
+    observations = Observations(
+        tuple(row[0] for row in rows),
+        tuple(row[1] for row in rows),
+        tuple(row[2] for row in rows),
+        np.array([row[3] for row in rows]),
+        np.tile(np.eye(2) * 0.005**2, (len(rows), 1, 1)),
+    )
+    images = tuple(Image(name, "rc20", kind) for name in rotations)
+    return Truth(
+        Network((camera,), images, points, observations),
+        rotations,
+        centers,
+        {p.id: xyz[k] for k, p in enumerate(points)},
+    )
+
+
+def camera_coordinates(xyz: Array, rotation: Array, center: Array, distortion: Sequence[float]) -> Array:
+    """Camera coordinates (n, 2), y up, by cv2.projectPoints; far outside the frame what is behind the camera."""
+    downward = np.diag([1.0, -1.0, -1.0]) @ rotation
+    matrix = np.array([[C_MM, 0.0, X0_MM], [0.0, C_MM, -Y0_MM], [0.0, 0.0, 1.0]])
+    projected, _ = cv2.projectPoints(
+        xyz, cv2.Rodrigues(downward)[0], -downward @ center, matrix, np.array(distortion, dtype=np.float64)
+    )
+    in_front = ((xyz - center) @ downward.T)[:, 2] > 0
+    return np.where(in_front[:, None], projected.reshape(-1, 2) * [1.0, -1.0], 1e6)
+
+
+def scan_from_camera(kind: Transformation, mirrored: bool, rng: np.random.Generator) -> tuple[Array, Array]:
+    """A scan turned anyhow on the bed (2, 2), (2,): stretched by some per mille if affine, mirrored if asked."""
+    if kind == "none":
+        return np.eye(2), np.zeros(2)
+    angle = rng.uniform(-np.pi, np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    stretch = np.eye(2) + (rng.normal(0.0, 2e-3, (2, 2)) if kind == "affine" else np.zeros((2, 2)))
+    return turn @ stretch @ np.diag([-1.0 if mirrored else 1.0, 1.0]), rng.uniform(50.0, 150.0, 2)
+
+
+def field(relief_m: float, seed: int = 5, n: int = 40) -> Array:
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (n, 3)) * [900.0, 900.0, relief_m]
+
+
+CONVERGENT = [
+    (0.0, 0.0, 1530.0, 0.0, 0.0, 0.0),
+    (700.0, 100.0, 1400.0, -0.07, 0.45, 1.6),
+    (-600.0, 80.0, 1600.0, -0.05, -0.4, 3.1),
+    (50.0, 700.0, 1480.0, -0.45, 0.03, -1.6),
+    (-80.0, -650.0, 1650.0, 0.4, -0.05, 0.4),
+]
+VERTICAL = [
+    (-300.0, 0.0, 1530.0, 0.02, -0.03, 0.1),
+    (300.0, 20.0, 1500.0, -0.03, 0.01, 2.9),
+    (0.0, 200.0, 1550.0, 0.0, 0.03, -1.5),
+]
+
+
+def assert_near(found: Approximations, truth: Truth, meters: float, radians: float) -> None:
+    for image, center in truth.centers.items():
+        assert np.linalg.norm(found.exterior[image][:3] - center) < meters
+        rotation = Rotation.from_euler("XYZ", found.exterior[image][3:]).as_matrix().T
+        assert np.linalg.norm(rotation - truth.rotations[image]) < radians
+    for name, xyz in truth.points.items():
+        if name in found.points:
+            assert np.linalg.norm(found.points[name] - xyz) < meters
+
+
+@pytest.mark.parametrize("relief_m", [0.0, 30.0, 300.0], ids=["flat", "hilly", "deep"])
+@pytest.mark.parametrize("stations", [CONVERGENT, VERTICAL, VERTICAL[:1]], ids=["convergent", "vertical", "single"])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_known_points_noise_and_gross_errors(
+    relief_m: float, stations: list[tuple[float, float, float, float, float, float]], mirrored: bool
+) -> None:
+    truth = simulated(field(relief_m), stations, mirrored=mirrored, outliers=0.05)
+    found = approximate(truth.network)
+    assert_near(found, truth, meters=2.0, radians=2e-3)
+    assert found.mirrored == (frozenset(truth.centers) if mirrored else frozenset())
+
+
+@pytest.mark.parametrize("kind", ["none", "congruent", "similarity", "affine"])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_every_film_transformation(kind: Transformation, mirrored: bool) -> None:
+    truth = simulated(field(300.0), CONVERGENT, kind=kind, mirrored=mirrored, noise_mm=0.0)
+    found = approximate(truth.network)
+    assert_near(found, truth, meters=1e-2, radians=1e-5)
+    assert found.mirrored == (frozenset(truth.centers) if mirrored and kind != "none" else frozenset())
+
+
+def test_distortion_known_beforehand_is_taken_off() -> None:
+    truth = simulated(field(300.0), CONVERGENT, noise_mm=0.0, distortion=(-0.25, 0.13, 1e-3, -5e-4))
+    assert_near(approximate(truth.network), truth, meters=1e-2, radians=1e-5)
+
+
+def test_unknown_distortion_leaves_a_usable_start() -> None:
+    truth = simulated(field(300.0), CONVERGENT, distortion=(-0.2, 0.05, 0.0, 0.0))
+    camera = replace(truth.network.cameras[0], distortion=Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
+    assert_near(approximate(replace(truth.network, cameras=(camera,))), truth, meters=100.0, radians=0.05)
+
+
+def test_unknown_principal_distance_from_a_deep_field() -> None:
+    truth = simulated(field(300.0), CONVERGENT, outliers=0.05)
+    found = approximate(without_interior(truth.network))
+    assert abs(found.interior["rc20"][0] - C_MM) < 0.3
+    assert_near(found, truth, meters=5.0, radians=5e-3)
+
+
+def test_unknown_principal_distance_from_twenty_boards() -> None:
+    board = np.array([[x, y, 0.0] for x in range(-4, 5) for y in range(-3, 4)]) * 100.0
+    rng = np.random.default_rng(8)
+    stations = []
+    for _ in range(20):
+        direction = Rotation.from_euler("XYZ", [*rng.uniform(-0.6, 0.6, 2), rng.uniform(-3, 3)])
+        center = direction.apply([0.0, 0.0, rng.uniform(900.0, 1300.0)])
+        stations.append((*center, *direction.as_euler("XYZ")))
+    truth = simulated(board, stations, kind="none", outliers=0.05, distortion=(-0.05, 0.01, 0.0, 0.0))
+    camera = replace(truth.network.cameras[0], distortion=Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
+    found = approximate(
+        replace(without_interior(truth.network), cameras=(replace(camera, principal_distance_mm=None),))
+    )
+    assert abs(found.interior["rc20"][0] / C_MM - 1) < 0.05
+    assert_near(found, truth, meters=80.0, radians=0.05)
+
+
+def test_a_principal_distance_that_nothing_shows_is_asked_for() -> None:
+    station = [(0.0, 0.0, 1500.0, 0.0, 0.0, 0.3)]
+    truth = simulated(field(0.0), station)
+    with pytest.raises(AdjustmentError, match=r"principal distance of camera rc20 .* give an approximate"):
+        approximate(without_interior(truth.network))
+
+
+def without_interior(network: Network) -> Network:
+    camera = replace(network.cameras[0], principal_distance_mm=None, x0_mm=None, y0_mm=None)
+    return replace(network, cameras=(camera,))
+
+
+def test_unknown_points_and_images_that_see_few_known_ones() -> None:
+    truth = simulated(field(300.0, n=60), CONVERGENT)
+    known_by_first_two = {f"t{k}" for k in range(8)}
+    network = with_unknown(truth.network, {p for p in truth.points if p not in known_by_first_two})
+    rows = [
+        i
+        for i, (image, point) in enumerate(zip(network.observations.image, network.observations.point, strict=True))
+        if not (image in {"f4", "f5"} and point in known_by_first_two)
+    ]
+    found = approximate(replace(network, observations=subset(network.observations, rows)))
+    assert_near(found, truth, meters=3.0, radians=3e-3)
+    assert set(found.points) >= set(truth.network.observations.point) - set(MARKS_MM)
+
+
+def test_given_orientations_are_kept_where_points_do_not_contradict_them() -> None:
+    truth = simulated(field(300.0), CONVERGENT)
+    wrong = np.array([50.0, 50.0, 50.0, 0.1, 0.1, 0.1])
+    exact = {name: exterior_of(truth, name) for name in truth.centers}
+    images = tuple(
+        replace(image, exterior=Exterior(exact[image.name] + (wrong if image.name == "f2" else 1e-9)))
+        for image in truth.network.images
+    )
+    found = approximate(replace(truth.network, images=images))
+    np.testing.assert_allclose(found.exterior["f1"], exact["f1"] + 1e-9, rtol=0, atol=1e-10)
+    assert np.linalg.norm(found.exterior["f2"][:3] - truth.centers["f2"]) < 2.0
+    held = tuple(replace(image, exterior=Exterior(exact[image.name] + wrong, np.zeros(6))) for image in images)
+    found = approximate(replace(truth.network, images=held))
+    np.testing.assert_allclose(found.exterior["f2"], exact["f2"] + wrong, rtol=0, atol=1e-9)
+
+
+def exterior_of(truth: Truth, image: str) -> Array:
+    angles = Rotation.from_matrix(truth.rotations[image].T).as_euler("XYZ")
+    return np.concatenate([truth.centers[image], angles])
+
+
+def test_the_order_of_things_does_not_matter() -> None:
+    truth = simulated(field(30.0), CONVERGENT, outliers=0.05)
+    network = without_interior(truth.network)
+    rng = np.random.default_rng(0)
+    shuffled = replace(
+        network,
+        images=network.images[::-1],
+        points=network.points[::-1],
+        observations=subset(network.observations, rng.permutation(len(network.observations)).tolist()),
+    )
+    first, second = approximate(network), approximate(shuffled)
+    for image in truth.centers:
+        np.testing.assert_allclose(first.exterior[image], second.exterior[image], rtol=1e-12)
+
+
+def test_too_few_known_points_are_named() -> None:
+    truth = simulated(field(300.0), CONVERGENT[:1])
+    network = with_unknown(truth.network, {f"t{k}" for k in range(2, 40)})
+    seen = sum(point in {"t0", "t1"} for point in network.observations.point)
+    with pytest.raises(AdjustmentError, match=f"image f1 sees {seen} known points; resection needs 3"):
+        approximate(network)
+
+
+def test_misnumbered_points_are_not_believed() -> None:
+    truth = simulated(field(300.0), CONVERGENT[:1])
+    points = truth.network.observations.point
+    targets = [i for i, kind in enumerate(truth.network.observations.kind) if kind == "target"]
+    mixed = list(points)
+    for i, j in zip(targets, np.random.default_rng(0).permutation(targets), strict=True):
+        mixed[i] = points[j]
+    network = replace(truth.network, observations=replace(truth.network.observations, point=tuple(mixed)))
+    with pytest.raises(AdjustmentError, match=r"image f1 sees .* check the point numbers"):
+        approximate(network)
+
+
+def test_a_point_seen_once_and_too_few_marks_are_named() -> None:
+    truth = simulated(field(300.0), CONVERGENT)
+    network = with_unknown(truth.network, {"t0"})
+    rows = [i for i, point in enumerate(network.observations.point) if point != "t0"]
+    once = network.observations.point.index("t0")
+    with pytest.raises(AdjustmentError, match=r"point t0 is unknown and seen in image f. only"):
+        approximate(replace(network, observations=subset(network.observations, [*rows, once])))
+    rows = [
+        i
+        for i, (image, kind, point) in enumerate(
+            zip(network.observations.image, network.observations.kind, network.observations.point, strict=True)
+        )
+        if not (image == "f3" and kind == "fiducial" and point in "1234")
+    ]
+    with pytest.raises(AdjustmentError, match=r"image f3 shows 2 fiducial marks .* affine needs 3"):
+        approximate(replace(network, observations=subset(network.observations, rows)))
+
+
+def with_unknown(network: Network, names: set[str]) -> Network:
+    points = (ObjectPoint(p.id, None, None, None) if p.id in names else p for p in network.points)
+    return replace(network, points=tuple(points))
+
+
+def subset(observations: Observations, rows: Sequence[int]) -> Observations:
+    return Observations(
+        tuple(observations.image[i] for i in rows),
+        tuple(observations.point[i] for i in rows),
+        tuple(observations.kind[i] for i in rows),
+        observations.xy_mm[rows],
+        observations.covariance_mm2[rows],
+    )
+
+
+def test_heights_alone_and_two_points_orient_vertical_frames() -> None:
+    truth = simulated(field(20.0, n=60), VERTICAL)
+    points = tuple(
+        p if p.id in {"t3", "t7"} else ObjectPoint(p.id, None, None, Prior(p.Z.value, 0.02))
+        for p in truth.network.points
+        if p.Z is not None
+    )
+    found = approximate(replace(truth.network, points=points))
+    assert_near(found, truth, meters=120.0, radians=0.08)
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="the reference cases are not beside this project")
+@pytest.mark.parametrize(
+    ("case", "meters", "radians"),
+    [
+        ("i_five_images_affine_reduced", 60.0, 0.03),
+        ("i_five_images_similarity_reduced", 60.0, 0.03),
+        ("i_five_images_affine_paper_noisefree", 1e-3, 1e-6),
+        ("ii_juhl_3photos", 0.5, 1e-3),
+        ("iii_selfcal_mixed", 60.0, 0.03),
+        ("iv_planar_board", 0.3, 3e-4),
+        ("v_singular_K2D_vert0_affine", 1e-3, 1e-6),
+        ("v_singular_K3D_conv_affine", 1e-3, 1e-6),
+    ],
+)
+def test_reference_cases_from_their_observations_alone(case: str, meters: float, radians: float) -> None:
+    data = json.loads((CASES / f"{case}.json").read_text(encoding="utf-8"))
+    found = approximate(network_of(data))
+    truth = data["truth"] if "truth" in data else data["state"]
+    for image in found.exterior:
+        expected = np.array([truth[f"EO{image}.{name}"] for name in ("X0", "Y0", "Z0", "omega", "phi", "kappa")])
+        assert np.linalg.norm(found.exterior[image][:3] - expected[:3]) < meters
+        turn = (found.exterior[image][3:] - expected[3:] + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(turn).max() < radians
+    for name, xyz in found.points.items():
+        expected = np.array([truth.get(f"PT{name}.{axis}", np.nan) for axis in "XYZ"])
+        assert np.nanmax(np.abs(xyz - expected), initial=0.0) < meters
+
+
+def network_of(data: dict[str, Any]) -> Network:
+    """The network of a reference case, without its approximations."""
+    given = data["input"]
+    interior = {
+        name: Prior(value, np.inf if sigma is None else sigma)
+        for name, value, sigma in zip(data["io_names"], given["io_obs"], given["io_sigma"], strict=True)
+    }
+    juhl = data["distortion"] == "juhl"
+    distortion = Distortion(
+        "juhl" if juhl else "torlegard",
+        {name: prior for name, prior in interior.items() if name not in ("x0", "y0", "c")},
+        "paper" if data["decentering_mode"] == "paper" else "reduced",
+        data["r0"] * (100.0 if juhl else 1.0),
+    )
+    marks = {
+        str(i + 1): Fiducial(*(Prior(v, np.inf if s is None else s) for v, s in zip(xy, sigma, strict=True)))
+        for i, (xy, sigma) in enumerate(zip(given["fid_obs"], given["fid_sigma"], strict=True))
+    }
+    points = tuple(
+        ObjectPoint(str(i + 1), *(None if s is None else Prior(v, s) for v, s in zip(xyz, sigma, strict=True)))
+        for i, (xyz, sigma) in enumerate(zip(given["pts_obs"], given["pts_sigma"], strict=True))
+    )
+    targets: list[ObservationKind] = ["target"] * len(given["obs"])
+    fiducials: list[ObservationKind] = ["fiducial"] * len(given["fobs"])
+    rows = given["obs"] + given["fobs"]
+    observations = Observations(
+        tuple(str(row[0]) for row in rows),
+        tuple(str(row[1]) for row in rows),
+        tuple(targets + fiducials),
+        np.array([row[2:4] for row in rows]),
+        np.array([np.diag(np.square(row[4:6])) for row in rows]),
+    )
+    names = sorted(set(observations.image))
+    images = tuple(Image(name, "camera", data["transform"]) for name in names)
+    camera = Camera("camera", interior["c"], interior["x0"], interior["y0"], distortion, marks)
+    return Network((camera,), images, points, observations)
