@@ -1,0 +1,373 @@
+"""Least-squares matching: a mark measured to the noise of the film, by fitting its own picture to the scan.
+
+The model of a window is `gain * picture(mark) + offset + slopes`; unknown are the mark's place, if wished its rotation,
+scale and shear, the blur, and the four grey-value parameters, all in one Gauss-Newton adjustment. Dust and scratches
+are first weighted down (Tukey's biweight), then cut out where smoothed residuals stand out, and the rest is adjusted again.
+The covariance comes from the residuals' own autocovariance where grain correlates them.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.noise import correlated, noise_model, robust_scale
+from measure.rendering import chip_mask, extent_px, render
+from measure.shapes import Disk, Mark, MarkTemplate, Ring
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Freedom = Literal["shift", "similarity", "affine", "ellipse"]
+
+# Changes of the mark's linear part: (I + e G) times it, G a generator.
+_TURN, _SCALE = ((0.0, -1.0), (1.0, 0.0)), ((1.0, 0.0), (0.0, 1.0))
+_STRETCH, _SHEAR = ((1.0, 0.0), (0.0, -1.0)), ((0.0, 1.0), (1.0, 0.0))
+_GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]], ...]] = {
+    "shift": (),
+    "similarity": (_SCALE, _TURN),
+    "affine": (_SCALE, _STRETCH, _SHEAR, _TURN),
+    "ellipse": (_SCALE, _STRETCH, _SHEAR),
+}
+_GREY = 4  # gain, offset and two slopes
+_TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
+_SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
+_BLUR_RANGE_PX = (0.25, 6.0)
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """How a mark is matched.
+
+    freedom: what is estimated beside the shift; "ellipse" is an affinity without rotation, for disks.
+    blur_px: standard deviation of the scan's blur; the start of its estimation, if it is estimated.
+    linear_sigma: prior standard deviation of rotation (rad), scale and shear, as known from the other marks; the
+    default holds only what the picture does not show at all.
+    margin_px: how far about the mark grey values are used.
+    """
+
+    freedom: Freedom = "similarity"
+    blur_px: float = 0.8
+    estimate_blur: bool = True
+    linear_sigma: float = 0.3
+    margin_px: float = 6.0
+    damage_sigmas: float = 3.2
+    damage_rounds: int = 3
+    max_iterations: int = 25
+    max_shift_px: float = 8.0
+    max_distortion: float = 0.3
+
+    def __post_init__(self) -> None:
+        if self.freedom not in _GENERATORS:
+            raise ValueError(f"freedom is {self.freedom!r}; one of {', '.join(_GENERATORS)} is right")
+        for name in (
+            "blur_px",
+            "linear_sigma",
+            "margin_px",
+            "damage_sigmas",
+            "max_iterations",
+            "max_shift_px",
+            "max_distortion",
+        ):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
+        if self.damage_rounds < 0:
+            raise ValueError(f"damage_rounds is {self.damage_rounds}; 0 or more is right")
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A mark as fitted. Where converged is false, reason says why and the numbers are the last approximations.
+
+    center_px (2,), covariance_px2 (2, 2), pixel_from_mark (2, 3): of the scan, not of the window.
+    contrast_dn: the mark's grey value less the background's, negative for a dark mark. noise_dn: standard deviation of
+    one pixel. damaged_fraction: share of the pixels about the mark that were cut out. redundancy: pixels used less
+    unknowns. neighbour_correlation: of the residuals; they were taken as white where covariance_is_white.
+    """
+
+    converged: bool
+    reason: str
+    center_px: Array
+    covariance_px2: Array
+    pixel_from_mark: Array
+    contrast_dn: float
+    noise_dn: float
+    blur_px: float
+    damaged_fraction: float
+    redundancy: int
+    neighbour_correlation: float
+    covariance_is_white: bool
+    residuals_dn: Array
+
+    @property
+    def snr(self) -> float:
+        return abs(self.contrast_dn) / max(self.noise_dn, 1e-12)
+
+
+def match(
+    window: NDArray[np.floating],
+    origin_px: tuple[float, float],
+    mark: Mark,
+    pixel_from_mark: Array,
+    options: MatchOptions | None = None,
+    valid: Mask | None = None,
+) -> Match:
+    """Fit the mark to a window of the scan.
+
+    window: (height, width) grey values whose top-left pixel's centre is at origin_px (col, row) of the scan; valid:
+    which of its pixels are true ones. pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col,
+    row): its last column is the approximate centre, right to a pixel or two. Never raises for what the picture holds.
+    """
+    options = options or MatchOptions()
+    origin = np.asarray(origin_px, dtype=float)
+    grey = np.asarray(window, dtype=float)
+    start = np.array(pixel_from_mark, dtype=float)
+    start[:, 2] -= origin
+    usable = np.isfinite(grey) if valid is None else np.isfinite(grey) & valid
+    fit = _Fit(np.where(usable, grey, 0.0), usable, mark, start, options)
+    fit.run()
+    result = fit.result()
+    moved = np.array(result.pixel_from_mark)
+    moved[:, 2] += origin
+    return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
+
+
+def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
+    """col0, row0, width, height of the window that holds the mark and margin_px about it."""
+    least, greatest = extent_px(mark, np.asarray(pixel_from_mark, dtype=float))
+    col0, row0 = np.floor(least - margin_px).astype(int)
+    col1, row1 = np.ceil(greatest + margin_px).astype(int)
+    return int(col0), int(row0), int(col1 - col0 + 1), int(row1 - row0 + 1)
+
+
+class _Fit:
+    """One mark's adjustment in progress: its state, and the steps that improve it."""
+
+    def __init__(self, grey: Array, usable: Mask, mark: Mark, start: Array, options: MatchOptions) -> None:
+        self.grey, self.usable, self.mark, self.start, self.options = grey, usable, mark, start, options
+        self.pixel_from_mark = start.copy()
+        self.variance_px2 = options.blur_px**2 if self._blurs_freely() else _sharpest(mark, options)
+        self.grey_parameters: Array = np.zeros(_GREY)
+        generators = [g for g in _GENERATORS[options.freedom] if not (g is _TURN and is_round(mark))]
+        self.generators = np.array(generators).reshape(-1, 2, 2)
+        self.used = usable
+        self.area = usable
+        self.residuals = np.zeros_like(grey)
+        self.design = np.zeros((0, *grey.shape))
+        self.reason = ""
+
+    def run(self) -> None:
+        """Plain, then robust, then on what is undamaged; stops with a reason where something gives way."""
+        self._choose_area()
+        if not self.reason:
+            self._adjust(robust=False, tolerance_px=0.05)
+        if not self.reason:
+            self._choose_area()
+        if not self.reason:
+            self._adjust(robust=True, tolerance_px=0.005)
+        for round_ in range(self.options.damage_rounds):
+            if self.reason:
+                return
+            undamaged = self.area & ~damage(self.residuals, self.area, self.options.damage_sigmas)
+            if round_ > 0 and np.array_equal(undamaged, self.used):
+                return
+            self.used = undamaged
+            if self.used.sum() < 3 * len(self.design):
+                self.reason = "too little of the mark is undamaged"
+                return
+            self._adjust(robust=False, tolerance_px=0.002)
+
+    def result(self) -> Match:
+        """The match in the window's own pixels."""
+        noise = noise_model(self.residuals, self.used, len(self.design))
+        covariance = np.full((2, 2), np.inf)
+        if not self.reason:
+            masked = self.design * self.used
+            normal = _normal(masked, masked) + np.diag(self._prior_weights() * max(noise.variance_dn2, 1e-12))
+            middle = normal * noise.variance_dn2
+            if not noise.is_white:
+                middle = _normal(masked, correlated(masked, noise) * self.used)
+            inverse = np.linalg.inv(normal)
+            full = inverse @ middle @ inverse
+            covariance = (full[:2, :2] + full[:2, :2].T) / 2
+            if not np.all(np.linalg.eigvalsh(covariance) > 0):
+                covariance = (inverse * noise.variance_dn2)[:2, :2]
+        return Match(
+            converged=not self.reason,
+            reason=self.reason,
+            center_px=self.pixel_from_mark[:, 2],
+            covariance_px2=covariance,
+            pixel_from_mark=self.pixel_from_mark,
+            contrast_dn=float(self.grey_parameters[0]),
+            noise_dn=float(np.sqrt(noise.variance_dn2)),
+            blur_px=float(np.sqrt(self.variance_px2)),
+            damaged_fraction=1.0 - float(self.used.sum() / max(self.area.sum(), 1)),
+            redundancy=int(self.used.sum()) - len(self.design),
+            neighbour_correlation=noise.neighbour_correlation,
+            covariance_is_white=noise.is_white,
+            residuals_dn=np.where(self.area, self.residuals, np.nan),
+        )
+
+    def _blurs_freely(self) -> bool:
+        return self.options.estimate_blur or not isinstance(self.mark, MarkTemplate)
+
+    def _choose_area(self) -> None:
+        """The pixels within margin_px of the mark: beyond it the background only disturbs."""
+        height, width = self.grey.shape
+        if isinstance(self.mark, MarkTemplate):
+            near = chip_mask(self.mark, self.pixel_from_mark, width, height)
+        else:
+            rendering = render(self.mark, self.pixel_from_mark, width, height, 0.3)
+            outside = (rendering.pixels(rendering.value) < 0.02).astype(np.uint8)
+            near = cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= self.options.margin_px
+            if outside.all():
+                self.reason = "the mark lies outside of its window"
+        self.area = self.used = self.usable & near
+        if self.area.sum() < 0.5 * near.sum() or self.area.sum() < 40:
+            self.reason = self.reason or "most of the mark lies outside of the scan"
+
+    def _adjust(self, robust: bool, tolerance_px: float) -> None:
+        """Gauss-Newton until the mark moves less than tolerance_px."""
+        for _ in range(self.options.max_iterations):
+            self._linearise()
+            weights = self.used.astype(float)
+            if robust:
+                weights = weights * self._tukey()
+            step = self._solve(weights)
+            if step is None:
+                self.reason = "the picture does not determine the mark's place"
+                return
+            moved = self._apply(step)
+            if self._ran_away():
+                return
+            if moved < tolerance_px:
+                self.residuals = self.residuals - np.tensordot(step, self.design, axes=1)
+                return
+        self.reason = "the adjustment did not converge"
+
+    def _linearise(self) -> None:
+        """The design (unknowns, height, width) and residuals of the present state, the gain from a linear fit at
+        first."""
+        height, width = self.grey.shape
+        rendering = render(self.mark, self.pixel_from_mark, width, height, float(np.sqrt(self.variance_px2)))
+        value = rendering.pixels(rendering.value)
+        slopes = self._slopes()
+        grey_design = np.stack([value, np.ones_like(value), *slopes])
+        if not self.grey_parameters.any():
+            rows = grey_design[:, self.used]
+            self.grey_parameters = np.asarray(np.linalg.lstsq(rows.T, self.grey[self.used], rcond=None)[0], dtype=float)
+        gain = self.grey_parameters[0]
+        col, row = self._cell_offsets(rendering.cells)
+        columns = [rendering.by_col, rendering.by_row]
+        for generator in self.generators:
+            along_col = generator[0, 0] * col + generator[0, 1] * row
+            along_row = generator[1, 0] * col + generator[1, 1] * row
+            columns.append(rendering.by_col * along_col + rendering.by_row * along_row)
+        design = [-gain * rendering.pixels(column) for column in columns]
+        if self.options.estimate_blur:
+            design.append(0.5 * gain * rendering.pixels(rendering.laplacian))
+        self.design = np.stack([*design, *grey_design])
+        self.residuals = self.grey - np.tensordot(self.grey_parameters, grey_design, axes=1)
+
+    def _slopes(self) -> tuple[Array, Array]:
+        height, width = self.grey.shape
+        scale = max(height, width) / 2
+        row, col = np.mgrid[:height, :width].astype(float)
+        return (col - (width - 1) / 2) / scale, (row - (height - 1) / 2) / scale
+
+    def _cell_offsets(self, cells: int) -> tuple[Array, Array]:
+        height, width = self.grey.shape
+        col = (np.arange(width * cells) + 0.5) / cells - 0.5 - self.pixel_from_mark[0, 2]
+        row = (np.arange(height * cells) + 0.5) / cells - 0.5 - self.pixel_from_mark[1, 2]
+        return col[None, :], row[:, None]
+
+    def _tukey(self) -> Array:
+        scale = max(robust_scale(self.residuals[self.used]), _SCALE_FLOOR * abs(float(self.grey_parameters[0])), 1e-9)
+        relative = np.clip(np.abs(self.residuals) / (_TUKEY * scale), 0.0, 1.0)
+        return np.asarray((1 - relative**2) ** 2)
+
+    def _solve(self, weights: Array) -> Array | None:
+        weighted = self.design * weights
+        scale_dn2 = max(
+            robust_scale(self.residuals[self.used]) ** 2, (_SCALE_FLOOR * self.grey_parameters[0]) ** 2, 1e-12
+        )
+        normal = _normal(self.design, weighted) + np.diag(self._prior_weights() * scale_dn2)
+        size = np.sqrt(np.diag(normal))
+        if not np.all(size > 0) or not np.all(np.isfinite(size)):
+            return None
+        scaled = normal / np.outer(size, size)
+        if np.linalg.cond(scaled) > 1e10:
+            return None
+        right = np.tensordot(weighted, self.residuals, axes=2) - self._prior_weights() * scale_dn2 * self._departures()
+        return np.asarray(np.linalg.solve(scaled, right / size) / size)
+
+    def _prior_weights(self) -> Array:
+        """1 / variance of the loose priors that hold what the picture does not show, a disk's rotation say."""
+        weights = np.zeros(len(self.design))
+        weights[2 : 2 + len(self.generators)] = 1 / self.options.linear_sigma**2
+        return weights
+
+    def _departures(self) -> Array:
+        """How far the parameters under a prior are from where they started."""
+        departures = np.zeros(len(self.design))
+        distortion = self._distortion()
+        for index, generator in enumerate(self.generators):
+            departures[2 + index] = np.sum(distortion * generator) / np.sum(generator**2)
+        return departures
+
+    def _distortion(self) -> Array:
+        return np.asarray(self.pixel_from_mark[:, :2] @ np.linalg.inv(self.start[:, :2]) - np.eye(2))
+
+    def _apply(self, step: Array) -> float:
+        """Take a step, shortened where it leaves the range of a linearisation; its length in px."""
+        shift, linear = step[:2], step[2 : 2 + len(self.generators)]
+        longest = max(np.hypot(*shift) / 1.5, float(np.abs(linear).max(initial=0.0)) / 0.1, 1.0)
+        self.pixel_from_mark[:, 2] += shift / longest
+        change = np.tensordot(linear / longest, self.generators, axes=1) if len(linear) else np.zeros((2, 2))
+        self.pixel_from_mark[:, :2] = (np.eye(2) + change) @ self.pixel_from_mark[:, :2]
+        if self.options.estimate_blur:
+            floor, ceiling = (limit**2 for limit in _BLUR_RANGE_PX)
+            sharpest = 0.0 if isinstance(self.mark, MarkTemplate) else floor
+            factor_range = self.variance_px2 / 2 - 0.05, self.variance_px2 * 2 + 0.3
+            wished = self.variance_px2 + step[2 + len(self.generators)] / longest
+            self.variance_px2 = float(np.clip(np.clip(wished, *factor_range), sharpest, ceiling))
+        self.grey_parameters = self.grey_parameters + step[-_GREY:] / longest
+        reach = max(self.grey.shape) / 4
+        return float(np.hypot(*shift) + reach * 0.1 * np.abs(linear).max(initial=0.0))
+
+    def _ran_away(self) -> bool:
+        moved = float(np.hypot(*(self.pixel_from_mark[:, 2] - self.start[:, 2])))
+        if moved > self.options.max_shift_px:
+            self.reason = f"the fit ran {moved:.1f} px away from where the mark was expected"
+        elif np.abs(self._distortion()).max() > self.options.max_distortion:
+            self.reason = "the fit wants a mark of another size or direction than the one drawn"
+        return bool(self.reason)
+
+
+def damage(residuals: Array, area: Mask, sigmas: float) -> Mask:
+    """Pixels of dust and scratches: where smoothed residuals exceed so many of their standard deviations over more
+    than a speck, and a pixel about it."""
+    weight = cv2.GaussianBlur(area.astype(float), (0, 0), 0.8)
+    smooth = cv2.GaussianBlur(np.where(area, residuals, 0.0), (0, 0), 0.8) / np.maximum(weight, 0.1)
+    smooth = np.where(area, smooth, 0.0)
+    scale = robust_scale(smooth[area])
+    large = (np.abs(smooth) > sigmas * scale).astype(np.uint8)
+    opened = cv2.morphologyEx(large, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return np.asarray(cv2.dilate(opened, np.ones((3, 3), np.uint8)) > 0)
+
+
+def is_round(mark: Mark) -> bool:
+    """Whether every rotation leaves the mark as it is."""
+    if isinstance(mark, MarkTemplate):
+        return False
+    return all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in mark.parts)
+
+
+def _sharpest(mark: Mark, options: MatchOptions) -> float:
+    """A chip already has its scan's blur: where none is estimated, none is added."""
+    return 0.0 if isinstance(mark, MarkTemplate) else options.blur_px**2
+
+
+def _normal(first: Array, second: Array) -> Array:
+    return np.asarray(np.tensordot(first, second, axes=((1, 2), (1, 2))))

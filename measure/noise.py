@@ -1,0 +1,76 @@
+"""What the residuals of a fit say about the noise of the film: its scale, and how far grain reaches."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated over 1.5 px, gone beyond 5
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """variance_dn2 of one pixel, and the (2 * reach + 1) square of autocovariances about it, a lone value for white
+    noise. neighbour_correlation: the mean correlation of pixels that touch along an edge."""
+
+    variance_dn2: float
+    autocovariance_dn2: Array
+    neighbour_correlation: float
+
+    @property
+    def is_white(self) -> bool:
+        return self.autocovariance_dn2.size == 1
+
+
+def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
+    """The noise model of residuals (height, width), where used, after a fit of so many unknowns.
+
+    Noise counts as white where the correlation of neighbours is within three standard errors of nothing.
+    """
+    count = int(used.sum())
+    kept = np.where(used, residuals, 0.0)
+    variance = float((kept**2).sum() / max(count - unknowns, 1))
+    if variance == 0.0:
+        return NoiseModel(0.0, np.zeros((1, 1)), 0.0)
+    lags = _autocovariance(kept, used, REACH_PX) * (variance / max(float((kept**2).sum() / count), 1e-300))
+    correlation = float(lags[REACH_PX, REACH_PX + 1] + lags[REACH_PX + 1, REACH_PX]) / (2 * variance)
+    if abs(correlation) < 3 / np.sqrt(2 * count):
+        return NoiseModel(variance, np.array([[variance]]), correlation)
+    return NoiseModel(variance, lags * _taper(REACH_PX), correlation)
+
+
+def robust_scale(values: Array) -> float:
+    """The standard deviation of normal values, from their median absolute deviation."""
+    if values.size == 0:
+        return 0.0
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def correlated(columns: Array, noise: NoiseModel) -> Array:
+    """The noise's covariance matrix times images (n, height, width), without ever forming it."""
+    return np.stack(
+        [cv2.filter2D(image, cv2.CV_64F, noise.autocovariance_dn2, borderType=cv2.BORDER_CONSTANT) for image in columns]
+    )
+
+
+def _autocovariance(kept: Array, used: Mask, reach: int) -> Array:
+    """Mean products at all lags up to reach, averaged over opposite and mirrored lags: grain has no direction."""
+    pad = [(0, reach), (0, reach)]
+    values, ones = np.pad(kept, pad), np.pad(used.astype(float), pad)
+    products = np.fft.irfft2(np.abs(np.fft.rfft2(values)) ** 2, s=values.shape)
+    pairs = np.fft.irfft2(np.abs(np.fft.rfft2(ones)) ** 2, s=ones.shape)
+    index = np.arange(-reach, reach + 1)
+    lags = (products / np.maximum(pairs, 1.0))[np.ix_(index, index)]
+    lags = (lags + lags[:, ::-1]) / 2
+    return np.asarray((lags + lags.T) / 2)
+
+
+def _taper(reach: int) -> Array:
+    """Fades out the far lags, which are noise themselves."""
+    index = np.arange(-reach, reach + 1)
+    distance = np.hypot(index[:, None], index[None, :])
+    return np.asarray(np.clip(reach + 1 - distance, 0.0, 1.0))

@@ -1,0 +1,137 @@
+"""The picture of a mark as film and scanner show it: its coverage, or a chip cut from a scan, under a Gaussian blur,
+with the derivatives that least-squares matching needs."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from measure.coverage import CELLS, cell_coverage, outline_mm, pixel_means
+from measure.shapes import Mark, MarkTemplate
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """A mark's picture and its derivatives, each (height * cells, width * cells): by column and row in px, and the
+    second derivative by place, which is twice that by the blur's variance."""
+
+    value: Array
+    by_col: Array
+    by_row: Array
+    laplacian: Array
+    cells: int
+
+    def pixels(self, cell_values: Array) -> Array:
+        return pixel_means(cell_values, self.cells)
+
+
+def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Rendering:
+    """The mark under a Gaussian of standard deviation blur_px, in a window of width x height px.
+
+    A drawn mark is 1 inside and 0 outside; a chip keeps its own grey values, to which the blur is added.
+    pixel_from_mark: (2, 3), from (x_mm, y_mm, 1) to (col, row) of the window.
+    """
+    pad = int(np.ceil(4 * blur_px)) + 1
+    shifted = np.array(pixel_from_mark, dtype=float)
+    shifted[:, 2] += pad
+    size = width + 2 * pad, height + 2 * pad
+    if isinstance(mark, MarkTemplate):
+        cells = max(1, round(_pixels_per_sample(mark, pixel_from_mark) ** -1))
+        sharp = _sampled(mark, shifted, *size, cells)
+    else:
+        cells = CELLS if blur_px < 0.9 else CELLS // 2  # blur hides what coarser cells get wrong
+        sharp = cell_coverage(mark, shifted, *size, cells)
+    smooth, slope, bend = _kernels(blur_px * cells)
+    inner = slice(pad * cells, -pad * cells)
+
+    def filtered(along_cols: Array, along_rows: Array) -> Array:
+        return np.asarray(cv2.sepFilter2D(sharp, cv2.CV_64F, along_cols, along_rows)[inner, inner])
+
+    return Rendering(
+        value=filtered(smooth, smooth),
+        by_col=filtered(slope, smooth) * cells,
+        by_row=filtered(smooth, slope) * cells,
+        laplacian=(filtered(bend, smooth) + filtered(smooth, bend)) * cells**2,
+        cells=cells,
+    )
+
+
+def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
+    """(height, width): the mark as `render` makes it, without derivatives."""
+    rendering = render(mark, pixel_from_mark, width, height, blur_px)
+    return rendering.pixels(rendering.value)
+
+
+def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
+    """(2,) least and (2,) greatest column and row that the mark reaches."""
+    if isinstance(mark, MarkTemplate):
+        rows, cols = mark.image.shape
+        corners = np.array([(0, 0), (cols - 1, 0), (cols - 1, rows - 1), (0, rows - 1)], dtype=float)
+        chip_from_mark = _chip_from_mark(mark)
+        outline = (corners - chip_from_mark[:, 2]) @ np.linalg.inv(chip_from_mark[:, :2]).T
+    else:
+        outline = np.concatenate([outline_mm(part) for part in mark.parts])
+    points = outline @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
+    return points.min(axis=0), points.max(axis=0)
+
+
+def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> NDArray[np.bool_]:
+    """(height, width): which pixels lie on the chip."""
+    col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
+    rows, cols = mark.image.shape
+    return np.asarray((col >= 1) & (col <= cols - 2) & (row >= 1) & (row <= rows - 2))
+
+
+@lru_cache(maxsize=256)
+def _kernels(sigma: float) -> tuple[Array, Array, Array]:
+    """A sampled Gaussian and its first and second derivative, normalised so that polynomials come out right."""
+    reach = int(np.ceil(4 * sigma)) + 1
+    place = np.arange(-reach, reach + 1, dtype=float)
+    smooth = np.exp(-0.5 * (place / max(sigma, 1e-3)) ** 2)
+    smooth /= smooth.sum()
+    if sigma < 0.5:
+        slope, bend = np.zeros_like(smooth), np.zeros_like(smooth)
+        slope[reach - 1 : reach + 2] = -0.5, 0.0, 0.5
+        bend[reach - 1 : reach + 2] = 1.0, -2.0, 1.0
+        return smooth, slope, bend
+    slope = place * smooth / (place**2 * smooth).sum()
+    bend = (place**2 - sigma**2) * smooth
+    bend -= smooth * bend.sum()
+    return smooth, slope, bend * 2 / (place**2 * bend).sum()
+
+
+def _pixels_per_sample(mark: MarkTemplate, pixel_from_mark: Array) -> float:
+    """How many pixels of the scan one pixel of the chip spans."""
+    scale = float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
+    return max(scale * mark.pitch_um / 1000, 1e-3)
+
+
+def _sampled(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int) -> Array:
+    col, row = _chip_positions(mark, pixel_from_mark, width, height, cells)
+    return np.asarray(ndimage.map_coordinates(mark.image, [row, col], order=3, mode="nearest"), dtype=float)
+
+
+def _chip_positions(
+    mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int
+) -> tuple[Array, Array]:
+    """Column and row in the chip of every cell's centre."""
+    place = [(np.arange(size * cells) + 0.5) / cells - 0.5 for size in (width, height)]
+    offset = np.stack(np.meshgrid(*place)) - pixel_from_mark[:, 2, None, None]
+    chip_from_mark = _chip_from_mark(mark)
+    chip_from_pixel = chip_from_mark[:, :2] @ np.linalg.inv(pixel_from_mark[:, :2])
+    col, row = np.tensordot(chip_from_pixel, offset, axes=1) + chip_from_mark[:, 2, None, None]
+    return col, row
+
+
+def _chip_from_mark(mark: MarkTemplate) -> Array:
+    """(2, 3) affine matrix from the mark's mm to the chip's column and row; a turned mark is turned back first."""
+    angle = np.deg2rad(mark.turn_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    scale = 1000 / mark.pitch_um
+    linear = scale * np.array([[1.0, 0.0], [0.0, -1.0]]) @ np.array([[c, s], [-s, c]])
+    return np.column_stack([linear, mark.origin_px])
