@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import cast
 
 from adjust import network
+from adjust.distortion import PARAMETERS
 from measure import shapes
 from pipeline.errors import InputError
 from pipeline.mark_table import read_mark
@@ -145,17 +146,13 @@ def _placed(mark: shapes.Mark, radial: bool, xy_mm: shapes.Point) -> shapes.Mark
 
 
 def _distortion(table: Table) -> network.Distortion:
-    family = cast(network.Family, table.text("family", "none", tuple(network.DISTORTION_PARAMETERS)))
-    known = network.DISTORTION_PARAMETERS[family]
+    family = cast(network.Family, table.text("family", "none", tuple(PARAMETERS)))
+    decentering = cast(network.Decentering, table.text("decentering", "reduced", ("reduced", "paper")))
+    r0_mm = table.number("r0_mm", 0.0, least=0.0)
     values, sigmas = table.table("value"), table.table("sigma")
-    parameters = {name: network.Prior(values.number(name, 0.0), sigmas.sigma(name, 0.0)) for name in known}
+    table.done()
+    parameters = {name: network.Prior(values.number(name, 0.0), sigmas.sigma(name, 0.0)) for name in PARAMETERS[family]}
     values.done()
     sigmas.done()
-    distortion = network.Distortion(
-        family,
-        {name: prior for name, prior in parameters.items() if name in values or name in sigmas},
-        cast(network.Decentering, table.text("decentering", "reduced", ("reduced", "paper"))),
-        table.number("r0_mm", 0.0, least=0.0),
-    )
-    table.done()
-    return distortion
+    named = {name: prior for name, prior in parameters.items() if name in values or name in sigmas}
+    return network.Distortion(family, named, decentering, r0_mm)

@@ -1,6 +1,5 @@
 """TOML files whose every key is checked: a wrong type, a missing key or a misspelt one gives a message that helps."""
 
-import difflib
 import math
 import re
 import tomllib
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
+from pipeline.spelling import did_you_mean
 
 FREE = "free"
 
@@ -60,7 +60,7 @@ class Table:
         if not isinstance(value, str):
             raise self.error(key, f'must be text in quotes, not {value!r}. Write {key} = "...".')
         if choices and value not in choices:
-            raise self.error(key, f"is {value!r}; possible are {_listed(choices)}.{_suggestion(value, choices)}")
+            raise self.error(key, f"is {value!r}; possible are {_listed(choices)}.{did_you_mean(value, choices)}")
         return value
 
     def flag(self, key: str, default: bool) -> bool:
@@ -98,6 +98,12 @@ class Table:
             return self.pair(key)
         number = self._number(key, value)
         return (number, number)
+
+    def triple(self, key: str, default: tuple[float, float, float] | None = None) -> tuple[float, float, float]:
+        value = self._get(key, default)
+        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 3:
+            raise self.error(key, f"must be three numbers, [x, y, z], not {value!r}.")
+        return (self._number(key, value[0]), self._number(key, value[1]), self._number(key, value[2]))
 
     def pairs(self, key: str) -> tuple[tuple[float, float], ...]:
         value = self._get(key, None)
@@ -148,14 +154,15 @@ class Table:
             if key not in self._known:
                 known = sorted(set(self._known))
                 raise self.error(
-                    key, f"is no key of this table.{_suggestion(key, known)} Known here: {_listed(known)}."
+                    key, f"is no key of this table.{did_you_mean(key, known)} Known here: {_listed(known)}."
                 )
 
     def _get(self, key: str, default: Any) -> Any:
         self._known.append(key)
         value = self.values.get(key, default)
         if value is None:
-            raise self.error(key, "is missing. Add it.")
+            strangers = [name for name in self.values if name not in self._known]
+            raise self.error(key, f"is missing. Add it.{did_you_mean(key, strangers)}")
         return value
 
     def _number(self, key: str, value: Any) -> float:
@@ -195,11 +202,6 @@ class Table:
             if key_line.match(lines[number]):
                 return number + 1
         return None
-
-
-def _suggestion(word: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
-    return f" Did you mean {close[0]!r}?" if close else ""
 
 
 def _listed(words: Sequence[str]) -> str:

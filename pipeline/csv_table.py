@@ -1,0 +1,107 @@
+"""CSV files with a header line, checked column by column; lines that begin with # are comments."""
+
+import csv
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.spelling import did_you_mean
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a CSV file, with its place for messages."""
+
+    file: Path
+    line: int
+    cells: dict[str, str]
+
+    def error(self, column: str, message: str) -> InputError:
+        return InputError(f"{self.file}, line {self.line}, column {column}: {message}")
+
+    def text(self, column: str) -> str:
+        """The cell without blanks around it; "" where the column is absent."""
+        return self.cells.get(column, "")
+
+    def name(self, column: str) -> str:
+        """A cell that must not be empty."""
+        value = self.text(column)
+        if not value:
+            raise self.error(column, "is empty; every line needs it.")
+        return value
+
+    def number(self, column: str) -> float | None:
+        """A finite number; None where the cell is blank or the column absent."""
+        value = self.text(column)
+        if not value:
+            return None
+        try:
+            number = float(value)
+        except ValueError:
+            raise self.error(column, f"must be a number with a decimal point or blank, not {value!r}.") from None
+        if not math.isfinite(number):
+            raise self.error(column, f"must be a finite number or blank, not {value!r}.")
+        return number
+
+    def sigma(self, column: str) -> float | None:
+        """A standard deviation: a number that is not negative; None where the cell is blank."""
+        sigma = self.number(column)
+        if sigma is not None and sigma < 0.0:
+            raise self.error(column, f"is a standard deviation and cannot be negative ({sigma:g}).")
+        return sigma
+
+
+def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
+    """The rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, a line cut short."""
+    lines = list(_content_lines(path))
+    if not lines:
+        raise InputError(f"{path}: is empty; its first line must name the columns: {','.join(required)}.")
+    header = [cell.strip() for cell in next(csv.reader([lines[0][1]]))]
+    _check_header(path, lines[0][0], header, required, optional)
+    rows = []
+    for number, text in lines[1:]:
+        cells = [cell.strip() for cell in next(csv.reader([text]))]
+        if len(cells) > len(header) and any(cells[len(header) :]):
+            raise InputError(
+                f"{path}, line {number}: has {len(cells)} values, but the header names {len(header)} columns. "
+                "Decimal commas must be points; text with a comma stands in quotes."
+            )
+        rows.append(Row(path, number, dict(zip(header, cells, strict=False))))
+    return tuple(rows)
+
+
+def _content_lines(path: Path) -> Iterator[tuple[int, str]]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not a text file (UTF-8); a CSV file is needed here.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield number, line
+
+
+def _check_header(
+    path: Path, line: int, header: Sequence[str], required: Sequence[str], optional: Sequence[str]
+) -> None:
+    known = [*required, *optional]
+    missing = [column for column in required if column not in header]
+    if missing:
+        raise InputError(
+            f"{path}, line {line}: the header lacks the column {missing[0]!r}. It must name {','.join(required)}"
+            + (f"; also possible are {','.join(optional)}." if optional else ".")
+        )
+    for column in header:
+        if column and column not in known:
+            hint = did_you_mean(column, known)
+            raise InputError(
+                f"{path}, line {line}: {column!r} is no column of this file.{hint} Known: {','.join(known)}."
+            )
+    twice = [column for column in header if header.count(column) > 1]
+    if twice:
+        raise InputError(f"{path}, line {line}: the column {twice[0]!r} is named twice.")

@@ -1,0 +1,87 @@
+"""Disks seen in perspective: how one looks in a scan, and by how much its image's centre is not its centre's image."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.projection import ImageModel
+from pipeline.comparator_file import pixel_from_comparator
+
+Array = NDArray[np.float64]
+
+_FLAT = 1e-6  # of the field's size: points this near a plane lie on a board
+
+
+def eccentricity_mm(model: ImageModel, centers: Array, normals: Array, radius: float) -> Array:
+    """The centre of each disk's image less the image of its centre, in the comparator, (n, 2) mm.
+
+    centers (n, 3) and radius in object units, normals (n, 3) of unit length. With c the centre and n the normal in the
+    camera frame, z forward, the centre of the perspective ellipse is off by
+    `f r² [n_xy n_z + (c_xy / c_z) (1 - n_z²)] / (c_z² - r² (1 - n_z²))`: the pole of the disk's plane section, as from
+    the dual conic of its circle.
+    """
+    forward = np.array([1.0, 1.0, -1.0])
+    c = ((centers - model.station) @ model.rotation.T) * forward
+    n = (normals @ model.rotation.T) * forward
+    tilt = 1.0 - n[:, 2] ** 2
+    reach = c[:, 2] ** 2 - radius**2 * tilt
+    across = n[:, :2] * n[:, 2:] + c[:, :2] / c[:, 2:] * tilt[:, None]
+    ideal = radius**2 * across / reach[:, None]
+    # The same small step of the ray, through distortion and film: the image point of a ray that is shifted by it.
+    shifted = c.copy()
+    shifted[:, :2] += ideal * c[:, 2:]
+    places, _ = model.comparator_from_object(centers)
+    off, _ = model.comparator_from_object((shifted * forward) @ model.rotation + model.station)
+    difference: Array = off - places
+    return difference
+
+
+def disk_images(
+    model: ImageModel, pitch_um: tuple[float, float], centers: Array, normals: Array, radius: float
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Predicted centres (n, 2) px, maps (n, 2, 2) from each disk's two radius vectors to pixels, what is visible."""
+    first, second = _in_plane(normals)
+    place, visible = model.comparator_from_object(centers)
+    columns = []
+    for direction in (first, second):
+        ahead, seen_ahead = model.comparator_from_object(centers + radius * direction)
+        behind, seen_behind = model.comparator_from_object(centers - radius * direction)
+        columns.append(pixel_from_comparator((ahead - behind) / 2.0, pitch_um))
+        visible = visible & seen_ahead & seen_behind
+    return pixel_from_comparator(place, pitch_um), np.stack(columns, axis=-1), visible
+
+
+def disk_normals(
+    ids: Sequence[str], coordinates: Array, given: Mapping[str, Array], plane: Array | None, station: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Unit normals (n, 3) of disks at coordinates (n, 3), and which of them are known.
+
+    Known are those that are given, and all of a flat field: its plane's normal. Others are taken to face the station.
+    """
+    towards = station - coordinates
+    normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    if plane is not None:
+        normals = np.where((towards @ plane)[:, None] < 0.0, -plane, plane)
+    known = np.array([plane is not None or id in given for id in ids], dtype=bool)
+    for i, id in enumerate(ids):
+        if id in given:
+            normals[i] = given[id]
+    return normals, known
+
+
+def plane_normal(coordinates: Array) -> Array | None:
+    """The normal of the plane that holds all points (n, 3); None where they are not flat, or too few to say."""
+    if len(coordinates) < 4:
+        return None
+    spread = np.linalg.svd(coordinates - coordinates.mean(axis=0), full_matrices=False)
+    flat = spread.S[2] <= _FLAT * spread.S[0] < spread.S[1]
+    return np.asarray(spread.Vh[2], dtype=np.float64) if flat else None
+
+
+def _in_plane(normals: Array) -> tuple[Array, Array]:
+    """Two unit vectors across each normal."""
+    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(normals, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(normals, first)

@@ -1,0 +1,231 @@
+"""The user's files: what is right is read, what is wrong gets a message with file, line and the likely remedy."""
+
+import errno
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from measure.results import FrameMeasurement, MarkMeasurement
+from measure.shapes import MarkShape, Polygon
+from measure.status import Status
+from pipeline.atomic import atomic_path, write_atomically
+from pipeline.camera_file import read_camera
+from pipeline.comparator_file import (
+    comparator_from_pixel,
+    pixel_from_comparator,
+    read_comparator,
+    write_comparator,
+)
+from pipeline.errors import InputError
+from pipeline.images_file import read_images
+from pipeline.points_file import read_points
+from pipeline.tables import read_toml
+
+CAMERA = """
+name = "C"
+frame_mm = [228.0, 228.0]
+principal_distance_mm = 153.0
+[sigma]
+principal_distance_mm = "free"
+principal_point_mm = [0.0, 2.0]
+[distortion]
+family = "torlegard"
+[distortion.sigma]
+k3 = "free"
+[[fiducial]]
+id = "1"
+xy_mm = [0.0, 106.0]
+sigma_mm = [1.0, "free"]
+mark = "side"
+[mark.side]
+kind = "cross"
+arm_mm = 1.0
+line_mm = 0.1
+gap_mm = 0.5
+rotate = "radial"
+"""
+
+
+def written(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refused(read: Callable[[Path], object], path: Path) -> str:
+    with pytest.raises(InputError) as error:
+        read(path)
+    return str(error.value)
+
+
+def test_camera_file_gives_priors_and_marks(tmp_path: Path) -> None:
+    file = read_camera(written(tmp_path, "camera.toml", CAMERA))
+    camera = file.camera()
+    assert camera.principal_distance_mm is not None
+    assert camera.principal_distance_mm.sigma == math.inf
+    assert camera.x0_mm is not None
+    assert camera.y0_mm is not None
+    assert (camera.x0_mm.sigma, camera.y0_mm.sigma) == (0.0, 2.0)
+    assert camera.distortion.parameters["k3"].sigma == math.inf
+    assert "k5" not in camera.distortion.parameters
+    assert camera.fiducials["1"].y_mm.sigma == math.inf
+    mark = file.layout().marks[0].mark
+    assert isinstance(mark, MarkShape)
+    assert len(mark.parts) == 4
+
+
+def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
+    text = CAMERA.replace('kind = "cross"\narm_mm = 1.0\nline_mm = 0.1\ngap_mm = 0.5', 'kind = "polygon"\n'
+                          "vertices_mm = [[0.0, -1.0], [2.0, 0.0], [0.0, 1.0]]")  # fmt: skip
+    mark = read_camera(written(tmp_path, "camera.toml", text)).layout().marks[0].mark
+    assert isinstance(mark, MarkShape)
+    # The tip points away from the centre of the frame: here up.
+    (part,) = mark.parts
+    assert isinstance(part, Polygon)
+    assert any(np.allclose(vertex, (0.0, 2.0)) for vertex in part.vertices_mm)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('family = "torlegard"', 'famly = "torlegard"', ["line 9", "famly", "family"]),
+        ('family = "torlegard"', 'family = "torlegaard"', ["line 9", "Did you mean 'torlegard'"]),
+        ("frame_mm = [228.0, 228.0]", "frame_mm = 228.0", ["frame_mm", "[x, y]"]),
+        ("frame_mm = [228.0, 228.0]", "frame_mm = [228.0, 228.0", ["not valid TOML", "line"]),
+        ("principal_distance_mm = 153.0", 'principal_distance_mm = "153,0"', ["must be a number"]),
+        ("principal_distance_mm = 153.0", "principal_distance_mm = -153.0", ["greater than 0"]),
+        ('mark = "side"', 'mark = "sid"', ["Did you mean 'side'"]),
+        ("arm_mm = 1.0", "arm_m = 1.0", ["arm_mm", "'arm_m'"]),
+        ("gap_mm = 0.5", "gap_mm = 1.5", ["smaller than arm_mm"]),
+        ('k3 = "free"', 'k3 = "fre"', ["k3", '"free"']),
+        ('k3 = "free"', 'k9 = "free"', ["k9", "Known here"]),
+        ("[[fiducial]]", '[[fiducial]]\nid = "1"\nxy_mm = [0.0, 1.0]\n[[fiducial]]', ["'1' is given twice"]),
+    ],
+)
+def test_camera_file_with_a_mistake_gets_a_message_that_helps(
+    tmp_path: Path, old: str, new: str, words: list[str]
+) -> None:
+    assert old in CAMERA
+    path = written(tmp_path, "camera.toml", CAMERA.replace(old, new, 1))
+    message = refused(read_camera, path)
+    for word in [str(path), *words]:
+        assert word in message
+
+
+def test_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:
+    path = tmp_path / "no.toml"
+    assert str(path.resolve()) in refused(read_toml, path)
+    assert str(path.resolve()) in refused(read_points, path)
+
+
+def test_points_file_fixed_free_and_unknown(tmp_path: Path) -> None:
+    text = "point,X,Y,Z,sX,sY,sZ\n# a comment\n1,1,2,3,0,0.5,\n2,,,7,,,0.02\n"
+    points = {point.id: point for point in read_points(written(tmp_path, "points.csv", text)).points}
+    first, second = points["1"], points["2"]
+    assert first.X is not None
+    assert first.Y is not None
+    assert first.Z is not None
+    assert (first.X.sigma, first.Y.sigma, first.Z.sigma) == (0.0, 0.5, math.inf)
+    assert second.X is None
+    assert second.Z is not None
+    assert second.Z.sigma == 0.02
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("point,X,Y,Z\n1,1,2,3\n1,4,5,6\n", ["line 3", "'1'", "line 2"]),
+        ("point,X,Y\n1,1,2\n", ["'Z'", "lacks"]),
+        ("point,X,Y,Z,sx\n1,1,2,3,0\n", ["'sx'", "Did you mean 'sX'"]),
+        ("point,X,Y,Z\n1,1,2,3a\n", ["line 2", "column Z", "'3a'"]),
+        ("point,X,Y,Z\n1,1,5,2,0,3,0\n", ["line 2", "7 values", "4 columns", "commas"]),
+        ("point,X,Y,Z,sX,sY,sZ\n1,1,2,3,-1,0,0\n", ["negative"]),
+        ("point,X,Y,Z,sX,sY,sZ\n1,,2,3,1,0,0\n", ["X", "blank"]),
+        ("point,X,Y,Z\n", ["no point"]),
+        ("", ["is empty"]),
+    ],
+)
+def test_points_file_with_a_mistake(tmp_path: Path, text: str, words: list[str]) -> None:
+    message = refused(read_points, written(tmp_path, "points.csv", text))
+    for word in words:
+        assert word in message
+
+
+def test_images_file_in_degrees_with_or_without_ending(tmp_path: Path) -> None:
+    text = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,sX0\na.tif,1,2,3,10,20,90,0.1\nb.2,,,,,,,\n"
+    images = read_images(written(tmp_path, "images.csv", text))
+    exterior = images.exterior["a"]
+    assert exterior is not None
+    np.testing.assert_allclose(exterior.values, [1, 2, 3, *np.deg2rad([10, 20, 90])])
+    assert exterior.sigmas[0] == 0.1
+    assert np.isinf(exterior.sigmas[1:]).all()
+    assert images.exterior["b.2"] is None
+
+
+def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) -> None:
+    covariance = np.array([[0.0004, 0.0001], [0.0001, 0.0009]])
+    marks = (
+        MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), covariance, Status.MEASURED),
+        MarkMeasurement("7", "target", None, None, Status.ABSENT, 'outside, "far" off'),
+    )
+    path = tmp_path / "comparator.csv"
+    write_comparator(path, [FrameMeasurement("f", marks)], {"f": (20.0, 10.0)})
+    first, second = read_comparator(path)
+    assert first.xy_mm is not None
+    assert first.sigma_mm is not None
+    np.testing.assert_allclose(first.xy_mm, [2.005, -2.005], atol=1e-9)
+    np.testing.assert_allclose(first.sigma_mm, [0.02 * 0.02, 0.01 * 0.03], rtol=1e-3)
+    assert first.rho == pytest.approx(-0.0001 / (0.02 * 0.03), abs=1e-4)  # y is turned round
+    assert second.xy_mm is None
+    assert second.status is Status.ABSENT
+    assert second.reason == 'outside, "far" off'
+
+
+def test_half_pixel_pixel_centres_are_whole_numbers() -> None:
+    pitch = (20.0, 20.0)
+    np.testing.assert_array_equal(comparator_from_pixel(np.zeros(2), pitch), np.zeros(2))
+    pixel = np.array([[3.25, 7.5], [0.0, 11.0]])
+    np.testing.assert_allclose(pixel_from_comparator(comparator_from_pixel(pixel, pitch), pitch), pixel, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("f,1,fiducial,1,2\nf,1,fiducial,3,4", ["line 3", "line 2", "fiducial '1'"]),
+        ("f,1,fidu,1,2", ["'fidu'", "possible are"]),
+        ("f,1,target,,2", ["x_mm", "blank"]),
+    ],
+)
+def test_comparator_file_with_a_mistake(tmp_path: Path, row: str, words: list[str]) -> None:
+    path = written(tmp_path, "comparator.csv", f"image,point,kind,x_mm,y_mm\n{row}\n")
+    message = refused(read_comparator, path)
+    for word in words:
+        assert word in message
+
+
+def test_failed_write_leaves_the_earlier_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path, "out.json", "earlier")
+
+    def full(_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        write_atomically(path, "later")
+    assert path.read_text(encoding="utf-8") == "earlier"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_interrupted_write_leaves_nothing_half_written(tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with atomic_path(tmp_path / "out.bin") as temporary:
+            temporary.write_bytes(b"half")
+            raise ValueError("stop")
+
+    with pytest.raises(ValueError, match="stop"):
+        interrupted()
+    assert list(tmp_path.iterdir()) == []
