@@ -15,7 +15,7 @@ Picture = NDArray[np.float32]
 
 TEXTURE_PX = 1024
 PARCELS = 130
-TEXEL_PX = 2.0  # scan pixels that one pixel of the texture covers
+TEXEL_PX = 3.0  # scan pixels that one pixel of the texture covers
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,20 +72,34 @@ def _ground_from_camera(geometry: FrameGeometry) -> Array:
 
 
 def _landscape(generator: np.random.Generator) -> Array:
-    """Parcels with their own tones and furrows, woods, roads along some of their sides."""
-    seeds = np.full((TEXTURE_PX, TEXTURE_PX), 255, np.uint8)
-    places = generator.integers(0, TEXTURE_PX, (PARCELS, 2))
-    seeds[places[:, 0], places[:, 1]] = 0
-    distance, labels = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    tone = generator.normal(0.0, 0.7, PARCELS + 1)[labels]
-    wooded = (generator.random(PARCELS + 1) < 0.3)[labels]
-    sides = (cv2.morphologyEx(labels.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0) & (
-        distance < TEXTURE_PX / 12
-    )
+    """Parcels with their own tones, woods, roads along some of their sides."""
+    parcels, road = _parcels(generator)
+    tone, wooded = generator.normal(0.0, 0.7, PARCELS)[parcels], (generator.random(PARCELS) < 0.3)[parcels]
     soil = tone + 0.45 * _rough(generator, 1.3) + 0.2 * _rough(generator, 0.0)
     wood = -0.9 + 0.9 * _rough(generator, 0.7)
-    pattern = np.where(wooded, wood, soil) + 1.4 * cv2.GaussianBlur(sides.astype(np.float64), (0, 0), 0.7)
+    pattern = np.where(wooded, wood, soil) + 1.4 * cv2.GaussianBlur(road.astype(np.float64), (0, 0), 0.7)
     return np.asarray(pattern - pattern.mean())
+
+
+def _parcels(generator: np.random.Generator) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Which parcel every pixel belongs to (that of the nearest of some random places), and where roads run."""
+    places = generator.choice(TEXTURE_PX**2, PARCELS, replace=False)
+    owner = np.full(TEXTURE_PX**2, -1)
+    owner[places] = np.arange(PARCELS)
+    around = np.pad(owner.reshape(TEXTURE_PX, TEXTURE_PX), TEXTURE_PX // 4, mode="wrap")
+    free = (around < 0).astype(np.uint8)
+    distance, labels = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    owner_of_label = np.zeros(int(labels.max()) + 1, np.float32)
+    owner_of_label[labels[around >= 0]] = around[around >= 0]
+    straight = owner_of_label[labels]
+    # Sides that wind a little, as they do on the ground.
+    y, x = np.indices((TEXTURE_PX, TEXTURE_PX), np.float32) + np.float32(TEXTURE_PX // 4)
+    x += (5 * _rough(generator, 1.4)).astype(np.float32)
+    y += (5 * _rough(generator, 1.4)).astype(np.float32)
+    parcels = cv2.remap(straight, x, y, cv2.INTER_NEAREST)
+    near = cv2.remap(distance, x, y, cv2.INTER_LINEAR) < TEXTURE_PX / 12
+    road = (cv2.morphologyEx(parcels, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0) & near
+    return np.asarray(parcels, np.intp), np.asarray(road, np.bool_)
 
 
 def _rough(generator: np.random.Generator, exponent: float) -> Array:

@@ -10,8 +10,8 @@ from synthetic_images.areas import Area, bounds, centroid, disk, polygon, subdiv
 from synthetic_images.damage import damage
 from synthetic_images.film import FrameGeometry, frame_geometry
 from synthetic_images.paint import AreaPaint, ChipPaint, Paint, chip_paint
-from synthetic_images.scene import BoardField, ChipMark, Scene, SceneFiducial
-from synthetic_images.targets import board_sheet, chessboard_squares, disk_outline, field_targets
+from synthetic_images.scene import BoardField, ChipMark, DiskField, Scene, SceneFiducial
+from synthetic_images.targets import Target, board_sheet, chessboard_squares, disk_outline, field_targets
 from synthetic_images.truth import FrameTruth, Position
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ def make_frame(scene: Scene, index: int) -> Frame:
     geometry = frame_geometry(scene, index)
     exposed = tuple(AreaPaint((geometry.pixel_area(area),), 1.0) for area in _exposed_areas(geometry))
     fiducials = {fiducial.id: _fiducial_position(fiducial, geometry) for fiducial in scene.camera.fiducials}
-    targets = dict(_target_positions(geometry))
+    targets = _target_positions(geometry)
     generator = np.random.default_rng([scene.seed, index, 2])
     defects = damage(scene.film, geometry.width_px, geometry.height_px, generator)
     paints = [*_field_paints(geometry, targets), *_fiducial_paints(geometry)]
@@ -87,24 +87,39 @@ def _beyond_scan(geometry: FrameGeometry, window: tuple[int, int, int, int]) -> 
     return ""
 
 
-def _target_positions(geometry: FrameGeometry) -> Iterator[tuple[str, Position]]:
-    """Positions of all targets that are imaged somewhere."""
-    station = np.asarray(geometry.image.exterior[:3])
-    for target in field_targets(geometry.scene.field):
+def _target_positions(geometry: FrameGeometry) -> dict[str, Position]:
+    """Positions of all targets that are imaged somewhere, in the field's order."""
+    field = geometry.scene.field
+    surround = max(field.surround, 1.0) if isinstance(field, DiskField) else 1.0
+    positions: dict[str, Position] = {}
+    nearer: list[tuple[Array, float]] = []
+    for target in reversed(_far_to_near(geometry)):
         outline = target.center[None] if target.radius == 0.0 else disk_outline(target, target.radius)
         pixels = geometry.pixel_from_object(np.vstack([target.center, outline]))
         if not np.isfinite(pixels).all():
             continue
         center, outline_px = pixels[0], pixels[1:]
         figure = center if target.radius == 0.0 else centroid((outline_px,))
-        hidden = _beyond_scan(geometry, bounds(((outline_px,),)))
-        if not hidden and not _inside_frame(geometry, outline_px):
-            hidden = "not wholly inside of the exposed frame"
-        if not hidden and target.normal @ (station - target.center) <= 0.0:
-            hidden = "faces away"
-        if not hidden and _behind_a_pad(geometry, outline_px):
-            hidden = "behind a fiducial"
-        yield target.id, Position(center, figure, hidden)
+        reach = float(np.linalg.norm(outline_px - center, axis=1).max())
+        hidden = _hidden(geometry, target, outline_px)
+        if not hidden and any(np.linalg.norm(center - other) < reach + size for other, size in nearer):
+            hidden = "behind another target"
+        if isinstance(field, DiskField) and hidden != "faces away":
+            nearer.append((center, reach * surround))
+        positions[target.id] = Position(center, figure, hidden)
+    return {target.id: positions[target.id] for target in field_targets(field) if target.id in positions}
+
+
+def _hidden(geometry: FrameGeometry, target: Target, outline_px: Array) -> str:
+    """Why a target alone cannot be seen whole; "" if it can."""
+    if target.normal @ (np.asarray(geometry.image.exterior[:3]) - target.center) <= 0.0:
+        return "faces away"
+    beyond = _beyond_scan(geometry, bounds(((outline_px,),)))
+    if beyond:
+        return beyond
+    if not _inside_frame(geometry, outline_px):
+        return "not wholly inside of the exposed frame"
+    return "behind a fiducial" if _behind_a_pad(geometry, outline_px) else ""
 
 
 def _inside_frame(geometry: FrameGeometry, pixels: Array) -> bool:
@@ -123,18 +138,23 @@ def _behind_a_pad(geometry: FrameGeometry, pixels: Array) -> bool:
 
 
 def _field_paints(geometry: FrameGeometry, positions: dict[str, Position]) -> Iterator[Paint]:
+    """The field, the far before the near."""
     field, tones = geometry.scene.field, geometry.scene.tones
     if isinstance(field, BoardField):
         yield from _board_paints(geometry, field)
         return
-    # What only the frame's edge or a pad hides in part is painted too: a picture shows half disks there.
-    unseen = ("faces away", "off the scan")
-    seen = [t for t in field_targets(field) if t.id in positions and positions[t.id].hidden not in unseen]
-    if field.surround:
-        for target in seen:
+    for target in _far_to_near(geometry):
+        # What only the frame's edge, a pad or a nearer target hides in part is painted too.
+        if target.id not in positions or positions[target.id].hidden in ("faces away", "off the scan"):
+            continue
+        if field.surround:
             yield from _object_paint(geometry, (disk_outline(target, target.radius * field.surround),), tones.surround)
-    for target in seen:
         yield from _object_paint(geometry, (disk_outline(target, target.radius),), tones.target)
+
+
+def _far_to_near(geometry: FrameGeometry) -> list[Target]:
+    station = np.asarray(geometry.image.exterior[:3])
+    return sorted(field_targets(geometry.scene.field), key=lambda t: (-float(np.linalg.norm(t.center - station)), t.id))
 
 
 def _board_paints(geometry: FrameGeometry, field: BoardField) -> Iterator[Paint]:

@@ -4,11 +4,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetic_images.scene import PARAMETERS, Distortion, SceneCamera
+from synthetic_images.distortion import correction
+from synthetic_images.scene import Distortion, SceneCamera
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 INVERSION_MM = 1e-13
 INVERSION_STEPS = 50
 
@@ -55,15 +56,16 @@ def distorted(camera: SceneCamera, tangents: Array) -> Array:
 
 
 def _opencv_distorted(distortion: Distortion, tangents: Array) -> Array:
-    """OpenCV's own model; its y points down."""
+    """OpenCV's own model, whose y points down; b1 makes its fx = c (1 + b1)."""
     down = np.array([1.0, -1.0])
-    coefficients = np.array([distortion.parameters.get(name, 0.0) for name in PARAMETERS["opencv"]])
+    stretch = np.array([1.0 + distortion.parameters.get("b1", 0.0), 1.0])
+    coefficients = np.array([distortion.parameters.get(name, 0.0) for name in OPENCV_ORDER])
     seen = np.isfinite(tangents).all(axis=1)
     result = np.full_like(tangents, np.nan)
     if seen.any():
         directions = np.column_stack([tangents[seen] * down, np.ones(seen.sum())])
         projected, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
-        result[seen] = np.asarray(projected).reshape(-1, 2) * down
+        result[seen] = np.asarray(projected).reshape(-1, 2) * down * stretch
     return result
 
 
@@ -82,32 +84,11 @@ def _observed(distortion: Distortion, ideal: Array, point: Array) -> Array:
         for axis in (0, 1):
             moved = start.astype(np.complex128)
             moved[:, axis] += 1e-30j
-            jacobian[:, :, axis] = -_correction(distortion, moved, point).imag / 1e-30
+            jacobian[:, :, axis] = -correction(distortion, moved, point).imag / 1e-30
         jacobian += np.eye(2)
-        miss = start - _correction(distortion, start.astype(np.complex128), point).real - ideal[open_]
+        miss = start - correction(distortion, start.astype(np.complex128), point).real - ideal[open_]
         step = np.linalg.solve(jacobian, miss[:, :, None])[:, :, 0]
         observed[open_] = start - step
         open_[open_] = np.hypot(step[:, 0], step[:, 1]) > INVERSION_MM * (1 + np.hypot(start[:, 0], start[:, 1]))
     observed[open_] = np.nan
     return observed
-
-
-def _correction(distortion: Distortion, reduced: ComplexArray, point: Array) -> ComplexArray:
-    """(n, 2) the correction (dx, dy) in mm that is subtracted from the observed point."""
-    value = dict.fromkeys(PARAMETERS[distortion.family], 0.0) | dict(distortion.parameters)
-    x, y = reduced[:, 0], reduced[:, 1]
-    r2 = x * x + y * y
-    p1, p2 = value["p1"], value["p2"]
-    if distortion.family == "brown":
-        radial = r2 * (value["k1"] + r2 * (value["k2"] + r2 * value["k3"]))
-        dx = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y + value["b1"] * x + value["b2"] * y
-        dy = y * radial + 2 * p1 * x * y + p2 * (r2 + 2 * y * y)
-        return np.stack([dx, dy], axis=1)
-    zero2 = distortion.r0_mm**2
-    radial = value["k3"] * (r2 - zero2) + value["k5"] * (r2**2 - zero2**2) + value["k7"] * (r2**3 - zero2**3)
-    dec = 1 + value["p3"] * r2 + value["p4"] * r2**2
-    # The paper prints the decentring terms with coordinates that are not reduced to the principal point.
-    px, py = (x, y) if distortion.decentering == "reduced" else (x + point[0], y + point[1])
-    dx = x * radial + (p1 * (r2 + 2 * px * px) + 2 * p2 * px * py) * dec
-    dy = y * radial + (2 * p1 * px * py + p2 * (r2 + 2 * py * py)) * dec
-    return np.stack([dx, dy], axis=1)

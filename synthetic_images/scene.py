@@ -16,7 +16,7 @@ from synthetic_images.checks import not_negative, one_of, positive, unique
 
 Array = NDArray[np.float64]
 
-Family = Literal["none", "torlegard", "brown", "opencv"]
+Family = Literal["none", "torlegard", "brown", "opencv", "juhl"]
 Side = Literal["left", "right", "top", "bottom"]
 Compression = Literal["none", "lzw", "deflate", "zstd", "jpeg"]
 Background = Literal["plain", "wall", "terrain"]
@@ -27,7 +27,8 @@ PARAMETERS: Mapping[Family, tuple[str, ...]] = {
     "none": (),
     "torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"),
     "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
-    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y"),
+    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1"),
+    "juhl": ("t1", "t2", "t3", "t4", "r1", "r2", "r3", "af", "sh"),
 }
 
 
@@ -44,6 +45,8 @@ class Distortion:
         one_of("distortion family", self.family, get_args(Family))
         for name in self.parameters:
             one_of(f"{self.family} parameter", name, PARAMETERS[self.family])
+        if self.family == "juhl" and not self.r0_mm > 0.0 and any(self.parameters.get(name) for name in ("r2", "r3")):
+            raise ValueError("juhl's r2 and r3 are waves of the length r0: r0_mm must be positive")
 
 
 @dataclass(frozen=True, eq=False)
