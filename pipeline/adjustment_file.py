@@ -14,17 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.distortion import PARAMETERS
 from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
 from adjust.projection import adjusted_image
 from adjust.result import Adjustment
+from adjust.transformation import NAMES
 from pipeline.atomic import write_atomically
 from pipeline.errors import InputError
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
 
-ANGLES = ("omega", "phi", "kappa")
-INTERIOR = ("c", "x0", "y0")
+ANGLES = ("omega", "phi", "kappa", "angle")
+DEG_PER_RAD = 180.0 / math.pi
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Covariance:
     def of(self, names: Iterable[str]) -> Array:
         """The covariance (k, k) of some unknowns; one that is not listed was fixed, its row is zero."""
         at = np.array([self._positions.get(name, -1) for name in names], dtype=int)
-        block = self.matrix[np.ix_(at, at)]
+        block: Array = self.matrix[np.ix_(at, at)]
         block[at < 0, :] = 0.0
         block[:, at < 0] = 0.0
         return block
@@ -56,8 +58,9 @@ def covariance_path(path: Path) -> Path:
 def write_adjustment(adjustment: Adjustment, path: Path) -> None:
     """Write the result to `path` and its covariance beside it, each by way of a temporary file.
 
-    Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity has
-    `given`, what was known of it beforehand, and every residual its place in the camera.
+    Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity
+    has `given`, what was known of it beforehand, and every residual its place in the camera. A camera without an image
+    and a point that nobody saw are not in it. Raises InputError where a file cannot be written.
     """
     text = json.dumps(without_nan(adjustment_json(adjustment)), indent=1, ensure_ascii=False, allow_nan=False)
     arrays = io.BytesIO()
@@ -74,6 +77,8 @@ def write_adjustment(adjustment: Adjustment, path: Path) -> None:
 def adjustment_json(adjustment: Adjustment) -> Json:
     """The result as `adjustment.json` holds it; numbers that mean nothing are still NaN or infinite."""
     network = adjustment.network
+    used = {image.camera for image in network.images}
+    names = frozenset(adjustment.names)
     return {
         "reseau": version("reseau"),
         "converged": adjustment.converged,
@@ -91,9 +96,10 @@ def adjustment_json(adjustment: Adjustment) -> Json:
             for null in adjustment.singular
         ],
         "warnings": list(adjustment.warnings),
-        "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras},
+        "variance_factors": dict(adjustment.variance_factors),
+        "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras if camera.name in used},
         "images": {image.name: _image(adjustment, image) for image in network.images},
-        "points": {point.id: _point(adjustment, point) for point in network.points},
+        "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
         "residuals": _residuals(adjustment),
         "groups": {
             name: {
@@ -113,11 +119,9 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
     distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
     if camera.distortion.family == "torlegard":
         distortion["decentering"] = camera.distortion.decentering
-    for name in adjustment.names:
-        parameter = name.removeprefix(interior)
-        if name.startswith(interior) and "." not in parameter and parameter not in INTERIOR:
-            given = camera.distortion.parameters.get(parameter, Prior(0.0))
-            distortion[parameter] = _quantity(adjustment, name, given)
+    for parameter in PARAMETERS[camera.distortion.family]:
+        given = camera.distortion.parameters.get(parameter, Prior(0.0))
+        distortion[parameter] = _quantity(adjustment, interior + parameter, given)
     return {
         "principal_distance_mm": _quantity(adjustment, interior + "c", camera.principal_distance_mm),
         "principal_point_mm": {
@@ -137,19 +141,17 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
 
 
 def _image(adjustment: Adjustment, image: Image) -> Json:
-    start = f"T.{image.name}."
     transformation: Json = {"kind": image.transformation, "mirrored": image.name in adjustment.mirrored}
-    for name in adjustment.names:
-        parameter = name.removeprefix(start)
-        if name.startswith(start) and "." not in parameter:
-            transformation[parameter] = _quantity(adjustment, name)
+    for parameter in NAMES[image.transformation]:
+        key, scale = (f"{parameter}_deg", DEG_PER_RAD) if parameter in ANGLES else (parameter, 1.0)
+        transformation[key] = _quantity(adjustment, f"T.{image.name}.{parameter}", None, scale)
     exterior: Json = {}
     for i, element in enumerate(EXTERIOR_NAMES):
         known = image.exterior
         given = None if known is None else Prior(float(known.values[i]), float(known.sigmas[i]))
         name = f"EO.{image.name}.{element}"
         if element in ANGLES:
-            exterior[f"{element}_deg"] = _quantity(adjustment, name, given, 180.0 / math.pi)
+            exterior[f"{element}_deg"] = _quantity(adjustment, name, given, DEG_PER_RAD)
         else:
             exterior[element] = _quantity(adjustment, name, given)
     return {"camera": image.camera, "transformation": transformation, "exterior": exterior}
@@ -188,6 +190,7 @@ def _residuals(adjustment: Adjustment) -> list[Json]:
     observations, residuals = adjustment.network.observations, adjustment.residuals
     sigma_um = 1e3 * np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2))
     v_um = 1e3 * residuals.v_mm
+    weights = adjustment.weights if adjustment.weights.size else np.ones(len(observations))
     camera_mm = _in_camera(adjustment, observations.xy_mm)
     v_camera_um = 1e3 * (_in_camera(adjustment, observations.xy_mm + residuals.v_mm) - camera_mm)
     return [
@@ -202,6 +205,7 @@ def _residuals(adjustment: Adjustment) -> list[Json]:
             "w": float(_larger(residuals.w[i])),
             "w_x": float(residuals.w[i, 0]),
             "w_y": float(residuals.w[i, 1]),
+            "weight": float(weights[i]),
             "sx_um": float(sigma_um[i, 0]),
             "sy_um": float(sigma_um[i, 1]),
             "x_mm": float(observations.xy_mm[i, 0]),
@@ -286,6 +290,10 @@ class _Each:
 
 
 _NUMBER = (float, int, type(None))  # null: a number that has no meaning here
+_RESIDUAL_NUMBERS = (
+    "vx_um", "vy_um", "redundancy_x", "redundancy_y", "w", "sx_um", "sy_um",
+    "camera_x_mm", "camera_y_mm", "camera_vx_um", "camera_vy_um",
+)  # fmt: skip
 _QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
 _ADJUSTMENT = {
     "reseau": str,
@@ -315,17 +323,7 @@ _ADJUSTMENT = {
     ),
     "points": _Each(dict, {"X": _QUANTITY, "Y": _QUANTITY, "Z": _QUANTITY}),
     "residuals": _Each(
-        list,
-        {
-            "image": str,
-            "point": str,
-            "kind": str,
-            "vx_um": _NUMBER,
-            "vy_um": _NUMBER,
-            "redundancy_x": _NUMBER,
-            "redundancy_y": _NUMBER,
-            "w": _NUMBER,
-        },
+        list, dict.fromkeys(("image", "point", "kind"), str) | dict.fromkeys(_RESIDUAL_NUMBERS, _NUMBER)
     ),
     "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),
 }

@@ -1,4 +1,4 @@
-"""What the report shows of each camera: its parameters, its distortion, its fiducial marks, its residuals, its check."""
+"""What the report shows of each camera: its parameters, distortion, fiducial marks, residuals and check."""
 
 from dataclasses import dataclass
 

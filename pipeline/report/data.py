@@ -46,8 +46,8 @@ class ReportData:
 
     comparator: the rows of comparator.csv. measurement, adjustment, check: the contents of measurement.json,
     adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed frame by
-    camera name. thumbnail: from the names of image and point to the mark's picture. problems: what the caller has to
-    say beyond the files.
+    camera name. thumbnail: from image, point and kind (a fiducial and a target may share a name) to the mark's picture.
+    problems: what the caller has to say beyond the files.
     """
 
     project: str
@@ -57,5 +57,5 @@ class ReportData:
     covariance: Covariance | None = None
     check: Json | None = None
     frame_mm: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    thumbnail: Callable[[str, str], Thumbnail | None] | None = None
+    thumbnail: Callable[[str, str, str], Thumbnail | None] | None = None
     problems: tuple[Problem, ...] = ()

@@ -15,8 +15,8 @@ from pipeline.report.data import Json
 Array = NDArray[np.float64]
 
 LONGEST_PX = 46.0
-WIDTH_PX = 460.0
-MARGIN_PX = 62.0
+WIDTH_PX = 400.0
+MARGIN_PX = 58.0
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,9 @@ class Figure:
 def figure(camera: str, fiducials: Json, covariance: Covariance) -> Figure | None:
     """The change of form of a camera's fiducials; None with fewer than three, whose form has nothing to say.
 
-    The datum that the fiducials stand in is itself uncertain, by a shift, a rotation and a scale that all of them share;
-    the S-transformation (Baarda 1973), C' = S C S' with S = I - G (G'G)^-1 G', takes it out of values and covariance.
+    The datum that the fiducials stand in is itself uncertain, by a shift, a rotation and a scale that all of them
+    share; the S-transformation (Baarda 1973), C' = S C S' with S = I - G (G'G)^-1 G', takes it out of values and
+    covariance.
     """
     known = {id: fiducial for id, fiducial in fiducials.items() if _given(fiducial) is not None}
     if len(known) < 3:
@@ -62,7 +63,10 @@ def figure_plot(change: Figure) -> Markup:
     height = float(high[1] - low[1]) * px_per_mm + 2.0 * MARGIN_PX
     places = MARGIN_PX + px_per_mm * np.stack([change.given_mm[:, 0] - low[0], high[1] - change.given_mm[:, 1]], axis=1)
     ends = places + px_per_um * change.change_um * (1.0, -1.0)
+    corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    x_corner, y_corner = (MARGIN_PX + px_per_mm * np.stack([corners[:, 0] - low[0], high[1] - corners[:, 1]], axis=1)).T
     content = [
+        svg.line(x_corner, y_corner, "frame", closed=True),
         *_ellipses(ends, px_per_um * radius, angles),
         svg.strokes(places, ends, "vector fiducial"),
         svg.strokes(places, places, "dot fiducial"),
@@ -94,11 +98,11 @@ def _without_datum(xy: Array) -> Array:
     columns = [(ones, zeros), (zeros, ones), (-y, x), (x, y)]
     g = np.stack([np.stack(column, axis=1).ravel() for column in columns], axis=1)
     q, _ = np.linalg.qr(g)
-    return np.eye(2 * len(xy)) - q @ q.T
+    return np.asarray(np.eye(2 * len(xy)) - q @ q.T)
 
 
 def _ellipse_axes(covariance: Array) -> tuple[Array, Array]:
-    """Semi-axes (n, 2), the larger last, and the direction (n,) of the larger one, counter-clockwise from x in degrees."""
+    """Semi-axes (n, 2), the larger last, and its direction (n,), counter-clockwise from x in degrees."""
     variances, directions = np.linalg.eigh(covariance)
     return np.sqrt(np.maximum(variances, 0.0)), np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
 

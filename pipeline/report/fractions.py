@@ -39,5 +39,5 @@ def fraction_test(position_px: Array) -> FractionTest:
 
 def expected_range(total: int) -> tuple[float, float]:
     """Where 99 % of all counts of a bin lie when the marks prefer no place."""
-    low, high = stats.binom.ppf([0.005, 0.995], total, 1.0 / BINS)
-    return float(low), float(high)
+    binomial = stats.binom(total, 1.0 / BINS)
+    return float(binomial.ppf(0.005)), float(binomial.ppf(0.995))

@@ -51,7 +51,7 @@ class FrameView:
 def frame_views(data: ReportData, shots: list[Frame]) -> list[FrameView]:
     """All frames, drawn to the same scales."""
     shown = thumbnails.shown_marks(shots)
-    px_per_um = thumbnail_scale(shots)
+    px_per_um, most_px = thumbnail_scale(shots), thumbnails.stored_px(shown)
     by_image = residuals_by_image(data)
     suspect = suspects(data.adjustment) if data.adjustment else []
     plots = _plots(data, by_image, suspect)
@@ -59,7 +59,7 @@ def frame_views(data: ReportData, shots: list[Frame]) -> list[FrameView]:
     for frame in shots:
         stored: Json = data.adjustment["images"].get(frame.image, {}) if data.adjustment else {}
         residuals = by_image.get(frame.image, [])
-        cards = tuple(_card(mark, data.thumbnail, px_per_um, suspect) for mark in shown[frame.image])
+        cards = tuple(_card(mark, data.thumbnail, px_per_um, most_px, suspect) for mark in shown[frame.image])
         views.append(
             FrameView(
                 frame=frame,
@@ -110,13 +110,17 @@ def _plots(data: ReportData, by_image: dict[str, list[Json]], suspect: list[Json
 
 
 def _card(
-    mark: Mark, picture_of: Callable[[str, str], Thumbnail | None] | None, px_per_um: float, suspect: list[Json]
+    mark: Mark,
+    picture_of: Callable[[str, str, str], Thumbnail | None] | None,
+    px_per_um: float,
+    most_px: float,
+    suspect: list[Json],
 ) -> Card:
-    thumbnail = picture_of(mark.image, mark.point) if picture_of else None
+    thumbnail = picture_of(mark.image, mark.point, mark.kind) if picture_of else None
     residual = mark.residual
     return Card(
         mark=mark,
-        picture=thumbnails.drawn(mark, thumbnail, px_per_um) if thumbnail else None,
+        picture=thumbnails.drawn(mark, thumbnail, px_per_um, most_px) if thumbnail else None,
         sigma=_sigma(mark),
         residual=f"{fixed(residual['vx_um'], 1, sign=True)}, {fixed(residual['vy_um'], 1, sign=True)}"
         if residual

@@ -149,7 +149,8 @@ def _directions() -> Array:
 
 
 def _sigma(by: Array, cofactor: Array) -> Array:
-    return np.sqrt(np.maximum(np.einsum("rk,kl,rl->r", by, cofactor, by), 0.0))
+    variance: Array = np.einsum("rk,kl,rl->r", by, cofactor, by)
+    return np.sqrt(np.maximum(variance, 0.0))
 
 
 def _band(x: Array, axes: svg.Axes, middle: Array, half: Array, class_: str) -> Markup:

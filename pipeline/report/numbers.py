@@ -41,7 +41,9 @@ def significant(value: float | None, digits: int = 3) -> str:
     if value is None or not math.isfinite(value):
         return NONE
     power = _power(abs(value))
-    return f"{value / 10.0**power:.{digits}g}".replace("-", "−") + _times(power)
+    mantissa = value / 10.0**power
+    whole = len(f"{abs(mantissa):.0f}")  # digits before the point are never dropped for a power of ten
+    return f"{mantissa:.{max(digits, whole)}g}".replace("-", "−") + _times(power)
 
 
 def _power(size: float) -> int:

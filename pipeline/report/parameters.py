@@ -95,7 +95,8 @@ def _origin(quantity: Json, sigma0: float) -> str:
     left = sigma / (sigma0 * given["sigma"])
     if left > MOSTLY_PRIOR:
         return f"{moved}; known from the given value, hardly from the observations"
-    return f"{moved}; {100.0 * (1.0 - left**2):.0f} % of what is known comes from the observations"
+    share = f"{100.0 * left**2:.0f} %" if left > 0.1 else "below 1 %"
+    return f"{moved}; the given value's share is {share}"
 
 
 def _significance(quantity: Json) -> str:

@@ -73,7 +73,7 @@ class Axes:
 
     def drawn(self, x_label: str, y_label: str) -> Markup:
         """Grid, ticks and labels."""
-        x_ticks, y_ticks = ticks(*self.x_range), ticks(*self.y_range)
+        x_ticks, y_ticks = ticks(*self.x_range, self.width / 50.0), ticks(*self.y_range, self.height / 28.0)
         x_left, x_right = self.left, self.width - self.right
         y_top, y_bottom = self.top, self.height - self.bottom
         middle = 0.5 * (y_top + y_bottom)
@@ -106,15 +106,15 @@ class Axes:
         )
 
 
-def ticks(low: float, high: float, about: int = 6) -> list[float]:
-    """Round values inside of a range, some six of them."""
-    step = round_step((high - low) / about)
+def ticks(low: float, high: float, most: float) -> list[float]:
+    """Round values inside of a range, `most` of them or fewer."""
+    step = round_step(2.5 * (high - low) / most)
     first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
     return [i * step for i in range(first, last + 1)]
 
 
 def round_step(size: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above `size`, or just above it."""
+    """The largest of 1, 2, 5 times a power of ten that is not above `size`."""
     power = 10.0 ** np.floor(np.log10(size))
     return float(power * max((m for m in (1.0, 2.0, 5.0) if m <= size / power * (1.0 + 1e-9)), default=1.0))
 

@@ -1,4 +1,4 @@
-"""Marks as they stand in the scan, with the measured centre, its standard deviation and its residual drawn over them."""
+"""Marks as they stand in the scan, with the measured centre and its residual drawn over them."""
 
 import base64
 
@@ -8,12 +8,13 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from pipeline.report import svg
-from pipeline.report.data import Thumbnail
+from pipeline.report.data import Json, Thumbnail
 from pipeline.report.marks import Frame, Mark
 
 SIZE_PX = 92.0  # a picture's width and height on the page
 TARGETS = 600  # pictures of targets in a report; with more of them, only the worst of each frame are shown
 LEAST_TARGETS = 4
+PICTURES = 1200  # of full size; with more of them they are stored half as fine, so that the file stays readable
 ARROW_PX = 34.0  # the longest arrow
 
 Array = NDArray[np.float64]
@@ -24,6 +25,11 @@ def shown_marks(shots: list[Frame]) -> dict[str, list[Mark]]:
     targets = sum(not mark.is_fiducial for frame in shots for mark in frame.marks)
     most = targets if targets <= TARGETS else max(LEAST_TARGETS, TARGETS // len(shots))
     return {frame.image: _worst(frame, most) for frame in shots}
+
+
+def stored_px(shown: dict[str, list[Mark]]) -> float:
+    """The greatest width of a picture as it is stored."""
+    return SIZE_PX if sum(len(marks) for marks in shown.values()) <= PICTURES else 0.5 * SIZE_PX
 
 
 def _worst(frame: Frame, most: int) -> list[Mark]:
@@ -48,27 +54,27 @@ def arrow_scale(marks: list[Mark]) -> float:
     return svg.round_step(ARROW_PX / longest) if longest > 0.0 else 1.0
 
 
-def drawn(mark: Mark, thumbnail: Thumbnail, px_per_um: float) -> Markup:
+def drawn(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) -> Markup:
     """The picture with its overlay: a crosshair where the centre was measured, the residual as an arrow from it."""
     rows, cols = thumbnail.pixels.shape
     zoom = SIZE_PX / (max(rows, cols) * thumbnail.step_px)  # page pixels to a pixel of the scan
     width, height = cols * thumbnail.step_px * zoom, rows * thumbnail.step_px * zoom
-    image = svg.tag("image", href=png_uri(thumbnail.pixels), width=width, height=height, class_="chip")
+    image = svg.tag("image", href=png_uri(thumbnail.pixels, most_px), width=width, height=height, class_="chip")
     overlay = Markup("")
     if mark.center_px is not None:
         # The centre of the top-left thumbnail pixel lies half a thumbnail pixel inside of the picture's edge.
         x, y = (mark.center_px - thumbnail.origin_px + 0.5 * thumbnail.step_px) * zoom
-        overlay = _crosshair(x, y, mark) + (_arrow(x, y, mark, px_per_um) if mark.residual else Markup(""))
+        overlay = _crosshair(x, y, mark) + (_arrow(x, y, mark.residual, px_per_um) if mark.residual else Markup(""))
     return svg.picture(SIZE_PX, SIZE_PX, _description(mark), image, overlay, class_="thumb")
 
 
-def png_uri(pixels: NDArray[np.generic]) -> str:
-    """Grey values as a PNG of 8 bit, stretched between their darkest and lightest per mille, in a data URI."""
+def png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
+    """Grey values as a PNG of 8 bit in a data URI, stretched from their darkest to their lightest per mille."""
     grey = pixels.astype(np.float64)
     low, high = np.percentile(grey, [0.1, 99.9])
     stretched = np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0
-    if max(grey.shape) > 2.0 * SIZE_PX:
-        factor = 2.0 * SIZE_PX / max(grey.shape)
+    if max(grey.shape) > most_px:
+        factor = most_px / max(grey.shape)
         stretched = cv2.resize(stretched, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     _, data = cv2.imencode(".png", np.rint(stretched).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")
@@ -84,19 +90,18 @@ def _crosshair(x: float, y: float, mark: Mark) -> Markup:
     )
 
 
-def _arrow(x: float, y: float, mark: Mark, px_per_um: float) -> Markup:
+def _arrow(x: float, y: float, residual: Json, px_per_um: float) -> Markup:
     """The residual from the measured centre; y of the comparator points up, rows point down."""
-    residual = mark.residual or {}
     v = px_per_um * np.array([residual["vx_um"], -residual["vy_um"]])
     length = float(np.hypot(*v))
     start = np.array([x, y])
     end = start + v
-    shaft = svg.line(*np.stack([start, end], axis=1), "arrow")
+    shaft = svg.strokes(start[None], end[None], "arrow")
     if length < 4.0:
         return shaft
     back, side = -v / length, np.array([v[1], -v[0]]) / length
-    head = np.stack([end + 6.0 * back + 3.0 * side, end, end + 6.0 * back - 3.0 * side], axis=1)
-    return svg.line(*np.stack([start, end], axis=1), "halo") + shaft + svg.line(*head, "arrow")
+    x_head, y_head = np.stack([end + 6.0 * back + 3.0 * side, end, end + 6.0 * back - 3.0 * side], axis=1)
+    return svg.strokes(start[None], end[None], "halo") + shaft + svg.line(x_head, y_head, "arrow")
 
 
 def _description(mark: Mark) -> str:

@@ -12,7 +12,7 @@ from pipeline.report.numbers import fixed
 
 Array = NDArray[np.float64]
 
-MARGIN_PX = 14.0
+MARGIN_PX = 26.0
 FOOT_PX = 30.0
 
 
@@ -126,7 +126,5 @@ def _stroke(start: Array, end: Array, row: Json, suspect: list[Json]) -> Markup:
 
 
 def _hint(row: Json) -> str:
-    return (
-        f"{row['kind']} {row['point']}: v = ({fixed(row['vx_um'], 1, sign=True)}, {fixed(row['vy_um'], 1, sign=True)}) µm, "
-        f"w = {fixed(row['w'], 1)}"
-    )
+    vx, vy = fixed(row["vx_um"], 1, sign=True), fixed(row["vy_um"], 1, sign=True)
+    return f"{row['kind']} {row['point']}: v = ({vx}, {vy}) µm in the scan, w = {fixed(row['w'], 1)}"

@@ -40,8 +40,8 @@ def judge(data: ReportData) -> Verdict:
     problems = (
         *fatal,
         *data.problems,
-        *(problem for frame in shots for problem in _frame_problems(frame)),
-        *(_locking(shots)),
+        *_frame_problems(shots),
+        *_locking(shots),
         *(_adjustment_problems(data.adjustment) if data.adjustment and not fatal else ()),
         *(_check_problems(data.check) if data.check else ()),
     )
@@ -52,7 +52,8 @@ def judge(data: ReportData) -> Verdict:
 
 def sigma0_bounds(redundancy: int) -> tuple[float, float]:
     """Where sigma0 lies, with a probability of 99 %, when the a-priori standard deviations are right."""
-    low, high = stats.chi2.ppf([0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)], redundancy)
+    chi_square = stats.chi2(redundancy)
+    low, high = chi_square.ppf(0.5 * (1.0 - CONFIDENCE)), chi_square.ppf(0.5 * (1.0 + CONFIDENCE))
     return float(np.sqrt(low / redundancy)), float(np.sqrt(high / redundancy))
 
 
@@ -84,28 +85,37 @@ def _no_solution(adjustment: Json) -> Iterator[Problem]:
         )
 
 
-def _frame_problems(frame: Frame) -> Iterator[Problem]:
+def _frame_problems(shots: list[Frame]) -> Iterator[Problem]:
+    """What the frames have to say, said once where several frames say the same."""
+    images: dict[Problem, list[str]] = {}
+    for frame in shots:
+        for problem in _problems_of(frame):
+            images.setdefault(problem, []).append(frame.image)
+    for problem, names in images.items():
+        yield Problem(f"{_listed(names)}: {problem.what}", problem.next_step)
+
+
+def _problems_of(frame: Frame) -> Iterator[Problem]:
     pose = frame.scan.get("pose")
     if pose and not pose["decided"]:
         reason = " ".join(pose.get("evidence", ()))
         yield Problem(
-            f"{frame.image}: pose assumed ({pose['name']}). {reason}",
+            f"pose assumed ({pose['name']}). {reason}",
             'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
         )
-    for problem in frame.scan.get("problems", ()):
-        yield Problem(f"{frame.image}: {problem}")
+    yield from (Problem(problem) for problem in frame.scan.get("problems", ()))
     lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
     if lost:
         names = "; ".join(f"{mark.point} {mark.status}: {mark.reason.rstrip('.')}" for mark in lost[:MANY])
         found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
         yield Problem(
-            f"{frame.image}: {_count(len(lost), 'fiducial mark')} not measured, {found} measured ({names}).",
+            f"{_count(len(lost), 'fiducial mark')} not measured, {found} measured ({names}).",
             "Look at their pictures below. The frame is used with the others; its film transformation is less certain.",
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     if targets and not any(mark.status.is_observation for mark in targets):
         yield Problem(
-            f"{frame.image}: none of its {len(targets)} targets was measured.",
+            f"none of its {len(targets)} targets was measured.",
             "Look at their reasons below: an approximate orientation, a pose or a diameter that is wrong misses all.",
         )
 
@@ -115,7 +125,7 @@ def _locking(shots: list[Frame]) -> Iterator[Problem]:
     for axis, positions in zip(("column", "row"), np.reshape(centers, (-1, 2)).T, strict=True):
         if fraction_test(positions).is_locked:
             yield Problem(
-                f"The {axis} positions of the marks prefer parts of a pixel: the measurement is biased (pixel locking).",
+                f"The {axis} positions of the marks prefer parts of a pixel: they are biased (pixel locking).",
                 "Look at the histogram of fractional parts; scan with a finer pitch or in 16 bit.",
             )
 

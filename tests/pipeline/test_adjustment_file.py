@@ -1,0 +1,154 @@
+"""adjustment.json and adjustment.npz: what is written is what was adjusted, and what is broken is said."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pytest
+
+from adjust.network import ObjectPoint, Prior
+from adjust.result import Adjustment, Residuals
+from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
+from pipeline.errors import InputError
+
+
+@pytest.fixture
+def path(adjustment: Adjustment, tmp_path: Path) -> Path:
+    write_adjustment(adjustment, tmp_path / "adjustment.json")
+    return tmp_path / "adjustment.json"
+
+
+def test_values_stand_with_their_a_posteriori_sigma_and_what_was_given(adjustment: Adjustment, path: Path) -> None:
+    camera = read_adjustment(path)["cameras"]["RC 20"]
+    sigma0 = np.sqrt(262.1 / 257)
+    assert camera["principal_distance_mm"]["value"] == 153.664
+    assert camera["principal_distance_mm"]["sigma"] == pytest.approx(0.0041 * sigma0, rel=1e-12)
+    assert camera["principal_distance_mm"]["given"] == {"value": 153.6, "sigma": 1.0}
+    assert camera["distortion"]["family"] == "torlegard"
+    assert camera["distortion"]["k3"]["given"] == {"value": 0.0, "sigma": None}, "free: no sigma is given"
+    assert camera["distortion"]["k7"] == {"value": 0.0, "sigma": 0.0, "given": {"value": 0.0, "sigma": 0.0}}
+    assert set(camera["fiducials"]) == set("12345678")
+
+
+def test_a_fixed_quantity_has_sigma_zero(path: Path) -> None:
+    assert read_adjustment(path)["points"]["3"]["Z"]["sigma"] == 0.0
+
+
+def test_angles_are_in_degrees_in_the_json_and_in_rad_in_the_covariance(adjustment: Adjustment, path: Path) -> None:
+    omega = read_adjustment(path)["images"]["f3"]["exterior"]["omega_deg"]
+    assert omega["value"] == pytest.approx(np.rad2deg(adjustment.value("EO.f3.omega")), rel=1e-14)
+    assert omega["sigma"] == pytest.approx(np.rad2deg(3e-5) * adjustment.sigma0, rel=1e-12)
+    variance = read_covariance(path).of(["EO.f3.omega"])
+    assert variance[0, 0] == pytest.approx((3e-5 * adjustment.sigma0) ** 2, rel=1e-12)
+
+
+def test_an_observed_attitude_is_given_in_degrees_and_a_mere_approximation_without_sigma(path: Path) -> None:
+    exterior = read_adjustment(path)["images"]["f1"]["exterior"]
+    assert exterior["Z0"]["given"] == {"value": 1500.0, "sigma": None}
+    assert exterior["kappa_deg"]["given"]["sigma"] == pytest.approx(np.rad2deg(0.5))
+    assert "given" not in read_adjustment(path)["images"]["f2"]["exterior"]["Z0"]
+
+
+def test_the_covariance_is_a_posteriori_and_holds_correlations(adjustment: Adjustment, path: Path) -> None:
+    block = read_covariance(path).of(["IO.RC 20.c", "IO.RC 20.k3", "IO.RC 20.nothing"])
+    assert block[0, 1] == pytest.approx(-0.95 * 0.0041 * 3.1e-9 * 262.1 / 257)
+    assert np.all(block[2] == 0.0)
+    assert np.all(block[:, 2] == 0.0)
+
+
+def test_residuals_stand_in_the_scan_and_in_the_camera(adjustment: Adjustment, path: Path) -> None:
+    """f2 is mirrored: x' = 0.1 - x + 0.02 y, y' = 0.2 + 0.02 x + y."""
+    i = adjustment.network.observations.image.index("f2")
+    row = read_adjustment(path)["residuals"][i]
+    x, y = adjustment.network.observations.xy_mm[i]
+    assert (row["image"], row["point"], row["kind"]) == ("f2", "1", "fiducial")
+    assert row["camera_x_mm"] == pytest.approx(0.1 - x + 0.02 * y)
+    assert row["camera_y_mm"] == pytest.approx(0.2 + 0.02 * x + y)
+    assert row["camera_vx_um"] == pytest.approx(-row["vx_um"] + 0.02 * row["vy_um"], abs=1e-9)
+    assert row["sx_um"] == pytest.approx(4.0)
+    assert row["vx_um"] == pytest.approx(1e3 * adjustment.residuals.v_mm[i, 0])
+
+
+def test_w_is_the_larger_of_the_two_axes_with_its_sign(adjustment: Adjustment, tmp_path: Path) -> None:
+    w = adjustment.residuals.w.copy()
+    w[0], w[1], w[2] = (1.0, -2.5), (np.nan, 0.5), (np.nan, np.nan)
+    residuals = Residuals(adjustment.residuals.v_mm, adjustment.residuals.redundancy, w)
+    write_adjustment(replace(adjustment, residuals=residuals), tmp_path / "adjustment.json")
+    rows = read_adjustment(tmp_path / "adjustment.json")["residuals"]
+    assert [row["w"] for row in rows[:3]] == [-2.5, 0.5, None]
+
+
+def test_a_singular_result_has_its_causes_no_sigmas_and_no_nan(singular_adjustment: Adjustment, tmp_path: Path) -> None:
+    path = tmp_path / "adjustment.json"
+    write_adjustment(singular_adjustment, path)
+
+    def refuse(constant: str) -> NoReturn:
+        raise AssertionError(f"{constant} is no JSON")
+
+    json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+    content = read_adjustment(path)
+    assert not content["converged"]
+    assert content["singular"][0]["parameters"] == ["IO.RC 20.c", "EO.f1.Z0"]
+    assert content["singular"][0]["remedy"] == "Fix c."
+    assert content["cameras"]["RC 20"]["principal_distance_mm"]["sigma"] is None
+
+
+def test_points_that_nobody_saw_are_left_out(adjustment: Adjustment, tmp_path: Path) -> None:
+    unseen = ObjectPoint("unseen", Prior(1.0), Prior(2.0), None)
+    network = replace(adjustment.network, points=(*adjustment.network.points, unseen))
+    write_adjustment(replace(adjustment, network=network), tmp_path / "adjustment.json")
+    assert "unseen" not in read_adjustment(tmp_path / "adjustment.json")["points"]
+
+
+def test_the_files_are_equal_when_written_twice(adjustment: Adjustment, path: Path) -> None:
+    before = path.read_bytes()
+    write_adjustment(adjustment, path)
+    assert path.read_bytes() == before
+    assert sorted(file.name for file in path.parent.iterdir()) == ["adjustment.json", "adjustment.npz"]
+
+
+def test_a_missing_file_says_what_to_run(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"adjustment\.json: there is no such file\. Run `reseau adjust`"):
+        read_adjustment(tmp_path / "adjustment.json")
+
+
+def test_text_that_is_no_json_is_named_with_its_line(path: Path) -> None:
+    path.write_text('{"reseau": "0.1",\n oh', encoding="utf-8")
+    with pytest.raises(InputError, match=r"is not valid JSON .*line 2"):
+        read_adjustment(path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "message"),
+    [
+        (("cameras",), None, r"cameras is None; it should be a table"),
+        (("sigma0",), "1.0", r"sigma0 is '1\.0'; it should be a number"),
+        (("iterations",), True, r"iterations is True; it should be a whole number"),
+        (("cameras", "RC 20", "principal_distance_mm"), {"value": 1.0}, r"\['RC 20'\]\.principal_distance_mm has no"),
+        (("residuals",), [{"image": "f1"}], r"residuals\[0\] has no key 'point'"),
+    ],
+)  # fmt: skip
+def test_a_broken_file_names_the_place(path: Path, keys: tuple[str, ...], value: object, message: str) -> None:
+    content: dict[str, Any] = read_adjustment(path)
+    inner = content
+    for key in keys[:-1]:
+        inner = inner[key]
+    inner[keys[-1]] = value
+    path.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        read_adjustment(path)
+
+
+def test_a_missing_or_broken_covariance_is_named(path: Path) -> None:
+    file = covariance_path(path)
+    file.write_bytes(b"no archive")
+    with pytest.raises(InputError, match=r"adjustment\.npz: is not a covariance file"):
+        read_covariance(path)
+    np.savez(file, names=np.array(["a", "b"]), values=np.zeros(2), matrix=np.zeros((3, 3)))
+    with pytest.raises(InputError, match="2 names do not fit a matrix"):
+        read_covariance(path)
+    file.unlink()
+    with pytest.raises(InputError, match="there is no such file"):
+        read_covariance(path)

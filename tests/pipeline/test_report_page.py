@@ -1,0 +1,205 @@
+"""report.html as a whole: well-formed, self-contained, and saying what is there in every state of a project."""
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from measure.status import MEANING, Status
+from pipeline.report import Problem, ReportData, render_report, write_report
+
+VOID = {"meta", "br", "img", "hr", "input", "link"}
+
+
+class Document(HTMLParser):
+    """Checks that every element is closed in its turn; collects text, ids and everything that could load."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.words: list[str] = []
+        self.ids: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(html)
+        self.close()
+        assert not self.open, f"never closed: {self.open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("src", "href", "xlink:href", "data", "action", "srcset"):
+                self.addresses.append(value or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+def rendered(data: ReportData) -> Document:
+    return Document(render_report(data))
+
+
+def test_a_good_calibration_says_so_first(adjusted: ReportData) -> None:
+    html = render_report(adjusted)
+    document = Document(html)
+    assert "✓ Good" in document.text
+    assert "Calibrated from 160 marks in 5 frames: RC 20 has c = 153.6640 ± 0.0041 mm." in document.text
+    assert "Exit code 0" in document.text
+    assert "None: nothing here needs a look." in document.text
+    assert (
+        html.index("✓ Good") < html.index('id="problems"') < html.index('id="frames"') < html.index('id="distortion"')
+    )
+
+
+def test_nothing_is_loaded_from_anywhere(adjusted: ReportData) -> None:
+    html = render_report(adjusted)
+    for address in Document(html).addresses:
+        assert address.startswith(("#", "data:image/png;base64,")), address
+    assert "http" not in html
+    assert "url(" not in html
+    assert "@import" not in html
+
+
+def test_every_link_inside_finds_its_place_and_no_id_stands_twice(adjusted: ReportData) -> None:
+    document = rendered(adjusted)
+    assert len(document.ids) == len(set(document.ids))
+    assert {address[1:] for address in document.addresses if address.startswith("#")} <= set(document.ids)
+
+
+def test_every_drawing_has_words_for_those_who_cannot_see_it(adjusted: ReportData) -> None:
+    html = render_report(adjusted)
+    for opening in re.findall(r"<svg[^>]*>", html):
+        assert re.search(r'aria-label="[^"]{10,}', opening), opening
+
+
+def test_every_mark_has_its_picture(adjusted: ReportData) -> None:
+    assert sum(address.startswith("data:") for address in rendered(adjusted).addresses) == 160
+
+
+def test_the_statuses_are_those_of_the_table(adjusted: ReportData) -> None:
+    text = rendered(adjusted).text
+    for status, meaning in MEANING.items():
+        assert status in text
+        assert meaning in text
+
+
+def test_no_check_stands_where_the_redundancy_is_zero(adjusted: ReportData) -> None:
+    assert re.search(r"control no check 0\.00 0\.00 0\.0: no check", rendered(adjusted).text)
+
+
+def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted: ReportData) -> None:
+    assert adjusted.adjustment is not None
+    unchecked = replace(adjusted, adjustment={**adjusted.adjustment, "redundancy": 0, "sigma0": 1.0})
+    text = rendered(unchecked).text
+    assert "Nothing checks the result" in text
+    assert "The redundancy is 0: no check." in text
+    assert "! Needs a look" in text
+
+
+def test_only_measured(measured: ReportData) -> None:
+    text = rendered(measured).text
+    assert "✓ Good" in text
+    assert "Measured: 160 marks in 5 frames." in text
+    assert "There is no adjustment yet: run `reseau adjust`." in text
+
+
+def test_given_coordinates_without_scans(adjusted: ReportData) -> None:
+    text = rendered(replace(adjusted, measurement=None, thumbnail=None)).text
+    assert "no picture" in text
+    assert "No pixel positions are known: the comparator coordinates were given." in text
+
+
+def test_no_check_against_opencv_yet(adjusted: ReportData) -> None:
+    assert "It has not been made: run reseau check ." in rendered(replace(adjusted, check=None)).text
+
+
+def test_without_the_covariance_the_curves_are_left_out_with_a_word(adjusted: ReportData) -> None:
+    text = rendered(replace(adjusted, covariance=None)).text
+    assert "The camera has no distortion parameters, or their covariance is missing." in text
+
+
+def test_nothing_at_all() -> None:
+    text = rendered(ReportData("Empty")).text
+    assert "✕ No result" in text
+    assert "No mark was measured." in text
+    assert "No frame has been measured yet" in text
+
+
+def test_a_singular_network_names_cause_and_remedy(singular: ReportData) -> None:
+    text = rendered(singular).text
+    assert "✕ No result" in text
+    assert "There is no calibration: the network is singular." in text
+    assert "c and the flying height move together over flat ground." in text
+    assert "Fix c." in text
+    assert "There is no solution to draw it from." in text
+
+
+def test_what_the_user_named_is_escaped(adjusted: ReportData) -> None:
+    name = '<script>alert("x")</script> & Co'
+    first = replace(adjusted.comparator[0], status=Status.WEAK, reason=name)
+    html = render_report(
+        replace(adjusted, project=name, comparator=[first, *adjusted.comparator[1:]], problems=(Problem(name, name),))
+    )
+    Document(html)
+    assert "<script>alert" not in html
+    assert "&lt;script&gt;alert" in html
+
+
+def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted: ReportData) -> None:
+    reason = "4.2 px off the other marks' places."
+    rejected = replace(adjusted.comparator[2], status=Status.REJECTED, reason=reason)
+    rows = [*adjusted.comparator[:2], rejected, *adjusted.comparator[3:]]
+    text = rendered(replace(adjusted, comparator=rows)).text
+    assert "! Needs a look" in text
+    assert "1 thing needs a look" in text
+    assert "f1: 1 fiducial mark not measured, 7 measured (3 rejected: 4.2 px off the other marks' places)." in text
+    assert "7 of 8 (1 rejected)" in text
+
+
+def test_of_many_targets_the_worst_are_shown_and_all_fiducials(adjusted: ReportData) -> None:
+    """60 frames of 8 fiducials and 24 targets: 600 // 60 = 10 targets a frame."""
+    assert adjusted.adjustment is not None
+    names = [f"{image}-{copy}" for copy in range(12) for image in ("f1", "f2", "f3", "f4", "f5")]
+    rows = [replace(row, image=name) for name in names for row in adjusted.comparator if row.image == name[:2]]
+    data = replace(adjusted, comparator=rows, measurement=None, adjustment=None, check=None)
+    first = _copy_pictures(data)
+    html = render_report(first)
+    assert html.count("data:image/png") == 60 * (8 + 10)
+    assert "14 more targets of this frame are not pictured" in html
+    assert html.count("<details") == 60
+    assert html.count(" open>") == 0, "with many frames only those with a lost fiducial are unfolded"
+
+
+def _copy_pictures(data: ReportData) -> ReportData:
+    picture = data.thumbnail
+    assert picture is not None
+    return replace(data, thumbnail=lambda image, point, kind: picture(image[:2], point, kind))
+
+
+def test_the_file_is_written_whole_and_the_same_each_time(adjusted: ReportData, tmp_path: Path) -> None:
+    write_report(adjusted, tmp_path / "report.html")
+    first = (tmp_path / "report.html").read_bytes()
+    shuffled = replace(adjusted, comparator=list(reversed(adjusted.comparator)))
+    write_report(shuffled, tmp_path / "report.html")
+    assert (tmp_path / "report.html").read_bytes() == first
+
+
+@pytest.mark.parametrize("verdict", ["differs", "not possible"])
+def test_the_verdict_of_the_check_stands_with_its_reason(adjusted: ReportData, verdict: str) -> None:
+    check = {"verdict": verdict, "reason": "One flat vertical frame.", "cameras": {}}
+    text = rendered(replace(adjusted, check=check)).text
+    assert f"{verdict} : One flat vertical frame." in text
+    assert ("! Needs a look" in text) == (verdict == "differs")
