@@ -19,13 +19,6 @@ Decentering = Literal["reduced", "paper"]
 Transformation = Literal["none", "congruent", "similarity", "affine"]
 ObservationKind = Literal["target", "fiducial", "tie"]
 
-DISTORTION_PARAMETERS: Mapping[Family, tuple[str, ...]] = {
-    "none": (),
-    "torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"),
-    "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
-    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1"),
-}
-
 
 @dataclass(frozen=True)
 class Prior:

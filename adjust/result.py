@@ -1,7 +1,7 @@
 """What an adjustment hands on."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -57,6 +57,9 @@ class Adjustment:
     names: the unknowns, in the order of values and covariance: `T.<image>.a1`, `EO.<image>.X0` (omega, phi, kappa in
     rad), `IO.<camera>.c` / `.x0` / `.y0` / `.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`; fixed quantities included, with
     zero rows. cofactor (n, n): a-priori covariance (sigma0 = 1); covariance is sigma0² times that.
+    mirrored: the images whose scan is mirrored, as in `Approximations`.
+    weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
+    variance_factors: the factors found for the variances of the groups "target" and "fiducial", where asked for.
     """
 
     network: Network
@@ -74,6 +77,9 @@ class Adjustment:
     singular: tuple[NullDirection, ...]
     warnings: tuple[str, ...]
     history: tuple[tuple[float, float], ...]  # (v'Pv, largest step in sigmas) per iteration
+    mirrored: frozenset[str] = frozenset()
+    weights: Array = field(default_factory=lambda: np.empty(0))
+    variance_factors: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def converged(self) -> bool:

@@ -62,7 +62,7 @@ def affine_by_parameters(kind: Transformation, parameters: Array, mirrored: bool
 
 
 def _unit(position: int) -> Array:
-    return np.eye(6)[position]
+    return np.asarray(np.eye(6)[position])
 
 
 def apply_affine(affine: Array, xy: Array) -> Array:

@@ -1,0 +1,259 @@
+"""The simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.datum import centered, inner_constraints, minimal_datum
+from adjust.diagnosis import singular_directions, undetermined, weak_directions
+from adjust.errors import AdjustmentError
+from adjust.functions import blind_target
+from adjust.iteration import Linearised, Solution, factorise, iterate, linearise
+from adjust.network import Approximations, Network
+from adjust.problem import Problem, State
+from adjust.residuals import groups, residuals
+from adjust.result import Adjustment, NullDirection, Residuals
+from adjust.reweighting import Weighting, robust_weights, variance_factor
+from adjust.rotation import vector_by_angles
+from adjust.rows import Numbering
+from adjust.unknowns import list_unknowns
+from adjust.validation import validate
+
+Array = NDArray[np.float64]
+
+Datum = Literal["control", "minimal", "free"]
+
+REWEIGHTINGS = 30  # rounds of robust estimation or of variance components at most
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to adjust.
+
+    datum: "control", what is given of points and stations and nothing else; "minimal", as many coordinates fixed as
+    these leave free, chosen automatically; "free", inner constraints over the points of which nothing is given.
+    robust: marks with large residuals lose weight (Huber). variance_components: the variances of targets and fiducials
+    are each multiplied by what their residuals say.
+    """
+
+    datum: Datum = "control"
+    robust: bool = False
+    variance_components: bool = False
+    iteration_limit: int = 50
+
+    def __post_init__(self) -> None:
+        if self.datum not in get_args(Datum):
+            raise ValueError(f"the datum must be one of {', '.join(get_args(Datum))}, not {self.datum}")
+        if self.iteration_limit < 1:
+            raise ValueError(f"the iteration limit must be at least 1, not {self.iteration_limit}")
+
+
+def adjust(network: Network, approximations: Approximations, options: Options | None = None) -> Adjustment:
+    """Adjust a network by least squares, all unknowns together.
+
+    The combined model A v + B dx = w is relinearised at the adjusted observations and unknowns until both stand still
+    (Torlegård, equations F1 to F9). The cofactor matrix is that of all unknowns, nothing held fixed but what a standard
+    deviation of 0 fixes. A singular network is a result with its null directions, not an error: its values are the
+    approximations, its cofactor matrix is zero and means nothing.
+
+    Raises AdjustmentError where the network is empty or contradictory, or where the approximations put a point where it
+    has no image.
+    """
+    options = options or Options()
+    validate(network)
+    problem = _problem(network, approximations)
+    solved = problem if options.datum == "control" else _minimal(problem)
+    numbering = Numbering(solved)
+    weighting = Weighting(np.ones(len(network.observations)))
+    state = solved.start()
+    for _ in range(REWEIGHTINGS):
+        run = _run(numbering, weighting, state, options.iteration_limit)
+        refined = _reweighted(run, weighting, options)
+        if not refined.differs(weighting):
+            break
+        weighting, state = refined, run.end.state
+    if options.datum == "free":
+        run = _freed(problem, run, weighting)
+    return _result(problem, run, weighting, options)
+
+
+def _problem(network: Network, approximations: Approximations) -> Problem:
+    cameras = {image.name: image.camera for image in network.images}
+    rows = zip(network.observations.image, network.observations.point, network.observations.kind, strict=True)
+    observed = frozenset((cameras[image] if kind == "fiducial" else "", point) for image, point, kind in rows)
+    return Problem(network, list_unknowns(network, approximations, observed), approximations.mirrored)
+
+
+def _minimal(problem: Problem) -> Problem:
+    return replace(problem, unknowns=problem.unknowns.fixed(minimal_datum(problem)))
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One adjustment with given weights: where it ended, its cofactor matrix (n, n), its residuals."""
+
+    numbering: Numbering
+    solution: Solution
+    singular: tuple[NullDirection, ...]
+    cofactor: Array
+    residuals: Residuals
+
+    @property
+    def end(self) -> Linearised:
+        return self.solution.end
+
+    @property
+    def converged(self) -> bool:
+        return self.solution.termination == "converged"
+
+
+def _run(numbering: Numbering, weighting: Weighting, state: State, limit: int) -> _Run:
+    problem = numbering.problem
+    covariance = weighting.covariance(problem)
+    start = linearise(numbering, covariance, state)
+    if start is None:
+        raise AdjustmentError(
+            f"The adjustment cannot start: with the approximations, {blind_target(problem, state)}. Check the "
+            f"approximate orientation of the image, and the sign of W: M rotates from object to camera, which looks "
+            f"along its negative z axis."
+        )
+    singular = singular_directions(problem, state, numbering.free, factorise(numbering, start))
+    if singular:
+        return _unsolved(numbering, Solution(start, None, "singular", ()), singular)
+    solution = iterate(numbering, covariance, start, limit)
+    factor = solution.factor or factorise(numbering, solution.end)
+    singular = singular_directions(problem, solution.end.state, numbering.free, factor)
+    if singular:
+        return _unsolved(numbering, replace(solution, termination="singular"), singular)
+    if solution.factor is None:
+        return _unsolved(numbering, solution, ())
+    cofactor = _spread(numbering, solution.factor.cofactor())
+    return _Run(numbering, solution, (), cofactor, residuals(problem, solution.end, solution.factor, covariance))
+
+
+def _unsolved(numbering: Numbering, solution: Solution, singular: tuple[NullDirection, ...]) -> _Run:
+    count = len(numbering.problem.unknowns)
+    nothing = np.zeros_like(solution.end.v_mm)
+    return _Run(numbering, solution, singular, np.zeros((count, count)), Residuals(solution.end.v_mm, nothing, nothing))
+
+
+def _spread(numbering: Numbering, cofactor: Array) -> Array:
+    """The cofactor matrix of all quantities (n, n): rows of zeros for fixed ones."""
+    count = len(numbering.problem.unknowns)
+    spread = np.zeros((count, count))
+    spread[np.ix_(numbering.free, numbering.free)] = cofactor
+    return spread
+
+
+def _reweighted(run: _Run, weighting: Weighting, options: Options) -> Weighting:
+    """The weights that the residuals of a run ask for."""
+    if not run.converged:
+        return weighting
+    problem = run.numbering.problem
+    covariance = weighting.covariance(problem)
+    if options.variance_components:
+        weighting = replace(
+            weighting,
+            target=weighting.target * variance_factor(covariance, run.residuals, ~problem.is_fiducial),
+            fiducial=weighting.fiducial * variance_factor(covariance, run.residuals, problem.is_fiducial),
+        )
+    if options.robust:
+        weighting = replace(weighting, weights=robust_weights(covariance, run.residuals, weighting.weights))
+    return weighting
+
+
+def _freed(problem: Problem, run: _Run, weighting: Weighting) -> _Run:
+    """A run with minimal datum, brought to inner constraints over the free points."""
+    if not run.converged:
+        return run
+    state = centered(problem, run.end.state)
+    end = linearise(run.numbering, weighting.covariance(problem), state)
+    if end is None:
+        return run
+    cofactor = _spread(run.numbering, factorise(run.numbering, end).cofactor())
+    solution = replace(run.solution, end=end)
+    return replace(run, solution=solution, cofactor=inner_constraints(problem, state, cofactor))
+
+
+def _result(problem: Problem, run: _Run, weighting: Weighting, options: Options) -> Adjustment:
+    numbering, unknowns = run.numbering, problem.unknowns
+    state = run.end.state
+    covariance = weighting.covariance(problem)
+    observed = run.residuals
+    # The test w of a mark that robust estimation has lost is that of the mark as it was given.
+    given = replace(observed, w=observed.w / np.sqrt(weighting.weights)[:, None])
+    cofactor = _with_angles(problem, state, run.cofactor)
+    conditions = 2 * len(problem.network.observations) + int(unknowns.has_prior.sum())
+    factors = {"target": weighting.target, "fiducial": weighting.fiducial} if options.variance_components else {}
+    return Adjustment(
+        network=problem.network,
+        termination=run.solution.termination,
+        iterations=len(run.solution.history),
+        conditions=conditions,
+        unknowns=len(numbering.free),
+        redundancy=conditions - len(numbering.free),
+        vpv=run.end.vpv,
+        names=unknowns.names,
+        values=state.values,
+        cofactor=cofactor,
+        residuals=given,
+        groups=groups(problem, state, cofactor, observed, covariance),
+        singular=run.singular,
+        warnings=_warnings(run, cofactor),
+        history=run.solution.history,
+        mirrored=problem.mirrored,
+        weights=weighting.weights,
+        variance_factors=factors,
+    )
+
+
+def _with_angles(problem: Problem, state: State, cofactor: Array) -> Array:
+    """The cofactor matrix with omega, phi, kappa in the place of the rotation vectors."""
+    positions = problem.exterior[:, 3:]
+    by_vector = np.linalg.pinv(vector_by_angles(state.values[positions]))
+    by_vector[problem.keeps_angles] = np.eye(3)
+    result = cofactor.copy()
+    result[positions] = by_vector @ result[positions]
+    columns = result[:, positions]
+    result[:, positions] = np.einsum("nik,ilk->nil", columns, by_vector)
+    return result
+
+
+def _warnings(run: _Run, cofactor: Array) -> tuple[str, ...]:
+    """What the user should look at in a result."""
+    problem = run.numbering.problem
+    warnings = []
+    if run.solution.termination == "iteration limit":
+        warnings.append(
+            f"The iteration did not stand still within {len(run.solution.history)} steps: the values are not final."
+        )
+    if run.solution.termination == "diverged":
+        warnings.append(
+            "The iteration diverged: no step from the last values makes the residuals smaller. Look for wrong point "
+            "numbers and wrong approximations."
+        )
+    if run.converged:
+        weak = weak_directions(
+            problem, run.end.state, run.numbering.free, factorise(run.numbering, run.end, camera_priors=False)
+        )
+        warnings += [
+            f"Practically singular without priors: {', '.join(each.parameters)}. {each.cause} {each.remedy}"
+            for each in weak
+        ]
+        blind = undetermined(problem, cofactor)
+        if blind:
+            warnings.append(
+                f"The observations say nothing about {', '.join(blind)}: the standard deviations stay as they were given."
+            )
+    return tuple(warnings + _unseen(problem))
+
+
+def _unseen(problem: Problem) -> list[str]:
+    """What is given and that no image shows."""
+    points = [point.id for point in problem.network.points if point.id not in problem.unknowns.point]
+    if not points:
+        return []
+    shown = ", ".join(points[:5]) + (f" and {len(points) - 5} more" if len(points) > 5 else "")
+    return [f"No image shows the object points {shown}: they take no part."]

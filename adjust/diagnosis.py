@@ -1,0 +1,191 @@
+"""What the observations do not determine: null directions of the equations, named with cause and remedy."""
+
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrcon
+
+from adjust.datum import free_coordinates, object_datum
+from adjust.directions import camera_leads, datum_sentence
+from adjust.elimination import BlockFactor, Factor
+from adjust.problem import Problem, State
+from adjust.result import NullDirection
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below which there is no solution
+WEAK = 1e-4  # below which noise makes the solution
+INVOLVED = 0.01  # part of a null vector's largest component that is worth a name
+PURE = 1e-5  # part that a name must have in an exact null direction, beyond what earlier names took
+MIXED = 0.05  # the same in a direction that is seen just a little, where everything plays a small part
+INSIDE = 1e-6  # what a known direction may stick out of the null space: rounding
+NAMES_SHOWN = 3  # more names of one kind than this are shown as one, with a star
+UNDETERMINED = 0.99  # posterior over prior standard deviation above which the observations say nothing
+
+
+def singular_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
+    """The null directions of the factor of a state, at its computed observations; none where it is regular."""
+    within = _within_images(problem, free, factor)
+    return within or _named(problem, state, free, factor, _null_space(factor, 0.0, SINGULAR), PURE)
+
+
+def weak_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
+    """What is seen so badly that noise decides; the factor is to be that without the cameras' priors."""
+    if _within_images(problem, free, factor):
+        return ()
+    return _named(problem, state, free, factor, _null_space(factor, SINGULAR, WEAK), MIXED)
+
+
+def undetermined(problem: Problem, cofactor: Array) -> tuple[str, ...]:
+    """Cameras' and images' quantities that the observations say nothing about: their priors alone place them.
+
+    A fiducial that no image shows is not among them: nobody expects otherwise.
+    """
+    unknowns = problem.unknowns
+    told = np.zeros(len(unknowns), dtype=bool)
+    told[np.unique(problem.columns[problem.columns >= 0])] = True
+    told[[i for point in unknowns.point.values() for i in point]] = False
+    prior = np.where(unknowns.has_prior & told, unknowns.sigma, np.inf)
+    blind = np.sqrt(np.diag(cofactor)) > UNDETERMINED * prior
+    return collapsed([unknowns.names[i] for i in np.flatnonzero(blind)])
+
+
+def collapsed(names: list[str]) -> tuple[str, ...]:
+    """Names of unknowns, those of one kind shown as one with a star where they are many."""
+    kinds: dict[str, list[str]] = {}
+    for name in names:
+        kind = name if name.startswith("IO.") else re.sub(r"^(FID\.[^.]*|[A-Z]+)\..*\.", r"\1.*.", name)
+        kinds.setdefault(kind, []).append(name)
+    shown = []
+    for kind, members in kinds.items():
+        shown += members if len(members) <= NAMES_SHOWN else [kind]
+    return tuple(shown)
+
+
+def _within_images(problem: Problem, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
+    """Null directions of images' own unknowns, which the shared ones have no part in."""
+    directions = []
+    for block in factor.blocks:
+        if len(block.own) == 0:
+            continue
+        _, singular, right = np.linalg.svd(block.triangle)
+        for vector in right[singular <= SINGULAR * singular[0]]:
+            names = [problem.unknowns.names[free[block.own[i]]] for i in _largest(vector)]
+            image = names[0].split(".", 1)[1].rsplit(".", 1)[0]
+            directions.append(
+                NullDirection(
+                    tuple(names),
+                    f"The marks of image {image} do not determine its own orientation and transformation.",
+                    "Measure more marks in this image, not all on one line, or leave the image out.",
+                )
+            )
+    return tuple(directions)
+
+
+def _null_space(factor: Factor, above: float, below: float) -> Array:
+    """Orthonormal vectors (n, d) of all scaled unknowns, whose singular values over the largest lie in a range."""
+    count = factor.shared_count
+    if count == 0 or _surely_above(factor.triangle, below):
+        return np.zeros((len(factor.scale), 0))
+    _, singular, right = np.linalg.svd(factor.triangle)
+    ratio = singular / singular[0]
+    shared = right[(ratio > above) & (ratio <= below)].T
+    vectors = np.zeros((len(factor.scale), shared.shape[1]))
+    vectors[:count] = shared
+    for block in factor.blocks:
+        vectors[block.own] = _followed(block, shared)
+    return np.linalg.qr(vectors)[0]
+
+
+def _surely_above(triangle: Array, ratio: float) -> bool:
+    """Whether an estimate of the condition already tells that all singular values lie above a ratio of the largest."""
+    reciprocal, _ = dtrcon(triangle)
+    return bool(reciprocal > ratio * len(triangle))
+
+
+def _followed(block: BlockFactor, shared: Array) -> Array:
+    """How an image's own unknowns follow the shared ones without changing its observations."""
+    return np.asarray(-solve_triangular(block.triangle, block.border @ shared[block.shared]))
+
+
+def _named(
+    problem: Problem, state: State, free: Indices, factor: Factor, null: Array, part: float
+) -> tuple[NullDirection, ...]:
+    """Sentences for the vectors (n, d) of a null space: the object datum first, then the camera, then what is left."""
+    if null.shape[1] == 0:
+        return ()
+    names = [problem.unknowns.names[i] for i in free]
+    datum, sentences, rest = _datum_part(problem, state, free, factor, null)
+    still = _with_points_still(problem, free, datum, rest)
+    leads = camera_leads(problem, state)
+    functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
+    lengths = np.linalg.norm(functionals, axis=1, keepdims=True)
+    seen = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest
+    chosen = _independent_rows(seen, part)
+    vectors = still @ np.linalg.pinv(seen[chosen])
+    left = still @ _complement(seen[chosen])
+    sentences += [(leads[i].cause, leads[i].remedy) for i in chosen]
+    sentences += [_unknown_direction(names, vector) for vector in left.T]
+    return tuple(
+        NullDirection(collapsed([names[i] for i in _largest(vector)]), cause, remedy)
+        for vector, (cause, remedy) in zip(np.hstack([datum, vectors, left]).T, sentences, strict=True)
+    )
+
+
+def _datum_part(
+    problem: Problem, state: State, free: Indices, factor: Factor, null: Array
+) -> tuple[Array, list[tuple[str, str]], Array]:
+    """The vectors (n, k) of the object datum in a null space, their sentences, and the rest (n, d - k) of the space."""
+    datum = object_datum(problem, state)
+    motion = (datum.generators @ datum.free)[free] * factor.scale[:, None]
+    orthonormal = np.linalg.qr(motion)[0]
+    left, cosines, _ = np.linalg.svd(null.T @ orthonormal)
+    count = int((cosines > 1.0 - INSIDE).sum())
+    if count < datum.free.shape[1]:
+        return np.zeros((len(free), 0)), [], null
+    chosen = _independent_rows(datum.free, PURE)
+    vectors = motion @ np.linalg.pinv(datum.free[chosen])
+    return vectors, [datum_sentence(i) for i in chosen], null @ left[:, count:]
+
+
+def _with_points_still(problem: Problem, free: Indices, datum: Array, vectors: Array) -> Array:
+    """Null vectors (n, d) with as much of the free datum (n, k) added as leaves the object points where they are."""
+    points = np.isin(free, free_coordinates(problem))
+    amounts = np.linalg.lstsq(datum[points], vectors[points])[0]
+    return np.asarray(vectors - datum @ amounts)
+
+
+def _independent_rows(rows: Array, part: float) -> list[int]:
+    """The first rows (m, d) that are linearly independent of those before them, up to d."""
+    chosen: list[int] = []
+    basis = np.zeros((0, rows.shape[1]))
+    for i, row in enumerate(rows):
+        rest = row - (basis @ row) @ basis
+        rest = rest - (basis @ rest) @ basis
+        length = np.linalg.norm(rest)
+        if length > part and len(chosen) < rows.shape[1]:
+            chosen.append(i)
+            basis = np.vstack([basis, rest / length])
+    return chosen
+
+
+def _complement(rows: Array) -> Array:
+    """Orthonormal vectors (d, d - k) that k independent rows (k, d) do not see."""
+    return np.asarray(np.linalg.svd(rows)[2][len(rows) :].T)
+
+
+def _largest(vector: Array) -> list[int]:
+    """The components that matter, in order."""
+    size = np.abs(vector)
+    return [int(i) for i in np.flatnonzero(size > INVOLVED * size.max())]
+
+
+def _unknown_direction(names: list[str], vector: Array) -> tuple[str, str]:
+    largest = names[int(np.argmax(np.abs(vector)))]
+    return (
+        f"These unknowns can move together, {largest} most, without changing any observation.",
+        f"Give {largest} or another of them a standard deviation, or add observations that see it.",
+    )

@@ -1,0 +1,141 @@
+"""A network whose quantities are numbered, observation by observation, and the state of its unknowns."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import Network
+from adjust.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
+from adjust.transformation import affine_by_parameters, affine_from_parameters
+from adjust.unknowns import Unknowns
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+EXTERIOR, TRANSFORMATION, PLACE = slice(0, 6), slice(6, 12), slice(12, 15)  # columns of an observation's derivatives
+CAMERA = slice(15, None)
+ABSENT = -1  # stands for the unknown of a column that an observation does not have
+
+
+@dataclass(frozen=True)
+class State:
+    """The unknowns of the moment: values (n,) and, image by image, the rotations (images, 3, 3).
+
+    The angles among the values follow the rotations, except in images whose angles are observed or fixed, where the
+    rotations follow the angles.
+    """
+
+    values: Array
+    rotations: Array
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A network with its list of unknowns; mirrored: the images whose scan is mirrored."""
+
+    network: Network
+    unknowns: Unknowns
+    mirrored: frozenset[str]
+
+    def start(self) -> State:
+        values = self.unknowns.start
+        return State(values, rotation_from_angles(values[self.exterior[:, 3:]]))
+
+    def moved(self, state: State, step: Array) -> State:
+        """The state after a step (n,) of the unknowns; rotation vectors stand in the places of the angles."""
+        values = state.values + step
+        rotations = rotation_from_vector(step[self.exterior[:, 3:]]) @ state.rotations
+        for i, positions in enumerate(self.exterior[:, 3:]):
+            if self.keeps_angles[i]:
+                rotations[i] = rotation_from_angles(values[positions])
+            else:
+                values[positions] = angles_near(rotations[i], state.values[positions])
+        return State(values, rotations)
+
+    def attitude_by_unknowns(self, state: State) -> Array:
+        """(images, 3, 3) derivative of the rotation vector by what moves the attitude: the vector itself, or angles."""
+        by_angles = vector_by_angles(state.values[self.exterior[:, 3:]])
+        return np.where(self.keeps_angles[:, None, None], by_angles, np.eye(3))
+
+    def affines(self, state: State) -> Array:
+        """(images, 6) the coefficients of the transformations."""
+        affines = np.empty((len(self.network.images), 6))
+        for i, image in enumerate(self.network.images):
+            parameters = state.values[self.unknowns.transformation[image.name]]
+            affines[i] = affine_from_parameters(image.transformation, parameters, image.name in self.mirrored)
+        return affines
+
+    def affines_by_parameters(self, state: State) -> Array:
+        """(images, 6, 6) their derivatives by the transformations' own parameters, zeros behind these."""
+        chain = np.zeros((len(self.network.images), 6, 6))
+        for i, image in enumerate(self.network.images):
+            parameters = state.values[self.unknowns.transformation[image.name]]
+            derivative = affine_by_parameters(image.transformation, parameters, image.name in self.mirrored)
+            chain[i, :, : len(parameters)] = derivative
+        return chain
+
+    @cached_property
+    def image_numbers(self) -> Indices:
+        """(n,) the image of every observation, by its number in the network."""
+        numbers = {image.name: i for i, image in enumerate(self.network.images)}
+        return np.array([numbers[name] for name in self.network.observations.image], dtype=np.intp)
+
+    @cached_property
+    def is_fiducial(self) -> NDArray[np.bool_]:
+        """(n,) whether it is a fiducial that is observed, and not an object point."""
+        return np.array([kind == "fiducial" for kind in self.network.observations.kind], dtype=bool)
+
+    @cached_property
+    def rows_by_image(self) -> list[Indices]:
+        """The observations of every image."""
+        order = np.argsort(self.image_numbers, kind="stable")
+        ends = np.cumsum(np.bincount(self.image_numbers, minlength=len(self.network.images)))
+        return np.split(order, ends[:-1])
+
+    @cached_property
+    def targets_by_camera(self) -> dict[str, Indices]:
+        """The observations of object points by every camera."""
+        cameras = np.array([image.camera for image in self.network.images])[self.image_numbers]
+        return {name: np.flatnonzero((cameras == name) & ~self.is_fiducial) for name in self.unknowns.camera}
+
+    @cached_property
+    def exterior(self) -> Indices:
+        """(images, 6) positions of the exterior orientations."""
+        return np.array([self.unknowns.exterior[image.name] for image in self.network.images])
+
+    @cached_property
+    def keeps_angles(self) -> NDArray[np.bool_]:
+        """(images,) whether the attitude is moved by its angles and not by a rotation vector."""
+        return np.array([self.unknowns.keeps_angles(image.name) for image in self.network.images])
+
+    @cached_property
+    def places(self) -> Indices:
+        """(n, 3) positions of the point's coordinates, or of the fiducial's two and ABSENT."""
+        cameras = {image.name: image.camera for image in self.network.images}
+        observations = self.network.observations
+        places = np.full((len(observations), 3), ABSENT, dtype=np.intp)
+        for row, (image, point) in enumerate(zip(observations.image, observations.point, strict=True)):
+            if self.is_fiducial[row]:
+                places[row, :2] = self.unknowns.fiducial[cameras[image], point]
+            else:
+                places[row] = self.unknowns.point[point]
+        return places
+
+    @cached_property
+    def columns(self) -> Indices:
+        """(n, k) positions of the unknowns in an observation's derivatives: EXTERIOR, TRANSFORMATION, PLACE, CAMERA."""
+        widest = max(len(positions) for positions in self.unknowns.camera.values())
+        by_image = np.full((len(self.network.images), CAMERA.start + widest), ABSENT, dtype=np.intp)
+        by_image[:, EXTERIOR] = self.exterior
+        for i, image in enumerate(self.network.images):
+            transformation = self.unknowns.transformation[image.name]
+            camera = self.unknowns.camera[image.camera]
+            by_image[i, TRANSFORMATION.start : TRANSFORMATION.start + len(transformation)] = transformation
+            by_image[i, CAMERA.start : CAMERA.start + len(camera)] = camera
+        columns = by_image[self.image_numbers]
+        columns[self.is_fiducial, EXTERIOR] = ABSENT
+        columns[self.is_fiducial, CAMERA] = ABSENT
+        columns[:, PLACE] = self.places
+        return columns

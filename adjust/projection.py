@@ -1,0 +1,152 @@
+"""Object points into images and back: rays, camera points, comparator points, with the adjustment's own functions."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.distortion import PARAMETERS, image_equations
+from adjust.network import EXTERIOR_NAMES, Approximations, Distortion, Network
+from adjust.result import Adjustment
+from adjust.rotation import rotation_from_angles
+from adjust.transformation import NAMES, affine_from_parameters, apply_affine, comparator_from_camera
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+NEWTON_STEPS = 30
+NEWTON_TOLERANCE = 1e-14  # of the principal distance
+
+
+@dataclass(frozen=True)
+class ImageModel:
+    """One image as it is known at a time: interior and exterior orientation, distortion, film transformation.
+
+    interior (3,): c, x0', y0' in mm; parameters (k,) of the distortion in the order of `adjust.distortion.PARAMETERS`;
+    rotation (3, 3) object to camera; station (3,) in object units; affine (6,): a1, a2, a3, b1, b2, b3.
+    """
+
+    distortion: Distortion
+    interior: Array
+    parameters: Array
+    rotation: Array
+    station: Array
+    affine: Array
+
+    def camera_from_object(self, xyz: Array) -> tuple[Array, Mask]:
+        """Observed, that is distorted, camera coordinates (n, 2) in mm of object points (n, 3); which have an image."""
+        ray, in_camera = rays(self.rotation, self.station, xyz)
+        xy_mm, found = camera_from_ray(self.distortion, self.interior, self.parameters, ray)
+        return xy_mm, found & (in_camera[:, 2] < 0.0)
+
+    def comparator_from_object(self, xyz: Array) -> tuple[Array, Mask]:
+        """Comparator coordinates (n, 2) in mm of object points (n, 3); which of them have an image."""
+        xy_mm, visible = self.camera_from_object(xyz)
+        return self.comparator_from_camera(xy_mm), visible
+
+    def camera_from_comparator(self, xy_mm: Array) -> Array:
+        """Observed camera coordinates (n, 2) of comparator coordinates (n, 2), mm."""
+        return apply_affine(self.affine, xy_mm)
+
+    def comparator_from_camera(self, xy_mm: Array) -> Array:
+        """Comparator coordinates (n, 2) of observed camera coordinates (n, 2), mm."""
+        return comparator_from_camera(self.affine, xy_mm)
+
+    def ideal_from_observed(self, xy_mm: Array) -> tuple[Array, Mask]:
+        """Camera coordinates (n, 2) free of distortion, of observed ones (n, 2), mm; which could be corrected."""
+        return ideal_from_observed(self.distortion, self.interior, self.parameters, xy_mm)
+
+
+def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
+    """An image with the values of an adjustment."""
+    network = adjustment.network
+    image = network.image_by_name[name]
+    camera = network.camera_by_name[image.camera]
+
+    def values(owner: str, names: tuple[str, ...]) -> Array:
+        return np.array([adjustment.value(f"{owner}.{each}") for each in names])
+
+    exterior = values(f"EO.{name}", EXTERIOR_NAMES)
+    transformation = values(f"T.{name}", NAMES[image.transformation])
+    return ImageModel(
+        distortion=camera.distortion,
+        interior=values(f"IO.{camera.name}", ("c", "x0", "y0")),
+        parameters=values(f"IO.{camera.name}", PARAMETERS[camera.distortion.family]),
+        rotation=rotation_from_angles(exterior[3:]),
+        station=exterior[:3],
+        affine=affine_from_parameters(image.transformation, transformation, name in adjustment.mirrored),
+    )
+
+
+def approximate_image(network: Network, approximations: Approximations, name: str) -> ImageModel:
+    """An image with its approximations and the given distortion."""
+    image = network.image_by_name[name]
+    camera = network.camera_by_name[image.camera]
+    given = camera.distortion.parameters
+    names = PARAMETERS[camera.distortion.family]
+    exterior = approximations.exterior[name]
+    transformation = approximations.transformation.get(name, np.empty(0))
+    return ImageModel(
+        distortion=camera.distortion,
+        interior=approximations.interior[camera.name],
+        parameters=np.array([given[each].value if each in given else 0.0 for each in names]),
+        rotation=rotation_from_angles(exterior[3:]),
+        station=exterior[:3],
+        affine=affine_from_parameters(image.transformation, transformation, name in approximations.mirrored),
+    )
+
+
+def rays(rotation: Array, station: Array, xyz: Array) -> tuple[Array, Array]:
+    """The rays (n, 2), -U/W and -V/W, of object points (n, 3), and the points in the camera's axes (n, 3).
+
+    rotation (3, 3) or (n, 3, 3), station (3,) or (n, 3). A point in front of the camera has W < 0.
+    """
+    in_camera = np.einsum("...ij,...j->...i", rotation, xyz - station)
+    depth = in_camera[..., 2:]
+    # A point in the plane of the lens has no image: its ray is kept finite and W = 0 tells.
+    return -in_camera[..., :2] / np.where(depth == 0.0, 1.0, depth), in_camera
+
+
+def camera_from_ray(distortion: Distortion, interior: Array, parameters: Array, ray: Array) -> tuple[Array, Mask]:
+    """The observed camera coordinates (n, 2) in mm of rays (n, 2), and which of them (n,) were found.
+
+    The correction is defined at the observed point, so that it is inverted by Newton's method. Where the distortion
+    folds the image over, which a polynomial does far enough outside, nothing is found.
+    """
+    xy_mm = interior[1:] + interior[0] * ray
+    tolerance_mm = NEWTON_TOLERANCE * (abs(interior[0]) + np.abs(xy_mm).max(initial=0.0))
+    found = np.zeros(len(ray), dtype=bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(NEWTON_STEPS):
+            at = image_equations(distortion, interior, parameters, xy_mm, ray)
+            step, regular = _solved(at.by_xy, at.value)
+            xy_mm = xy_mm - step
+            found = regular & (np.abs(step).max(axis=1) <= 4 * tolerance_mm)
+            if found.all():
+                break
+    return xy_mm, found
+
+
+def ideal_from_observed(distortion: Distortion, interior: Array, parameters: Array, xy_mm: Array) -> tuple[Array, Mask]:
+    """Camera coordinates (n, 2) in mm free of distortion, of observed ones (n, 2); which were found."""
+    ray = (xy_mm - interior[1:]) / interior[0]
+    found = np.zeros(len(ray), dtype=bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(NEWTON_STEPS):
+            at = image_equations(distortion, interior, parameters, xy_mm, ray)
+            step, regular = _solved(-at.by_ray, -at.value)
+            ray = ray - step
+            found = regular & (np.abs(step).max(axis=1) <= 4 * NEWTON_TOLERANCE * (1.0 + np.abs(ray).max(axis=1)))
+            if found.all():
+                break
+    return interior[1:] + interior[0] * ray, found
+
+
+def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
+    """The solutions (n, 2) of 2x2 systems (n, 2, 2), and which matrices (n,) keep the image's orientation."""
+    (a, b), (c, d) = np.moveaxis(matrix, 0, -1)
+    determinant = a * d - b * c
+    regular = np.isfinite(determinant) & (determinant > 0.0)
+    x, y = right.T
+    solution = np.stack([d * x - b * y, a * y - c * x], axis=1)
+    return solution / np.where(regular, determinant, 1.0)[:, None], regular

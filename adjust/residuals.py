@@ -1,0 +1,84 @@
+"""Residuals, redundancy numbers and standardised residuals, and their sums by group."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.elimination import Factor
+from adjust.iteration import Linearised
+from adjust.problem import Problem, State
+from adjust.result import Group, Residuals
+from adjust.rows import prior_differences
+
+Array = NDArray[np.float64]
+
+UNCHECKED = 1e-9  # an observation of a smaller redundancy is not checked by any other
+UM_PER_MM = 1000.0
+
+
+def residuals(problem: Problem, end: Linearised, factor: Factor, covariance_mm2: Array) -> Residuals:
+    """The residuals with their redundancy numbers, the diagonal of Q_vv P (Förstner; Baarda's w = v / sigma_v).
+
+    With K = C A' L^-T and the whitened rows L^-1 B: Q_vv = K (I - L^-1 B C_xx B' L^-T) K'.
+    """
+    at, root = end.at, end.rows.root
+    roots = factor.row_roots(end.rows.blocks)
+    adjusted = np.empty((len(end.v_mm), 2, 2))
+    for rows, g in zip(problem.rows_by_image, roots, strict=True):
+        pairs = g.reshape(len(rows), 2, -1)
+        adjusted[rows] = pairs @ pairs.transpose(0, 2, 1)
+    k = np.linalg.solve(root, at.by_observation @ covariance_mm2).transpose(0, 2, 1)
+    cofactor = k @ (np.eye(2) - adjusted) @ k.transpose(0, 2, 1)
+    redundancy = np.einsum("nij,nji->ni", cofactor, np.linalg.inv(covariance_mm2))
+    variance = np.einsum("nii->ni", cofactor)
+    checked = redundancy > UNCHECKED
+    w = np.where(checked, end.v_mm / np.sqrt(np.where(checked, variance, 1.0)), 0.0)
+    return Residuals(end.v_mm, redundancy, w)
+
+
+def groups(
+    problem: Problem, state: State, cofactor: Array, observed: Residuals, covariance_mm2: Array
+) -> dict[str, Group]:
+    """The groups of observations: target and fiducial in the comparator, and the priors.
+
+    control: object coordinates, whose rms is in millionths of the object unit; datum: the fiducials' given places
+    (F5, F6); interior: c, x0', y0' and distortion; exterior. The last two mix units and have no rms. target, fiducial
+    and control are always there.
+    """
+    weighted = np.linalg.solve(covariance_mm2, observed.v_mm[..., None])[..., 0] * observed.v_mm
+    result = {}
+    for name, rows in (("target", ~problem.is_fiducial), ("fiducial", problem.is_fiducial)):
+        rms_um = UM_PER_MM * _rms(observed.v_mm[rows, 0]), UM_PER_MM * _rms(observed.v_mm[rows, 1])
+        result[name] = _group(float(weighted[rows].sum()), float(observed.redundancy[rows].sum()), *rms_um)
+    result.update(_prior_groups(problem, state, cofactor))
+    return result
+
+
+def _prior_groups(problem: Problem, state: State, cofactor: Array) -> Iterator[tuple[str, Group]]:
+    unknowns = problem.unknowns
+    v = -prior_differences(problem, state)
+    variance = np.where(unknowns.has_prior, unknowns.sigma, 1.0) ** 2
+    redundancy = 1.0 - np.diag(cofactor) / variance
+    kinds = {"control": "PT.", "datum": "FID.", "interior": "IO.", "exterior": "EO."}
+    names = np.array(unknowns.names)
+    for group, prefix in kinds.items():
+        members = unknowns.has_prior & np.char.startswith(names, prefix)
+        if not members.any() and group != "control":
+            continue
+        rms = [0.0, 0.0]
+        if group in ("control", "datum"):
+            scale = 1e6 if group == "control" else UM_PER_MM
+            axes = ("X", "Y") if group == "control" else ("x", "y")
+            rms = [scale * _rms(v[members & np.char.endswith(names, f".{axis}")]) for axis in axes]
+        vpv = float((v[members] ** 2 / variance[members]).sum())
+        yield group, _group(vpv, float(redundancy[members].sum()), *rms)
+
+
+def _group(vpv: float, redundancy: float, rms_x_um: float, rms_y_um: float) -> Group:
+    sigma0 = float(np.sqrt(vpv / redundancy)) if redundancy > UNCHECKED else 0.0
+    return Group(sigma0, rms_x_um, rms_y_um, redundancy)
+
+
+def _rms(v: Array) -> float:
+    return float(np.sqrt(np.mean(v**2))) if len(v) else 0.0

@@ -1,0 +1,172 @@
+"""The list of all quantities of a network: what is given of each, and where the iteration starts."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.distortion import PARAMETERS
+from adjust.errors import AdjustmentError
+from adjust.network import EXTERIOR_NAMES, Approximations, Camera, Image, Network, ObjectPoint, Prior
+from adjust.transformation import NAMES
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+Quantity = tuple[str, Prior | None, float | None]  # name, what is given, approximation
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Every quantity of a network by its name in the result: its given value, how well that is known, where it starts.
+
+    given (n,): nan where nothing is given. sigma (n,): 0 fixed, inf free. start (n,): where the iteration starts.
+    Positions in these: camera by name (c, x0', y0', then the distortion parameters), fiducial by (camera, id),
+    point by id, transformation and exterior by image name. Cameras and points stand before the images.
+    """
+
+    names: tuple[str, ...]
+    given: Array
+    sigma: Array
+    start: Array
+    camera: dict[str, Indices]
+    fiducial: dict[tuple[str, str], Indices]
+    point: dict[str, Indices]
+    transformation: dict[str, Indices]
+    exterior: dict[str, Indices]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def has_prior(self) -> NDArray[np.bool_]:
+        """Which quantities are pseudo-observed: F5 to F9 and their like."""
+        return np.asarray((self.sigma > 0) & np.isfinite(self.sigma))
+
+    @property
+    def shared_count(self) -> int:
+        """How many quantities stand before those of the images."""
+        return min(int(positions.min(initial=len(self))) for positions in self.exterior.values())
+
+    def keeps_angles(self, image: str) -> bool:
+        """Whether an image's attitude is moved by its angles: where one of them is observed or fixed."""
+        return bool(np.isfinite(self.sigma[self.exterior[image][3:]]).any())
+
+    def fixed(self, positions: Iterable[int]) -> "Unknowns":
+        """The same, with some quantities fixed where they start."""
+        sigma = self.sigma.copy()
+        sigma[list(positions)] = 0.0
+        return replace(self, sigma=sigma)
+
+
+def list_unknowns(network: Network, approximations: Approximations, observed: frozenset[tuple[str, str]]) -> Unknowns:
+    """Take down all quantities: cameras with their fiducials, points, images.
+
+    observed: (camera, id) of every fiducial and ("", id) of every point that is seen in an image. Cameras without an
+    image are left out, and so are points that nobody saw; a fiducial that nobody saw and that is free is held where it
+    is given. Raises AdjustmentError where a quantity has neither a value nor an approximation.
+    """
+    listing = _Listing()
+    used = {image.camera for image in network.images}
+    camera = {}
+    fiducial = {}
+    for each in network.cameras:
+        if each.name not in used:
+            continue
+        camera[each.name] = listing.add(f"IO.{each.name}", _camera_quantities(each, approximations))
+        for id_, mark in each.fiducials.items():
+            priors = (mark.x_mm, mark.y_mm)
+            if (each.name, id_) not in observed:
+                priors = (_held(mark.x_mm), _held(mark.y_mm))
+            pair: list[Quantity] = [("x", priors[0], None), ("y", priors[1], None)]
+            fiducial[each.name, id_] = listing.add(f"FID.{each.name}.{id_}", pair)
+    point = {
+        each.id: listing.add(f"PT.{each.id}", _point_quantities(each, approximations))
+        for each in network.points
+        if ("", each.id) in observed
+    }
+    transformation = {}
+    exterior = {}
+    for image in network.images:
+        exterior[image.name] = listing.add(f"EO.{image.name}", _exterior_quantities(image, approximations))
+        transformation[image.name] = listing.add(f"T.{image.name}", _transformation_quantities(image, approximations))
+    given, sigma, start = np.array(listing.rows, dtype=np.float64).T
+    return Unknowns(tuple(listing.names), given, sigma, start, camera, fiducial, point, transformation, exterior)
+
+
+class _Listing:
+    """Takes the quantities down one after the other."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.rows: list[tuple[float, float, float]] = []
+
+    def add(self, owner: str, quantities: Iterable[Quantity]) -> Indices:
+        first = len(self.names)
+        for name, prior, approximation in quantities:
+            self.names.append(f"{owner}.{name}")
+            self.rows.append(_row(self.names[-1], prior, approximation))
+        return np.arange(first, len(self.names))
+
+
+def _row(name: str, prior: Prior | None, approximation: float | None) -> tuple[float, float, float]:
+    """What is given, its standard deviation, and where to start: what is fixed stays at its value."""
+    if prior is None:
+        if approximation is None or not np.isfinite(approximation):
+            raise AdjustmentError(
+                f"{name} has neither a value nor an approximation. Give one of them, or observe it in images whose "
+                f"orientation can be found."
+            )
+        return np.nan, np.inf, approximation
+    if approximation is None or prior.sigma == 0.0:
+        return prior.value, prior.sigma, prior.value
+    return prior.value, prior.sigma, approximation
+
+
+def _held(prior: Prior) -> Prior:
+    """A quantity that nothing observes: fixed if it is free, otherwise its prior alone makes it regular."""
+    return prior if np.isfinite(prior.sigma) else Prior(prior.value, 0.0)
+
+
+def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Quantity]:
+    interior = approximations.interior.get(camera.name)
+    starts = (None, None, None) if interior is None else tuple(float(value) for value in interior)
+    priors = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
+    quantities: list[Quantity] = list(zip(("c", "x0", "y0"), priors, starts, strict=True))
+    names = PARAMETERS[camera.distortion.family]
+    given = camera.distortion.parameters
+    strangers = sorted(set(given) - set(names))
+    if strangers:
+        raise AdjustmentError(
+            f"camera {camera.name}: the distortion family {camera.distortion.family} has no parameter "
+            f"{', '.join(strangers)}; it has {', '.join(names) or 'none at all'}."
+        )
+    return quantities + [(name, given.get(name, Prior(0.0, 0.0)), None) for name in names]
+
+
+def _point_quantities(point: ObjectPoint, approximations: Approximations) -> list[Quantity]:
+    start = approximations.points.get(point.id)
+    starts = (None, None, None) if start is None else tuple(float(value) for value in start)
+    return list(zip("XYZ", (point.X, point.Y, point.Z), starts, strict=True))
+
+
+def _exterior_quantities(image: Image, approximations: Approximations) -> list[Quantity]:
+    start = approximations.exterior.get(image.name)
+    starts = [None] * 6 if start is None else [float(value) for value in start]
+    priors: list[Prior | None] = [None] * 6
+    if image.exterior is not None:
+        rows = zip(image.exterior.values, image.exterior.sigmas, strict=True)
+        priors = [Prior(float(value), float(sigma)) for value, sigma in rows]
+    return list(zip(EXTERIOR_NAMES, priors, starts, strict=True))
+
+
+def _transformation_quantities(image: Image, approximations: Approximations) -> list[Quantity]:
+    names = NAMES[image.transformation]
+    start = approximations.transformation.get(image.name, np.full(len(names), np.nan))
+    if len(start) != len(names):
+        raise AdjustmentError(
+            f"image {image.name}: a transformation of the kind {image.transformation} has {len(names)} parameters "
+            f"({', '.join(names)}), but {len(start)} approximations are given."
+        )
+    return [(name, None, float(value)) for name, value in zip(names, start, strict=True)]

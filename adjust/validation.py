@@ -1,0 +1,151 @@
+"""What a network must have before it can be adjusted, told with the name of the culprit."""
+
+from collections import Counter
+from collections.abc import Iterable
+
+import numpy as np
+
+from adjust.errors import AdjustmentError
+from adjust.network import Image, Network, Observations
+
+FIDUCIALS_NEEDED = {"none": 0, "congruent": 2, "similarity": 2, "affine": 3}
+TARGETS_NEEDED = 3
+
+
+def validate(network: Network) -> None:
+    """Raise AdjustmentError where a network is empty, contradictory or lacks what an image needs."""
+    _check_not_empty(network)
+    _check_unique("camera", (camera.name for camera in network.cameras))
+    _check_unique("image", (image.name for image in network.images))
+    _check_unique("object point", (point.id for point in network.points))
+    _check_cameras(network)
+    _check_shapes(network.observations)
+    _check_names(network)
+    _check_duplicate_observations(network.observations)
+    _check_values(network.observations)
+    counts = _counts(network.observations)
+    for image in network.images:
+        _check_image(image, counts[image.name, False], counts[image.name, True])
+
+
+def _check_not_empty(network: Network) -> None:
+    if not network.images:
+        raise AdjustmentError("There is nothing to adjust: the network has no image.")
+    if not len(network.observations):
+        raise AdjustmentError(
+            "There is nothing to adjust: no mark was observed. Look at the statuses and reasons of the measurement."
+        )
+
+
+def _check_unique(what: str, names: Iterable[str]) -> None:
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
+    if twice:
+        raise AdjustmentError(
+            f"{what} {twice[0]} is given {_times(names=twice)}. Every {what} needs a name of its own."
+        )
+
+
+def _times(names: list[str]) -> str:
+    return "more than once" if len(names) == 1 else f"more than once, and so are {', '.join(names[1:6])}"
+
+
+def _check_cameras(network: Network) -> None:
+    for image in network.images:
+        if image.camera not in network.camera_by_name:
+            known = ", ".join(sorted(network.camera_by_name)) or "none"
+            raise AdjustmentError(
+                f"image {image.name} is of the camera {image.camera}, which is not given; given: {known}."
+            )
+    for camera in network.cameras:
+        c = camera.principal_distance_mm
+        if c is not None and c.value <= 0.0:
+            raise AdjustmentError(f"camera {camera.name}: the principal distance must be positive, not {c.value} mm.")
+        if camera.distortion.family == "juhl" and camera.distortion.r0_mm <= 0.0:
+            raise AdjustmentError(f"camera {camera.name}: the distortion family juhl needs r0 > 0, Juhl's is 1.35 dm.")
+
+
+def _check_shapes(observations: Observations) -> None:
+    count = len(observations)
+    shapes = (
+        len(observations.point),
+        len(observations.kind),
+        observations.xy_mm.shape,
+        observations.covariance_mm2.shape,
+    )
+    if shapes != (count, count, (count, 2), (count, 2, 2)):
+        raise AdjustmentError(
+            f"The observations do not go together: {count} images, {shapes[0]} points, {shapes[1]} kinds, coordinates "
+            f"of shape {shapes[2]} and covariances of shape {shapes[3]}; each needs one row an observation."
+        )
+
+
+def _check_names(network: Network) -> None:
+    observations = network.observations
+    for name, id_, kind in zip(observations.image, observations.point, observations.kind, strict=True):
+        image = network.image_by_name.get(name)
+        if image is None:
+            raise AdjustmentError(
+                f"{kind} {id_} is observed in image {name}, which is not in the network. Add the image."
+            )
+        if kind == "fiducial" and id_ not in network.camera_by_name[image.camera].fiducials:
+            raise AdjustmentError(
+                f"fiducial {id_} is observed in image {name}, but camera {image.camera} has no such mark. Give its "
+                f"coordinates in the camera file, or correct its id."
+            )
+        if kind != "fiducial" and id_ not in network.point_by_id:
+            raise AdjustmentError(
+                f"{kind} {id_} is observed in image {name}, but there is no such object point. Add it to the points "
+                f"(coordinates may be left blank), or correct its id."
+            )
+
+
+def _check_duplicate_observations(observations: Observations) -> None:
+    fiducial = (kind == "fiducial" for kind in observations.kind)
+    rows = Counter(zip(observations.image, observations.point, fiducial, strict=True))
+    for (image, point, is_fiducial), count in rows.items():
+        if count > 1:
+            what = "fiducial" if is_fiducial else "point"
+            raise AdjustmentError(f"{what} {point} is observed {count} times in image {image}. Keep one of the rows.")
+
+
+def _check_values(observations: Observations) -> None:
+    covariance = observations.covariance_mm2
+    finite = np.isfinite(observations.xy_mm).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    variances = np.einsum("nii->ni", covariance)
+    determinant = covariance[:, 0, 0] * covariance[:, 1, 1] - covariance[:, 0, 1] * covariance[:, 1, 0]
+    symmetric = np.isclose(covariance[:, 0, 1], covariance[:, 1, 0], rtol=1e-9, atol=0.0)
+    definite = (variances > 0.0).all(axis=1) & (determinant > 0.0) & symmetric
+    for good, what in (
+        (finite, "has a coordinate or covariance that is not a finite number"),
+        (
+            definite,
+            "has a covariance matrix that is not positive definite: its standard deviations must be positive, "
+            "its correlation between -1 and 1",
+        ),
+    ):
+        if not good.all():
+            row = int(np.argmin(good))
+            raise AdjustmentError(
+                f"{observations.kind[row]} {observations.point[row]} in image {observations.image[row]} {what}."
+            )
+
+
+def _counts(observations: Observations) -> Counter[tuple[str, bool]]:
+    """How many targets (False) and fiducials (True) every image shows."""
+    fiducial = (kind == "fiducial" for kind in observations.kind)
+    return Counter(zip(observations.image, fiducial, strict=True))
+
+
+def _check_image(image: Image, targets: int, fiducials: int) -> None:
+    needed = FIDUCIALS_NEEDED[image.transformation]
+    if fiducials < needed:
+        raise AdjustmentError(
+            f"image {image.name} shows {fiducials} fiducial marks; its {image.transformation} transformation needs "
+            f"{needed}. Measure more of them, choose a transformation that needs fewer, or leave the image out."
+        )
+    known = image.exterior is not None and bool(np.isfinite(image.exterior.sigmas).all())
+    if targets < TARGETS_NEEDED and not known:
+        raise AdjustmentError(
+            f"image {image.name} shows {targets} object points; its exterior orientation needs {TARGETS_NEEDED}. "
+            f"Measure more targets in it, give its orientation with standard deviations, or leave the image out."
+        )

@@ -1,0 +1,111 @@
+"""The reference adjustments of an independent implementation, as networks."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adjust.distortion import PARAMETERS
+from adjust.network import (
+    EXTERIOR_NAMES,
+    Approximations,
+    Camera,
+    Distortion,
+    Exterior,
+    Fiducial,
+    Image,
+    Network,
+    ObjectPoint,
+    Observations,
+    Prior,
+)
+from adjust.transformation import NAMES
+
+CASES = Path(__file__).parents[3] / "shared" / "cases"
+CAMERA = "K"
+
+Case = dict[str, Any]
+
+
+def load(name: str) -> Case:
+    """A case's file; the test is skipped where the reference cases are not there."""
+    file = CASES / f"{name}.json"
+    if not file.exists():
+        pytest.skip(f"the reference case {name} is not beside the project")
+    case: Case = json.loads(file.read_text())
+    return case
+
+
+def network_of(case: Case) -> Network:
+    """The case's input. Names are the case's numbers."""
+    given = case["input"]
+    interior = dict(zip(case["io_names"], map(prior, given["io_obs"], given["io_sigma"]), strict=True))
+    family = case["distortion"]
+    camera = Camera(
+        CAMERA,
+        interior["c"],
+        interior["x0"],
+        interior["y0"],
+        Distortion(
+            family,
+            {name: interior[name] for name in PARAMETERS[family]},
+            decentering="paper" if case["decentering_mode"] == "paper" else "reduced",
+            r0_mm=case["r0"] * (100.0 if family == "juhl" else 1.0),
+        ),
+        {
+            str(i): Fiducial(*map(prior, values, sigmas))
+            for i, (values, sigmas) in enumerate(zip(given["fid_obs"], given["fid_sigma"], strict=True), 1)
+        },
+    )
+    points = tuple(
+        ObjectPoint(str(i), *map(prior, values, sigmas))
+        for i, (values, sigmas) in enumerate(zip(given["pts_obs"], given["pts_sigma"], strict=True), 1)
+    )
+    rows = [(*row, "target") for row in given["obs"]] + [(*row, "fiducial") for row in given["fobs"]]
+    images = tuple(Image(str(i), CAMERA, case["transform"]) for i in sorted({row[0] for row in rows}))
+    observations = Observations(
+        tuple(str(row[0]) for row in rows),
+        tuple(str(row[1]) for row in rows),
+        tuple(row[6] for row in rows),
+        np.array([row[2:4] for row in rows]),
+        np.array([np.diag(np.square(row[4:6])) for row in rows]),
+    )
+    return Network((camera,), images, points, observations)
+
+
+def prior(value: float, sigma: float | None) -> Prior:
+    return Prior(value, np.inf if sigma is None else sigma)
+
+
+def approximations_of(case: Case, values: dict[str, float]) -> Approximations:
+    """Approximations by the case's own names; a given value where the case names none."""
+    given = case["input"]
+    network = network_of(case)
+    interior = dict(zip(case["io_names"], given["io_obs"], strict=True))
+    start = {
+        f"PT{i}.{axis}": x for i, row in enumerate(given["pts_obs"], 1) for axis, x in zip("XYZ", row, strict=True)
+    }
+    start |= {f"IO.{name}": value for name, value in interior.items()} | values
+    return Approximations(
+        interior={CAMERA: np.array([start[f"IO.{name}"] for name in ("c", "x0", "y0")])},
+        exterior={
+            image.name: np.array([start[f"EO{image.name}.{e}"] for e in EXTERIOR_NAMES]) for image in network.images
+        },
+        transformation={
+            image.name: np.array([start[f"T{image.name}.{p}"] for p in NAMES[case["transform"]]])
+            for image in network.images
+        },
+        points={point.id: np.array([start[f"PT{point.id}.{axis}"] for axis in "XYZ"]) for point in network.points},
+    )
+
+
+def own_name(name: str) -> str:
+    """A case's name of an unknown in the names of this project: `EO1.X0` is `EO.1.X0`."""
+    owner, quantity = name.split(".")
+    for prefix in ("EO", "PT", "FID", "T"):
+        if owner.startswith(prefix) and owner != "IO":
+            number = owner.removeprefix(prefix)
+            return f"FID.{CAMERA}.{number}.{quantity}" if prefix == "FID" else f"{prefix}.{number}.{quantity}"
+    return f"IO.{CAMERA}.{quantity}"
