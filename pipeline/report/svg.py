@@ -108,7 +108,7 @@ class Axes:
 
 def ticks(low: float, high: float, most: float) -> list[float]:
     """Round values inside of a range, `most` of them or fewer."""
-    step = round_step(2.5 * (high - low) / most)
+    step = 1.0 / round_step(most / (high - low))  # the smallest round step that is not too fine
     first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
     return [i * step for i in range(first, last + 1)]
 

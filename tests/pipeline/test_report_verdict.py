@@ -1,0 +1,154 @@
+"""The verdict: the tests behind it against published tables, and a problem for everything that needs a look."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from measure.status import Status
+from pipeline.report import Problem, ReportData, judge
+from pipeline.report.fractions import fraction_test
+from pipeline.report.verdict import critical_w, sigma0_bounds, suspects
+
+Json = dict[str, Any]
+
+
+def test_the_bounds_of_sigma0_are_those_of_the_chi_square_table() -> None:
+    """Chi-square with 10 degrees of freedom: 2.156 and 25.188 (any table, 0.005 and 0.995)."""
+    low, high = sigma0_bounds(10)
+    assert (low, high) == pytest.approx((np.sqrt(0.2156), np.sqrt(2.5188)), abs=1e-4)
+
+
+def test_the_critical_w_grows_with_the_number_of_tests() -> None:
+    """One test: 2.576; a hundred: 0.01 / 100 two-sided, 3.891 (normal table)."""
+    assert critical_w(1) == pytest.approx(2.576, abs=1e-3)
+    assert critical_w(100) == pytest.approx(3.891, abs=1e-3)
+
+
+def test_good_observations_are_rarely_called_suspect() -> None:
+    rng = np.random.default_rng(11)
+    called = sum(bool(suspects({"sigma0": 1.0, "residuals": _rows(rng.standard_normal((200, 2)))})) for _ in range(400))
+    assert called < 14, "one adjustment of a hundred is expected"
+
+
+def _rows(w: Any) -> list[Json]:
+    return [
+        {"image": "f1", "point": str(i), "kind": "target", "w": float(pair[np.argmax(np.abs(pair))])}
+        for i, pair in enumerate(w)
+    ]
+
+
+def changed(data: ReportData, **values: object) -> ReportData:
+    assert data.adjustment is not None
+    return replace(data, adjustment={**data.adjustment, **values})
+
+
+def told(data: ReportData) -> str:
+    """All problems in one text, for a calibration that is not good."""
+    verdict = judge(data)
+    assert verdict.level == "look"
+    assert verdict.exit_code == 1
+    return " ".join(f"{problem.what} {problem.next_step}" for problem in verdict.problems)
+
+
+def test_good(adjusted: ReportData) -> None:
+    verdict = judge(adjusted)
+    assert (verdict.level, verdict.exit_code, verdict.problems) == ("good", 0, ())
+
+
+def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
+    assert "σ₀ = 1.60 is above 1.11" in told(changed(adjusted, sigma0=1.6))
+    assert "film_sigma_um" in told(changed(adjusted, sigma0=1.6))
+    assert "σ₀ = 0.50 is below 0.89" in told(changed(adjusted, sigma0=0.5))
+
+
+def test_a_gross_error_is_named_with_its_image(adjusted: ReportData) -> None:
+    assert adjusted.adjustment is not None
+    rows = [*adjusted.adjustment["residuals"]]
+    rows[40] = {**rows[40], "w": -9.3}
+    assert "1 observation beyond chance: f2/1 (w = −9.3)." in told(changed(adjusted, residuals=rows))
+
+
+def test_with_a_large_sigma0_no_residual_is_singled_out_by_it(adjusted: ReportData) -> None:
+    assert adjusted.adjustment is not None
+    rows = [{**row, "w": 3.0 * (row["w"] or 0.0)} for row in adjusted.adjustment["residuals"]]
+    assert "beyond chance" not in told(changed(adjusted, sigma0=3.0, residuals=rows))
+
+
+def test_warnings_of_the_adjustment_need_a_look(adjusted: ReportData) -> None:
+    assert "c is carried by its prior." in told(changed(adjusted, warnings=["c is carried by its prior."]))
+
+
+def test_no_convergence_is_no_result(adjusted: ReportData) -> None:
+    verdict = judge(changed(adjusted, converged=False, termination="iteration limit", iterations=50))
+    assert verdict.level == "failed"
+    assert "There is no calibration: the iteration did not come to rest." in verdict.sentence
+    assert "iteration limit, 50 iterations" in verdict.problems[0].what
+
+
+def test_an_assumed_pose_needs_a_look_once_for_all_frames(measured: ReportData) -> None:
+    assert measured.measurement is not None
+    pose = {"name": "0", "decided": False, "evidence": ["The marks are symmetric to 3 µm."]}
+    images = {name: {**scan, "pose": pose} for name, scan in measured.measurement["images"].items()}
+    data = replace(measured, measurement={"images": images})
+    assert len(judge(data).problems) == 1
+    assert "f1, f2, f3, f4, f5: pose assumed (0). The marks are symmetric to 3 µm." in told(data)
+    assert 'pose = "90"' in told(data)
+
+
+def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured: ReportData) -> None:
+    assert measured.measurement is not None
+    images = measured.measurement["images"]
+    images = {**images, "f4": {**images["f4"], "problems": ["nearly black."]}}
+    data = replace(measured, measurement={"images": images}, problems=(Problem("points.csv: 99 was not measured."),))
+    assert "f4: nearly black." in told(data)
+    assert "99 was not measured" in told(data)
+
+
+def test_a_frame_without_any_target_needs_a_look(measured: ReportData) -> None:
+    rows = [
+        replace(row, status=Status.ABSENT, reason="Outside the scan.")
+        if (row.image, row.kind) == ("f2", "target")
+        else row
+        for row in measured.comparator
+    ]
+    assert "f2: none of its 24 targets was measured." in told(replace(measured, comparator=rows))
+
+
+def test_single_targets_outside_the_scan_are_ordinary(measured: ReportData) -> None:
+    rows = [*measured.comparator]
+    rows[-1] = replace(rows[-1], status=Status.ABSENT, reason="Outside the scan.")
+    assert judge(replace(measured, comparator=rows)).level == "good"
+
+
+def test_when_opencv_differs_it_needs_a_look_and_when_it_cannot_it_is_a_note(adjusted: ReportData) -> None:
+    check: Json = {"verdict": "differs", "reason": "k1 differs by 7 sigma.", "cameras": {}}
+    assert "k1 differs by 7 sigma." in told(replace(adjusted, check=check))
+    verdict = judge(replace(adjusted, check={**check, "verdict": "not possible", "reason": "One flat frame."}))
+    assert verdict.level == "good"
+    assert "OpenCV cannot check this calibration. One flat frame." in verdict.notes
+
+
+def test_nothing_measured_is_no_result() -> None:
+    assert judge(ReportData("none")).level == "failed"
+
+
+def test_even_fractions_pass_and_locked_ones_do_not() -> None:
+    rng = np.random.default_rng(2)
+    even = rng.uniform(0.0, 2000.0, 800)
+    assert not fraction_test(even).is_locked
+    pulled = np.round(even) + 0.6 * (even - np.round(even))
+    assert fraction_test(pulled).is_locked
+    assert fraction_test(even[:20]).probability is None
+    assert fraction_test(even).counts.sum() == 800
+
+
+def test_locked_positions_need_a_look(measured: ReportData) -> None:
+    assert measured.measurement is not None
+    images: Json = {}
+    for name, scan in measured.measurement["images"].items():
+        images[name] = {**scan, "marks": [{**mark, "col_px": round(mark["col_px"]) + 0.02} for mark in scan["marks"]]}
+    text = told(replace(measured, measurement={"images": images}))
+    assert "The column positions of the marks prefer parts of a pixel" in text
+    assert "The row positions" not in text
