@@ -1,0 +1,247 @@
+"""The check against OpenCV, on simulated networks whose observations come from cv2.projectPoints."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from adjust.adjustment import adjust
+from adjust.approximations import approximate
+from adjust.network import (
+    Camera,
+    Distortion,
+    Family,
+    Fiducial,
+    Image,
+    Network,
+    ObjectPoint,
+    ObservationKind,
+    Observations,
+    Prior,
+)
+from pipeline.check import CameraCheck, Check, check_against_opencv
+
+Array = NDArray[np.float64]
+
+C_MM, X0_MM, Y0_MM = 152.0, 0.05, -0.03
+SIGMA_MM = 0.004
+MARKS_MM = {
+    str(i): 106.0 * np.array(xy) for i, xy in enumerate([(1, -1), (-1, -1), (-1, 1), (1, 1), (-1, 0), (1, 0)], 1)
+}
+MODERATE = (-0.002, 0.001, 5e-5, -3e-5, 0.0)  # 150 um in the frame's corner
+CONVERGENT = [
+    (0.0, 0.0, 1530.0, 0.0, 0.0, 0.0),
+    (700.0, 100.0, 1400.0, -0.07, 0.45, 1.6),
+    (-600.0, 80.0, 1600.0, -0.05, -0.4, 3.1),
+    (50.0, 700.0, 1480.0, -0.45, 0.03, -1.6),
+    (-80.0, -650.0, 1650.0, 0.4, -0.05, 0.4),
+]
+VERTICAL = [(0.0, 0.0, 1530.0, 0.0, 0.0, 0.3)]
+FREE = np.inf
+NO_DISTORTION = Distortion()
+
+
+def simulated(
+    stations: Sequence[tuple[float, float, float, float, float, float]],
+    *,
+    relief_m: float = 300.0,
+    film: bool = True,
+    lens: Sequence[float] = MODERATE,
+    aspect: float = 1.0,
+    noise_mm: float = SIGMA_MM,
+    distortion: Distortion = NO_DISTORTION,
+    seed: int = 1,
+) -> Network:
+    """Frames of a test field through a known lens, scanned with an affinity each, priors of 1 mm on the interior."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-1.0, 1.0, (60, 3)) * [900.0, 900.0, relief_m]
+    matrix = np.array([[aspect * C_MM, 0.0, X0_MM], [0.0, C_MM, -Y0_MM], [0.0, 0.0, 1.0]])
+    rows: list[tuple[str, str, ObservationKind, Array]] = []
+    for number, station in enumerate(stations, 1):
+        downward = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("XYZ", station[3:]).as_matrix().T
+        center = np.array(station[:3])
+        seen, _ = cv2.projectPoints(xyz, cv2.Rodrigues(downward)[0], -downward @ center, matrix, np.array(lens))
+        camera_mm = seen.reshape(-1, 2) * [1.0, -1.0]
+        inside = np.flatnonzero((np.abs(camera_mm) < 112.0).all(axis=1))
+        scan = np.eye(2) + rng.normal(0.0, 0.05 if film else 0.0, (2, 2))
+
+        def scanned(xy_mm: Array, scan: Array = scan) -> Array:
+            return xy_mm @ scan.T + rng.normal(0.0, noise_mm, xy_mm.shape)
+
+        rows += [
+            (f"f{number}", f"t{k}", "target", xy) for k, xy in zip(inside, scanned(camera_mm[inside]), strict=True)
+        ]
+        if film:
+            marks = scanned(np.array(list(MARKS_MM.values())))
+            rows += [(f"f{number}", name, "fiducial", xy) for name, xy in zip(MARKS_MM, marks, strict=True)]
+    camera = Camera(
+        "rc20",
+        Prior(C_MM + 0.3, 1.0),
+        Prior(0.0, 1.0),
+        Prior(0.0, 1.0),
+        distortion,
+        {name: Fiducial(Prior(x, 0.001), Prior(y, 0.001)) for name, (x, y) in MARKS_MM.items()} if film else {},
+    )
+    return Network(
+        (camera,),
+        tuple(Image(f"f{n}", "rc20", "affine" if film else "none") for n in range(1, len(stations) + 1)),
+        tuple(ObjectPoint(f"t{k}", *(Prior(float(v)) for v in row)) for k, row in enumerate(xyz)),
+        Observations(
+            tuple(row[0] for row in rows),
+            tuple(row[1] for row in rows),
+            tuple(row[2] for row in rows),
+            np.array([row[3] for row in rows]),
+            np.tile(SIGMA_MM**2 * np.eye(2), (len(rows), 1, 1)),
+        ),
+    )
+
+
+def free(family: Family, *names: str) -> Distortion:
+    return Distortion(family, {name: Prior(0.0, FREE) for name in names})
+
+
+def checked(network: Network) -> CameraCheck:
+    return check_against_opencv(adjust(network, approximate(network))).cameras["rc20"]
+
+
+@pytest.mark.parametrize(
+    ("distortion", "aspect"),
+    [
+        (free("torlegard", "k3", "k5", "k7", "p1", "p2"), 1.0),
+        (free("brown", "k1", "k2", "k3", "p1", "p2", "b1"), 1.0003),
+        (free("opencv", "k1", "k2", "p1", "p2", "k3"), 1.0),
+        (free("opencv", "k1", "k2", "p1", "p2", "b1"), 1.0003),
+    ],
+    ids=["torlegard", "brown", "opencv", "opencv two focal lengths"],
+)
+@pytest.mark.parametrize("film", [True, False], ids=["film", "digital"])
+def test_a_moderate_lens_agrees_to_a_tenth_of_a_sigma(distortion: Distortion, aspect: float, film: bool) -> None:
+    check = checked(simulated(CONVERGENT, film=film, distortion=distortion, aspect=aspect))
+    assert check.verdict == "agrees", check.reason
+    assert check.images == 5
+    assert check.refit_residual_um is not None
+    assert check.refit_residual_um < 0.02
+    assert check.rms_opencv_um == pytest.approx(check.rms_reseau_um, rel=1e-3)
+    for row in check.rows:
+        assert row.difference_sigmas < 0.1
+        assert row.sigma == pytest.approx(row.opencv_sigma, rel=0.03)
+    assert {row.name for row in check.rows} >= {"fx", "cx", "cy", "k1", "k2", "p1", "p2"}
+    assert ("fy" in {row.name for row in check.rows}) == (aspect != 1.0)
+
+
+def test_parameters_found_are_those_simulated() -> None:
+    check = checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
+    truth = {
+        "fx": C_MM,
+        "cx": X0_MM,
+        "cy": Y0_MM,
+        "k1": MODERATE[0],
+        "k2": MODERATE[1],
+        "p1": MODERATE[2],
+        "p2": MODERATE[3],
+    }
+    rows = {row.name: row for row in check.rows}
+    for name, value in truth.items():
+        # the marks carry a part of the uncertainty that both programs take as known
+        assert abs(rows[name].value - value) < 5 * rows[name].sigma
+        assert abs(rows[name].opencv_value - value) < 5 * rows[name].opencv_sigma
+
+
+def test_fixed_distortion_stays_fixed() -> None:
+    fixed = Distortion("opencv", {name: Prior(v) for name, v in zip(("k1", "k2", "p1", "p2"), MODERATE, strict=False)})
+    check = checked(simulated(CONVERGENT, distortion=fixed))
+    assert check.verdict == "agrees", check.reason
+    assert [row.name for row in check.rows] == ["fx", "cx", "cy"]
+    assert max(row.difference_sigmas for row in check.rows) < 0.1
+
+
+def test_exact_observations_agree_as_far_as_single_precision_goes() -> None:
+    distortion = free("opencv", "k1", "k2", "p1", "p2")
+    check = checked(simulated(CONVERGENT, noise_mm=0.0, distortion=distortion))
+    assert check.verdict == "agrees", check.reason
+    assert check.rms_opencv_um is not None
+    assert check.rms_opencv_um < 0.02
+
+
+def test_one_flat_vertical_frame_is_not_possible_and_the_reason_is_told() -> None:
+    check = checked(simulated(VERTICAL, relief_m=0.0, lens=[0.0] * 5))
+    assert check.verdict == "not possible"
+    assert check.reason.startswith("Priors carried the solution")
+    assert not check.rows
+
+
+def test_unknown_points_are_told() -> None:
+    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    points = tuple(
+        ObjectPoint(p.id, None, None, None) if int(p.id[1:]) >= 30 and seen(network, p.id) > 1 else p
+        for p in network.points
+    )
+    check = checked(replace(network, points=points))
+    unknown = sum(point.X is None for point in points)
+    assert unknown > 5
+    assert check.verdict == "agrees", check.reason
+    assert f"{unknown} points are in truth uncertain" in check.reason
+    assert max(row.difference_sigmas for row in check.rows) < 0.1
+
+
+def seen(network: Network, point: str) -> int:
+    return network.observations.point.count(point)
+
+
+def test_different_standard_deviations_are_told() -> None:
+    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    covariance = network.observations.covariance_mm2.copy()
+    covariance[::2] *= 9.0
+    check = checked(replace(network, observations=replace(network.observations, covariance_mm2=covariance)))
+    assert "differ up to 3" in check.reason
+
+
+def test_a_prior_that_contradicts_the_observations_differs() -> None:
+    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    camera = replace(network.cameras[0], principal_distance_mm=Prior(C_MM + 0.5, 0.002))
+    check = checked(replace(network, cameras=(camera,)))
+    assert check.verdict == "differs"
+    assert "priors or weights move c" in check.reason
+
+
+def test_wrong_values_in_an_adjustment_differ() -> None:
+    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    adjustment = adjust(network, approximate(network))
+    values = adjustment.values.copy()
+    values[adjustment.index("IO.rc20.c")] += 0.5
+    assert check_against_opencv(replace(adjustment, values=values)).verdict == "differs"
+
+
+def test_what_opencv_has_no_model_for() -> None:
+    network = simulated(VERTICAL, distortion=Distortion("juhl", {"t1": Prior(0.0)}, r0_mm=135.0))
+    assert "no counterpart of the distortion family juhl" in checked(network).reason
+    one_fixed = replace(network.cameras[0], distortion=Distortion(), x0_mm=Prior(0.0))
+    assert "both coordinates of the principal point" in checked(replace(network, cameras=(one_fixed,))).reason
+
+
+def test_verdict_on_the_whole() -> None:
+    good, bad = CameraCheck("agrees", "a."), CameraCheck("differs", "d.")
+    impossible = CameraCheck("not possible", "n.")
+    assert Check({"1": good, "2": good}).verdict == "agrees"
+    assert Check({"1": good, "2": impossible}).verdict == "not possible"
+    assert Check({"1": bad, "2": impossible}).verdict == "differs"
+    assert Check({"1": bad, "2": impossible}).reason == "Camera 1: d."
+    assert Check({"1": good}).reason == "a."
+
+
+def test_json_has_the_documented_keys_and_no_nan() -> None:
+    network = simulated(CONVERGENT, distortion=free("opencv", "k1", "k2", "p1", "p2"))
+    check = check_against_opencv(adjust(network, approximate(network)))
+    written = json.loads(json.dumps(check.to_json(), allow_nan=False))
+    assert set(written) == {"verdict", "reason", "cameras"}
+    camera = written["cameras"]["rc20"]
+    assert set(camera) == {
+        "verdict", "reason", "images", "points", "rms_opencv_um", "rms_reseau_um", "refit_residual_um", "rows"
+    }  # fmt: skip
+    assert set(camera["rows"][0]) == {"name", "unit", "reseau", "opencv", "difference_sigmas"}
+    assert set(camera["rows"][0]["reseau"]) == {"value", "sigma"}
