@@ -6,20 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS, image_equations
+from adjust.distortion import PARAMETERS
 from adjust.errors import AdjustmentError
-from adjust.fiducial_fit import FEWEST_MARKS, fit_transformation
+from adjust.fiducial_fit import fit_transformation
 from adjust.network import Approximations, Camera, Image, Network
 from adjust.orientation import orient
 from adjust.principal_distance import KnownField, find_principal_distance
+from adjust.projection import ideal_from_observed
 from adjust.resection import Pose
 from adjust.rotation import angles_from_rotation, angles_near
 from adjust.sight import Sight
 from adjust.transformation import affine_from_parameters, apply_affine
+from adjust.validation import validate
 
 Array = NDArray[np.float64]
-
-NEWTON_STEPS = 6
 
 
 def approximate(network: Network) -> Approximations:
@@ -31,6 +31,7 @@ def approximate(network: Network) -> Approximations:
     themselves. Independent of the order of images, points and observations.
     Raises AdjustmentError, naming the image, camera or point, where something cannot be found, and what would help.
     """
+    validate(network)
     rows = _rows_by_image(network)
     fits = {image.name: _film_transformation(network, image, rows[image.name]) for image in network.images}
     frames = {image.name: _frame(network, image, rows[image.name], fits[image.name]) for image in network.images}
@@ -63,10 +64,6 @@ def _rows_by_image(network: Network) -> dict[str, list[int]]:
     rows: dict[str, list[int]] = {image.name: [] for image in network.images}
     observations = network.observations
     for row, image in enumerate(observations.image):
-        if image not in rows:
-            raise AdjustmentError(
-                f"point {observations.point[row]} is observed in image {image}, which the network does not hold"
-            )
         rows[image].append(row)
     for image in rows:
         rows[image].sort(key=lambda row: (observations.kind[row], observations.point[row]))
@@ -76,16 +73,11 @@ def _rows_by_image(network: Network) -> dict[str, list[int]]:
 def _film_transformation(network: Network, image: Image, rows: list[int]) -> tuple[Array, bool]:
     """Parameters and whether mirrored."""
     observations, given = network.observations, network.camera_by_name[image.camera].fiducials
-    marks = [row for row in rows if observations.kind[row] == "fiducial" and observations.point[row] in given]
-    fewest = FEWEST_MARKS[image.transformation]
-    if len(marks) < fewest:
-        raise AdjustmentError(
-            f"image {image.name} shows {len(marks)} fiducial marks of camera {image.camera}; the transformation "
-            f"{image.transformation} needs {fewest}: measure more marks, or choose a simpler transformation"
-        )
-    fiducials = [given[observations.point[row]] for row in marks]
-    camera_mm = np.array([[mark.x_mm.value, mark.y_mm.value] for mark in fiducials]).reshape(-1, 2)
-    return fit_transformation(image.transformation, observations.xy_mm[marks], camera_mm)
+    marks = [row for row in rows if observations.kind[row] == "fiducial"]
+    camera_mm = np.array(
+        [[mark.x_mm.value, mark.y_mm.value] for mark in (given[observations.point[row]] for row in marks)]
+    )
+    return fit_transformation(image.transformation, observations.xy_mm[marks], camera_mm.reshape(-1, 2))
 
 
 def _frame(network: Network, image: Image, rows: list[int], fit: tuple[Array, bool]) -> _Frame:
@@ -123,32 +115,23 @@ def _interior(network: Network, camera: Camera, frames: Mapping[str, _Frame]) ->
 
 def _known_field(network: Network, frame: _Frame, x0: float, y0: float) -> KnownField:
     """The points of one image whose coordinates are all known."""
-    listed = [network.point_by_id.get(name) for name in frame.points]
     known = [
         (i, [point.X.value, point.Y.value, point.Z.value])
-        for i, point in enumerate(listed)
-        if point is not None and point.X is not None and point.Y is not None and point.Z is not None
+        for i, point in enumerate(network.point_by_id[name] for name in frame.points)
+        if point.X is not None and point.Y is not None and point.Z is not None
     ]
     xyz = np.array([coordinates for _, coordinates in known]).reshape(-1, 3)
     return KnownField(xyz, frame.xy_mm[[i for i, _ in known]] - [x0, y0], frame.sigma_mm)
 
 
 def _sight(camera: Camera, frame: _Frame, interior: Array) -> Sight:
-    c = float(interior[0])
-    return Sight(frame.points, c * _ideal_rays(camera, interior, frame.xy_mm), c, frame.sigma_mm)
-
-
-def _ideal_rays(camera: Camera, interior: Array, xy_mm: Array) -> Array:
-    """-U/W, -V/W (n, 2) with the distortion as it is known beforehand, by Newton's method on the image equations."""
+    """Freed of the distortion as it is known beforehand; a coordinate that it cannot have produced stays as it is."""
     known = camera.distortion.parameters
-    parameters = np.array(
-        [known[name].value if name in known else 0.0 for name in PARAMETERS[camera.distortion.family]]
-    )
-    rays: Array = (xy_mm - interior[1:]) / interior[0]
-    for _ in range(NEWTON_STEPS):
-        equations = image_equations(camera.distortion, interior, parameters, xy_mm, rays)
-        rays = rays - np.linalg.solve(equations.by_ray, equations.value[..., None])[..., 0]
-    return rays
+    names = PARAMETERS[camera.distortion.family]
+    parameters = np.array([known[name].value if name in known else 0.0 for name in names])
+    ideal, found = ideal_from_observed(camera.distortion, interior, parameters, frame.xy_mm)
+    xy_mm = np.where(found[:, np.newaxis], ideal, frame.xy_mm) - interior[1:]
+    return Sight(frame.points, xy_mm, float(interior[0]), frame.sigma_mm)
 
 
 def _exterior(image: Image, pose: Pose) -> Array:

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from adjust.network import Transformation
 from adjust.transformation import affine_from_parameters, apply_affine
+from adjust.validation import FIDUCIALS_NEEDED
 
 Array = NDArray[np.float64]
 
-FEWEST_MARKS = {"none": 0, "congruent": 2, "similarity": 2, "affine": 3}
 MOST_SUBSETS = 100
 GROSS = 13.8  # squared distance, in variances of a coordinate, beyond which a mark is left out (0.1 % point)
 
@@ -18,9 +18,9 @@ GROSS = 13.8  # squared distance, in variances of a coordinate, beyond which a m
 def fit_transformation(kind: Transformation, comparator_mm: Array, camera_mm: Array) -> tuple[Array, bool]:
     """Parameters of the transformation in the order of `adjust.transformation.NAMES`; whether the scan is mirrored.
 
-    comparator_mm, camera_mm (n, 2): the same marks, n at least `FEWEST_MARKS[kind]`. Fitted by least squares to those
-    marks that the least trimmed squares over the smallest subsets find in agreement. A scan is mirrored where a
-    mirrored fit leaves less; two marks cannot tell, and are taken as not mirrored.
+    comparator_mm, camera_mm (n, 2): the same marks, at least `adjust.validation.FIDUCIALS_NEEDED[kind]`. Fitted by
+    least squares to those marks that the least trimmed squares over the smallest subsets find in agreement. A scan is
+    mirrored where a mirrored fit leaves less; two marks cannot tell, and are taken as not mirrored.
     """
     if kind == "none":
         return np.zeros(0), False
@@ -34,7 +34,7 @@ def fit_transformation(kind: Transformation, comparator_mm: Array, camera_mm: Ar
 
 def _robust_fit(kind: Transformation, comparator_mm: Array, camera_mm: Array, mirrored: bool) -> tuple[Array, float]:
     """Parameters, and the trimmed sum of squared distances that chose them."""
-    n, fewest = len(comparator_mm), FEWEST_MARKS[kind]
+    n, fewest = len(comparator_mm), FIDUCIALS_NEEDED[kind]
     half = (n + fewest + 1) // 2
     best, best_cost = _fit(kind, comparator_mm, camera_mm, mirrored), np.inf
     subsets = list(combinations(range(n), fewest))

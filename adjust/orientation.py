@@ -39,7 +39,7 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
 
     Raises AdjustmentError for the image or point that cannot be found.
     """
-    state = _State(sights, _coordinates(network, sights, firm=True), _coordinates(network, sights, firm=False))
+    state = _State(sights, _coordinates(network, firm=True), _coordinates(network, firm=False))
     for image in network.images:
         if image.exterior is not None:
             state.poses[image.name] = _checked(image.exterior, state, image.name)
@@ -53,13 +53,11 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
     return state.poses, _all_points(state)
 
 
-def _coordinates(network: Network, sights: Mapping[str, Sight], firm: bool) -> dict[str, Array]:
-    """What is known of every point, listed or merely seen."""
-    seen = {name for sight in sights.values() for name in sight.points}
-    unlisted = seen - network.point_by_id.keys()
+def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
+    """What is known of every point (3,), nan where nothing is."""
     return {
         point.id: np.array([_value(prior, firm) for prior in (point.X, point.Y, point.Z)]) for point in network.points
-    } | {name: np.full(3, np.nan) for name in unlisted}
+    }
 
 
 def _value(prior: Prior | None, firm: bool) -> float:

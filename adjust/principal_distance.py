@@ -64,7 +64,7 @@ def _minimum(fields: Sequence[KnownField], resections: dict[int, Resection], c: 
         lambda s: _cost(fields, resections, float(np.exp(s))),
         bounds=(np.log(c / width), np.log(c * width)),
         method="bounded",
-        options={"xatol": 1e-5},
+        options={"xatol": 1e-4},
     ).x
     return float(np.exp(logarithm))
 

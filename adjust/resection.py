@@ -15,6 +15,7 @@ MAX_TRIPLES = 120  # enough for one free of gross errors among them when every t
 MAX_SCORED_POINTS = 200
 REFINED_CANDIDATES = 16  # poses kept for the refinement: the two minima of a flat field must both be among them
 LM_ITERATIONS = 12
+SETTLED = 1e-9  # relative change of a sum of squares that is none
 BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
 EXACT = 1e-12  # squared residual of three points that are met
 SAME_PLACE = 1e-4  # poses nearer than this, in extents of the points, are one
@@ -239,9 +240,12 @@ def _refined(rotations: Array, shifts: Array, points: Array, tangents: Array, we
         new_rotations, new_shifts = turn @ rotations, np.einsum("kij,kj->ki", turn, shifts) + step[:, 3:]
         new_cost = (weights * _squared(new_rotations, new_shifts, points, tangents)).sum(axis=1)
         better = new_cost < cost
+        settled = np.abs(cost - new_cost) <= SETTLED * cost
         rotations = np.where(better[:, None, None], new_rotations, rotations)
         shifts = np.where(better[:, None], new_shifts, shifts)
         cost, damping = np.where(better, new_cost, cost), np.where(better, damping / 10, damping * 10)
+        if settled.all():
+            break
     return rotations, shifts
 
 
