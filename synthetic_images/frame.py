@@ -130,7 +130,7 @@ def _inside_frame(geometry: FrameGeometry, pixels: Array) -> bool:
 def _behind_a_pad(geometry: FrameGeometry, pixels: Array) -> bool:
     scene = geometry.scene
     reach_mm = max(scene.pad_mm, TAPE_MM * 1.5 if geometry.image.covered else 0.0)
-    if reach_mm == 0.0:
+    if reach_mm == 0.0 or not scene.camera.fiducials:
         return False
     camera = (np.column_stack([pixels, np.ones(len(pixels))]) @ geometry.camera_from_pixel.T)[:, :2]
     marks = np.array([fiducial.xy_mm for fiducial in scene.camera.fiducials])

@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetic_images.areas import Area, Cover, bounds, coverage
+from synthetic_images.areas import Area, Cover, bounds
 from synthetic_images.film import FrameGeometry
+from synthetic_images.optics import reach_px, seen_coverage
 from synthetic_images.scene import ChipMark
 
 Array = NDArray[np.float64]
@@ -25,15 +26,16 @@ class AreaPaint:
     tone: float
     inside_frame: bool = False
 
-    def rows(self, row0: int, height: int, width_px: int) -> tuple[Window, Cover] | None:
+    def rows(self, row0: int, height: int, width_px: int, blur_px: float) -> tuple[Window, Cover] | None:
         """The window of a picture of rows row0 on that is touched, and its coverage; None where there is none."""
         col0, top, width, tall = self._bounds
-        left, right = max(col0, 0), min(col0 + width, width_px)
-        upper, lower = max(top, row0), min(top + tall, row0 + height)
+        reach = reach_px(blur_px)
+        left, right = max(col0 - reach, 0), min(col0 + width + reach, width_px)
+        upper, lower = max(top - reach, row0), min(top + tall + reach, row0 + height)
         if left >= right or upper >= lower:
             return None
         window = (slice(upper - row0, lower - row0), slice(left, right))
-        return window, coverage(self.areas, left, upper, right - left, lower - upper)
+        return window, seen_coverage(self.areas, left, upper, right - left, lower - upper, blur_px)
 
     @cached_property
     def _bounds(self) -> tuple[int, int, int, int]:
@@ -50,8 +52,8 @@ class ChipPaint:
     tone: float
     inside_frame: bool = False
 
-    def rows(self, row0: int, height: int, width_px: int) -> tuple[Window, Cover] | None:
-        """As `AreaPaint.rows`."""
+    def rows(self, row0: int, height: int, width_px: int, _: float) -> tuple[Window, Cover] | None:
+        """As `AreaPaint.rows`; a picture of a mark is blurred as it is."""
         tall, width = self.cover.shape
         left, right = max(self.col0, 0), min(self.col0 + width, width_px)
         upper, lower = max(self.row0, row0), min(self.row0 + tall, row0 + height)

@@ -1,7 +1,7 @@
 """A scene rendered: scans/*.tif and truth.json.
 
-A frame is painted strip by strip, so that its size costs time but hardly memory: area coverage without error, then the
-scanner's blur, then grain and noise, then whole grey values.
+A frame is painted strip by strip, so that its size costs time but hardly memory: areas as the scanner's optics and
+pixels see them, then grain and noise, then whole grey values.
 """
 
 import os
@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +23,6 @@ Picture = NDArray[np.float32]
 Progress = Callable[[str, int, int], None]
 
 STRIP_PX = 256
-BLUR_REACH = 5.0  # sigmas
 CHANNEL_GAINS = (1.0, 0.94, 0.8)  # a faintly warm film
 
 
@@ -65,41 +63,30 @@ def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Gr
     geometry, scene = frame.truth.geometry, background.scene
     for row0 in range(0, geometry.height_px, STRIP_PX):
         height = min(STRIP_PX, geometry.height_px - row0)
-        shares = _blurred(frame, background, row0, height)
+        shares = _painted(frame, background, row0, height)
         if scene.film.grain > 0.0:
             seed = [scene.seed, index, 3]
             shares = shares + scene.film.grain * grain(seed, row0, height, geometry.width_px, scene.film.grain_px)
         yield _digitised(shares, scene, index, row0)
 
 
-def _blurred(frame: Frame, background: Background, row0: int, height: int) -> Picture:
-    """Shares of full scale after the scanner's optics."""
-    sigma = background.scene.scanner.blur_px
-    reach = int(np.ceil(BLUR_REACH * sigma))
-    painted = _painted(frame, background, row0 - reach, height + 2 * reach)
-    if reach == 0:
-        return painted
-    size = 2 * reach + 1
-    blurred = cv2.GaussianBlur(painted, (size, size), sigma, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(blurred[reach : reach + height], np.float32)
-
-
 def _painted(frame: Frame, background: Background, row0: int, height: int) -> Picture:
-    """Shares of full scale, averaged over every pixel's area."""
+    """Shares of full scale, after the scanner's optics and averaged over every pixel's area."""
     geometry, border = frame.truth.geometry, background.scene.tones.border
+    window = (row0, height, geometry.width_px, background.scene.scanner.blur_px)
     exposed = np.zeros((height, geometry.width_px), np.float32)
     for part in frame.exposed:
-        touched = part.rows(row0, height, geometry.width_px)
+        touched = part.rows(*window)
         if touched is not None:
             exposed[touched[0]] += touched[1]
     picture = border + exposed * (background.rows(geometry, row0, height) - border)
     for paint in frame.paints:
-        touched = paint.rows(row0, height, geometry.width_px)
+        touched = paint.rows(*window)
         if touched is not None:
-            window, cover = touched
+            place, cover = touched
             if paint.inside_frame:
-                cover = cover * exposed[window]
-            picture[window] += cover * (paint.tone - picture[window])
+                cover = cover * exposed[place]
+            picture[place] += cover * (paint.tone - picture[place])
     return np.asarray(picture, np.float32)
 
 

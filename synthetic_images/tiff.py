@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from synthetic_images.scene import Scanner
+from synthetic_images.scene import Compression, Scanner
 
 Grey = NDArray[np.unsignedinteger]
 
@@ -21,27 +22,38 @@ def write_tiff(
 
     The resolution tags hold the pitch. Raises OSError where the file cannot be written.
     """
-    shape = (height_px, width_px, 3) if scanner.colour else (height_px, width_px)
-    photometric = "rgb" if scanner.colour else "miniswhite" if scanner.white_is_zero else "minisblack"
     pitch_x_um, pitch_y_um = scanner.pitch_um
-    # Strips are handed to the writer as they come; tiles are cut from them.
-    layout = {"tile": (scanner.tile_px, scanner.tile_px)} if scanner.tile_px else {"rowsperstrip": strip_px}
-    chunks = _tiles(strips, scanner.tile_px) if scanner.tile_px else strips
+    segments = _tiles(strips, scanner.tile_px) if scanner.tile_px else strips
     tifffile.imwrite(
         path,
-        chunks,
-        shape=shape,
+        (_encoded(segment, scanner.compression) for segment in segments),
+        shape=(height_px, width_px, 3) if scanner.colour else (height_px, width_px),
         dtype=np.uint16 if scanner.bit_depth == 16 else np.uint8,
-        photometric=photometric,
+        photometric="rgb" if scanner.colour else "miniswhite" if scanner.white_is_zero else "minisblack",
         compression=None if scanner.compression == "none" else scanner.compression,
-        compressionargs={"level": JPEG_LEVEL} if scanner.compression == "jpeg" else None,
+        compressionargs={"outcolorspace": "RGB"} if scanner.colour and scanner.compression == "jpeg" else None,
+        tile=(scanner.tile_px, scanner.tile_px) if scanner.tile_px else None,
+        rowsperstrip=None if scanner.tile_px else strip_px,
         resolution=(1e4 / pitch_x_um, 1e4 / pitch_y_um),
         resolutionunit="CENTIMETER",
         software="reseau",
         metadata=None,
-        maxworkers=1,
-        **layout,
     )
+
+
+def _encoded(segment: Grey, compression: Compression) -> bytes:
+    """A tile or a strip as it stands in the file; a writer that is handed pictures wants all of them at once."""
+    if compression == "jpeg":
+        space = "RGB" if segment.ndim == 3 else None
+        return bytes(imagecodecs.jpeg8_encode(segment, JPEG_LEVEL, colorspace=space, outcolorspace=space))
+    data = np.ascontiguousarray(segment).tobytes()
+    if compression == "lzw":
+        return bytes(imagecodecs.lzw_encode(data))
+    if compression == "deflate":
+        return bytes(imagecodecs.zlib_encode(data))
+    if compression == "zstd":
+        return bytes(imagecodecs.zstd_encode(data))
+    return data
 
 
 def _tiles(strips: Iterator[Grey], tile_px: int) -> Iterator[Grey]:
@@ -54,7 +66,7 @@ def _tiles(strips: Iterator[Grey], tile_px: int) -> Iterator[Grey]:
         yield from _cut(rows[:whole], tile_px)
         held = [rows[whole:]] if whole < len(rows) else []
     if held:
-        yield from _cut(np.concatenate(held), tile_px)
+        yield from _cut(held[0], tile_px)
 
 
 def _cut(rows: Grey, tile_px: int) -> Iterator[Grey]:
@@ -62,4 +74,4 @@ def _cut(rows: Grey, tile_px: int) -> Iterator[Grey]:
     padded = np.pad(rows, fill)
     for row in range(0, len(padded), tile_px):
         for column in range(0, padded.shape[1], tile_px):
-            yield np.ascontiguousarray(padded[row : row + tile_px, column : column + tile_px])
+            yield padded[row : row + tile_px, column : column + tile_px]

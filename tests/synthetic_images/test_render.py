@@ -1,0 +1,329 @@
+"""Rendered scans against their truth, by means that know nothing of the renderer: centroids and symmetry."""
+
+import json
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from synthetic_images.areas import bar, disk, ring
+from synthetic_images.render import render_scene
+from synthetic_images.scene import (
+    POSES,
+    BoardField,
+    ChipMark,
+    Compression,
+    DiskField,
+    DiskTarget,
+    Distortion,
+    DrawnMark,
+    Film,
+    FilmTransformation,
+    Scanner,
+    Scene,
+    SceneCamera,
+    SceneFiducial,
+    SceneImage,
+    Tones,
+)
+from synthetic_images.truth import Truth
+
+Array = NDArray[np.float64]
+
+CENTER_PX = 0.002  # what a rendered centre must keep to
+
+CROSS = DrawnMark((ring((0.0, 0.0), 0.5, 0.1), bar((-0.4, 0.0), (0.4, 0.0), 0.1), bar((0.0, -0.4), (0.0, 0.4), 0.1)))
+PLACES = {"a": (4.0, -4.1), "b": (-4.2, -4.0), "c": (-4.0, 4.3), "d": (3.9, 3.8)}
+CAMERA = SceneCamera(
+    "small",
+    (12.0, 12.0),
+    14.0,
+    (0.05, -0.04),
+    Distortion("torlegard", {"k3": -2.0e-4, "p1": 3.0e-5}),
+    tuple(SceneFiducial(id, xy, CROSS) for id, xy in PLACES.items()),
+)
+FIELD = DiskField(
+    tuple(
+        DiskTarget(f"{10 * i + j}", (0.55 * i, 0.55 * j, 0.1 * ((i + j) % 3)), (0.1, 0.05, 1.0))
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+    ),
+    0.12,
+    surround=0.0,
+)
+OBLIQUE = SceneImage("f", (1.2, -0.5, 3.2, 0.16, 0.34, 0.4))
+SCANNER = Scanner((40.0, 40.0), margin_mm=1.0)
+
+
+def scene(**changes: Any) -> Scene:
+    plain = Scene("test", 4, CAMERA, FIELD, (OBLIQUE,), SCANNER, Film(), Tones(contrast=0.0), pad_mm=1.2)
+    return replace(plain, **changes)
+
+
+def rendered(folder: Path, made: Scene) -> tuple[Array, Truth]:
+    """The first scan's grey values as shares of full scale, and the truth."""
+    truth = render_scene(made, folder)
+    grey = tifffile.imread(folder / "scans" / f"{made.images[0].name}.tif")
+    return np.asarray(grey, np.float64) / np.iinfo(grey.dtype).max, truth
+
+
+def centroid(picture: Array, near_px: Array, half: int) -> Array:
+    """(column, row) of the centre of gravity of what differs from the window's even surroundings."""
+    col, row = np.rint(near_px).astype(int)
+    window = picture[row - half : row + half + 1, col - half : col + half + 1]
+    weights = window - np.median(np.concatenate([window[0], window[-1], window[:, 0], window[:, -1]]))
+    rows, columns = np.indices(window.shape)
+    total = weights.sum()
+    return np.array([(weights * columns).sum() / total + col - half, (weights * rows).sum() / total + row - half])
+
+
+def test_disks_lie_where_the_truth_says(tmp_path: Path) -> None:
+    """Oblique, distorted and on a film that has moved: the centre of the ellipse, not the projected centre."""
+    film = FilmTransformation((1.002, 0.999), 3e-4, 0.01, (0.02, -0.03))
+    made = scene(images=(replace(OBLIQUE, film=film, pose="270m", turn_rad=0.01),), film=Film(deformation_um=4.0))
+    picture, truth = rendered(tmp_path, made)
+    targets = truth.frames[0].targets
+    assert len(targets) == 9
+    misses = [centroid(picture, p.figure_px, 13) - p.figure_px for p in targets.values() if not p.hidden]
+    assert len(misses) == 9
+    assert np.abs(misses).max() < CENTER_PX / 4
+    # The test could not tell the two centres apart if they were the same.
+    assert min(np.linalg.norm(p.figure_px - p.center_px) for p in targets.values()) > 10 * CENTER_PX
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_a_fiducial_lies_where_its_pose_puts_it(tmp_path: Path, pose: str) -> None:
+    made = scene(images=(replace(OBLIQUE, pose=pose, turn_rad=0.004, offset_mm=(0.11, -0.07)),))
+    picture, truth = rendered(tmp_path, made)
+    for id, (x, y) in PLACES.items():
+        position = truth.frames[0].fiducials[id].center_px
+        assert np.abs(centroid(picture, position, 18) - position).max() < CENTER_PX
+        # By the definition of the pose alone, to the small turn: mirrored first, then turned counter-clockwise.
+        z = complex(-x if pose.endswith("m") else x, y) * np.exp(1j * np.deg2rad(int(pose.rstrip("m"))))
+        expected = np.array([174.5 + (z.real + 0.11) / 0.04, 174.5 - (z.imag - 0.07) / 0.04])
+        assert np.linalg.norm(position - expected) < 0.0045 * np.hypot(x, y) / 0.04
+
+
+def test_turned_and_mirrored_scans_are_the_same_picture(tmp_path: Path) -> None:
+    """By symmetry: half a pixel wrong anywhere would show."""
+    upright, _ = rendered(tmp_path / "0", scene())
+    images = {pose: rendered(tmp_path / pose, scene(images=(replace(OBLIQUE, pose=pose),)))[0] for pose in POSES}
+    for pose, picture in images.items():
+        expected = upright[:, ::-1] if pose.endswith("m") else upright
+        expected = np.rot90(expected, int(pose.rstrip("m")) // 90)
+        assert np.abs(picture - expected).max() < 2e-5, pose
+
+
+def test_a_symmetric_mark_is_rendered_symmetrically(tmp_path: Path) -> None:
+    camera = replace(CAMERA, fiducials=(SceneFiducial("o", (0.0, 0.0), CROSS),))
+    picture, _ = rendered(tmp_path, scene(camera=camera, field=hidden_field()))
+    assert np.abs(picture - picture[::-1, ::-1]).max() < 2e-5
+    assert np.abs(picture - picture.T).max() < 2e-5
+
+
+def hidden_field() -> DiskField:
+    return DiskField((DiskTarget("1", (0.0, 0.0, 50.0)),), 0.1)
+
+
+def test_a_chip_lies_with_its_origin_on_the_mark(tmp_path: Path) -> None:
+    chip = np.zeros((41, 51))
+    rows, columns = np.indices(chip.shape)
+    chip[:] = np.exp(-((columns - 27.3) ** 2 + (rows - 18.6) ** 2) / (2 * 3.0**2))
+    mark = ChipMark(chip, 30.0, (27.3, 18.6), turn_deg=30.0)
+    camera = replace(CAMERA, fiducials=tuple(SceneFiducial(id, xy, mark) for id, xy in PLACES.items()))
+    picture, truth = rendered(tmp_path, scene(camera=camera, field=hidden_field()))
+    for position in truth.frames[0].fiducials.values():
+        assert np.abs(centroid(picture, position.center_px, 14) - position.center_px).max() < 0.01
+
+
+@pytest.mark.parametrize("compression", ["none", "lzw", "deflate", "zstd"])
+@pytest.mark.parametrize("tile_px", [0, 64, 384])
+@pytest.mark.parametrize("colour", [False, True])
+def test_files_hold_the_same_picture(tmp_path: Path, compression: Compression, tile_px: int, colour: bool) -> None:
+    scanner = replace(SCANNER, colour=colour, noise=0.01)
+    expected, _ = rendered(tmp_path / "a", scene(scanner=scanner))
+    other = replace(scanner, compression=compression, tile_px=tile_px)
+    picture, _ = rendered(tmp_path / "b", scene(scanner=other))
+    assert picture.shape == ((350, 350, 3) if colour else (350, 350))
+    assert np.array_equal(picture, expected)
+    with tifffile.TiffFile(tmp_path / "b" / "scans" / "f.tif") as file:
+        tags = file.pages.first.tags
+        assert tags["XResolution"].value[0] / tags["XResolution"].value[1] == pytest.approx(250.0)  # a cm over 40 um
+        assert ("TileWidth" in tags) == (tile_px > 0)
+
+
+@pytest.mark.parametrize("tile_px", [0, 64])
+@pytest.mark.parametrize("colour", [False, True])
+def test_jpeg_is_near(tmp_path: Path, tile_px: int, colour: bool) -> None:
+    scanner = replace(SCANNER, bit_depth=8, colour=colour, tile_px=tile_px)
+    expected, _ = rendered(tmp_path / "a", scene(scanner=scanner))
+    picture, _ = rendered(tmp_path / "b", scene(scanner=replace(scanner, compression="jpeg")))
+    assert 0.0 < np.abs(picture - expected).max() < 0.06
+
+
+def test_eight_bits_are_the_sixteen_rounded(tmp_path: Path) -> None:
+    fine, _ = rendered(tmp_path / "16", scene())
+    coarse, _ = rendered(tmp_path / "8", scene(scanner=replace(SCANNER, bit_depth=8)))
+    assert np.abs(coarse - fine).max() < 0.51 / 255
+
+
+def test_a_negative_is_the_positive_reversed(tmp_path: Path) -> None:
+    positive, truth = rendered(tmp_path / "p", scene())
+    negative, _ = rendered(tmp_path / "n", scene(scanner=replace(SCANNER, negative=True)))
+    assert np.abs(negative - (1 - positive)).max() < 2e-5
+    assert positive[tuple(np.rint(truth.frames[0].fiducials["a"].center_px[::-1]).astype(int))] > 0.5
+
+
+def test_white_is_zero_changes_the_file_and_not_the_picture(tmp_path: Path) -> None:
+    usual, _ = rendered(tmp_path / "b", scene())
+    stored, _ = rendered(tmp_path / "w", scene(scanner=replace(SCANNER, white_is_zero=True)))
+    assert np.abs(stored - (1 - usual)).max() < 2e-5
+    with tifffile.TiffFile(tmp_path / "w" / "scans" / "f.tif") as file:
+        assert file.pages.first.tags["PhotometricInterpretation"].value == 0
+
+
+def test_grain_and_noise_have_the_strength_and_the_correlation_asked_for(tmp_path: Path) -> None:
+    sigma = 1.2
+    made = scene(
+        film=Film(grain=0.03, grain_px=sigma),
+        scanner=replace(SCANNER, noise=0.01, margin_mm=5.0, blur_px=0.0),
+        field=hidden_field(),
+        camera=replace(CAMERA, fiducials=()),
+        tones=Tones(border=0.4, background=0.4, contrast=0.0),
+    )
+    picture, _ = rendered(tmp_path, made)
+    noise = picture - picture.mean()
+    assert noise.std() == pytest.approx(np.hypot(0.03, 0.01), rel=0.02)
+    beside = float((noise[:, 1:] * noise[:, :-1]).mean())
+    below = float((noise[2:] * noise[:-2]).mean())
+    # White noise after a Gaussian is correlated by exp(-d^2 / (4 sigma^2)); across the seams of the strips too.
+    assert beside == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.05)
+    assert below == pytest.approx(0.03**2 * np.exp(-4 / (4 * sigma**2)), rel=0.07)
+    seam = float((noise[255] * noise[256]).mean())
+    assert seam == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.35)
+
+
+def test_the_same_scene_gives_the_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
+    film = Film(grain=0.02, dust=5, scratches=1, hairs=1)
+    made = scene(film=film, background="terrain", tones=Tones())
+    for name, one in (("a", made), ("b", made), ("c", replace(made, seed=5))):
+        render_scene(one, tmp_path / name)
+    scans = [(tmp_path / name / "scans" / "f.tif").read_bytes() for name in "abc"]
+    assert scans[0] == scans[1]
+    assert scans[0] != scans[2]
+    assert (tmp_path / "a" / "truth.json").read_bytes() == (tmp_path / "b" / "truth.json").read_bytes()
+
+
+def test_what_cannot_be_seen_is_said(tmp_path: Path) -> None:
+    camera = replace(CAMERA, fiducials=(*CAMERA.fiducials, SceneFiducial("e", (9.0, 0.0), CROSS)))
+    targets = (
+        DiskTarget("seen", (0.0, 0.0, 0.0)),
+        DiskTarget("behind it", (0.0, 0.02, -0.5)),
+        DiskTarget("from behind", (0.4, 0.0, 0.0), (0.0, 0.0, -1.0)),
+        DiskTarget("outside", (1.33, 0.0, 0.0)),
+        DiskTarget("above", (0.0, 0.0, 9.0)),
+    )
+    made = scene(
+        camera=replace(camera, distortion=Distortion()),
+        field=DiskField(targets, 0.12),
+        images=(SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0), covered=("b",)),),
+    )
+    _, truth = rendered(tmp_path, made)
+    frame = truth.frames[0]
+    assert {id: position.hidden for id, position in frame.fiducials.items()} == {
+        "a": "",
+        "b": "covered",
+        "c": "",
+        "d": "",
+        "e": "off the scan",
+    }
+    assert {id: position.hidden for id, position in frame.targets.items()} == {
+        "seen": "",
+        "behind it": "behind another target",
+        "from behind": "faces away",
+        "outside": "not wholly inside of the exposed frame",
+    }
+    written = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))["images"]["f"]
+    assert written["fiducials"]["b"]["visible"] is False
+    assert written["fiducials"]["b"]["reason"] == "covered"
+
+
+def test_a_neighbours_marks_stand_a_frame_further(tmp_path: Path) -> None:
+    alone, _ = rendered(tmp_path / "a", scene(scanner=replace(SCANNER, margin_mm=6.0)))
+    image = replace(OBLIQUE, neighbour="right", neighbour_gap_mm=1.0)
+    both, truth = rendered(tmp_path / "b", scene(scanner=replace(SCANNER, margin_mm=6.0), images=(image,)))
+    ours = truth.frames[0].fiducials["c"].center_px
+    theirs = ours + np.array([13.0 / 0.04, 0.0])
+    assert np.abs(centroid(both, theirs, 18) - theirs).max() < CENTER_PX
+    assert np.array_equal(both[:, : int(ours[0]) + 200], alone[:, : int(ours[0]) + 200])
+
+
+def test_a_chessboards_corners_are_points_of_symmetry(tmp_path: Path) -> None:
+    board = BoardField("chessboard", 3, 2, 0.5)
+    camera = replace(CAMERA, distortion=Distortion(), principal_point_mm=(0.0, 0.0), fiducials=())
+    image = SceneImage("f", (0.5, 0.0, 3.5, 0.0, 0.0, 0.0))
+    picture, truth = rendered(tmp_path, scene(field=board, camera=camera, images=(image,)))
+    corner = truth.frames[0].targets["r0c1"].center_px
+    assert corner == pytest.approx((174.5, 174.5))
+    window = picture[155:195, 155:195]
+    assert np.abs(window - window[::-1, ::-1]).max() < 2e-5
+    assert window[0, 0] > window[0, -1]  # the square left above r0c0 is black, and so the next one is white
+
+
+def test_circle_grids_are_staggered(tmp_path: Path) -> None:
+    board = BoardField("circle-grid", 3, 4, 0.4, 0.12, asymmetric=True)
+    camera = replace(CAMERA, fiducials=())
+    picture, truth = rendered(tmp_path, scene(field=board, camera=camera))
+    targets = truth.frames[0].targets
+    misses = [centroid(picture, p.figure_px, 10) - p.figure_px for p in targets.values() if not p.hidden]
+    assert len(misses) == 12
+    assert np.abs(misses).max() < CENTER_PX
+
+
+def test_memory_does_not_grow_with_the_scans_length(tmp_path: Path) -> None:
+    peaks = []
+    for height_mm in (40.0, 160.0):
+        camera = replace(CAMERA, frame_mm=(40.0, height_mm), fiducials=())
+        made = scene(camera=camera, film=Film(grain=0.02), field=hidden_field())
+        tracemalloc.start()
+        render_scene(made, tmp_path)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
+
+
+def test_a_disk_is_no_smaller_than_it_should_be(tmp_path: Path) -> None:
+    """Seen upright from 3 m with c = 14 mm, a disk of 0.12 m has pi (0.06 / 3 * 14 / 0.04)^2 px."""
+    camera = replace(CAMERA, distortion=Distortion(), fiducials=())
+    field = DiskField((DiskTarget("1", (0.1, 0.2, 0.0)),), 0.12, surround=0.0)
+    image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
+    tones = Tones(background=0.2, target=0.8, contrast=0.0)
+    picture, truth = rendered(tmp_path, scene(camera=camera, field=field, images=(image,), tones=tones))
+    col, row = np.rint(truth.frames[0].targets["1"].center_px).astype(int)
+    window = picture[row - 14 : row + 15, col - 14 : col + 15]
+    assert (window - 0.2).sum() / 0.6 == pytest.approx(np.pi * 7.0**2, rel=5e-4)
+
+
+def test_a_failed_rendering_leaves_the_earlier_scan(tmp_path: Path) -> None:
+    render_scene(scene(), tmp_path)
+    before = (tmp_path / "scans" / "f.tif").read_bytes()
+
+    def stop(image: str, done: int, total: int) -> None:
+        raise OSError(f"{image} {done} {total}")
+
+    with pytest.raises(OSError, match="f 1 2"):
+        render_scene(scene(seed=9), tmp_path, stop)
+    assert (tmp_path / "scans" / "f.tif").read_bytes() == before
+    assert sorted(path.name for path in (tmp_path / "scans").iterdir()) == ["f.tif"]
+
+
+def test_a_polygonised_disk_is_a_disk() -> None:
+    """256 vertices: the outline is nowhere off by more than 1e-4 of the radius."""
+    outline = disk((0.0, 0.0), 1.0)[0]
+    middles = (outline + np.roll(outline, -1, axis=0)) / 2
+    assert 1.0 - np.hypot(*middles.T).min() < 1e-4
