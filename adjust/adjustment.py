@@ -245,7 +245,7 @@ def _warnings(run: _Run, cofactor: Array) -> tuple[str, ...]:
         blind = undetermined(problem, cofactor)
         if blind:
             warnings.append(
-                f"The observations say nothing about {', '.join(blind)}: the standard deviations stay as they were given."
+                f"The observations say nothing about {', '.join(blind)}: their standard deviations stay as given."
             )
     return tuple(warnings + _unseen(problem))
 

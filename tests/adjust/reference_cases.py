@@ -13,7 +13,6 @@ from adjust.network import (
     Approximations,
     Camera,
     Distortion,
-    Exterior,
     Fiducial,
     Image,
     Network,

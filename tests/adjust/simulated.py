@@ -1,0 +1,172 @@
+"""Networks simulated with formulas of their own, point by point: nothing of them comes from the code under test."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import (
+    Approximations,
+    Camera,
+    Decentering,
+    Distortion,
+    Family,
+    Fiducial,
+    Image,
+    Network,
+    ObjectPoint,
+    Observations,
+    Prior,
+    Transformation,
+)
+
+Array = NDArray[np.float64]
+
+FIDUCIALS = {"1": (106.0, -106.0), "2": (-106.0, -106.0), "3": (-106.0, 106.0), "4": (106.0, 106.0), "5": (0.0, -113.0)}
+STATIONS = ((0.0, 0.0, 1500.0), (500.0, 100.0, 1400.0), (-480.0, 80.0, 1600.0), (60.0, 520.0, 1480.0))
+ATTITUDES = ((0.01, -0.02, 0.1), (-0.08, 0.36, 1.6), (-0.05, -0.29, 3.0), (-0.35, 0.03, -1.5))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a network is simulated from. affine: comparator to camera, a1 a2 a3 b1 b2 b3, one an image."""
+
+    c: float = 153.0
+    x0: float = 0.4
+    y0: float = -0.3
+    family: Family = "torlegard"
+    decentering: Decentering = "reduced"
+    distortion: dict[str, float] = field(default_factory=lambda: {"k3": 1.5e-7, "k5": -4e-12, "p1": 8e-7, "p2": -6e-7})
+    stations: tuple[tuple[float, float, float], ...] = STATIONS
+    attitudes: tuple[tuple[float, float, float], ...] = ATTITUDES
+    mirrored: tuple[bool, ...] = (False, False, False, False)
+
+
+def rotation(omega: float, phi: float, kappa: float) -> Array:
+    """R3(kappa) R2(phi) R1(omega) as a product of three."""
+    so, co, sp, cp, sk, ck = (f(a) for a in (omega, phi, kappa) for f in (np.sin, np.cos))
+    r1 = np.array([[1, 0, 0], [0, co, so], [0, -so, co]])
+    r2 = np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
+    r3 = np.array([[ck, sk, 0], [-sk, ck, 0], [0, 0, 1]])
+    return np.asarray(r3 @ r2 @ r1)
+
+
+def torlegard(truth: Truth, x: float, y: float) -> tuple[float, float]:
+    """dx, dy at an observed camera point, with r0 = 0."""
+    p = dict.fromkeys(("k3", "k5", "k7", "p1", "p2", "p3", "p4"), 0.0) | truth.distortion
+    xr, yr = x - truth.x0, y - truth.y0
+    r2 = xr * xr + yr * yr
+    ex, ey = (x, y) if truth.decentering == "paper" else (xr, yr)
+    rad = p["k3"] * r2 + p["k5"] * r2 * r2 + p["k7"] * r2**3
+    dec = 1 + p["p3"] * r2 + p["p4"] * r2 * r2
+    dx = xr * rad + (p["p1"] * (r2 + 2 * ex * ex) + 2 * p["p2"] * ex * ey) * dec
+    dy = yr * rad + (2 * p["p1"] * ex * ey + p["p2"] * (r2 + 2 * ey * ey)) * dec
+    return dx, dy
+
+
+def camera_point(truth: Truth, image: int, xyz: Array) -> Array:
+    """Where an object point is observed in the camera frame: the ideal point plus the correction there."""
+    u, v, w = rotation(*truth.attitudes[image]) @ (xyz - np.array(truth.stations[image]))
+    ideal = np.array([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w])
+
+    xy = ideal
+    for _ in range(100):  # the corrections contract: each turn leaves less than a hundredth of the error
+        xy = ideal + np.array(torlegard(truth, xy[0], xy[1]))
+    return xy
+
+
+def affine(truth: Truth, image: int, kind: Transformation) -> Array:
+    """The film and scanner of an image: a turn, a shift, and what its kind allows beyond them."""
+    turn = 0.05 + 1.3 * image
+    c, s = np.cos(turn), np.sin(turn)
+    m = -1.0 if truth.mirrored[image] else 1.0
+    scale = 1.0 if kind == "congruent" else 1.001
+    stretch = 1.0003 if kind == "affine" else 1.0
+    return np.array([3.0 - image, scale * stretch * c, -m * scale * s, 1.0 + image, scale * s, m * scale * c])
+
+
+def field_points(rng: np.random.Generator, count: int, relief: float = 200.0) -> Array:
+    return rng.uniform([-800.0, -800.0, -relief], [800.0, 800.0, relief], (count, 3))
+
+
+def simulated(
+    rng: np.random.Generator,
+    truth: Truth | None = None,
+    kind: Transformation = "affine",
+    points: Array | None = None,
+    point_sigma: float = 0.0,
+    free: dict[str, float] | None = None,
+    noise: bool = True,
+    fiducial_sigma: float = 1.0,
+) -> tuple[Network, Approximations]:
+    """A network of one camera K, with 4 um noise on targets and 3 um on fiducials, and its rounded truth as a start.
+
+    point_sigma: of all object coordinates, 0 known, inf unknown. free: the distortion parameters that are unknown, with
+    a prior's standard deviation.
+    """
+    truth = truth or Truth()
+    points = field_points(rng, 12) if points is None else points
+    rows: list[tuple[str, str, str, Array, float]] = []
+    for i in range(len(truth.stations)):
+        film = affine(truth, i, kind)
+        inverse = np.linalg.inv([[film[1], film[2]], [film[4], film[5]]])
+        marks = [(id_, "fiducial", np.array(xy), 0.003) for id_, xy in FIDUCIALS.items()] if kind != "none" else []
+        marks += [(str(j), "target", camera_point(truth, i, xyz), 0.004) for j, xyz in enumerate(points)]
+        for id_, what, xy, sigma in marks:
+            observed = xy if kind == "none" else inverse @ (xy - film[[0, 3]])
+            rows.append((f"f{i}", id_, what, observed + noise * rng.normal(0.0, sigma, 2), sigma))
+    given = {name: Prior(value, (free or {}).get(name, 0.0)) for name, value in truth.distortion.items()}
+    spread = fiducial_sigma * noise
+    camera = Camera(
+        "K",
+        Prior(truth.c + noise * rng.normal(0.0, 1.0), 1.0),
+        Prior(truth.x0 + noise * rng.normal(0.0, 1.0), 1.0),
+        Prior(truth.y0 + noise * rng.normal(0.0, 1.0), 1.0),
+        Distortion(truth.family, given, truth.decentering),
+        {
+            id_: Fiducial(*(Prior(value + spread * rng.normal(), fiducial_sigma) for value in xy))
+            for id_, xy in FIDUCIALS.items()
+        },
+    )
+    offset = noise * point_sigma if np.isfinite(point_sigma) else 0.0
+    object_points = tuple(
+        ObjectPoint(str(j), *(Prior(float(value + offset * rng.normal()), point_sigma) for value in xyz))
+        for j, xyz in enumerate(points)
+    )
+    observations = Observations(
+        tuple(row[0] for row in rows),
+        tuple(row[1] for row in rows),
+        tuple("fiducial" if row[2] == "fiducial" else "target" for row in rows),
+        np.array([row[3] for row in rows]),
+        np.array([row[4] ** 2 * np.eye(2) for row in rows]),
+    )
+    images = tuple(Image(f"f{i}", "K", kind) for i in range(len(truth.stations)))
+    return Network((camera,), images, object_points, observations), start_of(truth, kind, points)
+
+
+def start_of(truth: Truth, kind: Transformation, points: Array) -> Approximations:
+    """The truth, coarsely rounded."""
+    films = [affine(truth, i, kind) for i in range(len(truth.stations))]
+    return Approximations(
+        interior={"K": np.array([truth.c, truth.x0, truth.y0])},
+        exterior={
+            f"f{i}": np.concatenate([np.round(station, -1), np.round(attitude, 2)])
+            for i, (station, attitude) in enumerate(zip(truth.stations, truth.attitudes, strict=True))
+        },
+        transformation={f"f{i}": np.round(film_parameters(film, kind), 3) for i, film in enumerate(films)},
+        points={str(j): xyz for j, xyz in enumerate(points)},
+        mirrored=frozenset(f"f{i}" for i, mirrored in enumerate(truth.mirrored) if mirrored),
+    )
+
+
+def film_parameters(film: Array, kind: Transformation) -> Array:
+    """The parameters of a transformation's kind, of its six coefficients."""
+    match kind:
+        case "none":
+            return np.empty(0)
+        case "congruent":
+            return np.array([film[0], film[3], np.arctan2(film[4], film[1])])
+        case "similarity":
+            return np.asarray(film[[0, 3, 1, 4]])
+        case "affine":
+            return film

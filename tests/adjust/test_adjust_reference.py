@@ -1,0 +1,132 @@
+"""The reference adjustments: an independent, dense implementation with complex-step derivatives."""
+
+import random
+
+import numpy as np
+import pytest
+from reference_cases import CAMERA, Case, approximations_of, load, network_of, own_name
+
+from adjust.adjustment import Options, adjust
+from adjust.network import Network, Observations
+from adjust.result import Adjustment
+
+CASES = (
+    "i_five_images_affine_reduced",
+    "i_five_images_affine_paper_noisefree",
+    "i_five_images_similarity_reduced",
+    "ii_juhl_3photos",
+    "iii_selfcal_mixed",
+    "iii_selfcal_all_unknown_datum_A",
+    "iv_planar_board",
+)
+
+
+def adjusted(case: Case, network: Network | None = None) -> Adjustment:
+    network = network or network_of(case)
+    return adjust(network, approximations_of(case, case["input"]["initial_approximations"]), Options())
+
+
+def differences(case: Case, result: Adjustment) -> np.ndarray:
+    """Estimates less the reference's, in the reference's a-priori standard deviations."""
+    parameters = case["result"]["parameters"]
+    return np.array(
+        [(result.value(own_name(name)) - row["value"]) / row["std_apriori"] for name, row in parameters.items()]
+    )
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_reference_case(name: str) -> None:
+    case = load(name)
+    reference = case["result"]
+    result = adjusted(case)
+
+    assert result.converged
+    counts = (result.conditions, result.unknowns, result.redundancy)
+    assert counts == (reference["conditions"], reference["unknowns"], reference["redundancy"])
+    assert np.abs(differences(case, result)).max() < 1e-8
+    sigmas = np.array(
+        [np.sqrt(result.cofactor[i, i]) for i in map(result.index, map(own_name, reference["parameters"]))]
+    )
+    expected = np.array([row["std_apriori"] for row in reference["parameters"].values()])
+    np.testing.assert_allclose(sigmas, expected, rtol=1e-9)
+    if reference["vpv"] > 1e-12:
+        posterior = [row["std_aposteriori"] for row in reference["parameters"].values()]
+        np.testing.assert_allclose([result.sigma(own_name(n)) for n in reference["parameters"]], posterior, rtol=1e-9)
+    assert result.vpv == pytest.approx(reference["vpv"], rel=1e-8, abs=1e-15)
+    v = np.array(reference["residuals_obs"] + reference["residuals_fobs"])
+    np.testing.assert_allclose(result.residuals.v_mm, v, rtol=0, atol=1e-11)
+    redundancy = reference["redundancy_numbers"][: v.size]
+    np.testing.assert_allclose(result.residuals.redundancy.ravel(), redundancy, rtol=0, atol=1e-9)
+    assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
+
+
+def test_juhls_table_of_standard_deviations() -> None:
+    """The paper's own figures, to the digits that it prints; its simulated points are others than the case's."""
+    case = load("ii_juhl_3photos")
+    result = adjusted(case)
+    for name, printed_um in case["paper_table_rmse_um"].items():
+        assert result.sigma(f"IO.{CAMERA}.{name}") == pytest.approx(printed_um, rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["i_five_images_affine_reduced", "iii_selfcal_mixed"])
+def test_the_order_of_inputs_does_not_matter(name: str) -> None:
+    case = load(name)
+    network = network_of(case)
+    order = list(range(len(network.observations)))
+    random.Random(7).shuffle(order)
+    rows = network.observations
+    shuffled = Network(
+        network.cameras,
+        network.images[::-1],
+        tuple(sorted(network.points, key=lambda point: point.id[::-1])),
+        Observations(
+            tuple(rows.image[i] for i in order),
+            tuple(rows.point[i] for i in order),
+            tuple(rows.kind[i] for i in order),
+            rows.xy_mm[order],
+            rows.covariance_mm2[order],
+        ),
+    )
+    plain, other = adjusted(case), adjusted(case, shuffled)
+    for i, unknown in enumerate(plain.names):
+        sigma = max(np.sqrt(plain.cofactor[i, i]), 1e-30)
+        assert abs(plain.values[i] - other.value(unknown)) <= 1e-9 * sigma
+    np.testing.assert_allclose(other.residuals.w, plain.residuals.w[order], atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_poor_approximations_lead_to_the_same_result(seed: int) -> None:
+    """Stations wrong by a tenth of the flying height, attitudes by 10 degrees, film by millimetres."""
+    case = load("i_five_images_affine_reduced")
+    rng = np.random.default_rng(seed)
+    start = {}
+    for name, value in case["input"]["initial_approximations"].items():
+        owner, quantity = name.split(".")
+        if owner.startswith("EO"):
+            size = 150.0 if quantity in ("X0", "Y0", "Z0") else 0.17
+        elif owner.startswith("T"):
+            size = 3.0 if quantity in ("a1", "b1") else 0.02
+        else:
+            size = 0.0
+        start[name] = value + rng.uniform(-size, size)
+    result = adjust(network_of(case), approximations_of(case, start))
+    assert result.converged
+    assert np.abs(differences(case, result)).max() < 1e-7
+    assert result.iterations < 20
+
+
+def test_history_ends_at_the_result() -> None:
+    case = load("i_five_images_affine_reduced")
+    result = adjusted(case)
+    assert len(result.history) == result.iterations
+    assert result.history[-1][0] == pytest.approx(result.vpv)
+    assert result.history[-1][1] < 1e-6
+
+
+def test_an_iteration_limit_is_told() -> None:
+    case = load("i_five_images_affine_reduced")
+    start = approximations_of(case, case["input"]["initial_approximations"])
+    result = adjust(network_of(case), start, Options(iteration_limit=2))
+    assert result.termination == "iteration limit"
+    assert not result.converged
+    assert "not final" in " ".join(result.warnings)

@@ -1,0 +1,141 @@
+"""Every derivative against complex steps, or against differences of the functions it belongs to."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from simulated import Truth, simulated
+
+from adjust.adjustment import _problem
+from adjust.distortion import PARAMETERS, image_equations
+from adjust.functions import computed_observations, derivatives
+from adjust.network import Decentering, Distortion, Family, Transformation
+from adjust.problem import Problem
+from adjust.projection import rays
+from adjust.rotation import rotation_from_angles, rotation_from_vector, vector_by_angles
+from adjust.transformation import affine_by_parameters, affine_design, affine_from_parameters, apply_affine
+
+Array = NDArray[np.float64]
+
+STEP = 1e-30
+
+PARAMETER_VALUES: dict[Family, list[float]] = {
+    "none": [],
+    "torlegard": [1e-7, -2e-12, 3e-17, 1e-6, -2e-6, 1e-5, 3e-9],
+    "brown": [1e-7, -2e-12, 3e-17, 1e-6, -2e-6, 1e-4, -3e-4],
+    "opencv": [0.1, -0.05, 0.01, -0.02, 0.03, 0.04, -0.03, 0.02, 0.01, 0.02, -0.01, 0.03, 0.002],
+    "juhl": [6.0, -4.0, 3.0, -2.0, 5.0, -4.0, 2.0, -7.0, 3.0],
+}
+
+
+@pytest.mark.parametrize("decentering", ["reduced", "paper"])
+@pytest.mark.parametrize("family", list(PARAMETERS))
+def test_image_equations_by_complex_steps(family: Family, decentering: Decentering) -> None:
+    rng = np.random.default_rng(3)
+    distortion = Distortion(family, decentering=decentering, r0_mm=135.0)
+    parts = [
+        np.array([153.0, 0.8, -0.5]),
+        np.array(PARAMETER_VALUES[family]),
+        rng.uniform(-100, 100, (6, 2)),
+        rng.uniform(-0.7, 0.7, (6, 2)),
+    ]
+    at = image_equations(distortion, *parts)
+    for number, derivative in enumerate((at.by_interior, at.by_parameters, at.by_xy, at.by_ray)):
+        for column in range(derivative.shape[2]):
+            moved = [part.astype(complex) for part in parts]
+            moved[number][..., column] += 1j * STEP
+            numeric = image_equations(distortion, *moved).value.imag / STEP
+            scale = np.abs(numeric).max() or 1.0
+            np.testing.assert_allclose(derivative[..., column], numeric, rtol=0, atol=1e-14 * scale)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        ("congruent", [3.0, -2.0, 0.4]),
+        ("similarity", [3.0, -2.0, 0.9, 0.3]),
+        ("affine", [3.0, 0.9, 0.1, -2.0, 0.2, 1.1]),
+    ],
+)
+def test_transformations_by_complex_steps(kind: Transformation, parameters: list[float], mirrored: bool) -> None:
+    xy = np.random.default_rng(1).uniform(-100, 100, (5, 2))
+    values = np.array(parameters)
+    design = affine_design(xy) @ affine_by_parameters(kind, values, mirrored)
+    affine = affine_from_parameters(kind, values, mirrored)
+    assert affine[1] * affine[5] - affine[2] * affine[4] < 0 if mirrored and kind != "affine" else affine[1] > 0
+    h = 1e-6
+    for column in range(len(values)):
+        step = h * np.eye(len(values))[column]
+        ends = [apply_affine(affine_from_parameters(kind, values + s * step, mirrored), xy) for s in (1, -1)]
+        np.testing.assert_allclose(design[..., column], (ends[0] - ends[1]) / (2 * h), rtol=1e-7, atol=1e-7)
+
+
+def test_rotation_is_the_product_of_three() -> None:
+    omega, phi, kappa = 0.3, -0.7, 2.1
+    so, co, sp, cp, sk, ck = (f(a) for a in (omega, phi, kappa) for f in (np.sin, np.cos))
+    r1 = [[1, 0, 0], [0, co, so], [0, -so, co]]
+    r2 = [[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]]
+    r3 = [[ck, sk, 0], [-sk, ck, 0], [0, 0, 1]]
+    product = np.array(r3) @ np.array(r2) @ np.array(r1)
+    np.testing.assert_allclose(rotation_from_angles(np.array([omega, phi, kappa])), product, atol=1e-15)
+
+
+def test_rotation_vector_by_angles() -> None:
+    """M(angles + d) is, to first order, the rotation by J d on top of M(angles)."""
+    angles = np.array([0.3, -0.7, 2.1])
+    jacobian = vector_by_angles(angles)
+    step = 1e-7 * np.array([0.4, -1.0, 0.7])
+    moved = rotation_from_vector(jacobian @ step) @ rotation_from_angles(angles)
+    np.testing.assert_allclose(moved, rotation_from_angles(angles + step), atol=1e-13)
+
+
+def test_rays_accept_complex_steps() -> None:
+    rng = np.random.default_rng(5)
+    rotation = rotation_from_angles(np.array([0.1, 0.2, 0.3]))
+    xyz = rng.uniform(-1, 1, (4, 3)).astype(complex)
+    xyz[:, 2] += -10 + 1j * STEP
+    ray, in_camera = rays(rotation, np.zeros(3), xyz)
+    u, v, w = in_camera.real.T
+    m = rotation[:, 2]
+    expected = np.stack([-m[0] / w + u * m[2] / w**2, -m[1] / w + v * m[2] / w**2], axis=1)
+    np.testing.assert_allclose(ray.imag / STEP, expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("kind", ["none", "congruent", "similarity", "affine"])
+def test_functions_by_differences_of_computed_observations(kind: Transformation) -> None:
+    """F(l(x), x) = 0 defines l(x), so that dl/dx = -A^-1 B: by central differences of l for every unknown."""
+    rng = np.random.default_rng(11)
+    truth = Truth(mirrored=(False, kind != "none", False, False))
+    network, start = simulated(rng, truth, kind, point_sigma=np.inf, free={"k3": np.inf, "k5": np.inf})
+    problem = _problem(network, start)
+    state = problem.start()
+    computed = computed_observations(problem, state)
+    assert computed is not None
+    at = derivatives(problem, state, computed)
+    by_unknowns = -np.linalg.solve(at.by_observation, at.by_unknowns)
+    columns = problem.columns
+    for position, name in enumerate(problem.unknowns.names):
+        size = step_of(name)
+        numeric = (moved(problem, position, size) - moved(problem, position, -size)) / (2 * size)
+        analytic = (by_unknowns * (columns == position)[:, None, :]).sum(axis=2)
+        scale = np.abs(numeric).max()
+        np.testing.assert_allclose(analytic, numeric, rtol=0, atol=3e-6 * scale + 1e-30, err_msg=name)
+
+
+def step_of(name: str) -> float:
+    """A step that moves the image by some micrometres."""
+    owner, quantity = name.split(".")[0], name.rsplit(".", 1)[1]
+    if owner in ("EO", "PT"):
+        return 1e-5 if quantity in ("omega", "phi", "kappa") else 0.01
+    if owner == "T" and quantity not in ("a1", "b1"):
+        return 1e-6
+    powers = {"k3": 1e-10, "k5": 1e-14, "k7": 1e-18, "p1": 1e-8, "p2": 1e-8, "p3": 1e-7, "p4": 1e-11}
+    return powers.get(quantity, 1e-3)
+
+
+def moved(problem: Problem, position: int, size: float) -> Array:
+    step = np.zeros(len(problem.unknowns))
+    step[position] = size
+    computed = computed_observations(problem, problem.moved(problem.start(), step))
+    assert computed is not None
+    return computed

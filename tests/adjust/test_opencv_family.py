@@ -1,0 +1,179 @@
+"""The `opencv` family against OpenCV itself, and the corrections inverted."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from simulated import Truth, camera_point, field_points, simulated
+
+from adjust.adjustment import adjust
+from adjust.distortion import PARAMETERS
+from adjust.network import Approximations, Camera, Distortion, Image, Network, ObjectPoint, Observations, Prior
+from adjust.projection import ImageModel, adjusted_image, approximate_image, camera_from_ray, ideal_from_observed
+from adjust.rotation import angles_from_rotation, rotation_from_angles
+
+Array = NDArray[np.float64]
+
+PIXEL_MM = 0.005
+SIZE_PX = np.array([4000.0, 3000.0])
+FX, FY, CX, CY = 4810.0, 4800.0, 2010.0, 1490.0
+DISTORTION = np.array([-0.12, 0.09, 0.0012, -0.0008, -0.03, 0.02, -0.01, 0.004, 0.0011, -0.0007, 0.0005, 0.0009])
+NAMES = PARAMETERS["opencv"][:12]
+FLIP = np.diag([1.0, -1.0, -1.0])  # from the camera's axes, y up and z backward, to OpenCV's
+
+
+def opencv_pixels(angles: Array, station: Array, xyz: Array) -> Array:
+    """Pixels (n, 2) by OpenCV."""
+    rotation = FLIP @ rotation_from_angles(angles)
+    rvec, _ = cv2.Rodrigues(rotation)
+    matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+    pixels, _ = cv2.projectPoints(xyz, rvec, -rotation @ station, matrix, DISTORTION)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+
+def mm(pixels: Array) -> Array:
+    """Comparator coordinates: x right, y up, origin at the centre of the top-left pixel."""
+    return pixels * np.array([PIXEL_MM, -PIXEL_MM])
+
+
+def camera(free: bool) -> Camera:
+    """The camera; its denominator is fixed, from which a numerator in the same powers can hardly be told."""
+    sigma = np.inf if free else 0.0
+    values = [*DISTORTION, FX / FY - 1.0]
+    parameters = {
+        name: Prior(value, 0.0 if name in ("k4", "k5", "k6") else sigma)
+        for name, value in zip(PARAMETERS["opencv"], values, strict=True)
+    }
+    c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
+    return Camera("D", Prior(c, sigma), Prior(x0, sigma), Prior(y0, sigma), Distortion("opencv", parameters))
+
+
+def board() -> Array:
+    x, y = np.meshgrid(np.arange(-6.0, 7.0), np.arange(-5.0, 6.0))
+    return np.stack([x.ravel() * 100, y.ravel() * 100, np.zeros(x.size)], axis=1)
+
+
+def test_projection_is_opencvs() -> None:
+    angles, station = np.array([0.2, -0.3, 0.5]), np.array([300.0, -200.0, 1500.0])
+    xyz = np.random.default_rng(2).uniform(-400, 400, (50, 3))
+    image = Image("a", "D", "none")
+    observations = Observations((), (), (), np.empty((0, 2)), np.empty((0, 2, 2)))
+    network = Network((camera(False),), (image,), (), observations)
+    start = Approximations(
+        {"D": np.array([FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM])},
+        {"a": np.concatenate([station, angles])},
+        {},
+        {},
+    )
+    projected, visible = approximate_image(network, start, "a").comparator_from_object(xyz)
+    assert visible.all()
+    np.testing.assert_allclose(projected, mm(opencv_pixels(angles, station, xyz)), atol=1e-11)
+
+
+def test_corrected_points_are_opencvs_undistorted_points() -> None:
+    rng = np.random.default_rng(4)
+    pixels = rng.uniform([0, 0], SIZE_PX, (40, 2))
+    values = np.array([*DISTORTION, FX / FY - 1.0])
+    interior = np.array([FY, CX, -CY]) * PIXEL_MM
+    ideal, found = ideal_from_observed(Distortion("opencv"), interior, values, mm(pixels))
+    matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+    normal = cv2.undistortPoints(pixels[:, None], matrix, DISTORTION, R=np.eye(3), P=np.eye(3), criteria=criteria)
+    expected = np.asarray(normal).reshape(-1, 2) * [1, -1] * interior[0] + interior[1:]
+    assert found.all()
+    np.testing.assert_allclose(ideal, expected, atol=1e-9)
+
+
+def test_adjustment_recovers_opencvs_parameters() -> None:
+    """Exact images by OpenCV, its parameters and fx/fy free: estimated as they went in."""
+    rng = np.random.default_rng(6)
+    plane = board()
+    relief = plane + np.stack([0 * plane[:, 0], 0 * plane[:, 0], 150 * np.sin(plane[:, 0] / 70)], axis=1)
+    poses = [(np.array([a, b, k]), np.array([1200 * b, -1200 * a, 1150.0]))
+             for a, b, k in [(0, 0, 0), (0.4, 0.1, 1.5), (-0.4, 0.2, 3.0), (0.1, 0.45, -1.5), (-0.1, -0.4, 0.7)]]  # fmt: skip
+    rows = [
+        (f"i{i}", str(j), xy) for i, pose in enumerate(poses) for j, xy in enumerate(mm(opencv_pixels(*pose, relief)))
+    ]
+    network = Network(
+        (camera(True),),
+        tuple(Image(f"i{i}", "D", "none") for i in range(len(poses))),
+        tuple(ObjectPoint(str(j), *map(Prior, map(float, xyz))) for j, xyz in enumerate(relief)),
+        Observations(
+            tuple(row[0] for row in rows),
+            tuple(row[1] for row in rows),
+            ("target",) * len(rows),
+            np.array([row[2] for row in rows]),
+            np.broadcast_to(0.0005**2 * np.eye(2), (len(rows), 2, 2)),
+        ),
+    )
+    c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
+    start = Approximations(
+        {"D": np.array([c * 1.01, x0 + 0.1, y0 - 0.1])},
+        {f"i{i}": np.concatenate([s + rng.uniform(-10, 10, 3), a + rng.uniform(-0.02, 0.02, 3)])
+         for i, (a, s) in enumerate(poses)},
+        {}, {},
+    )  # fmt: skip
+    result = adjust(network, start)
+    assert result.converged
+    assert result.vpv < 1e-12
+    expected = dict(zip(NAMES, DISTORTION, strict=True)) | {"c": c, "x0": x0, "y0": y0, "b1": FX / FY - 1}
+    for name, value in expected.items():
+        i = result.index(f"IO.D.{name}")
+        assert result.values[i] == pytest.approx(value, abs=1e-3 * np.sqrt(result.cofactor[i, i]))
+
+
+def test_torlegard_is_inverted() -> None:
+    truth = Truth()
+    xyz = field_points(np.random.default_rng(1), 30)
+    angles, station = np.array(truth.attitudes[1]), np.array(truth.stations[1])
+    model = ImageModel(
+        Distortion("torlegard"),
+        np.array([truth.c, truth.x0, truth.y0]),
+        np.array([truth.distortion.get(name, 0.0) for name in PARAMETERS["torlegard"]]),
+        rotation_from_angles(angles),
+        station,
+        np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+    )
+    observed, visible = model.camera_from_object(xyz)
+    assert visible.all()
+    expected = np.array([camera_point(truth, 1, point) for point in xyz])
+    np.testing.assert_allclose(observed, expected, atol=1e-10)
+    ideal, found = model.ideal_from_observed(observed)
+    u, v, w = model.rotation @ (xyz - station).T
+    assert found.all()
+    np.testing.assert_allclose(
+        ideal, np.stack([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w], axis=1), atol=1e-10
+    )
+
+
+def test_what_has_no_image_is_told() -> None:
+    """Behind the camera, and beyond the radius where a polynomial folds the image over."""
+    fold = Distortion("torlegard")
+    parameters = np.array([4e-5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # x - k3 x³ turns back at 91 mm
+    _, found = camera_from_ray(fold, np.array([100.0, 0.0, 0.0]), parameters, np.array([[0.3, 0.0], [2.0, 0.0]]))
+    assert list(found) == [True, False]
+    model = ImageModel(
+        Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0), np.eye(3), np.zeros(3), np.array([0.0, 1, 0, 0, 0, 1])
+    )
+    _, visible = model.comparator_from_object(np.array([[0.0, 0.0, -5.0], [0.0, 0.0, 5.0], [1.0, 0.0, 0.0]]))
+    assert list(visible) == [True, False, False]
+
+
+def test_angles_of_any_rotation() -> None:
+    for matrix in Rotation.random(50, rng=np.random.default_rng(8)).as_matrix():
+        np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(matrix)), matrix, atol=1e-12)
+    locked = rotation_from_angles(np.array([0.4, np.pi / 2, 0.3]))
+    np.testing.assert_allclose(rotation_from_angles(angles_from_rotation(locked)), locked, atol=1e-12)
+
+
+def test_adjusted_image_predicts_its_observations() -> None:
+    xyz = field_points(np.random.default_rng(1), 12)
+    network, start = simulated(np.random.default_rng(9), points=xyz, noise=False)
+    result = adjust(network, start)
+    predicted, visible = adjusted_image(result, "f2").comparator_from_object(xyz)
+    observations = network.observations
+    keys = zip(observations.image, observations.kind, strict=True)
+    rows = [row for row, key in enumerate(keys) if key == ("f2", "target")]
+    assert visible.all()
+    np.testing.assert_allclose(predicted, observations.xy_mm[rows], atol=1e-8)
