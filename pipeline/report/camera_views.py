@@ -6,6 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from adjust.distortion import PARAMETERS
+from pipeline.adjustment_file import Covariance
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image
@@ -57,6 +58,7 @@ class CameraView:
     images: int
     radius_mm: float
     parameters: list[ParameterRow]
+    in_given_figure: list[tuple[str, str, str]]
     correlations: list[tuple[str, str, float]]
     curves: Markup | None
     curve_rows: list[CurveRow]
@@ -77,30 +79,26 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
     images = [image for image in stored["images"] if camera_of(data, image) == name]
     by_image = residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
-    radius_mm = _observed_radius_mm(camera, rows)
-    form = (
-        fiducials.figure(name, camera["fiducials"], data.covariance) if _is_solved(data) and data.covariance else None
-    )
-    curve = _curves(data, name, camera, radius_mm)
+    covariance = data.covariance if stored["converged"] else None
+    radius_mm, frame_mm = _observed_radius_mm(camera, rows), data.frame_mm.get(name)
+    form = fiducials.figure(name, camera, covariance) if covariance else None
+    curve = _curves(name, camera, covariance, radius_mm, frame_mm) if covariance else None
     check: Json | None = data.check["cameras"].get(name) if data.check else None
     return CameraView(
         name=name,
         images=len(images),
         radius_mm=radius_mm,
         parameters=parameter_rows(name, camera, stored["sigma0"] or 1.0, radius_mm),
-        correlations=high_correlations(name, camera, data.covariance) if _is_solved(data) and data.covariance else [],
+        in_given_figure=_in_given_figure(form) if form else [],
+        correlations=high_correlations(name, camera, covariance) if covariance else [],
         curves=lens.curves_plot(curve, radius_mm) if curve else None,
         curve_rows=_curve_rows(curve) if curve else [],
         fiducials=[_fiducial_row(id, fiducial, form) for id, fiducial in camera["fiducials"].items()],
         figure=fiducials.figure_plot(form) if form else None,
-        vectors=_vectors(rows, data.frame_mm.get(name)),
+        vectors=_vectors(rows, frame_mm),
         check=check,
         check_rows=[_check_row(row) for row in check.get("rows", ())] if check else [],
     )
-
-
-def _is_solved(data: ReportData) -> bool:
-    return bool(data.adjustment and data.adjustment["converged"])
 
 
 def _observed_radius_mm(camera: Json, rows: list[Json]) -> float:
@@ -113,14 +111,21 @@ def _observed_radius_mm(camera: Json, rows: list[Json]) -> float:
     return float(np.hypot(*offsets.T).max())
 
 
-def _curves(data: ReportData, name: str, camera: Json, radius_mm: float) -> lens.Curves | None:
+def _in_given_figure(form: fiducials.Figure) -> list[tuple[str, str, str]]:
+    """c, x0' and y0' with their sigmas when the fiducials stand where they were given."""
+    rows = zip(("c", "x₀′", "y₀′"), form.interior_mm.tolist(), form.interior_sigma_mm.tolist(), strict=True)
+    return [(symbol, *value_and_sigma(value, sigma)) for symbol, value, sigma in rows]
+
+
+def _curves(
+    name: str, camera: Json, covariance: Covariance, radius_mm: float, frame_mm: tuple[float, float] | None
+) -> lens.Curves | None:
     """Out to the frame's corner where its size is known, else to the outermost target."""
-    if not PARAMETERS[camera["distortion"]["family"]] or data.covariance is None or not _is_solved(data):
-        return None
-    frame_mm = data.frame_mm.get(name)
     corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
     largest = max(radius_mm, corner_mm)
-    return lens.curves(lens.lens(name, camera), data.covariance, largest) if largest > 0.0 else None
+    if not PARAMETERS[camera["distortion"]["family"]] or largest == 0.0:
+        return None
+    return lens.curves(lens.lens(name, camera), covariance, largest)
 
 
 def _curve_rows(curve: lens.Curves) -> list[CurveRow]:

@@ -1,4 +1,4 @@
-"""Fiducial marks, given against estimated: in the camera's datum, and as a figure that is free of the datum."""
+"""Fiducial marks, given against estimated, as a figure that is free of the datum in which the camera stands."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,35 +21,51 @@ MARGIN_PX = 58.0
 
 @dataclass(frozen=True)
 class Figure:
-    """Estimated less given fiducials, less their own shift, rotation and scale: the figure's change of form.
+    """The camera, laid over its given fiducials by the shift, rotation and scale that fit them best.
 
-    ids (n); given_mm (n, 2); change_um (n, 2); covariance_um2 (n, 2, 2) of each mark's change.
+    ids (n); given_mm (n, 2); change_um (n, 2): what is left of estimated less given; covariance_um2 (n, 2, 2) of each
+    mark's change. interior_mm (3,): c, x0', y0' laid over along with the marks, interior_sigma_mm (3,).
     """
 
     ids: tuple[str, ...]
     given_mm: Array
     change_um: Array
     covariance_um2: Array
+    interior_mm: Array
+    interior_sigma_mm: Array
 
 
-def figure(camera: str, fiducials: Json, covariance: Covariance) -> Figure | None:
-    """The change of form of a camera's fiducials; None with fewer than three, whose form has nothing to say.
+def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
+    """A camera's entry of adjustment.json, free of its datum; None with fewer than three given fiducials.
 
-    The datum that the fiducials stand in is itself uncertain, by a shift, a rotation and a scale that all of them
-    share; the S-transformation (Baarda 1973), C' = S C S' with S = I - G (G'G)^-1 G', takes it out of values and
-    covariance.
+    The datum that the fiducials stand in is itself uncertain, by a shift, a rotation and a scale that all of them and
+    the interior orientation share. Values are laid over the given marks by a Helmert transformation, and the covariance
+    by the S-transformation (Baarda 1973) C' = S C S' with S = I - G (G_f'G_f)^-1 G_f', G_f the rows of the marks.
     """
-    known = {id: fiducial for id, fiducial in fiducials.items() if _given(fiducial) is not None}
+    known = {id: fiducial for id, fiducial in camera["fiducials"].items() if _given(fiducial) is not None}
     if len(known) < 3:
         return None
+    count = 2 * len(known)
+    point = camera["principal_point_mm"]
+    c, x0, y0 = (q["value"] for q in (camera["principal_distance_mm"], point["x"], point["y"]))
     given = np.array([_given(fiducial) for fiducial in known.values()])
     estimated = np.array([(fiducial["x_mm"]["value"], fiducial["y_mm"]["value"]) for fiducial in known.values()])
-    names = [f"FID.{camera}.{id}.{axis}" for id in known for axis in "xy"]
-    s = _without_datum(given)
-    reduced = 1e6 * s @ covariance.of(names) @ s.T
-    blocks = reduced.reshape(len(known), 2, len(known), 2)
+    turn_and_scale, shift = _helmert(estimated, given)
+
+    marks = [f"FID.{name}.{id}.{axis}" for id in known for axis in "xy"]
+    s = _s_transformation(estimated, c, (x0, y0))
+    reduced = s @ covariance.of([*marks, *(f"IO.{name}.{each}" for each in ("c", "x0", "y0"))]) @ s.T
+    blocks = reduced[:count, :count].reshape(len(known), 2, len(known), 2)
     at = np.arange(len(known))
-    return Figure(tuple(known), given, 1e3 * (s @ (estimated - given).ravel()).reshape(-1, 2), blocks[at, :, at, :])
+    principal_point = turn_and_scale @ (x0, y0) + shift
+    return Figure(
+        ids=tuple(known),
+        given_mm=given,
+        change_um=1e3 * (estimated @ turn_and_scale.T + shift - given),
+        covariance_um2=1e6 * blocks[at, :, at, :],
+        interior_mm=np.array([c * np.sqrt(np.linalg.det(turn_and_scale)), *principal_point]),
+        interior_sigma_mm=np.sqrt(np.maximum(np.diag(reduced)[count:], 0.0)),
+    )
 
 
 def figure_plot(change: Figure) -> Markup:
@@ -91,14 +107,31 @@ def _given(fiducial: Json) -> tuple[float, float] | None:
     return None if x is None or y is None else (x["value"], y["value"])
 
 
-def _without_datum(xy: Array) -> Array:
-    """(2n, 2n) the projector that takes shift, rotation and scale out of changes of the points (n, 2)."""
-    x, y = (xy - xy.mean(axis=0)).T
-    ones, zeros = np.ones(len(xy)), np.zeros(len(xy))
-    columns = [(ones, zeros), (zeros, ones), (-y, x), (x, y)]
-    g = np.stack([np.stack(column, axis=1).ravel() for column in columns], axis=1)
-    q, _ = np.linalg.qr(g)
-    return np.asarray(np.eye(2 * len(xy)) - q @ q.T)
+def _helmert(source: Array, target: Array) -> tuple[Array, Array]:
+    """Matrix (2, 2) of rotation and scale, and shift (2,), that lay the source points over the target points best."""
+    z, w = source @ (1.0, 1.0j), target @ (1.0, 1.0j)
+    centred = z - z.mean()
+    factor = complex(np.vdot(centred, w) / np.vdot(centred, centred).real)
+    matrix = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+    return matrix, target.mean(axis=0) - matrix @ source.mean(axis=0)
+
+
+def _s_transformation(marks: Array, c: float, principal_point: tuple[float, float]) -> Array:
+    """(2n + 3, 2n + 3): takes the marks' common shift, rotation and scale out of marks, c, x0' and y0'."""
+    center = marks.mean(axis=0)
+    x, y = (np.vstack([marks, principal_point]) - center).T
+    ones, zeros = np.ones(len(x)), np.zeros(len(x))
+    moved = [(ones, zeros, 0.0), (zeros, ones, 0.0), (-y, x, 0.0), (x, y, c)]
+    g = np.stack([_in_order(dx, dy, dc) for dx, dy, dc in moved], axis=1)
+    of_marks = g.copy()
+    of_marks[2 * len(marks) :] = 0.0
+    return np.asarray(np.eye(len(g)) - g @ np.linalg.solve(of_marks.T @ of_marks, of_marks.T))
+
+
+def _in_order(dx: Array, dy: Array, dc: float) -> Array:
+    """Changes of the marks and, last, of the principal point, in the order of the covariance."""
+    changes = np.stack([dx, dy], axis=1)
+    return np.concatenate([changes[:-1].ravel(), [dc], changes[-1]])
 
 
 def _ellipse_axes(covariance: Array) -> tuple[Array, Array]:

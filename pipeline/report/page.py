@@ -51,6 +51,7 @@ def _context(data: ReportData) -> dict[str, Any]:
         "adjustment": adjustment,
         "check": data.check,
         "frames": frame_views(data, shots),
+        "has_pictures": data.thumbnail is not None,
         "cameras": camera_views(data),
         "fractions": list(_fractions(shots)),
         "least_marks": LEAST_MARKS,

@@ -111,11 +111,11 @@ def scale_bar(on: Plane, px_per_um: float) -> Markup:
     y = on.height_px + 8.0
     bars = Markup("")
     for x, length, text in (
-        (MARGIN_PX, um * px_per_um, f"{um:g} µm"),
-        (on.width_px / 2.0, mm * on.px_per_mm, f"{mm:g} mm"),
+        (MARGIN_PX, um * px_per_um, f"{um:g} µm (vectors)"),
+        (on.width_px / 2.0, mm * on.px_per_mm, f"{mm:g} mm (frame)"),
     ):
         bars += svg.line((x, x, x, x + length, x + length, x + length), (y - 3, y + 3, y, y, y - 3, y + 3), "bar")
-        bars += svg.words(x + length + 6.0, y + 4.0, text + (" residual" if "µ" in text else " in the camera"), "tick")
+        bars += svg.words(x + length + 6.0, y + 4.0, text, "tick")
     return bars
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
+import made_up_calibration
 import numpy as np
 import pytest
 
@@ -12,6 +13,11 @@ from adjust.network import ObjectPoint, Prior
 from adjust.result import Adjustment, Residuals
 from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
 from pipeline.errors import InputError
+
+
+@pytest.fixture
+def adjustment() -> Adjustment:
+    return made_up_calibration.adjustment()
 
 
 @pytest.fixture
@@ -80,9 +86,9 @@ def test_w_is_the_larger_of_the_two_axes_with_its_sign(adjustment: Adjustment, t
     assert [row["w"] for row in rows[:3]] == [-2.5, 0.5, None]
 
 
-def test_a_singular_result_has_its_causes_no_sigmas_and_no_nan(singular_adjustment: Adjustment, tmp_path: Path) -> None:
+def test_a_singular_result_has_its_causes_no_sigmas_and_no_nan(tmp_path: Path) -> None:
     path = tmp_path / "adjustment.json"
-    write_adjustment(singular_adjustment, path)
+    write_adjustment(made_up_calibration.singular_adjustment(), path)
 
     def refuse(constant: str) -> NoReturn:
         raise AssertionError(f"{constant} is no JSON")

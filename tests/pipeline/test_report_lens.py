@@ -141,16 +141,20 @@ def fiducials(estimated: Array) -> Json:
 
 def changed(estimated: Array, matrix: Array) -> Figure:
     names = tuple(f"FID.A.{i}.{axis}" for i in range(len(GIVEN)) for axis in "xy")
-    form = figure("A", fiducials(estimated), Covariance(names, estimated.ravel(), matrix))
+    form = figure(
+        "A", camera("none") | {"fiducials": fiducials(estimated)}, Covariance(names, estimated.ravel(), matrix)
+    )
     assert form is not None
     return form
 
 
 def test_a_shift_a_turn_and_a_scale_change_no_form() -> None:
-    angle = 1e-4
+    angle = 0.02
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     form = changed(1.0002 * GIVEN @ turn.T + (0.3, -0.4), np.eye(10))
-    np.testing.assert_allclose(form.change_um, 0.0, atol=2e-3)
+    np.testing.assert_allclose(form.change_um, 0.0, atol=1e-9)
+    expected = (np.array([0.3, -0.2]) - (0.3, -0.4)) @ turn / 1.0002
+    np.testing.assert_allclose(form.interior_mm, [153.0 / 1.0002, *expected], rtol=1e-12)
 
 
 def test_an_uncertain_datum_leaves_the_ellipses_as_they_are() -> None:
@@ -176,4 +180,4 @@ def test_one_displaced_mark_is_the_one_that_changed_most() -> None:
 
 def test_two_marks_have_no_form() -> None:
     few = dict(list(fiducials(GIVEN).items())[:2])
-    assert figure("A", few, Covariance((), np.empty(0), np.empty((0, 0)))) is None
+    assert figure("A", camera("none") | {"fiducials": few}, Covariance((), np.empty(0), np.empty((0, 0)))) is None

@@ -5,10 +5,27 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import made_up_calibration
 import pytest
 
 from measure.status import MEANING, Status
 from pipeline.report import Problem, ReportData, render_report, write_report
+
+
+@pytest.fixture
+def measured() -> ReportData:
+    return made_up_calibration.measured()
+
+
+@pytest.fixture
+def adjusted() -> ReportData:
+    return made_up_calibration.adjusted()
+
+
+@pytest.fixture
+def singular() -> ReportData:
+    return made_up_calibration.singular()
+
 
 VOID = {"meta", "br", "img", "hr", "input", "link"}
 
@@ -97,7 +114,7 @@ def test_the_statuses_are_those_of_the_table(adjusted: ReportData) -> None:
 
 
 def test_no_check_stands_where_the_redundancy_is_zero(adjusted: ReportData) -> None:
-    assert re.search(r"control no check 0\.00 0\.00 0\.0: no check", rendered(adjusted).text)
+    assert re.search(r"control given object coordinates no check 0\.00 0\.00 0\.0: no check", rendered(adjusted).text)
 
 
 def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted: ReportData) -> None:
@@ -118,7 +135,7 @@ def test_only_measured(measured: ReportData) -> None:
 
 def test_given_coordinates_without_scans(adjusted: ReportData) -> None:
     text = rendered(replace(adjusted, measurement=None, thumbnail=None)).text
-    assert "no picture" in text
+    assert "There are no pictures: the scans are not at hand." in text
     assert "No pixel positions are known: the comparator coordinates were given." in text
 
 

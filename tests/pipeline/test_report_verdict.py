@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import made_up_calibration
 import numpy as np
 import pytest
 
@@ -12,6 +13,16 @@ from pipeline.report.fractions import fraction_test
 from pipeline.report.verdict import critical_w, sigma0_bounds, suspects
 
 Json = dict[str, Any]
+
+
+@pytest.fixture
+def measured() -> ReportData:
+    return made_up_calibration.measured()
+
+
+@pytest.fixture
+def adjusted() -> ReportData:
+    return made_up_calibration.adjusted()
 
 
 def test_the_bounds_of_sigma0_are_those_of_the_chi_square_table() -> None:
