@@ -11,11 +11,11 @@ Array = NDArray[np.float64]
 
 def tag(name: str, *content: str, **attributes: object) -> Markup:
     """One element; an underscore in an attribute's name stands for a hyphen, one at its end (class_) for nothing."""
-    pairs = Markup("").join(
-        Markup(' {}="{}"').format(key.rstrip("_").replace("_", "-"), _text(value)) for key, value in attributes.items()
+    pairs = "".join(
+        f' {key.rstrip("_").replace("_", "-")}="{escape(_text(value))}"' for key, value in attributes.items()
     )
-    inside = Markup("").join(escape(item) for item in content)
-    return Markup("<{0}{1}>{2}</{0}>").format(Markup(name), pairs, inside)
+    inside = "".join(str(escape(item)) for item in content)
+    return Markup(f"<{name}{pairs}>{inside}</{name}>")
 
 
 def picture(width: float, height: float, title: str, *content: Markup, class_: str = "plot") -> Markup:
