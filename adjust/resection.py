@@ -192,7 +192,7 @@ def _triad(points: Array) -> Array:
 
 def _squared(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
     """Squared residuals (k, n) in units of the principal distance."""
-    camera = np.einsum("kij,nj->kni", rotations, points) + shifts[:, None]
+    camera = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
     depth = np.where(camera[..., 2] < 0, -camera[..., 2], np.nan)
     squared = ((camera[..., :2] / depth[..., None] - tangents) ** 2).sum(axis=2)
     return np.asarray(np.minimum(np.nan_to_num(squared, nan=BEHIND), BEHIND))
@@ -253,7 +253,7 @@ def _normal_equations(
     rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
 ) -> tuple[Array, Array]:
     """J'WJ (k, 6, 6) and J'Wr (k, 6) for a small turn of the camera and a shift in its frame."""
-    camera = np.einsum("kij,nj->kni", rotations, points) + shifts[:, None]
+    camera = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
     u, v, w = np.moveaxis(camera, 2, 0)
     w = np.minimum(w, -1e-9)
     p, q = -u / w, -v / w
@@ -262,8 +262,9 @@ def _normal_equations(
     cross = np.stack([np.stack([zero, w, -v], 2), np.stack([-w, zero, u], 2), np.stack([v, -u, zero], 2)], 2)
     jacobian = np.concatenate([by_shift @ cross, by_shift], axis=3)
     residual = tangents - np.stack([p, q], 2)
-    weighted = jacobian * weights[..., None, None]
-    return np.einsum("kndi,kndj->kij", weighted, jacobian), np.einsum("kndi,knd->ki", weighted, residual)
+    k, n = w.shape
+    weighted = (jacobian * weights[..., None, None]).reshape(k, 2 * n, 6).swapaxes(1, 2)
+    return weighted @ jacobian.reshape(k, 2 * n, 6), (weighted @ residual.reshape(k, 2 * n, 1))[..., 0]
 
 
 def _robust_sigma(squared: Array) -> float:
