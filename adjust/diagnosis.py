@@ -20,6 +20,7 @@ SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below w
 WEAK = 1e-4  # below which noise makes the solution
 INVOLVED = 0.01  # part of a null vector's largest component that is worth a name
 PURE = 1e-5  # part that a name must have in an exact null direction, beyond what earlier names took
+SETTLED = 3.0  # how much more than observations priors must weigh to make a weak direction theirs
 MIXED = 0.05  # the same in a direction that is seen just a little, where everything plays a small part
 INSIDE = 1e-6  # what a known direction may stick out of the null space: rounding
 NAMES_SHOWN = 3  # more names of one kind than this are shown as one, with a star
@@ -29,14 +30,24 @@ UNDETERMINED = 0.99  # posterior over prior standard deviation above which the o
 def singular_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
     """The null directions of the factor of a state, at its computed observations; none where it is regular."""
     within = _within_images(problem, free, factor)
-    return within or _named(problem, state, free, factor, _null_space(factor, 0.0, SINGULAR), PURE)
+    return within or _named(problem, state, free, factor, _null_space(factor, SINGULAR)[0], PURE)
 
 
 def weak_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
-    """What is seen so badly that noise decides; the factor is to be that without the cameras' priors."""
+    """What the observations hardly see, and priors do not settle: there the solution is made by noise.
+
+    The factor is to be that without the cameras' priors. Of all directions below WEAK those are told in which these
+    priors weigh less than SETTLED times what the observations do.
+    """
     if _within_images(problem, free, factor):
         return ()
-    return _named(problem, state, free, factor, _null_space(factor, SINGULAR, WEAK), MIXED)
+    hardly, told = _null_space(factor, WEAK)
+    positions = [*problem.unknowns.camera.values(), *problem.unknowns.fiducial.values()]
+    sigma = np.where(np.isin(free, np.concatenate(positions)), problem.unknowns.sigma[free], np.inf)
+    of_unit_weight = hardly / np.maximum(told, SINGULAR)
+    _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)
+    unsettled = of_unit_weight @ right[weight < SETTLED].T
+    return _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
 
 
 def undetermined(problem: Problem, cofactor: Array) -> tuple[str, ...]:
@@ -85,19 +96,22 @@ def _within_images(problem: Problem, free: Indices, factor: Factor) -> tuple[Nul
     return tuple(directions)
 
 
-def _null_space(factor: Factor, above: float, below: float) -> Array:
-    """Orthonormal vectors (n, d) of all scaled unknowns, whose singular values over the largest lie in a range."""
+def _null_space(factor: Factor, below: float) -> tuple[Array, Array]:
+    """Orthonormal vectors (n, d) of all scaled unknowns that are hardly seen, and how much they are seen (d,).
+
+    These are the vectors whose singular values are below a part of the largest of all.
+    """
     count = factor.shared_count
     if count == 0 or _surely_above(factor.triangle, below):
-        return np.zeros((len(factor.scale), 0))
+        return np.zeros((len(factor.scale), 0)), np.zeros(0)
     _, singular, right = np.linalg.svd(factor.triangle)
-    ratio = singular / singular[0]
-    shared = right[(ratio > above) & (ratio <= below)].T
-    vectors = np.zeros((len(factor.scale), shared.shape[1]))
-    vectors[:count] = shared
+    hardly = singular <= below * singular[0]
+    vectors = np.zeros((len(factor.scale), int(hardly.sum())))
+    vectors[:count] = right[hardly].T
     for block in factor.blocks:
-        vectors[block.own] = _followed(block, shared)
-    return np.linalg.qr(vectors)[0]
+        vectors[block.own] = _followed(block, vectors[:count])
+    lengths = np.linalg.norm(vectors, axis=0)
+    return np.linalg.qr(vectors)[0], singular[hardly] / lengths
 
 
 def _surely_above(triangle: Array, ratio: float) -> bool:
@@ -124,7 +138,7 @@ def _named(
     functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
     lengths = np.linalg.norm(functionals, axis=1, keepdims=True)
     seen = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest
-    chosen = _independent_rows(seen, part)
+    chosen = _independent_rows(seen, part, np.array([lead.rank for lead in leads], dtype=np.intp))
     vectors = still @ np.linalg.pinv(seen[chosen])
     left = still @ _complement(seen[chosen])
     sentences += [(leads[i].cause, leads[i].remedy) for i in chosen]
@@ -146,7 +160,7 @@ def _datum_part(
     count = int((cosines > 1.0 - INSIDE).sum())
     if count < datum.free.shape[1]:
         return np.zeros((len(free), 0)), [], null
-    chosen = _independent_rows(datum.free, PURE)
+    chosen = _independent_rows(datum.free, PURE, np.arange(7))
     vectors = motion @ np.linalg.pinv(datum.free[chosen])
     return vectors, [datum_sentence(i) for i in chosen], null @ left[:, count:]
 
@@ -158,18 +172,21 @@ def _with_points_still(problem: Problem, free: Indices, datum: Array, vectors: A
     return np.asarray(vectors - datum @ amounts)
 
 
-def _independent_rows(rows: Array, part: float) -> list[int]:
-    """The first rows (m, d) that are linearly independent of those before them, up to d."""
+def _independent_rows(rows: Array, part: float, ranks: Indices) -> list[int]:
+    """Independent rows (m, d), up to d: those of the lowest rank first, of equals that which sticks out most."""
     chosen: list[int] = []
-    basis = np.zeros((0, rows.shape[1]))
-    for i, row in enumerate(rows):
-        rest = row - (basis @ row) @ basis
-        rest = rest - (basis @ rest) @ basis
-        length = np.linalg.norm(rest)
-        if length > part and len(chosen) < rows.shape[1]:
-            chosen.append(i)
-            basis = np.vstack([basis, rest / length])
-    return chosen
+    rest = rows.copy()
+    for rank in np.unique(ranks):
+        while len(chosen) < rows.shape[1]:
+            lengths = np.where(ranks == rank, np.linalg.norm(rest, axis=1), 0.0)
+            first = int(np.argmax(lengths))
+            if lengths[first] <= part:
+                break
+            chosen.append(first)
+            unit = rest[first] / lengths[first]
+            rest = rest - np.outer(rest @ unit, unit)
+            rest[first] = 0.0
+    return sorted(chosen)
 
 
 def _complement(rows: Array) -> Array:

@@ -13,8 +13,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Lead:
-    """What a null direction is called after: a functional (n,) of the unknowns that it changes, cause and remedy."""
+    """What a null direction is called after: a functional (n,) of the unknowns that it changes, cause and remedy.
 
+    rank: of several leads that would do, that of the lowest rank gives the name.
+    """
+
+    rank: int
     functional: Array
     cause: str
     remedy: str
@@ -41,7 +45,7 @@ def datum_sentence(number: int) -> tuple[str, str]:
 
 
 def camera_leads(problem: Problem, state: State) -> list[Lead]:
-    """What moves with fiducials and interior orientation, in the order in which null directions are named."""
+    """What a null direction of fiducials (rank 0), interior orientation (1) or distortion (2) is called after."""
     leads = []
     for name, positions in problem.unknowns.camera.items():
         leads += _fiducial_leads(problem, state, name)
@@ -101,7 +105,7 @@ def _fiducial_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
     for dx, dy, cause, known in texts:
         functional = np.zeros(len(problem.unknowns))
         functional[positions] = np.stack([dx, dy], axis=1)
-        leads.append(Lead(functional, cause, f"Give a standard deviation to {known}."))
+        leads.append(Lead(0, functional, cause, f"Give a standard deviation to {known}."))
     return leads
 
 
@@ -131,4 +135,7 @@ def _interior_leads(problem: Problem, camera: str, positions: NDArray[np.intp]) 
         for name in PARAMETERS[problem.network.camera_by_name[camera].distortion.family]
     ]
     unit = np.eye(len(problem.unknowns))[positions]
-    return [Lead(functional, cause, remedy) for functional, (cause, remedy) in zip(unit, texts, strict=True)]
+    return [
+        Lead(1 if number < 3 else 2, functional, cause, remedy)
+        for number, (functional, (cause, remedy)) in enumerate(zip(unit, texts, strict=True))
+    ]

@@ -1,0 +1,162 @@
+"""Singular networks: as many null directions as an independent rank test finds, each named with cause and remedy."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference_cases import CAMERA, Case, approximations_of, load, network_of
+from simulated import Truth, field_points, simulated
+
+from adjust.adjustment import Options, adjust
+from adjust.network import Network, Observations
+from adjust.result import Adjustment
+
+SINGULAR = ("K2D_vert0", "K3D_conv", "U3D_vert0", "H2D_vertcross")
+DROPPED: dict[str, set[int]] = {
+    "F5-F9": {5, 6, 7, 8, 9},
+    "F5-F8": {5, 6, 7, 8},
+    "F5,F6": {5, 6},
+    "F5,F6,F9": {5, 6, 9},
+    "F7,F8": {7, 8},
+    "F7-F9": {7, 8, 9},
+    "F9": {9},
+    "none": set(),
+}
+WORDS = {
+    "F:tx": "shift together in x'",
+    "F:ty": "shift together in y'",
+    "F:rot": "turn together",
+    "F:scale": "grow together",
+    "F:aff": "stretch in x'",
+    "F:shear": "shear",
+    "IO.x0": "x0' of camera",
+    "IO.y0": "y0' of camera",
+    "IO.c": "principal distance of camera",
+}
+
+
+def dropped(case: Case, functions: set[int]) -> Case:
+    """The case with priors of 1 mm, but for the pseudo-observations that are dropped."""
+    case = copy.deepcopy(case)
+    sigma = {number: None if number in functions else 1.0 for number in range(5, 10)}
+    case["input"]["fid_sigma"] = [[sigma[5], sigma[6]]] * len(case["input"]["fid_obs"])
+    case["input"]["io_sigma"][:3] = [sigma[7], sigma[8], sigma[9]]
+    return case
+
+
+def adjusted(case: Case, options: Options | None = None) -> Adjustment:
+    return adjust(network_of(case), approximations_of(case, case["state"]), options)
+
+
+@pytest.mark.parametrize("priors", list(DROPPED))
+@pytest.mark.parametrize("name", SINGULAR)
+def test_null_directions_are_counted_and_named(name: str, priors: str) -> None:
+    case = load(f"v_singular_{name}_affine")
+    expected = case["expected_defects_by_dropped_pseudo_observations"][priors]
+    result = adjusted(dropped(case, DROPPED[priors]))
+
+    assert len(result.singular) == expected["total_defect"]
+    assert result.termination == ("singular" if expected["total_defect"] else "converged")
+    datum, camera = np.split(np.array(result.singular, dtype=object), [expected["object_datum_defect"]])
+    assert all("object space" in direction.cause for direction in datum)
+    for direction, row in zip(camera, expected["directions"], strict=True):
+        assert WORDS[row["lead"]] in direction.cause
+        assert direction.remedy
+        named = {"T" if name.startswith("T.") else kind(name) for name in direction.parameters}
+        assert named - {"FID"} <= set(row["involved"]) | {"IO.x0", "IO.y0", "IO.c"}
+
+
+def kind(name: str) -> str:
+    """`EO.3.X0` is of the kind EO.X0, a fiducial of the kind FID."""
+    owner, quantity = name.split(".")[0], name.rsplit(".", 1)[1]
+    return "FID" if owner == "FID" else f"{owner}.{quantity}"
+
+
+def test_a_singular_result_keeps_the_approximations() -> None:
+    case = load("v_singular_K3D_conv_affine")
+    result = adjusted(dropped(case, {5, 6, 7, 8, 9}))
+    assert result.value("EO.2.X0") == case["state"]["EO2.X0"]
+    assert not result.converged
+    assert result.history == ()
+
+
+@pytest.mark.parametrize("datum", ["minimal", "free"])
+def test_a_datum_for_the_object_leaves_the_camera_directions(datum: str) -> None:
+    case = load("v_singular_U3D_vert0_affine")
+    result = adjusted(dropped(case, {9}), Options(datum="minimal" if datum == "minimal" else "free"))
+    assert [WORDS["IO.c"] in direction.cause for direction in result.singular] == [True]
+
+
+def test_a_flat_field_of_heights_needs_four_datum_values() -> None:
+    """With noisy heights too, which make the equations formally regular with three."""
+    case = dropped(load("v_singular_H2D_vertcross_affine"), set())
+    rng = np.random.default_rng(1)
+    for row, sigma in zip(case["input"]["pts_obs"], case["input"]["pts_sigma"], strict=True):
+        row[2] += rng.normal(0.0, 0.02)
+        sigma[2] = 0.02
+    result = adjusted(case, Options(datum="minimal"))
+    assert result.converged
+    fixed = [name for name in result.names if name.startswith("PT.") and result.sigma(name) == 0.0]
+    assert sorted(name[-1] for name in fixed) == ["X", "X", "Y", "Y"]
+
+
+def test_a_prior_that_nothing_else_determines_is_told() -> None:
+    """One flat vertical frame: the principal distance cannot be told from the flying height."""
+    case = load("v_singular_K2D_vert0_affine")
+    result = adjusted(dropped(case, set()))
+    assert result.converged
+    (warning,) = [text for text in result.warnings if "say nothing" in text]
+    for name in ("c", "x0", "y0"):
+        assert f"IO.{CAMERA}.{name}" in warning
+        assert result.cofactor[(result.index(f"IO.{CAMERA}.{name}"),) * 2] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_good_network_has_no_warning() -> None:
+    network, start = simulated(np.random.default_rng(2), free={"k3": np.inf, "p1": np.inf})
+    assert adjust(network, start).warnings == ()
+
+
+def test_a_nearly_flat_and_vertical_network_is_practically_singular() -> None:
+    """c free, relief of a decimetre under 1500 m: only noise tells c from the flying height."""
+    rng = np.random.default_rng(5)
+    truth = Truth(
+        attitudes=((0.0, 0.0, 0.0), (1e-5, 0.0, 1.5), (0.0, 1e-5, 3.1), (0.0, 0.0, -1.5)),
+        stations=((0.0, 0.0, 1500.0), (300.0, 100.0, 1500.0), (-280.0, 80.0, 1500.0), (60.0, 320.0, 1500.0)),
+    )
+    network, start = simulated(rng, truth, points=field_points(rng, 20, relief=0.02), free={})
+    camera = replace(network.cameras[0], principal_distance_mm=None)
+    result = adjust(replace(network, cameras=(camera,)), start)
+    warning = " ".join(result.warnings)
+    assert result.converged
+    assert "Practically singular" in warning
+    assert "IO.K.c" in warning
+
+
+def test_points_of_an_image_on_one_line_are_named() -> None:
+    """An image whose targets all lie on a line cannot be oriented: its own unknowns are singular."""
+    rng = np.random.default_rng(3)
+    points = np.stack([np.linspace(-700, 700, 6), np.linspace(-300, 300, 6), np.zeros(6)], axis=1)
+    network, start = simulated(rng, Truth(distortion={}), points=points, noise=False)
+    result = adjust(network, start)
+    assert result.termination == "singular"
+    assert {"EO"} <= {name.split(".")[0] for name in result.singular[0].parameters}
+    assert "do not determine its own orientation" in result.singular[0].cause
+
+
+def test_what_no_image_shows_is_told() -> None:
+    network, start = simulated(np.random.default_rng(4))
+    rows = network.observations
+    keep = [
+        i for i, (point, kind) in enumerate(zip(rows.point, rows.kind, strict=True)) if (point, kind) != ("3", "target")
+    ]
+    shorter = Observations(
+        tuple(rows.image[i] for i in keep),
+        tuple(rows.point[i] for i in keep),
+        tuple(rows.kind[i] for i in keep),
+        rows.xy_mm[keep],
+        rows.covariance_mm2[keep],
+    )
+    result = adjust(Network(network.cameras, network.images, network.points, shorter), start)
+    assert result.converged
+    assert result.warnings == ("No image shows the object points 3: they take no part.",)
