@@ -291,7 +291,7 @@ class _Each:
 
 _NUMBER = (float, int, type(None))  # null: a number that has no meaning here
 _RESIDUAL_NUMBERS = (
-    "vx_um", "vy_um", "redundancy_x", "redundancy_y", "w", "sx_um", "sy_um",
+    "vx_um", "vy_um", "redundancy_x", "redundancy_y", "w", "weight", "sx_um", "sy_um",
     "camera_x_mm", "camera_y_mm", "camera_vx_um", "camera_vy_um",
 )  # fmt: skip
 _QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
@@ -325,6 +325,7 @@ _ADJUSTMENT = {
     "residuals": _Each(
         list, dict.fromkeys(("image", "point", "kind"), str) | dict.fromkeys(_RESIDUAL_NUMBERS, _NUMBER)
     ),
+    "variance_factors": _Each(dict, _NUMBER),
     "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),
 }
 

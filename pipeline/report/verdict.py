@@ -45,8 +45,7 @@ def judge(data: ReportData) -> Verdict:
         *(_adjustment_problems(data.adjustment) if data.adjustment and not fatal else ()),
         *(_check_problems(data.check) if data.check else ()),
     )
-    nothing = not any(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
-    level: Level = "failed" if fatal or nothing else "look" if problems else "good"
+    level: Level = "failed" if fatal or not _observed(data, shots) else "look" if problems else "good"
     return Verdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
 
 
@@ -110,13 +109,13 @@ def _problems_of(frame: Frame) -> Iterator[Problem]:
         found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
         yield Problem(
             f"{_count(len(lost), 'fiducial mark')} not measured, {found} measured ({names}).",
-            "Look at their pictures below. The frame is used with the others; its film transformation is less certain.",
+            "Look at their pictures in the report. The frame is used; its film transformation is less certain.",
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     if targets and not any(mark.status.is_observation for mark in targets):
         yield Problem(
             f"none of its {len(targets)} targets was measured.",
-            "Look at their reasons below: an approximate orientation, a pose or a diameter that is wrong misses all.",
+            "Look at their reasons in comparator.csv: a wrong pose, diameter or orientation misses them all.",
         )
 
 
@@ -125,8 +124,8 @@ def _locking(shots: list[Frame]) -> Iterator[Problem]:
     for axis, positions in zip(("column", "row"), np.reshape(centers, (-1, 2)).T, strict=True):
         if fraction_test(positions).is_locked:
             yield Problem(
-                f"The {axis} positions of the marks prefer parts of a pixel: they are biased (pixel locking).",
-                "Look at the histogram of fractional parts; scan with a finer pitch or in 16 bit.",
+                f"The {axis} positions of the marks prefer parts of a pixel, as biased ones do (pixel locking).",
+                "Look at the histogram of fractional parts in the report; scan with a finer pitch or in 16 bit.",
             )
 
 
@@ -156,12 +155,12 @@ def _global_test(sigma0: float, redundancy: int) -> Iterator[Problem]:
         yield Problem(
             f"σ₀ = {sigma0:.2f} is above {high:.2f}: the residuals are larger than the standard deviations given.",
             "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
-            "film_sigma_um or add distortion parameters. The sigmas below are already multiplied by σ₀.",
+            "film_sigma_um or add distortion parameters. All sigmas are already multiplied by σ₀.",
         )
     elif sigma0 < low:
         yield Problem(
             f"σ₀ = {sigma0:.2f} is below {low:.2f}: the marks fit better than the standard deviations given.",
-            "Lower sigma_target_um, sigma_fiducial_um or film_sigma_um. The sigmas below are already multiplied by σ₀.",
+            "Lower sigma_target_um, sigma_fiducial_um or film_sigma_um. All sigmas are already multiplied by σ₀.",
         )
 
 
@@ -183,29 +182,50 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield "There is no check against OpenCV yet: run `reseau check`."
     elif data.check["verdict"] == "not possible":
         yield f"OpenCV cannot check this calibration. {data.check['reason']}"
+    if data.adjustment:
+        yield from _weight_notes(data.adjustment)
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
         number = sum(mark.status is status and not mark.is_fiducial for frame in shots for mark in frame.marks)
         if number:
             yield f"{_count(number, 'target')} {status} (their reasons stand with the marks)."
 
 
+def _weight_notes(adjustment: Json) -> Iterator[str]:
+    """What the adjustment itself has changed of the weights."""
+    lowered = [row for row in adjustment["residuals"] if row["weight"] < 1.0]
+    if lowered:
+        least = min(lowered, key=lambda row: row["weight"])
+        yield (
+            f"Robust estimation lowered the weight of {_count(len(lowered), 'observation')}, most that of "
+            f"{least['image']}/{least['point']}, to {least['weight']:.2f} of what was given."
+        )
+    for group, factor in adjustment["variance_factors"].items():
+        yield f"Variance components: the sigmas of the group {group} were multiplied by {factor**0.5:.2f}."
+
+
 def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int) -> str:
-    marks = sum(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
+    marks = _observed(data, shots)
     found = f"{_count(marks, 'mark')} in {_count(len(shots), 'frame')}"
-    look = {"good": ".", "look": f", but {_count(problems, 'thing needs', 'things need')} a look.", "failed": "."}[
-        level
-    ]
+    ending = f", but {_count(problems, 'thing needs', 'things need')} a look." if level == "look" else "."
+    if not marks:
+        return "No mark was measured."
     if not data.adjustment:
-        return f"Measured: {found}{look}" if marks else "No mark was measured."
+        return f"Measured: {found}{ending}"
     if level == "failed":
         why = "the network is singular" if data.adjustment["singular"] else "the iteration did not come to rest"
-        return f"There is no calibration: {why if marks or data.adjustment['residuals'] else 'nothing was measured'}."
+        return f"There is no calibration: {why}."
     constants = "; ".join(
         f"{name} has c = {value} ± {sigma} mm" if sigma != "fixed" else f"{name} has c = {value} mm, fixed"
         for name, camera in data.adjustment["cameras"].items()
         for value, sigma in [value_and_sigma(*(camera["principal_distance_mm"][key] for key in ("value", "sigma")))]
     )
-    return f"Calibrated from {found}: {constants}{look}"
+    return f"Calibrated from {found}: {constants}{ending}"
+
+
+def _observed(data: ReportData, shots: list[Frame]) -> int:
+    """How many marks are observations; those of the adjustment where the comparator file is not at hand."""
+    marks = sum(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
+    return marks or (len(data.adjustment["residuals"]) if data.adjustment else 0)
 
 
 def _listed(names: list[str]) -> str:

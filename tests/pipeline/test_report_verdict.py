@@ -141,6 +141,21 @@ def test_when_opencv_differs_it_needs_a_look_and_when_it_cannot_it_is_a_note(adj
     assert "OpenCV cannot check this calibration. One flat frame." in verdict.notes
 
 
+def test_weights_that_the_adjustment_changed_are_noted(adjusted: ReportData) -> None:
+    assert adjusted.adjustment is not None
+    rows = [*adjusted.adjustment["residuals"]]
+    rows[5] = {**rows[5], "weight": 0.25}
+    notes = " ".join(judge(changed(adjusted, residuals=rows, variance_factors={"target": 4.0})).notes)
+    assert "lowered the weight of 1 observation, most that of f1/6, to 0.25" in notes
+    assert "the sigmas of the group target were multiplied by 2.00" in notes
+
+
+def test_an_adjustment_without_its_comparator_file_is_judged_all_the_same(adjusted: ReportData) -> None:
+    verdict = judge(replace(adjusted, comparator=(), measurement=None))
+    assert verdict.level == "good"
+    assert verdict.sentence.startswith("Calibrated from 160 marks in 5 frames")
+
+
 def test_nothing_measured_is_no_result() -> None:
     assert judge(ReportData("none")).level == "failed"
 
