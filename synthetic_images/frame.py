@@ -92,7 +92,7 @@ def _target_positions(geometry: FrameGeometry) -> dict[str, Position]:
     field = geometry.scene.field
     surround = max(field.surround, 1.0) if isinstance(field, DiskField) else 1.0
     positions: dict[str, Position] = {}
-    nearer: list[tuple[Array, float]] = []
+    centers, reaches = np.empty((0, 2)), np.empty(0)  # of the nearer targets, with their surrounds
     for target in reversed(_far_to_near(geometry)):
         outline = target.center[None] if target.radius == 0.0 else disk_outline(target, target.radius)
         pixels = geometry.pixel_from_object(np.vstack([target.center, outline]))
@@ -102,10 +102,10 @@ def _target_positions(geometry: FrameGeometry) -> dict[str, Position]:
         figure = center if target.radius == 0.0 else centroid((outline_px,))
         reach = float(np.linalg.norm(outline_px - center, axis=1).max())
         hidden = _hidden(geometry, target, outline_px)
-        if not hidden and any(np.linalg.norm(center - other) < reach + size for other, size in nearer):
+        if not hidden and (np.linalg.norm(centers - center, axis=1) < reaches + reach).any():
             hidden = "behind another target"
         if isinstance(field, DiskField) and hidden != "faces away":
-            nearer.append((center, reach * surround))
+            centers, reaches = np.vstack([centers, center]), np.append(reaches, reach * surround)
         positions[target.id] = Position(center, figure, hidden)
     return {target.id: positions[target.id] for target in field_targets(field) if target.id in positions}
 

@@ -123,10 +123,11 @@ class DiskField:
 
 @dataclass(frozen=True)
 class BoardField:
-    """A board in the plane Z = 0: inner corner (or dot) "r{row}c{column}" at X = column · spacing, Y = -row · spacing.
+    """A board in the plane Z = 0, x right, y up, seen from above. Its point "r{row}c{column}" stands at
+    X = column · spacing, Y = (rows - 1 - row) · spacing.
 
-    A chessboard's columns and rows count inner corners. diameter: of the dots; in an asymmetric circle grid odd rows
-    stand half a spacing to the right, and rows are half a spacing apart.
+    A chessboard's columns and rows count inner corners. diameter: of the dots of a circle grid; in an asymmetric one
+    only places where row + column is even hold a dot.
     """
 
     kind: Literal["chessboard", "circle-grid"]

@@ -33,14 +33,13 @@ def field_targets(field: DiskField | BoardField) -> tuple[Target, ...]:
         Target(f"r{row}c{column}", np.array([*board_point(field, row, column), 0.0]), up, radius)
         for row in range(field.rows)
         for column in range(field.columns)
+        if not field.asymmetric or (row + column) % 2 == 0
     )
 
 
 def board_point(field: BoardField, row: int, column: int) -> tuple[float, float]:
     """X and Y of a board's point."""
-    if field.asymmetric:
-        return (column + row % 2 / 2) * field.spacing, -row * field.spacing / 2
-    return column * field.spacing, -row * field.spacing
+    return column * field.spacing, (field.rows - 1 - row) * field.spacing
 
 
 def disk_outline(target: Target, radius: float) -> Array:
@@ -54,21 +53,19 @@ def disk_outline(target: Target, radius: float) -> Array:
 
 def board_sheet(field: BoardField) -> Array:
     """(n, 3) the outline of the board's white sheet: one spacing and a half beyond its outer points."""
-    columns = field.columns - 1 + (0.5 if field.asymmetric else 0.0)
-    rows = (field.rows - 1) * (0.5 if field.asymmetric else 1.0)
     edge = 1.5 * field.spacing
-    return _rectangle(-edge, columns * field.spacing + edge, -rows * field.spacing - edge, edge)
+    right, top = board_point(field, 0, field.columns - 1)
+    return _rectangle(-edge, right + edge, -edge, top + edge)
 
 
 def chessboard_squares(field: BoardField) -> tuple[Array, ...]:
     """Outlines (n, 3) of the black squares; the one above and left of the first inner corner is black."""
-    s = field.spacing
-    return tuple(
-        _rectangle((column - 1) * s, column * s, -row * s, (1 - row) * s)
-        for row in range(field.rows + 1)
-        for column in range(field.columns + 1)
-        if (row + column) % 2 == 0
-    )
+    squares = []
+    for row in range(field.rows + 1):
+        for column in range(row % 2, field.columns + 1, 2):
+            right, bottom = board_point(field, row, column)
+            squares.append(_rectangle(right - field.spacing, right, bottom, bottom + field.spacing))
+    return tuple(squares)
 
 
 def _disk_target(target: DiskTarget, diameter: float) -> Target:

@@ -1,0 +1,260 @@
+"""Scene files, and the projects that are written from them."""
+
+import csv
+import json
+import tomllib
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from measure import shapes
+from measure.board_specs import ChessboardSpec, CircleGridSpec
+from measure.scan import open_scan
+from pipeline.camera_file import read_camera
+from pipeline.errors import InputError
+from pipeline.project_file import read_project
+from pipeline.scene_file import read_scene, render_project
+from pipeline.scene_project import write_project
+from synthetic_images.frame import make_frame
+from synthetic_images.scene import BoardField, ChipMark, DrawnMark
+from synthetic_images.targets import field_targets
+
+TEMPLATE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")
+READY = sorted(
+    entry.name
+    for entry in resources.files("synthetic_images").joinpath("scenes").iterdir()
+    if not entry.name.endswith("_camera.toml")
+)
+IMAGES = TEMPLATE.index("[[image]]")
+
+
+def scene_path(name: str) -> Path:
+    return Path(str(resources.files("synthetic_images").joinpath("scenes", name)))
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def changed(old: str, new: str, text: str = TEMPLATE) -> str:
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+def test_the_ready_scenes_are_those_that_are_documented() -> None:
+    assert READY == ["aerial_five.toml", "calibration_field.toml", "demo.toml", "juhl_crosswise.toml"]
+
+
+@pytest.mark.parametrize("name", READY)
+def test_every_frame_of_a_ready_scene_shows_its_marks_and_enough_targets(name: str) -> None:
+    scene = read_scene(scene_path(name)).scene
+    for index in range(len(scene.images)):
+        truth = make_frame(scene, index).truth
+        assert not any(position.hidden for position in truth.fiducials.values())
+        assert len(truth.fiducials) == 8
+        assert sum(not position.hidden for position in truth.targets.values()) >= 35
+
+
+def test_the_aerial_scene_has_two_scans_turned_and_one_mirrored() -> None:
+    scene = read_scene(scene_path("aerial_five.toml")).scene
+    assert sorted(image.pose for image in scene.images) == ["0", "0", "0m", "270", "90"]
+    assert scene.scanner.bit_depth == 16
+    assert scene.film.grain > 0
+    assert scene.film.dust > 0
+
+
+def test_juhls_photographs_overlap_by_sixty_and_ninety_per_cent() -> None:
+    scene = read_scene(scene_path("juhl_crosswise.toml")).scene
+    x = [image.exterior[0] for image in scene.images]
+    covered = scene.camera.frame_mm[0] / scene.camera.principal_distance_mm * scene.images[0].exterior[2]
+    assert 1 - (x[1] - x[0]) / covered == pytest.approx(0.6, abs=0.01)
+    assert 1 - (x[2] - x[0]) / covered == pytest.approx(0.9, abs=0.01)
+
+
+def test_the_template_becomes_a_project_that_can_be_read(tmp_path: Path) -> None:
+    calls: list[tuple[str, int, int]] = []
+    render_project(written(tmp_path, TEMPLATE), tmp_path / "out", lambda *call: calls.append(call))
+    project = read_project(tmp_path / "out" / "project.toml")
+    assert list(project.scans) == ["frame1", "frame2"]
+    assert project.default_camera.name == "small metric camera"
+    assert project.given_points is not None
+    assert len(project.given_points.points) == 30
+    assert set(project.given_points.normals) == {point.id for point in project.given_points.points}
+    assert project.targets is not None
+    assert project.targets.diameter_mm == 26.0
+    with open_scan(project.scans["frame2"]) as scan:
+        assert scan.pitch_um == pytest.approx((45.0, 45.0))
+        assert scan.width_px == 1356
+    assert calls[-1] == ("frame2", 12, 12)
+    assert [done for _, done, _ in calls] == list(range(1, 13))
+
+
+def test_truth_has_the_names_of_the_adjustment(tmp_path: Path) -> None:
+    render_project(written(tmp_path, TEMPLATE), tmp_path / "out")
+    truth = json.loads((tmp_path / "out" / "truth.json").read_text(encoding="utf-8"))
+    camera = truth["cameras"]["small metric camera"]
+    assert camera["principal_distance_mm"] == {"value": 60.0}
+    assert camera["principal_point_mm"] == {"x": {"value": 0.05}, "y": {"value": -0.03}}
+    assert camera["distortion"]["family"] == "torlegard"
+    assert camera["distortion"]["k3"] == {"value": -6.0e-6}
+    assert camera["fiducials"]["1"] == {"x_mm": {"value": 25.0}, "y_mm": {"value": -25.0}}
+    image = truth["images"]["frame2"]
+    assert image["pose"] == "90m"
+    assert image["exterior"]["kappa_deg"]["value"] == pytest.approx(90.0)
+    transformation = {name: one["value"] for name, one in image["transformation"].items() if name != "kind"}
+    assert list(transformation) == ["a1", "a2", "a3", "b1", "b2", "b3"]
+    assert set(truth["points"]["101"]) == {"X", "Y", "Z", "normal"}
+    # The comparator coordinates of a mark, transformed, are its camera coordinates.
+    mark = image["fiducials"]["1"]
+    x, y = mark["col_px"] * 0.045, -mark["row_px"] * 0.045
+    t = transformation
+    assert t["a1"] + t["a2"] * x + t["a3"] * y == pytest.approx(25.0, abs=1e-9)
+    assert t["b1"] + t["b2"] * x + t["b3"] * y == pytest.approx(-25.0, abs=1e-9)
+
+
+def test_what_is_given_has_the_errors_that_the_scene_asks_for(tmp_path: Path) -> None:
+    text = changed("point_sigma = [0.0, 0.0]", "point_sigma = [0.002, 0.004]")
+    scene_file = read_scene(written(tmp_path, text))
+    write_project(scene_file, tmp_path)
+    given = read_camera(tmp_path / "camera.toml")
+    assert given.principal_distance_mm != 60.0
+    assert given.principal_distance_mm == pytest.approx(60.0, abs=5 * 0.2)
+    misses = np.array([one.xy_mm for one in given.fiducials]) - [one.xy_mm for one in scene_file.camera.fiducials]
+    assert 0.002 < misses.std() < 0.01
+    assert given.fiducials[0].sigma_mm == (0.005, 0.005)
+    assert given.distortion.parameters["k3"].value == 0.0
+    assert np.isinf(given.distortion.parameters["k3"].sigma)
+    points = rows(tmp_path / "points.csv")
+    true = {target.id: target.center for target in field_targets(scene_file.scene.field)}
+    errors = np.array([[float(row[axis]) for axis in "XYZ"] - true[row["point"]] for row in points])
+    assert errors[:, :2].std() == pytest.approx(0.002, rel=0.35)
+    assert errors[:, 2].std() == pytest.approx(0.004, rel=0.5)
+    assert {(row["sX"], row["sY"], row["sZ"]) for row in points} == {("0.002", "0.002", "0.004")}
+
+
+def test_heights_only_leave_the_plane_free_but_for_the_fixed_points(tmp_path: Path) -> None:
+    scene_file = read_scene(scene_path("juhl_crosswise.toml"))
+    write_project(scene_file, tmp_path)
+    points = {row["point"]: row for row in rows(tmp_path / "points.csv")}
+    assert {(row["sX"], row["sY"]) for row in points.values()} == {("", ""), ("0", "0")}
+    assert {id for id, row in points.items() if row["sX"]} == {"5", "143"}
+    assert {row["sZ"] for row in points.values()} == {"0.02"}
+    exact = next(target for target in field_targets(scene_file.scene.field) if target.id == "5")
+    assert [float(points["5"][axis]) for axis in "XY"] == pytest.approx(list(exact.center[:2]), abs=1e-6)
+
+
+def test_a_distortion_parameter_that_is_fixed_is_given_right(tmp_path: Path) -> None:
+    text = changed('k3 = "free"                             #', "k3 = 0.0  #")
+    write_project(read_scene(written(tmp_path, text)), tmp_path)
+    assert read_camera(tmp_path / "camera.toml").distortion.parameters["k3"].value == -6.0e-6
+
+
+def test_the_given_camera_draws_the_marks_of_the_true_one(tmp_path: Path) -> None:
+    scene_file = read_scene(written(tmp_path, TEMPLATE))
+    write_project(scene_file, tmp_path)
+    given = read_camera(tmp_path / "camera.toml")
+    assert [one.mark for one in given.fiducials] == [one.mark for one in scene_file.camera.fiducials]
+    assert given.frame_mm == (55.0, 55.0)
+
+
+def test_a_mark_cut_from_a_scan_is_drawn_and_given(tmp_path: Path) -> None:
+    render_project(written(tmp_path, TEMPLATE), tmp_path / "first")
+    text = changed(
+        'kind = "ring-cross"\npolarity = "light"\nring_mm = 0.5\nring_line_mm = 0.1\narm_mm = 0.36\nline_mm = 0.1\n',
+        'kind = "template"\nimage = "first/scans/frame1.tif"\npitch_um = 45.0\norigin_px = [7.5, 9.0]\n',
+    )
+    scene_file = read_scene(written(tmp_path, text))
+    mark = scene_file.scene.camera.fiducials[1].mark
+    assert isinstance(mark, ChipMark)
+    assert (mark.image.min(), mark.image.max()) == (0.0, 1.0)
+    write_project(scene_file, tmp_path / "out")
+    given = read_camera(tmp_path / "out" / "camera.toml").fiducials[1].mark
+    assert isinstance(given, shapes.MarkTemplate)
+    assert given.origin_px == (7.5, 9.0)
+    assert np.abs(given.image / 65535 - mark.image).max() < 1e-4
+
+
+def test_a_light_mark_in_a_negative_is_dark_on_the_positive(tmp_path: Path) -> None:
+    text = changed("negative = false", "negative = true")
+    marks = [one.mark for one in read_scene(written(tmp_path, text)).scene.camera.fiducials]
+    assert all(isinstance(mark, DrawnMark) and not mark.light for mark in marks)
+
+
+@pytest.mark.parametrize(
+    ("field", "board"),
+    [
+        ('kind = "chessboard"\ncolumns = 7\nrows = 5\nsquare_mm = 90.0', ChessboardSpec(7, 5, 90.0)),
+        (
+            'kind = "circle-grid"\ncolumns = 7\nrows = 5\nspacing_mm = 90.0\ndiameter_mm = 40.0\nasymmetric = true',
+            CircleGridSpec(7, 5, 90.0, 40.0, True),
+        ),
+    ],
+)
+def test_boards_have_the_points_that_the_measurement_names(
+    tmp_path: Path, field: str, board: ChessboardSpec | CircleGridSpec
+) -> None:
+    text = TEMPLATE[: TEMPLATE.index("\n[field]")] + f'\n[field]\nunit = "mm"\n{field}\n' + TEMPLATE[IMAGES:]
+    text = text.replace("[[image]]", "[scan]\npitch_um = 45.0\n\n[[image]]", 1)
+    scene_file = read_scene(written(tmp_path, text))
+    write_project(scene_file, tmp_path)
+    points = {target.id: tuple(target.center) for target in field_targets(scene_file.scene.field)}
+    assert points == {id: pytest.approx(place) for id, place in board.object_points().items()}
+    project = tomllib.loads((tmp_path / "project.toml").read_text(encoding="utf-8"))
+    assert isinstance(scene_file.scene.field, BoardField)
+    assert project["targets"]["kind"] == scene_file.scene.field.kind
+    assert project["targets"]["columns"] == 7
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("pitch_um", "pich_um", ["[scan] pitch_um", "is missing", "'pich_um'"]),
+        ("grain_px", "grain_pixel", ["line", "grain_pixel", "no key", "'grain_px'"]),
+        ('pose = "90m"', 'pose = "m90"', ["image[2]", "pose", "'m90'", "'90m'"]),
+        ('compression = "lzw"', 'compression = "jpeg"', ["jpeg", "8 bits", "bit_depth = 8"]),
+        ("bit_depth = 16", "bit_depth = 12", ["bit_depth", "12", "8, 16"]),
+        ("# covered = [", "covered = [", ["frame2"]),
+        ('name = "frame2"', 'name = "frame1"', ["'frame1'", "twice"]),
+        ("tile_px = 256", "tile_px = 100", ["tile_px", "multiple of 16"]),
+        ("up = [0.0, 0.58, 0.0]", "up = [0.58, 0.0, 0.0]", ["field.grid[1]", "up", "parallel"]),
+        ("position = [0.1, -0.05, 4.1]", "position = [0.1, -0.05]", ["image[1]", "position", "three numbers"]),
+        ("frame_mm = [55.0, 55.0]\n", "", ["camera", "frame_mm"]),
+        ("border = 0.06", "border = 6", ["border", "0 to 1", "6"]),
+        ("surround = 2.0 ", "surround = 0.5 ", ["surround", "above 1"]),
+    ],
+)
+def test_a_wrong_scene_file_says_what_is_wrong(tmp_path: Path, old: str, new: str, words: list[str]) -> None:
+    text = changed(old, new).replace('covered = ["3"]', 'covered = ["9"]')
+    with pytest.raises(InputError) as caught:
+        read_scene(written(tmp_path, text))
+    message = str(caught.value)
+    assert "scene.toml" in message
+    for word in words:
+        assert word in message
+
+
+def test_a_missing_scene_file_says_where_it_was_looked_for(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nowhere\.toml: there is no such file"):
+        read_scene(tmp_path / "nowhere.toml")
+
+
+def test_a_scene_without_targets_or_images_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="at least one image"):
+        read_scene(written(tmp_path, TEMPLATE[:IMAGES]))
+    bare = TEMPLATE[: TEMPLATE.index("[[field.grid]]")] + TEMPLATE[TEMPLATE.index("[picture]") :]
+    with pytest.raises(InputError, match="no target"):
+        read_scene(written(tmp_path, bare))
+
+
+def test_a_folder_that_cannot_be_made_is_an_input_error(tmp_path: Path) -> None:
+    path = written(tmp_path, TEMPLATE)
+    with pytest.raises(InputError, match="cannot be written"):
+        render_project(path, path / "out")
