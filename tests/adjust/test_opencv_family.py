@@ -34,7 +34,7 @@ def opencv_pixels(angles: Array, station: Array, xyz: Array) -> Array:
 
 def mm(pixels: Array) -> Array:
     """Comparator coordinates: x right, y up, origin at the centre of the top-left pixel."""
-    return pixels * np.array([PIXEL_MM, -PIXEL_MM])
+    return np.asarray(pixels * np.array([PIXEL_MM, -PIXEL_MM]))
 
 
 def camera(free: bool) -> Camera:
@@ -90,8 +90,8 @@ def test_adjustment_recovers_opencvs_parameters() -> None:
     rng = np.random.default_rng(6)
     plane = board()
     relief = plane + np.stack([0 * plane[:, 0], 0 * plane[:, 0], 150 * np.sin(plane[:, 0] / 70)], axis=1)
-    poses = [(np.array([a, b, k]), np.array([1200 * b, -1200 * a, 1150.0]))
-             for a, b, k in [(0, 0, 0), (0.4, 0.1, 1.5), (-0.4, 0.2, 3.0), (0.1, 0.45, -1.5), (-0.1, -0.4, 0.7)]]  # fmt: skip
+    tilts = [(0.0, 0.0, 0.0), (0.4, 0.1, 1.5), (-0.4, 0.2, 3.0), (0.1, 0.45, -1.5), (-0.1, -0.4, 0.7)]
+    poses = [(np.array(tilt), np.array([1200 * tilt[1], -1200 * tilt[0], 1150.0])) for tilt in tilts]
     rows = [
         (f"i{i}", str(j), xy) for i, pose in enumerate(poses) for j, xy in enumerate(mm(opencv_pixels(*pose, relief)))
     ]
@@ -102,7 +102,7 @@ def test_adjustment_recovers_opencvs_parameters() -> None:
         Observations(
             tuple(row[0] for row in rows),
             tuple(row[1] for row in rows),
-            ("target",) * len(rows),
+            tuple("target" for _ in rows),
             np.array([row[2] for row in rows]),
             np.broadcast_to(0.0005**2 * np.eye(2), (len(rows), 2, 2)),
         ),

@@ -1,0 +1,109 @@
+"""The blockwise elimination against a dense solution of the same rows."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from simulated import Truth, field_points, simulated
+
+from adjust import elimination
+from adjust.adjustment import adjust
+from adjust.elimination import Block, eliminate
+
+Array = NDArray[np.float64]
+
+SHARED, OWN, IMAGES = 7, 4, 5
+COUNT = SHARED + OWN * IMAGES
+
+
+def random_blocks(rng: np.random.Generator) -> list[Block]:
+    """Blocks of columns of very different size; one sees little of what is shared, one has fewer rows than columns."""
+    blocks = []
+    for i in range(IMAGES):
+        own = SHARED + OWN * i + np.arange(OWN)
+        shared = np.array([1, 4]) if i == 0 else np.sort(rng.permutation(SHARED)[:5])
+        rows = 5 if i == 1 else 20
+        matrix = rng.normal(size=(rows, OWN + len(shared))) * 10.0 ** rng.integers(-4, 5, OWN + len(shared))
+        blocks.append(Block(own, shared, matrix, rng.normal(size=rows)))
+    return blocks
+
+
+def dense(blocks: list[Block], weight: Array, right: Array) -> tuple[Array, Array]:
+    """All rows, priors included, as one matrix."""
+    rows = [np.diag(weight)]
+    for block in blocks:
+        wide = np.zeros((len(block.matrix), COUNT))
+        wide[:, np.concatenate([block.own, block.shared])] = block.matrix
+        rows.append(wide)
+    return np.vstack(rows), np.concatenate([right, *(block.right for block in blocks)])
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_it_is_the_dense_least_squares_solution(damping: float) -> None:
+    rng = np.random.default_rng(1)
+    blocks = random_blocks(rng)
+    weight = np.where(np.arange(COUNT) % 3 == 0, rng.uniform(0.1, 5.0, COUNT), 0.0)
+    right = weight * rng.normal(size=COUNT)
+    factor = eliminate(blocks, COUNT, weight, right, damping)
+    matrix, observed = dense(blocks, weight, right)
+    scale = np.linalg.norm(matrix, axis=0)
+    damped = np.vstack([matrix / scale, np.sqrt(damping) * np.eye(COUNT)])
+    expected, *_ = np.linalg.lstsq(damped, np.concatenate([observed, np.zeros(COUNT)]))
+    np.testing.assert_allclose(factor.solution() * scale, expected, rtol=1e-9, atol=1e-12)
+
+    cofactor = np.linalg.inv(damped.T @ damped)
+    np.testing.assert_allclose(factor.cofactor() * np.outer(scale, scale), cofactor, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(factor.variances(), np.diag(factor.cofactor()), rtol=1e-12)
+    for block, root in zip(blocks, factor.row_roots(blocks), strict=True):
+        columns = np.concatenate([block.own, block.shared])
+        scaled = block.matrix / scale[columns]
+        expected_rows = scaled @ cofactor[np.ix_(columns, columns)] @ scaled.T
+        np.testing.assert_allclose(root @ root.T, expected_rows, atol=1e-9)
+
+
+def test_the_condition_is_not_squared() -> None:
+    """Two shared columns alike but for 1e-10: the normal equations cannot tell them apart, the rows can."""
+    rng = np.random.default_rng(2)
+    column = rng.normal(size=(40, 1))
+    other = rng.normal(size=(40, 1))
+    matrix = np.hstack([rng.normal(size=(40, 2)), column, column + 1e-10 * other])
+    truth = np.array([1.0, -2.0, 3.0, 4.0])
+    block = Block(np.array([2, 3]), np.array([0, 1]), matrix, matrix @ truth)
+    factor = eliminate([block], 4, np.zeros(4), np.zeros(4))
+    np.testing.assert_allclose(factor.solution(), truth[[2, 3, 0, 1]], atol=1e-4)
+
+
+def test_all_shared_unknowns_fixed() -> None:
+    rng = np.random.default_rng(3)
+    matrix = rng.normal(size=(10, 3))
+    block = Block(np.arange(3), np.empty(0, dtype=np.intp), matrix, matrix @ np.array([1.0, 2.0, 3.0]))
+    factor = eliminate([block], 3, np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(factor.solution(), [1.0, 2.0, 3.0], rtol=1e-12)
+    np.testing.assert_allclose(factor.cofactor(), np.linalg.inv(matrix.T @ matrix), rtol=1e-10)
+
+
+def test_the_cost_is_linear_in_the_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted, not timed: rows times columns squared of every factorisation, with known points."""
+    costs: list[float] = []
+    original = elimination._triangle
+
+    def counted(rows: Array) -> Array:
+        costs.append(rows.shape[0] * rows.shape[1] ** 2)
+        return original(rows)
+
+    monkeypatch.setattr(elimination, "_triangle", counted)
+
+    def cost(images: int) -> float:
+        rng = np.random.default_rng(4)
+        angles = np.linspace(0.0, 6.0, images)
+        truth = Truth(
+            stations=tuple((400 * np.cos(a), 400 * np.sin(a), 1500.0) for a in angles),
+            attitudes=tuple((-0.25 * np.sin(a), 0.25 * np.cos(a), a) for a in angles),
+            mirrored=(False,) * images,
+        )
+        network, start = simulated(rng, truth, points=field_points(rng, 8), noise=False)
+        costs.clear()
+        result = adjust(network, start)
+        assert result.converged
+        return sum(costs) / result.iterations
+
+    assert cost(24) < 2.2 * cost(12)

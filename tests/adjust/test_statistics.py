@@ -1,0 +1,238 @@
+"""Standard deviations, redundancy numbers, robust weights and variance components against simulation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from simulated import Truth, field_points, simulated
+
+from adjust.adjustment import Options, adjust
+from adjust.network import Network, ObservationKind, Observations
+from adjust.result import Adjustment
+
+Array = NDArray[np.float64]
+
+
+def with_rows(network: Network, xy_mm: Array | None = None, covariance_mm2: Array | None = None) -> Network:
+    rows = network.observations
+    xy_mm = rows.xy_mm if xy_mm is None else xy_mm
+    covariance_mm2 = rows.covariance_mm2 if covariance_mm2 is None else covariance_mm2
+    return replace(network, observations=Observations(rows.image, rows.point, rows.kind, xy_mm, covariance_mm2))
+
+
+def row_of(network: Network, image: str, point: str, kind: ObservationKind) -> int:
+    rows = network.observations
+    return list(zip(rows.image, rows.point, rows.kind, strict=True)).index((image, point, kind))
+
+
+def monte_carlo(runs: int) -> tuple[Array, Array]:
+    """Normalised errors (runs, unknowns) of c, x0', y0', fiducials, k3 and exteriors, and v'Pv of every run."""
+    truth = Truth()
+    points = field_points(np.random.default_rng(0), 12)
+    exact, _ = simulated(np.random.default_rng(0), truth, points=points, noise=False)
+    camera = exact.cameras[0]
+    expected = {"IO.K.c": truth.c, "IO.K.x0": truth.x0, "IO.K.y0": truth.y0, "IO.K.k3": truth.distortion["k3"]}
+    expected |= {f"FID.K.{id_}.x": mark.x_mm.value for id_, mark in camera.fiducials.items()}
+    expected |= {
+        f"EO.f{i}.{name}": value
+        for i in range(4)
+        for name, value in zip(("X0", "Y0", "Z0"), truth.stations[i], strict=True)
+    }
+    expected |= {
+        f"EO.f{i}.{name}": value
+        for i in range(4)
+        for name, value in zip(("omega", "phi", "kappa"), truth.attitudes[i], strict=True)
+    }
+    errors, vpv = [], []
+    for run in range(runs):
+        network, start = simulated(np.random.default_rng(100 + run), truth, points=points, free={"k3": np.inf})
+        result = adjust(network, start)
+        assert result.converged
+        sigmas = np.sqrt(np.diag(result.cofactor))
+        errors.append([(result.value(n) - value) / sigmas[result.index(n)] for n, value in expected.items()])
+        vpv.append(result.vpv / result.redundancy)
+    return np.array(errors), np.array(vpv)
+
+
+def check_monte_carlo(runs: int) -> None:
+    errors, variance = monte_carlo(runs)
+    low, high = np.sqrt(chi2.ppf([1e-5, 1 - 1e-5], runs) / runs)
+    rms = np.sqrt((errors**2).mean(axis=0))
+    assert (rms > low).all()
+    assert (rms < high).all()
+    assert np.abs(errors.mean(axis=0)).max() < 4.5 / np.sqrt(runs)
+    assert variance.mean() == pytest.approx(1.0, abs=6.0 * variance.std() / np.sqrt(runs))
+
+
+def test_claimed_standard_deviations_are_realised() -> None:
+    check_monte_carlo(100)
+
+
+@pytest.mark.slow
+def test_claimed_standard_deviations_are_realised_closely() -> None:
+    check_monte_carlo(3000)
+
+
+def test_a_point_covariance_is_not_conditional_on_everything_else() -> None:
+    """With everything else held fixed, an intersected point looks far better than it is."""
+    network, start = simulated(np.random.default_rng(1), point_sigma=np.inf)
+    result = adjust(network, start, Options(datum="minimal"))
+    points = [i for i, name in enumerate(result.names) if name.startswith("PT.") and result.cofactor[i, i] > 0.0]
+    weight = np.linalg.inv(result.cofactor[np.ix_(points, points)])
+    conditional = 1.0 / np.diag(weight)
+    claimed = np.diag(result.cofactor)[points]
+    assert (claimed > conditional).all()
+    assert np.median(claimed / conditional) > 4.0
+
+
+def test_a_weight_is_the_inverse_of_a_variance() -> None:
+    """Halving a mark's sigma lowers its share of a contradiction; a covariance taken for a weight raises it."""
+    network, start = simulated(np.random.default_rng(2), noise=False)
+    row = row_of(network, "f1", "4", "target")
+    xy = network.observations.xy_mm.copy()
+    xy[row] += [0.02, 0.0]
+    plain = adjust(with_rows(network, xy), start)
+    covariance = network.observations.covariance_mm2.copy()
+    covariance[row] /= 4.0
+    halved = adjust(with_rows(network, xy, covariance), start)
+    assert abs(halved.residuals.v_mm[row, 0]) < 0.95 * abs(plain.residuals.v_mm[row, 0])
+    assert halved.residuals.redundancy[row, 0] < plain.residuals.redundancy[row, 0]
+
+
+def test_redundancy_is_what_a_residual_shows_of_an_error() -> None:
+    """An error in one coordinate appears in its residual times minus the redundancy number, correlations included."""
+    network, start = simulated(np.random.default_rng(3), noise=False)
+    row = row_of(network, "f2", "7", "target")
+    covariance = network.observations.covariance_mm2.copy()
+    covariance[row] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
+    for axis in (0, 1):
+        xy = network.observations.xy_mm.copy()
+        xy[row, axis] += 1e-4
+        result = adjust(with_rows(network, xy, covariance), start)
+        shown = -result.residuals.v_mm[row, axis] / 1e-4
+        assert shown == pytest.approx(result.residuals.redundancy[row, axis], rel=1e-4)
+
+
+def test_standardised_residuals_are_standard() -> None:
+    w = np.concatenate([run_w(seed) for seed in range(8)])
+    assert np.sqrt((w**2).mean()) == pytest.approx(1.0, abs=0.06)
+    assert abs(w.mean()) < 0.1
+
+
+def run_w(seed: int) -> Array:
+    network, start = simulated(np.random.default_rng(50 + seed))
+    return adjust(network, start).residuals.w.ravel()
+
+
+def test_rms_is_per_axis() -> None:
+    """Per point it would be larger by the root of two."""
+    network, start = simulated(np.random.default_rng(4))
+    result = adjust(network, start)
+    targets = np.array([kind == "target" for kind in network.observations.kind])
+    v_um = 1000.0 * result.residuals.v_mm[targets]
+    group = result.groups["target"]
+    assert group.rms_x_um == pytest.approx(np.sqrt((v_um[:, 0] ** 2).mean()))
+    per_point = np.sqrt((v_um**2).sum(axis=1).mean())
+    assert np.hypot(group.rms_x_um, group.rms_y_um) == pytest.approx(per_point)
+
+
+def test_units_do_not_matter() -> None:
+    """Object space in millimetres instead of metres: the same camera."""
+    points = field_points(np.random.default_rng(5), 12)
+    network, start = simulated(np.random.default_rng(5), points=points)
+    large = Truth(stations=tuple((1000 * x, 1000 * y, 1000 * z) for x, y, z in Truth().stations))
+    other, other_start = simulated(np.random.default_rng(5), large, points=1000.0 * points)
+    first, second = adjust(network, start), adjust(other, other_start)
+    scale = np.sqrt(first.cofactor[first.index("IO.K.c"), first.index("IO.K.c")])
+    assert second.value("IO.K.c") == pytest.approx(first.value("IO.K.c"), abs=1e-6 * scale)
+    assert second.sigma("EO.f1.Z0") == pytest.approx(1000.0 * first.sigma("EO.f1.Z0"), rel=1e-6)
+
+
+def with_gross_errors(rng: np.random.Generator) -> tuple[Adjustment, Adjustment, Adjustment, list[int]]:
+    """Clean, plain and robust adjustments of a network whose second and third have 5 gross errors of 50 to 100 um."""
+    points = field_points(rng, 20)
+    network, start = simulated(rng, points=points)
+    targets = [i for i, kind in enumerate(network.observations.kind) if kind == "target"]
+    wrong = [int(i) for i in rng.choice(targets, 5, replace=False)]
+    xy = network.observations.xy_mm.copy()
+    xy[wrong] += rng.choice([-1.0, 1.0], (5, 2)) * rng.uniform(0.05, 0.1, (5, 2))
+    dirty = with_rows(network, xy)
+    return adjust(network, start), adjust(dirty, start), adjust(dirty, start, Options(robust=True)), wrong
+
+
+def test_robust_estimation_withstands_gross_errors() -> None:
+    clean, plain, robust, wrong = with_gross_errors(np.random.default_rng(6))
+    names = [name for name in clean.names if name.startswith(("EO.", "IO.")) and clean.sigma(name) > 0.0]
+    sigma = np.array([np.sqrt(clean.cofactor[clean.index(n), clean.index(n)]) for n in names])
+    error = {
+        label: np.sqrt(np.mean([((r.value(n) - clean.value(n)) / s) ** 2 for n, s in zip(names, sigma, strict=True)]))
+        for label, r in (("plain", plain), ("robust", robust))
+    }
+    assert robust.converged
+    assert error["robust"] < 0.35 * error["plain"]
+    assert (robust.weights[wrong] < 0.25).all()
+    others = np.setdiff1d(np.arange(len(robust.weights)), wrong)
+    assert np.median(robust.weights[others]) == 1.0
+    assert set(np.argsort(-np.abs(robust.residuals.w).max(axis=1))[:5]) == set(wrong)
+
+
+def test_robust_estimation_leaves_clean_marks_alone() -> None:
+    network, start = simulated(np.random.default_rng(7))
+    plain, robust = adjust(network, start), adjust(network, start, Options(robust=True))
+    assert (robust.weights == 1.0).mean() > 0.85
+    i = plain.index("IO.K.c")
+    assert abs(robust.values[i] - plain.values[i]) < np.sqrt(plain.cofactor[i, i])
+
+
+def test_variance_components_find_the_variances() -> None:
+    """Targets twice as bad as claimed, fiducials half as bad; 1 is what a right claim gives."""
+    rng = np.random.default_rng(8)
+    network, start = simulated(rng, points=field_points(rng, 40))
+    fiducial = np.array([kind == "fiducial" for kind in network.observations.kind])
+    claimed = network.observations.covariance_mm2 * np.where(fiducial, 4.0, 0.25)[:, None, None]
+    result = adjust(with_rows(network, covariance_mm2=claimed), start, Options(variance_components=True))
+    assert result.converged
+    assert result.variance_factors["target"] == pytest.approx(4.0, rel=0.3)
+    assert result.variance_factors["fiducial"] == pytest.approx(0.25, rel=0.6)
+    assert result.groups["target"].sigma0 == pytest.approx(1.0, abs=2e-3)
+    assert result.groups["fiducial"].sigma0 == pytest.approx(1.0, abs=2e-3)
+
+
+def test_two_cameras_are_adjusted_together() -> None:
+    """Two cameras over one field of unknown points, one of them with another lens: both are found."""
+    rng = np.random.default_rng(9)
+    points = field_points(rng, 15)
+    first, first_start = simulated(rng, points=points, point_sigma=0.0, noise=False)
+    other = Truth(c=90.0, x0=-0.2, y0=0.1, distortion={"k3": -1e-7})
+    second, second_start = simulated(rng, other, "none", points=points, noise=False)
+    wide = replace(second.cameras[0], name="W", fiducials={})
+    images = tuple(replace(image, name=f"w{i}", camera="W") for i, image in enumerate(second.images))
+    rename = {image.name: f"w{i}" for i, image in enumerate(second.images)}
+    a, b = first.observations, second.observations
+    network = Network(
+        (first.cameras[0], wide),
+        (*first.images, *images),
+        first.points,
+        Observations(
+            a.image + tuple(rename[name] for name in b.image),
+            a.point + b.point,
+            a.kind + b.kind,
+            np.concatenate([a.xy_mm, b.xy_mm]),
+            np.concatenate([a.covariance_mm2, b.covariance_mm2]),
+        ),
+    )
+    start = replace(
+        first_start,
+        interior=dict(first_start.interior) | {"W": second_start.interior["K"]},
+        exterior=dict(first_start.exterior) | {rename[n]: v for n, v in second_start.exterior.items()},
+        transformation=dict(first_start.transformation)
+        | {rename[n]: v for n, v in second_start.transformation.items()},
+    )
+    result = adjust(network, start)
+    assert result.converged
+    assert result.vpv < 1e-10
+    assert result.value("IO.K.c") == pytest.approx(153.0, abs=1e-6)
+    assert result.value("IO.W.c") == pytest.approx(90.0, abs=1e-6)
+    assert result.value("IO.W.x0") == pytest.approx(-0.2, abs=1e-6)
