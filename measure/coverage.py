@@ -5,6 +5,7 @@ pixels (col right, row down); every part is then a region with smooth or straigh
 is that of the half-plane through the nearest point of its edge, which has a closed form.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,10 +37,11 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     return 1.0 - empty
 
 
-def pixel_means(cell_values: Array, cells: int) -> Array:
-    """Means over the cells of each pixel; leading axes are kept."""
-    *lead, rows, cols = cell_values.shape
-    return np.asarray(cell_values.reshape(*lead, rows // cells, cells, cols // cells, cells).mean(axis=(-3, -1)))
+def pixel_means(cell_values: NDArray[np.floating], cells: int) -> Array:
+    """Means over the cells of each pixel of an image (rows, columns)."""
+    rows, cols = cell_values.shape
+    size = (cols // cells, rows // cells)
+    return np.asarray(cv2.resize(cell_values, size, interpolation=cv2.INTER_AREA), dtype=float)
 
 
 def _part_coverage(part: Part, cell_from_mark: Array, width: int, height: int) -> Array:

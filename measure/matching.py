@@ -1,8 +1,8 @@
 """Least-squares matching: a mark measured to the noise of the film, by fitting its own picture to the scan.
 
 The model of a window is `gain * picture(mark) + offset + slopes`; unknown are the mark's place, if wished its rotation,
-scale and shear, the blur, and the four grey-value parameters, all in one Gauss-Newton adjustment. Dust and scratches
-are first weighted down (Tukey's biweight), then cut out where smoothed residuals stand out, and the rest is adjusted again.
+scale and shear, the blur, and four grey-value parameters, all in one Gauss-Newton adjustment. Dust and scratches
+are first weighted down (Tukey's biweight), then cut out where smoothed residuals stand out; the rest decides.
 The covariance comes from the residuals' own autocovariance where grain correlates them.
 """
 
@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise import correlated, noise_model, robust_scale
+from measure.noise import correlated, is_textured, noise_model, robust_scale
 from measure.rendering import chip_mask, extent_px, render
-from measure.shapes import Disk, Mark, MarkTemplate, Ring
+from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,7 +33,9 @@ _GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]]
 _GREY = 4  # gain, offset and two slopes
 _TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
-_BLUR_RANGE_PX = (0.25, 6.0)
+_SPARE_PX = 2.0  # beyond the margin: room for the mark to move
+_BLUR_RANGE_PX = (0.3, 6.0)
+_HALVINGS = 4
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class MatchOptions:
     margin_px: float = 6.0
     damage_sigmas: float = 3.2
     damage_rounds: int = 3
-    max_iterations: int = 25
+    max_iterations: int = 20
     max_shift_px: float = 8.0
     max_distortion: float = 0.3
 
@@ -83,7 +85,8 @@ class Match:
     center_px (2,), covariance_px2 (2, 2), pixel_from_mark (2, 3): of the scan, not of the window.
     contrast_dn: the mark's grey value less the background's, negative for a dark mark. noise_dn: standard deviation of
     one pixel. damaged_fraction: share of the pixels about the mark that were cut out. redundancy: pixels used less
-    unknowns. neighbour_correlation: of the residuals; they were taken as white where covariance_is_white.
+    unknowns. neighbour_correlation: of the residuals; they were taken as white where covariance_is_white. likeness:
+    correlation of the fitted picture with the window, less its plane background: 1 for a perfect mark, 0 for none.
     """
 
     converged: bool
@@ -98,6 +101,7 @@ class Match:
     redundancy: int
     neighbour_correlation: float
     covariance_is_white: bool
+    likeness: float
     residuals_dn: Array
 
     @property
@@ -120,17 +124,34 @@ def match(
     row): its last column is the approximate centre, right to a pixel or two. Never raises for what the picture holds.
     """
     options = options or MatchOptions()
-    origin = np.asarray(origin_px, dtype=float)
-    grey = np.asarray(window, dtype=float)
     start = np.array(pixel_from_mark, dtype=float)
+    grey, usable, origin = _cropped(np.asarray(window, dtype=float), valid, origin_px, mark, start, options)
     start[:, 2] -= origin
-    usable = np.isfinite(grey) if valid is None else np.isfinite(grey) & valid
-    fit = _Fit(np.where(usable, grey, 0.0), usable, mark, start, options)
+    fit = _Fit(grey, usable, mark, start, options)
     fit.run()
     result = fit.result()
+    if fit.reason or is_textured(fit.residuals, fit.used):
+        detail = _Fit(grey, usable, mark, start, options, background_px=_background_px(mark, start))
+        detail.run()
+        if not detail.reason:
+            result = detail.result()
     moved = np.array(result.pixel_from_mark)
     moved[:, 2] += origin
     return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
+
+
+def _cropped(
+    window: Array, valid: Mask | None, origin_px: tuple[float, float], mark: Mark, start: Array, options: MatchOptions
+) -> tuple[Array, Mask, Array]:
+    """The part of the window that the fit can use, which of it is usable, and its own origin."""
+    height, width = window.shape
+    usable = np.isfinite(window) if valid is None else np.isfinite(window) & valid
+    col0, row0, wide, tall = window_about(mark, start, options.margin_px + _SPARE_PX)
+    first_col, first_row = max(round(col0 - origin_px[0]), 0), max(round(row0 - origin_px[1]), 0)
+    rows = slice(min(first_row, height - 1), max(first_row + tall, 1))
+    cols = slice(min(first_col, width - 1), max(first_col + wide, 1))
+    origin = np.array([origin_px[0] + cols.start, origin_px[1] + rows.start])
+    return np.where(usable, window, 0.0)[rows, cols], usable[rows, cols], origin
 
 
 def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
@@ -144,8 +165,18 @@ def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[
 class _Fit:
     """One mark's adjustment in progress: its state, and the steps that improve it."""
 
-    def __init__(self, grey: Array, usable: Mask, mark: Mark, start: Array, options: MatchOptions) -> None:
-        self.grey, self.usable, self.mark, self.start, self.options = grey, usable, mark, start, options
+    def __init__(
+        self,
+        grey: Array,
+        usable: Mask,
+        mark: Mark,
+        start: Array,
+        options: MatchOptions,
+        background_px: float | None = None,
+    ) -> None:
+        self.background_px = background_px
+        self.usable, self.mark, self.start, self.options = usable, mark, start, options
+        self.grey = self._detail(grey)
         self.pixel_from_mark = start.copy()
         self.variance_px2 = options.blur_px**2 if self._blurs_freely() else _sharpest(mark, options)
         self.grey_parameters: Array = np.zeros(_GREY)
@@ -155,6 +186,7 @@ class _Fit:
         self.area = usable
         self.residuals = np.zeros_like(grey)
         self.design = np.zeros((0, *grey.shape))
+        self.scale_dn2 = 1.0
         self.reason = ""
 
     def run(self) -> None:
@@ -206,8 +238,17 @@ class _Fit:
             redundancy=int(self.used.sum()) - len(self.design),
             neighbour_correlation=noise.neighbour_correlation,
             covariance_is_white=noise.is_white,
+            likeness=self._likeness(),
             residuals_dn=np.where(self.area, self.residuals, np.nan),
         )
+
+    def _likeness(self) -> float:
+        background = np.stack([np.ones_like(self.grey), *self._slopes()])[:, self.used]
+        grey = self.grey[self.used]
+        if len(grey) <= len(background):
+            return 0.0
+        without = grey - background.T @ np.linalg.lstsq(background.T, grey, rcond=None)[0]
+        return float(np.sqrt(max(1 - np.sum(self.residuals[self.used] ** 2) / max(np.sum(without**2), 1e-12), 0.0)))
 
     def _blurs_freely(self) -> bool:
         return self.options.estimate_blur or not isinstance(self.mark, MarkTemplate)
@@ -228,30 +269,54 @@ class _Fit:
             self.reason = self.reason or "most of the mark lies outside of the scan"
 
     def _adjust(self, robust: bool, tolerance_px: float) -> None:
-        """Gauss-Newton until the mark moves less than tolerance_px."""
+        """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""
+        self._linearise()
+        self.scale_dn2 = self._tukey_scale() ** 2
+        scale_dn = self._tukey_scale() if robust else np.inf
         for _ in range(self.options.max_iterations):
-            self._linearise()
-            weights = self.used.astype(float)
-            if robust:
-                weights = weights * self._tukey()
-            step = self._solve(weights)
+            step = self._solve(self.used * _tukey_weights(self.residuals, scale_dn))
             if step is None:
                 self.reason = "the picture does not determine the mark's place"
                 return
+            before, cost = self._state(), self._cost(scale_dn)
             moved = self._apply(step)
-            if self._ran_away():
-                return
             if moved < tolerance_px:
                 self.residuals = self.residuals - np.tensordot(step, self.design, axes=1)
                 return
+            self._linearise()
+            for _ in range(_HALVINGS):
+                if self._cost(scale_dn) <= cost:
+                    break
+                step = step / 2
+                self._restore(before)
+                moved = self._apply(step)
+                self._linearise()
+            if self._ran_away():
+                return
+            if moved < tolerance_px:
+                return
         self.reason = "the adjustment did not converge"
+
+    def _state(self) -> tuple[Array, float, Array]:
+        return self.pixel_from_mark.copy(), self.variance_px2, self.grey_parameters
+
+    def _restore(self, state: tuple[Array, float, Array]) -> None:
+        self.pixel_from_mark, self.variance_px2, self.grey_parameters = state[0].copy(), state[1], state[2]
+
+    def _cost(self, scale_dn: float) -> float:
+        """What the adjustment makes small: Tukey's loss, squares where the scale is infinite, and the priors'."""
+        residuals = self.residuals[self.used]
+        if np.isfinite(scale_dn):
+            limit = _TUKEY * scale_dn
+            residuals = limit * np.sqrt((1 - np.clip(1 - (residuals / limit) ** 2, 0.0, None) ** 3) / 3)
+        return float(np.sum(residuals**2) + self.scale_dn2 * np.sum(self._prior_weights() * self._departures() ** 2))
 
     def _linearise(self) -> None:
         """The design (unknowns, height, width) and residuals of the present state, the gain from a linear fit at
         first."""
         height, width = self.grey.shape
         rendering = render(self.mark, self.pixel_from_mark, width, height, float(np.sqrt(self.variance_px2)))
-        value = rendering.pixels(rendering.value)
+        value = self._detail(rendering.pixels(rendering.value))
         slopes = self._slopes()
         grey_design = np.stack([value, np.ones_like(value), *slopes])
         if not self.grey_parameters.any():
@@ -264,11 +329,17 @@ class _Fit:
             along_col = generator[0, 0] * col + generator[0, 1] * row
             along_row = generator[1, 0] * col + generator[1, 1] * row
             columns.append(rendering.by_col * along_col + rendering.by_row * along_row)
-        design = [-gain * rendering.pixels(column) for column in columns]
+        design = [-gain * self._detail(rendering.pixels(column)) for column in columns]
         if self.options.estimate_blur:
-            design.append(0.5 * gain * rendering.pixels(rendering.laplacian))
+            design.append(0.5 * gain * self._detail(rendering.pixels(rendering.laplacian)))
         self.design = np.stack([*design, *grey_design])
         self.residuals = self.grey - np.tensordot(self.grey_parameters, grey_design, axes=1)
+
+    def _detail(self, image: Array) -> Array:
+        """Grey values, or their model, without what is coarser than the mark's lines."""
+        if self.background_px is None:
+            return image
+        return np.asarray(image - cv2.GaussianBlur(image, (0, 0), self.background_px))
 
     def _slopes(self) -> tuple[Array, Array]:
         height, width = self.grey.shape
@@ -282,25 +353,28 @@ class _Fit:
         row = (np.arange(height * cells) + 0.5) / cells - 0.5 - self.pixel_from_mark[1, 2]
         return col[None, :], row[:, None]
 
-    def _tukey(self) -> Array:
-        scale = max(robust_scale(self.residuals[self.used]), _SCALE_FLOOR * abs(float(self.grey_parameters[0])), 1e-9)
-        relative = np.clip(np.abs(self.residuals) / (_TUKEY * scale), 0.0, 1.0)
-        return np.asarray((1 - relative**2) ** 2)
+    def _tukey_scale(self) -> float:
+        return max(robust_scale(self.residuals[self.used]), _SCALE_FLOOR * abs(float(self.grey_parameters[0])), 1e-9)
 
     def _solve(self, weights: Array) -> Array | None:
+        """The step, None where it is not determined. A blur at its limit stays there instead of pulling the others."""
         weighted = self.design * weights
-        scale_dn2 = max(
-            robust_scale(self.residuals[self.used]) ** 2, (_SCALE_FLOOR * self.grey_parameters[0]) ** 2, 1e-12
-        )
-        normal = _normal(self.design, weighted) + np.diag(self._prior_weights() * scale_dn2)
-        size = np.sqrt(np.diag(normal))
-        if not np.all(size > 0) or not np.all(np.isfinite(size)):
-            return None
-        scaled = normal / np.outer(size, size)
-        if np.linalg.cond(scaled) > 1e10:
-            return None
-        right = np.tensordot(weighted, self.residuals, axes=2) - self._prior_weights() * scale_dn2 * self._departures()
-        return np.asarray(np.linalg.solve(scaled, right / size) / size)
+        priors = self._prior_weights() * self.scale_dn2
+        normal = _normal(self.design, weighted) + np.diag(priors)
+        right = np.tensordot(weighted, self.residuals, axes=2) - priors * self._departures()
+        free = np.ones(len(right), dtype=bool)
+        step = _solution(normal, right, free)
+        blur = 2 + len(self.generators)
+        if step is not None and self.options.estimate_blur:
+            low, high = self._variance_range()
+            if (self.variance_px2 <= low and step[blur] < 0) or (self.variance_px2 >= high and step[blur] > 0):
+                free[blur] = False
+                step = _solution(normal, right, free)
+        return step
+
+    def _variance_range(self) -> tuple[float, float]:
+        low, high = _BLUR_RANGE_PX
+        return (0.0 if isinstance(self.mark, MarkTemplate) else low**2), high**2
 
     def _prior_weights(self) -> Array:
         """1 / variance of the loose priors that hold what the picture does not show, a disk's rotation say."""
@@ -327,11 +401,9 @@ class _Fit:
         change = np.tensordot(linear / longest, self.generators, axes=1) if len(linear) else np.zeros((2, 2))
         self.pixel_from_mark[:, :2] = (np.eye(2) + change) @ self.pixel_from_mark[:, :2]
         if self.options.estimate_blur:
-            floor, ceiling = (limit**2 for limit in _BLUR_RANGE_PX)
-            sharpest = 0.0 if isinstance(self.mark, MarkTemplate) else floor
-            factor_range = self.variance_px2 / 2 - 0.05, self.variance_px2 * 2 + 0.3
+            near = self.variance_px2 / 2 - 0.05, self.variance_px2 * 2 + 0.3
             wished = self.variance_px2 + step[2 + len(self.generators)] / longest
-            self.variance_px2 = float(np.clip(np.clip(wished, *factor_range), sharpest, ceiling))
+            self.variance_px2 = float(np.clip(np.clip(wished, *near), *self._variance_range()))
         self.grey_parameters = self.grey_parameters + step[-_GREY:] / longest
         reach = max(self.grey.shape) / 4
         return float(np.hypot(*shift) + reach * 0.1 * np.abs(linear).max(initial=0.0))
@@ -345,6 +417,23 @@ class _Fit:
         return bool(self.reason)
 
 
+def _tukey_weights(residuals: Array, scale_dn: float) -> Array:
+    return np.asarray((1 - np.clip(np.abs(residuals) / (_TUKEY * scale_dn), 0.0, 1.0) ** 2) ** 2)
+
+
+def _solution(normal: Array, right: Array, free: Mask) -> Array | None:
+    """The solution for the free unknowns, 0 for the others; None where the equations are singular."""
+    size = np.sqrt(np.diag(normal))[free]
+    if not np.all(size > 0) or not np.all(np.isfinite(size)):
+        return None
+    scaled = normal[np.ix_(free, free)] / np.outer(size, size)
+    if np.linalg.cond(scaled) > 1e10:
+        return None
+    result = np.zeros(len(right))
+    result[free] = np.linalg.solve(scaled, right[free] / size) / size
+    return result
+
+
 def damage(residuals: Array, area: Mask, sigmas: float) -> Mask:
     """Pixels of dust and scratches: where smoothed residuals exceed so many of their standard deviations over more
     than a speck, and a pixel about it."""
@@ -355,6 +444,11 @@ def damage(residuals: Array, area: Mask, sigmas: float) -> Mask:
     large = (np.abs(smooth) > sigmas * scale).astype(np.uint8)
     opened = cv2.morphologyEx(large, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     return np.asarray(cv2.dilate(opened, np.ones((3, 3), np.uint8)) > 0)
+
+
+def _background_px(mark: Mark, pixel_from_mark: Array) -> float:
+    scale = float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
+    return max(1.5 * scale * thinnest_mm(mark), 1.0) + 1.0
 
 
 def is_round(mark: Mark) -> bool:

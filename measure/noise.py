@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_TEXTURE = 0.25  # correlation at REACH_PX that grain never has
+
 REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated over 1.5 px, gone beyond 5
 
 
@@ -41,6 +43,16 @@ def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
     if abs(correlation) < 3 / np.sqrt(2 * count):
         return NoiseModel(variance, np.array([[variance]]), correlation)
     return NoiseModel(variance, lags * _taper(REACH_PX), correlation)
+
+
+def is_textured(residuals: Array, used: Mask) -> bool:
+    """Whether what a fit leaves is a landscape rather than grain: still alike beyond the reach of any grain."""
+    kept = np.where(used, residuals, 0.0)
+    if not kept.any():
+        return False
+    lags = _autocovariance(kept, used, REACH_PX)
+    far = (lags[REACH_PX, 2 * REACH_PX] + lags[2 * REACH_PX, REACH_PX]) / 2
+    return bool(far > _TEXTURE * lags[REACH_PX, REACH_PX])
 
 
 def robust_scale(values: Array) -> float:

@@ -46,11 +46,12 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
     else:
         cells = CELLS if blur_px < 0.9 else CELLS // 2  # blur hides what coarser cells get wrong
         sharp = cell_coverage(mark, shifted, *size, cells)
+    sharp = sharp.astype(np.float32)
     smooth, slope, bend = _kernels(blur_px * cells)
     inner = slice(pad * cells, -pad * cells)
 
     def filtered(along_cols: Array, along_rows: Array) -> Array:
-        return np.asarray(cv2.sepFilter2D(sharp, cv2.CV_64F, along_cols, along_rows)[inner, inner])
+        return np.asarray(cv2.sepFilter2D(sharp, cv2.CV_32F, along_cols, along_rows)[inner, inner])
 
     return Rendering(
         value=filtered(smooth, smooth),

@@ -161,3 +161,19 @@ def turned_part(part: Part, angle_deg: float) -> Part:
     if isinstance(part, Bar):
         return Bar(turn(part.from_mm), turn(part.to_mm), part.line_mm)
     return replace(part, center_mm=turn(part.center_mm))
+
+
+def thinnest_mm(mark: Mark) -> float:
+    """The width of the mark's thinnest line, as far as its parts tell."""
+    if isinstance(mark, MarkTemplate):
+        return mark.pitch_um / 1000 * 2
+    widths = []
+    for part in mark.parts:
+        if isinstance(part, Bar | Ring):
+            widths.append(part.line_mm)
+        elif isinstance(part, Disk):
+            widths.append(2 * part.radius_mm)
+        elif isinstance(part, Polygon):
+            vertices = np.asarray(part.vertices_mm)
+            widths.append(float(np.ptp(vertices, axis=0).min()) / 3)
+    return min(widths)

@@ -1,0 +1,168 @@
+"""Where in a scan something looks like a mark: normalised correlation with the rendered mark, at reduced size.
+
+A mark alone gives false answers on every film, so nothing is decided here: the responses go to the constellation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.rendering import extent_px, picture
+from measure.scan import Scan
+from measure.shapes import Mark, thinnest_mm
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+
+_EXTENT_PX = 14.0  # of the reduced mark
+_THINNEST_PX = 0.6  # of its thinnest line: below this the line drowns
+_LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
+_ALIKE = 0.8  # correlation above which two pictures of marks share one response
+_COARSE = 4.0  # times the finest detail: coarser structure is background
+_CLIP = 2.0  # times the local contrast
+FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Correlations with the looks of the marks, over the reduced scan.
+
+    light, dark: one map (rows, columns) per look, how much the place looks like the mark lighter or darker than its
+    surroundings. reduction: by which the scan was reduced.
+    """
+
+    light: tuple[Map, ...]
+    dark: tuple[Map, ...]
+    reduction: int
+
+    def reduced_px(self, scan_px: Array) -> Array:
+        """Scan pixels (..., 2) in pixels of the maps."""
+        return (scan_px - (self.reduction - 1) / 2) / self.reduction
+
+    def scan_px(self, reduced_px: Array) -> Array:
+        """Pixels of the maps (..., 2) in scan pixels."""
+        return reduced_px * self.reduction + (self.reduction - 1) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A mark as one pose shows it: linear is the (2, 2) part of pixel_from_mark in the scan."""
+
+    mark: Mark
+    linear: Array
+
+
+def respond(scan: Scan, looks: Sequence[Look]) -> tuple[Responses, tuple[int, ...]]:
+    """The responses to the looks that differ, and for every look which of the responses is its own.
+
+    Of a colour scan every channel is tried, and the one that answers best at a place counts there.
+    """
+    reduction = _reduction(scan, looks)
+    templates = [_template(look, reduction) for look in looks]
+    kinds, index = _distinct(templates)
+    details = [detail_px(looks[index.index(kind)].mark, looks[0].linear) / reduction for kind in range(len(kinds))]
+    light = [np.full(_reduced_shape(scan, reduction), -1.0, np.float32) for _ in kinds]
+    dark = [map_.copy() for map_ in light]
+    for weights in _channel_weights(scan):
+        grey = scan.reduced(reduction, weights)
+        for kind, template in enumerate(kinds):
+            response = _correlation(grey, template, max(details[kind], 1.0), scan.full_scale_dn * FAINT)
+            np.maximum(light[kind], response, out=light[kind])
+            np.maximum(dark[kind], -response, out=dark[kind])
+    return Responses(tuple(light), tuple(dark), reduction), index
+
+
+def peaks(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[Array, Array]:
+    """(n, 2) places (col, row) and (n,) heights of the highest local maxima above least, in order of height."""
+    highest = cv2.dilate(response, np.ones((2 * apart_px + 1, 2 * apart_px + 1), np.uint8))
+    rows, cols = np.nonzero((response == highest) & (response > least))
+    order = np.argsort(-response[rows, cols], kind="stable")[:count]
+    places = np.column_stack([cols, rows])[order].astype(float)
+    return places, response[rows, cols][order].astype(float)
+
+
+def detail_px(mark: Mark, linear: Array) -> float:
+    """The width of the mark's finest detail in px, and no less than one."""
+    return max(float(np.sqrt(abs(np.linalg.det(linear)))) * thinnest_mm(mark), 1.0)
+
+
+def correlate(grey: NDArray[np.floating], template: Array, detail_px: float, faint_dn: float) -> Map:
+    """Normalised correlation of the template with grey values, where it lies wholly inside.
+
+    Both are freed of everything much coarser than the mark's finest detail (detail_px), and strong contrasts are
+    clipped, so that a thin cross on a landscape answers as on an even ground. Contrasts of faint_dn or below count for
+    less.
+    """
+    image = _flattened(np.asarray(grey, np.float32), detail_px, faint_dn)
+    chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), _COARSE * detail_px), np.float32)
+    return np.asarray(cv2.matchTemplate(image, chip, cv2.TM_CCOEFF_NORMED), np.float32)
+
+
+def _flattened(image: Map, detail_px: float, faint_dn: float) -> Map:
+    coarse_px = _COARSE * detail_px
+    detail = image - cv2.GaussianBlur(image, (0, 0), coarse_px)
+    contrast = np.sqrt(cv2.GaussianBlur(detail**2, (0, 0), 2 * coarse_px) + faint_dn**2)
+    return np.asarray(np.clip(detail / contrast, -_CLIP, _CLIP), np.float32)
+
+
+def _reduction(scan: Scan, looks: Sequence[Look]) -> int:
+    """The largest that leaves every mark large enough and every line thick enough to be seen."""
+    limits = []
+    for look in looks:
+        least, greatest = extent_px(look.mark, _centred(look.linear))
+        scale = float(np.sqrt(abs(np.linalg.det(look.linear))))
+        limits.append(min((greatest - least).max() / _EXTENT_PX, scale * thinnest_mm(look.mark) / _THINNEST_PX))
+    needed = max(scan.width_px, scan.height_px) / _LARGEST_PX
+    return max(1, int(min(limits)), int(np.ceil(needed)))
+
+
+def _template(look: Look, reduction: int) -> Array:
+    linear = _centred(look.linear) / reduction
+    least, greatest = extent_px(look.mark, linear)
+    half = int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + 2
+    linear[:, 2] = half
+    return picture(look.mark, linear, 2 * half + 1, 2 * half + 1, 0.6)
+
+
+def _centred(linear: Array) -> Array:
+    return np.column_stack([linear, np.zeros(2)])
+
+
+def _distinct(templates: Sequence[Array]) -> tuple[list[Array], tuple[int, ...]]:
+    """Templates that differ, and which of them stands for each."""
+    kinds: list[Array] = []
+    index = []
+    for template in templates:
+        likeness = [_likeness(template, kind) for kind in kinds]
+        if likeness and max(likeness) > _ALIKE:
+            index.append(int(np.argmax(likeness)))
+        else:
+            index.append(len(kinds))
+            kinds.append(template)
+    return kinds, tuple(index)
+
+
+def _likeness(first: Array, second: Array) -> float:
+    half = max(first.shape[0], second.shape[0]) // 2
+    padded = np.stack([np.pad(t, half - t.shape[0] // 2).ravel() for t in (first, second)])
+    return float(np.asarray(np.corrcoef(padded))[0, 1])
+
+
+def _correlation(grey: Map, template: Array, detail_px: float, faint_dn: float) -> Map:
+    """The correlation at every pixel, the scan's edge being repeated beyond it."""
+    half = template.shape[0] // 2
+    padded = cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE)
+    return correlate(np.asarray(padded, np.float32), template, detail_px, faint_dn)
+
+
+def _reduced_shape(scan: Scan, reduction: int) -> tuple[int, int]:
+    return scan.height_px // reduction, scan.width_px // reduction
+
+
+def _channel_weights(scan: Scan) -> tuple[tuple[float, ...], ...]:
+    if scan.channels == 1:
+        return ((1.0,),)
+    return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

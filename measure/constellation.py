@@ -1,0 +1,219 @@
+"""The frame's place in its scan: the small similarity, in each pose, under which most marks have a response.
+
+Places are complex numbers here, x + iy in mm of the scan's own axes (right, up), so that a similarity is `a w + b`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.candidates import Map, Responses, peaks
+from measure.poses import up_from_camera
+from measure.shapes import LayoutMark
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_LEAST_RESPONSE = 0.25
+_CANDIDATES = 100  # of each look
+_PAIRS = 60  # of marks that hypotheses are made from
+_KEPT = 12  # placements of a pose that are refined
+_OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What is known of the placement: scale is 1 within scale_tolerance for the pitch at hand."""
+
+    scale_tolerance: float
+    rotation_rad: float
+    misfit_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A frame in its scan. score: how much of the constellation answers; supported: how many marks do.
+
+    pixel_from_camera: (2, 3). polarity: +1 where the marks are lighter than their surroundings, -1 darker. reduction:
+    of the scan that it was found in.
+    """
+
+    pose: str
+    pixel_from_camera: Array
+    score: float
+    supported: int
+    polarity: int
+    reduction: int
+
+
+def placements(
+    marks: Sequence[LayoutMark],
+    pose: str,
+    responses: Responses,
+    look_of_mark: Sequence[int],
+    pitch_mm: tuple[float, float],
+    bounds: Bounds,
+) -> list[Placement]:
+    """The best placements of one pose that differ from one another, best first; none where no two marks respond."""
+    search = _Search(marks, pose, responses, look_of_mark, pitch_mm, bounds)
+    found = [placement for polarity in (1, -1) for placement in search.run(polarity)]
+    found.sort(key=lambda placement: -placement.score)
+    return _different(found, marks, bounds.misfit_mm / pitch_mm[0])
+
+
+def _different(found: Sequence[Placement], marks: Sequence[LayoutMark], tolerance_px: float) -> list[Placement]:
+    kept: list[tuple[Placement, Array]] = []
+    xy = np.array([mark.xy_mm for mark in marks])
+    for placement in found:
+        places = xy @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        if all(np.hypot(*(places - other).T).max() > 2 * tolerance_px for _, other in kept):
+            kept.append((placement, places))
+    return [placement for placement, _ in kept]
+
+
+class _Search:
+    """The search for one pose's placements."""
+
+    def __init__(
+        self,
+        marks: Sequence[LayoutMark],
+        pose: str,
+        responses: Responses,
+        look_of_mark: Sequence[int],
+        pitch_mm: tuple[float, float],
+        bounds: Bounds,
+    ) -> None:
+        self.marks, self.pose, self.responses, self.bounds = marks, pose, responses, bounds
+        self.looks = np.asarray(look_of_mark)
+        self.pitch = np.asarray(pitch_mm)
+        turned = np.array([mark.xy_mm for mark in marks]) @ up_from_camera(pose).T
+        self.camera: Complex = turned[:, 0] + 1j * turned[:, 1]
+        self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, 1.5)
+
+    def run(self, polarity: int) -> list[Placement]:
+        maps = self._maps(polarity)
+        candidates = [self._candidates(map_) for map_ in maps]
+        scale, offset = self._hypotheses(candidates)
+        if len(scale) == 0:
+            return []
+        wide = [_dilated(map_, self.tolerance_px) for map_ in maps]
+        scores, _ = self._scores(wide, scale, offset)
+        near = [_dilated(map_, max(self.tolerance_px / 2, 1.5)) for map_ in maps]
+        result: list[Placement] = []
+        for index in np.argsort(-scores, kind="stable")[:_KEPT]:
+            a, b = self._refined(maps, complex(scale[index]), complex(offset[index]))
+            score, supported = self._scores(near, np.array([a]), np.array([b]))
+            result.append(
+                Placement(
+                    self.pose,
+                    self._pixel_from_camera(a, b),
+                    float(score[0]),
+                    int(supported[0]),
+                    polarity,
+                    self.responses.reduction,
+                )
+            )
+        return result
+
+    def _maps(self, polarity: int) -> list[Map]:
+        return list(self.responses.light if polarity > 0 else self.responses.dark)
+
+    def _candidates(self, map_: Map) -> Complex:
+        places, _ = peaks(map_, _CANDIDATES, _LEAST_RESPONSE)
+        return self._complex(self.responses.scan_px(places))
+
+    def _complex(self, scan_px: Array) -> Complex:
+        scaled = scan_px * self.pitch
+        return np.asarray(scaled[..., 0] - 1j * scaled[..., 1])
+
+    def _scan_px(self, places: Complex) -> Array:
+        return np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.pitch)
+
+    def _hypotheses(self, candidates: Sequence[Complex]) -> tuple[Complex, Complex]:
+        """Every similarity within bounds that takes two marks to two of their candidates."""
+        scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
+        for first, second in self._pairs():
+            of_first, of_second = candidates[self.looks[first]], candidates[self.looks[second]]
+            base = self.camera[second] - self.camera[first]
+            scale = (of_second[None, :] - of_first[:, None]) / base
+            allowed = (np.abs(np.abs(scale) - 1) < self.bounds.scale_tolerance) & (
+                np.abs(np.angle(scale)) < self.bounds.rotation_rad
+            )
+            i, j = np.nonzero(allowed)
+            scales.append(scale[i, j])
+            offsets.append(of_first[i] - scale[i, j] * self.camera[first])
+        return np.concatenate(scales), np.concatenate(offsets)
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """Pairs of marks far apart, spread evenly over all marks where there are too many."""
+        pairs = list(combinations(range(len(self.camera)), 2))
+        length = np.array([abs(self.camera[i] - self.camera[j]) for i, j in pairs])
+        far = [pair for pair, distance in zip(pairs, length, strict=True) if distance >= 0.4 * length.max()]
+        step = max(1.0, len(far) / _PAIRS)
+        return [far[int(index * step)] for index in range(min(len(far), _PAIRS))]
+
+    def _scores(self, maps: Sequence[Map], scale: Complex, offset: Complex) -> tuple[Array, Array]:
+        """Scores and numbers of supporting marks of many placements at once."""
+        places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
+        rows, cols = maps[0].shape
+        nearest = np.rint(places).astype(int)
+        inside = (nearest >= 0).all(axis=-1) & (nearest[..., 0] < cols) & (nearest[..., 1] < rows)
+        stack = np.stack(maps)
+        col, row = np.clip(nearest[..., 0], 0, cols - 1), np.clip(nearest[..., 1], 0, rows - 1)
+        response = np.where(inside, stack[self.looks, row, col], 0.0).astype(float)
+        strength = np.maximum(response, 0.0) ** 2 - _LEAST_RESPONSE**2
+        score = np.maximum(strength, 0.0).sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
+        return score, (strength > 0).sum(axis=1)
+
+    def _refined(self, maps: Sequence[Map], scale: complex, offset: complex) -> tuple[complex, complex]:
+        """The similarity through the responses about its predictions, each weighed by its strength."""
+        for tolerance_px in (self.tolerance_px, max(self.tolerance_px / 2, 1.5)):
+            predicted = self.responses.reduced_px(self._scan_px(scale * self.camera + offset))
+            found = [
+                _highest(maps[look], place, tolerance_px) for look, place in zip(self.looks, predicted, strict=True)
+            ]
+            weight = np.array([max(height - _LEAST_RESPONSE, 0.0) for _, height in found])
+            if (weight > 0).sum() < 2:
+                break
+            places = self._complex(self.responses.scan_px(np.array([place for place, _ in found])))
+            mean_from, mean_to = (np.sum(weight * p) / weight.sum() for p in (self.camera, places))
+            from_, to = self.camera - mean_from, places - mean_to
+            scale = complex(np.sum(weight * np.conj(from_) * to) / np.sum(weight * np.abs(from_) ** 2))
+            offset = complex(mean_to - scale * mean_from)
+        return scale, offset
+
+    def _pixel_from_camera(self, scale: complex, offset: complex) -> Array:
+        turn = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ up_from_camera(self.pose)
+        up = np.column_stack([turn, [offset.real, offset.imag]])
+        return np.asarray(np.diag([1.0, -1.0]) @ up / self.pitch[:, None])
+
+
+def _dilated(map_: Map, radius_px: float) -> Map:
+    size = 2 * round(radius_px) + 1
+    return np.asarray(cv2.dilate(map_, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))))
+
+
+def _highest(map_: Map, place: Array, radius_px: float) -> tuple[Array, float]:
+    """The highest response about a place, refined by a parabola; height 0 outside of the map."""
+    rows, cols = map_.shape
+    col0, row0 = np.clip(np.floor(place - radius_px).astype(int), 0, None)
+    col1, row1 = np.clip(np.ceil(place + radius_px).astype(int) + 1, None, (cols, rows))
+    if col0 >= col1 or row0 >= row1:
+        return place, 0.0
+    part = map_[row0:row1, col0:col1]
+    best = divmod(int(part.argmax()), part.shape[1])
+    row, col = best[0] + int(row0), best[1] + int(col0)
+    top = np.array([col, row], dtype=float)
+    if 0 < col < cols - 1 and 0 < row < rows - 1:
+        top += [_vertex(map_[row, col - 1 : col + 2]), _vertex(map_[row - 1 : row + 2, col])]
+    return top, float(map_[row, col])
+
+
+def _vertex(three: Map) -> float:
+    """Where the parabola through three values, the middle one the highest, has its top: -0.5 to 0.5."""
+    bend = float(three[0] - 2 * three[1] + three[2])
+    return float(np.clip((three[0] - three[2]) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0

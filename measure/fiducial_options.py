@@ -1,0 +1,32 @@
+"""What a user may set about the measurement of fiducial marks."""
+
+from dataclasses import dataclass, field
+
+from measure.matching import MatchOptions
+from measure.poses import POSES
+
+
+@dataclass(frozen=True)
+class FiducialOptions:
+    """How fiducial marks are measured.
+
+    pose: "auto", or one of the eight where the user knows it. rotation_deg, scale_tolerance: how far the frame may be
+    turned and scaled against its pose and the pitch. misfit_mm: how far a mark may lie from its given place when it is
+    searched. gate_mm: how far a measured mark may lie from where the others put it. film_sigma_mm: scatter of marks by
+    film and scanner. match: of the fit at full resolution; a polygon is always matched by its shift alone.
+    """
+
+    pose: str = "auto"
+    rotation_deg: float = 6.0
+    scale_tolerance: float = 0.04
+    misfit_mm: float = 0.6
+    gate_mm: float = 0.3
+    film_sigma_mm: float = 0.005
+    match: MatchOptions = field(default_factory=lambda: MatchOptions(linear_sigma=0.05))
+
+    def __post_init__(self) -> None:
+        if self.pose != "auto" and self.pose not in POSES:
+            raise ValueError(f"pose is {self.pose!r}; auto or one of {', '.join(POSES)} is right")
+        for name in ("rotation_deg", "scale_tolerance", "misfit_mm", "gate_mm", "film_sigma_mm"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")

@@ -1,0 +1,159 @@
+"""Fiducial marks of one scan: found by their constellation, named by the frame's pose, measured at full resolution."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.candidates import Look, respond
+from measure.constellation import Bounds, Placement, placements
+from measure.fiducial_options import FiducialOptions
+from measure.frame import Frame, measure_frame
+from measure.pose_decision import decide_pose
+from measure.poses import POSES, up_from_camera
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.scan import Scan
+from measure.shapes import FiducialLayout, LayoutMark
+from measure.status import Status
+
+Array = NDArray[np.float64]
+
+_SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
+_STEP_TOLERANCE = 0.06
+_SET = ("set in the project",)
+_AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
+
+
+def measure_fiducials(
+    scan: Scan,
+    layout: FiducialLayout,
+    pitch_um: tuple[float, float] | None,
+    options: FiducialOptions | None = None,
+) -> FrameMeasurement:
+    """Measure every mark of the layout in the scan: one row a mark, whatever became of it.
+
+    pitch_um: of the scan in x and y; None where it is not known: then the frame's size says about what it is.
+    The centres are in the scan's pixels, the centre of the top-left one being (0, 0). Never raises for what the
+    picture shows: statuses, reasons and problems say it.
+    """
+    options = options or FiducialOptions()
+    found, pitch_mm = _find(scan, layout, pitch_um, options)
+    if not found:
+        return _nothing(scan, layout, "nothing in the scan looks like two or more of the camera's marks")
+    frame = measure_frame(scan, layout, found[0], pitch_mm, options)
+    if not frame.accepted:
+        return _nothing(scan, layout, frame.misfit())
+    pose = Pose(options.pose, True, _SET)
+    if options.pose == "auto":
+        pose = decide_pose(scan, layout, found, frame.fits, frame.weights, pitch_mm, options)
+        if pose.name != frame.placement.pose:
+            frame = measure_frame(scan, layout, _best(found, pose.name), pitch_mm, options)
+    return _measurement(scan, layout, frame, pose, _rivals(found, pose.name))
+
+
+def _find(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> tuple[list[Placement], tuple[float, float]]:
+    """The placements of all poses asked for, best first, and the pitch in mm that they were found with."""
+    best: tuple[list[Placement], tuple[float, float]] = ([], (1.0, 1.0))
+    for pitch_mm, tolerance in _pitches(scan, layout, pitch_um, options):
+        found = _placements(scan, layout, pitch_mm, tolerance, options)
+        if found and (not best[0] or found[0].score > best[0][0].score):
+            best = found, pitch_mm
+    return best
+
+
+def _pitches(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> list[tuple[tuple[float, float], float]]:
+    """Pitches (mm) to try, each with the relative tolerance of scale that goes with it."""
+    if pitch_um is not None:
+        return [((pitch_um[0] / 1000, pitch_um[1] / 1000), options.scale_tolerance)]
+    long_mm, short_mm = max(layout.frame_mm), min(layout.frame_mm)
+    long_px, short_px = max(scan.width_px, scan.height_px), min(scan.width_px, scan.height_px)
+    largest = min(long_px / long_mm, short_px / short_mm)
+    return [((1 / (step * largest),) * 2, _STEP_TOLERANCE) for step in _SCALE_STEPS]
+
+
+def _placements(
+    scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float], tolerance: float, options: FiducialOptions
+) -> list[Placement]:
+    poses = POSES if options.pose == "auto" else (options.pose,)
+    flip = np.diag([1 / pitch_mm[0], -1 / pitch_mm[1]])
+    looks = [Look(mark.mark, flip @ up_from_camera(pose)) for pose in poses for mark in layout.marks]
+    responses, index = respond(scan, looks)
+    bounds = Bounds(tolerance, float(np.deg2rad(options.rotation_deg)), options.misfit_mm)
+    count = len(layout.marks)
+    found = []
+    for number, pose in enumerate(poses):
+        own = index[number * count : (number + 1) * count]
+        found += placements(layout.marks, pose, responses, own, pitch_mm, bounds)
+    # Poses that score alike keep their order: of a symmetric camera's eight, "0" comes first.
+    return sorted(found, key=lambda placement: -round(placement.score, 2))
+
+
+def _best(found: Sequence[Placement], pose: str) -> Placement:
+    return next(placement for placement in found if placement.pose == pose)
+
+
+def _rivals(found: Sequence[Placement], pose: str) -> list[str]:
+    """Sentences about other placements in the same pose that nearly as many marks speak for."""
+    same = [placement for placement in found if placement.pose == pose]
+    best = same[0]
+    problems = []
+    for other in same[1:]:
+        if other.score >= _AMBIGUOUS * best.score and other.supported >= best.supported - 1:
+            shift = np.linalg.solve(
+                best.pixel_from_camera[:, :2], other.pixel_from_camera[:, 2] - best.pixel_from_camera[:, 2]
+            )
+            problems.append(
+                f"the constellation fits nearly as well shifted by ({shift[0]:.1f}, {shift[1]:.1f}) mm, on "
+                f"{other.supported} marks against {best.supported}: the marks' names are not certain"
+            )
+    return problems[:3]
+
+
+def _nothing(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasurement:
+    marks = tuple(
+        MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}") for mark in layout.marks
+    )
+    problem = f"{scan.name}: no fiducial was measured: {reason}; look whether the scan and the camera belong together"
+    return FrameMeasurement(scan.name, marks, None, None, (problem,))
+
+
+def _measurement(
+    scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, rivals: Sequence[str]
+) -> FrameMeasurement:
+    marks = tuple(_row(mark, index, frame) for index, mark in enumerate(layout.marks))
+    problems = [f"{scan.name}: {sentence}" for sentence in rivals]
+    if rivals:
+        pose = Pose(pose.name, False, (*pose.evidence, *rivals)) if pose.evidence != _SET else pose
+    if not pose.decided:
+        problems.append(f"{scan.name}: pose assumed: {pose.evidence[0]}")
+    used = int(frame.belongs.sum())
+    if used < len(layout.marks):
+        problems.append(f"{scan.name}: {used} of {len(layout.marks)} fiducials measured")
+    if used <= 3:
+        problems.append(f"{scan.name}: an affine transformation on {used} fiducials has no redundancy: no check")
+    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, tuple(problems))
+
+
+def _row(mark: LayoutMark, index: int, frame: Frame) -> MarkMeasurement:
+    sighting = frame.sightings[index]
+    fit = sighting.fit
+    if not sighting.inside:
+        return MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, sighting.reason)
+    if fit is None:
+        return MarkMeasurement(mark.id, "fiducial", sighting.predicted_px, None, Status.PREDICTED, sighting.reason)
+    quality = {
+        "snr": fit.snr,
+        "contrast_dn": fit.contrast_dn,
+        "noise_dn": fit.noise_dn,
+        "blur_px": fit.blur_px,
+        "damaged_fraction": fit.damaged_fraction,
+        "likeness": fit.likeness,
+        "redundancy": float(fit.redundancy),
+        "neighbour_correlation": fit.neighbour_correlation,
+    }
+    status, reason = frame.verdict(index)
+    return MarkMeasurement(mark.id, "fiducial", fit.center_px, fit.covariance_px2, status, reason, quality)

@@ -1,0 +1,207 @@
+"""One frame in one placement: its marks sighted at full resolution, and those told apart that do not belong."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.channels import best_weights
+from measure.constellation import Placement
+from measure.fiducial_options import FiducialOptions
+from measure.frame_fit import fit_frame, strangers
+from measure.matching import Match
+from measure.poses import up_from_camera
+from measure.refinement import Sighting, sight
+from measure.scan import LUMINANCE, Scan
+from measure.shapes import FiducialLayout
+from measure.status import Status
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well...
+_FAINT_LIKENESS = 0.2  # ...unless this many others say within a few pixels where it must be
+_MANY = 8
+_CLEAR_LIKENESS = 0.5
+_CLEAR_SNR = 3.0
+_CLEAR_DAMAGE = 0.25
+_CLEAR_SIGMA_PX = 0.3
+_GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
+_CHANNEL_TRIALS = 6  # marks that the channels are chosen from
+_REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """belongs: (n,) marks that were found and agree. misfit_mm: (n,) how far each mark found is from where the frame
+    puts it, nan without one. pixel_from_camera: (2, 3), the placement's own where fewer than two marks belong."""
+
+    placement: Placement
+    sightings: tuple[Sighting, ...]
+    belongs: Mask
+    misfit_mm: Array
+    pixel_from_camera: Array
+    weights: tuple[float, ...] | None
+
+    @property
+    def fits(self) -> list[Match | None]:
+        """The fits of the marks that belong."""
+        return [s.fit if ok else None for s, ok in zip(self.sightings, self.belongs, strict=True)]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether enough marks agree for the frame not to be chance: three, and three in ten of those in the scan."""
+        inside = sum(sighting.inside for sighting in self.sightings)
+        needed = max(min(3, len(self.sightings)), 2, int(np.ceil(0.3 * inside)))
+        return int(self.belongs.sum()) >= needed
+
+    def misfit(self) -> str:
+        """A sentence for a frame that is not accepted."""
+        return (
+            f"the constellation does not fit: only {int(self.belongs.sum())} of {len(self.sightings)} marks were found "
+            "where the others put them"
+        )
+
+    def verdict(self, index: int) -> tuple[Status, str]:
+        """What became of a mark that was fitted."""
+        fit = self.sightings[index].fit
+        if fit is None or not self.belongs[index]:
+            off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.belongs.sum())} marks put it"
+            return Status.REJECTED, f"what was measured lies {off}"
+        reasons = []
+        if fit.likeness < _CLEAR_LIKENESS:
+            reasons.append(f"it correlates with its drawing by only {fit.likeness:.2f}")
+        if fit.snr < _CLEAR_SNR:
+            reasons.append(f"its contrast is only {fit.snr:.1f} times the noise")
+        if fit.damaged_fraction > _CLEAR_DAMAGE:
+            reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
+        sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
+        if sigma_px > _CLEAR_SIGMA_PX:
+            reasons.append(f"its standard deviation is {sigma_px:.2f} px")
+        return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")
+
+
+def measure_frame(
+    scan: Scan, layout: FiducialLayout, placement: Placement, pitch_mm: tuple[float, float], options: FiducialOptions
+) -> Frame:
+    """Sight all marks from the placement, fit the frame to those that agree, and look again for the others."""
+    sighter = _Sighter(scan, layout, placement, pitch_mm, options)
+    sighter.choose_channels()
+    everything = range(len(layout.marks))
+    sighter.look(everything, sighter.first_search_px)
+    sighter.judge()
+    if sighter.belongs.sum() >= 2:
+        sighter.learn()
+        sighter.look([index for index in everything if not sighter.belongs[index]], sighter.second_search_px())
+        sighter.judge()
+    return sighter.frame()
+
+
+class _Sighter:
+    """The state of a frame's measurement."""
+
+    def __init__(
+        self,
+        scan: Scan,
+        layout: FiducialLayout,
+        placement: Placement,
+        pitch_mm: tuple[float, float],
+        options: FiducialOptions,
+    ) -> None:
+        self.scan, self.layout, self.placement, self.options = scan, layout, placement, options
+        self.match = options.match
+        self.pitch = np.asarray(pitch_mm)
+        self.camera = np.array([mark.xy_mm for mark in layout.marks])
+        self.turn = up_from_camera(placement.pose)
+        self.pixel_from_camera = placement.pixel_from_camera
+        self.sightings: list[Sighting | None] = [None] * len(layout.marks)
+        self.belongs: Mask = np.zeros(len(layout.marks), dtype=bool)
+        self.weights: tuple[float, ...] | None = None
+        gate_px = options.gate_mm / float(self.pitch.mean())
+        self.first_search_px = _REDUCED_PX * placement.reduction + gate_px
+        self.gate_px = gate_px
+
+    def choose_channels(self) -> None:
+        """Of a colour scan: the channel in which some marks are most like their drawings, then from these the best
+        combination."""
+        if self.scan.channels == 1:
+            return
+        step = max(1, len(self.layout.marks) // _CHANNEL_TRIALS)
+        fits = []
+        for index in range(0, len(self.layout.marks), step):
+            tried = [self._sight(index, self.first_search_px, weights).fit for weights in (LUMINANCE, *_SINGLE)]
+            good = [fit for fit in tried if fit is not None and fit.likeness > _CLEAR_LIKENESS]
+            if good:
+                best = max(good, key=lambda fit: fit.likeness)
+                fits.append((self.layout.marks[index].mark, best.pixel_from_mark))
+        self.weights = best_weights(self.scan, fits)
+
+    def look(self, indices: Sequence[int], search_px: float) -> None:
+        for index in indices:
+            self.sightings[index] = self._sight(index, search_px, self.weights)
+
+    def judge(self) -> None:
+        """Which marks found belong together, and the frame through them."""
+        found = np.array([s is not None and s.fit is not None for s in self.sightings])
+        self.belongs = found.copy()
+        if found.sum() < 2:
+            return
+        index = np.flatnonzero(found)
+        up, sigma = self._up_mm(index), self._sigma_mm(index)
+        out = strangers(self.camera[index], up, sigma, self.turn, self.options.gate_mm)
+        self.belongs[index[out]] = False
+        fit = fit_frame(self.camera[index[~out]], up[~out], sigma[~out], self.turn)
+        self.pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / self.pitch[:, None]
+
+    def learn(self) -> None:
+        """Many marks tell blur, rotation and scale better than a faint mark does itself."""
+        if self.belongs.sum() < _MANY:
+            return
+        blurs = [s.fit.blur_px for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s and s.fit]
+        self.match = replace(self.match, blur_px=float(np.median(blurs)), estimate_blur=False, linear_sigma=0.01)
+
+    def second_search_px(self) -> float:
+        """How far a mark can be from where the others put it: the gate, less where many others agree better."""
+        if self.belongs.sum() < _MANY:
+            return self.gate_px
+        scatter_px = float(np.median(self._misfit_mm()[self.belongs])) / float(self.pitch.mean())
+        return min(self.gate_px, max(6 * scatter_px, 3.0))
+
+    def frame(self) -> Frame:
+        sightings = tuple(sighting for sighting in self.sightings if sighting is not None)
+        return Frame(self.placement, sightings, self.belongs, self._misfit_mm(), self.pixel_from_camera, self.weights)
+
+    def _misfit_mm(self) -> Array:
+        misfit = np.full(len(self.sightings), np.nan)
+        predicted = self._predicted_px()
+        for index, sighting in enumerate(self.sightings):
+            if sighting is not None and sighting.fit is not None:
+                misfit[index] = np.hypot(*((sighting.fit.center_px - predicted[index]) * self.pitch))
+        return misfit
+
+    def _sight(self, index: int, search_px: float, weights: Sequence[float] | None) -> Sighting:
+        pixel_from_mark = np.column_stack([self.pixel_from_camera[:, :2], self._predicted_px()[index]])
+        mark = self.layout.marks[index].mark
+        sighting = sight(self.scan, mark, pixel_from_mark, search_px, self.placement.polarity, weights, self.match)
+        least = _FAINT_LIKENESS if self.belongs.sum() >= _MANY else _LEAST_LIKENESS
+        if sighting.fit is not None and sighting.fit.likeness < least:
+            reason = f"nothing within {search_px:.0f} px of its place looks like it"
+            return Sighting(sighting.predicted_px, True, None, reason)
+        return sighting
+
+    def _predicted_px(self) -> Array:
+        return self.camera @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2]
+
+    def _up_mm(self, index: NDArray[np.intp]) -> Array:
+        centers = np.array([s.fit.center_px for s in (self.sightings[i] for i in index) if s is not None and s.fit])
+        return np.asarray(centers * self.pitch * (1.0, -1.0))
+
+    def _sigma_mm(self, index: NDArray[np.intp]) -> Array:
+        covariances = [s.fit.covariance_px2 for s in (self.sightings[i] for i in index) if s is not None and s.fit]
+        measured = np.sqrt(np.trace(np.array(covariances), axis1=1, axis2=2) / 2) * self.pitch.mean()
+        given = np.array([min(*self.layout.marks[i].sigma_mm, _GIVEN_SIGMA_MM) for i in index])
+        return np.asarray(np.sqrt(measured**2 + given**2 + self.options.film_sigma_mm**2))
+
+
+_SINGLE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -1,0 +1,95 @@
+"""One mark, looked for about a predicted place at full resolution and matched."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.candidates import FAINT, correlate, detail_px
+from measure.matching import Match, MatchOptions, match, window_about
+from measure.rendering import extent_px, picture
+from measure.scan import Scan
+from measure.shapes import Mark, MarkShape, Polygon
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """What was seen where a mark was predicted: predicted_px (2,); fit is None where nothing could be fitted, and
+    reason says why. inside: whether the predicted place lies in the scan."""
+
+    predicted_px: Array
+    inside: bool
+    fit: Match | None
+    reason: str = ""
+
+
+def sight(
+    scan: Scan,
+    mark: Mark,
+    pixel_from_mark: Array,
+    search_px: float,
+    polarity: int,
+    weights: Sequence[float] | None,
+    options: MatchOptions,
+) -> Sighting:
+    """Look for the mark within search_px of its predicted place and match it there.
+
+    pixel_from_mark: (2, 3), predicted. polarity: +1 for a mark lighter than its surroundings, -1 for a darker one.
+    """
+    predicted = pixel_from_mark[:, 2].copy()
+    inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
+    if not inside:
+        return Sighting(predicted, False, None, "its place is outside of the scan")
+    margin_px = search_px + options.margin_px + 4
+    col0, row0, width, height = window_about(mark, pixel_from_mark, margin_px)
+    window = scan.window(col0, row0, width, height, weights).astype(float)
+    valid = _inside_scan(scan, col0, row0, width, height)
+    start = np.array(pixel_from_mark)
+    start[:, 2] = _strongest(window, mark, start, (col0, row0), search_px, polarity, scan.full_scale_dn)
+    fit = match(window, (col0, row0), mark, start, _options_for(mark, options), valid)
+    if not fit.converged:
+        return Sighting(predicted, True, None, fit.reason)
+    if fit.contrast_dn * polarity <= 0:
+        return Sighting(predicted, True, None, "what lies there has the other polarity")
+    return Sighting(predicted, True, fit)
+
+
+def _inside_scan(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
+    col, row = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
+    inside_col, inside_row = (col >= 0) & (col < scan.width_px), (row >= 0) & (row < scan.height_px)
+    return inside_row[:, None] & inside_col[None, :]
+
+
+def _strongest(
+    window: Array,
+    mark: Mark,
+    pixel_from_mark: Array,
+    origin: tuple[int, int],
+    search_px: float,
+    polarity: int,
+    full_scale_dn: float,
+) -> Array:
+    """The scan's pixel (col, row) within the search radius where the mark correlates best."""
+    centred = np.array(pixel_from_mark)
+    centred[:, 2] = 0.0
+    least, greatest = extent_px(mark, centred)
+    low, high = np.floor(least).astype(int) - 2, np.ceil(greatest).astype(int) + 2
+    centred[:, 2] = -low
+    width, height = high - low + 1
+    template = picture(mark, centred, int(width), int(height), 1.0)
+    response = polarity * correlate(window, template, detail_px(mark, pixel_from_mark[:, :2]), full_scale_dn * FAINT)
+    place = np.stack(np.meshgrid(*(np.arange(size, dtype=float) for size in response.shape[::-1])), axis=-1) - low
+    place = place + np.asarray(origin)
+    near = np.hypot(*np.moveaxis(place - pixel_from_mark[:, 2], -1, 0)) <= search_px
+    best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
+    return np.asarray(place[best])
+
+
+def _options_for(mark: Mark, options: MatchOptions) -> MatchOptions:
+    """A wedge's or a notch's edges do not tell its scale from its place: both come from the other marks."""
+    if isinstance(mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.parts):
+        return replace(options, freedom="shift")
+    return options
