@@ -37,14 +37,19 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     """What the observations hardly see, and priors do not settle: there the solution is made by noise.
 
     The factor is to be that without the cameras' priors. Of all directions below WEAK those are told in which these
-    priors weigh less than SETTLED times what the observations do.
+    priors weigh less than SETTLED times what the observations do. Directions that move fiducials with priors are no
+    cause for alarm: their priors are meant to place them.
     """
     if _within_images(problem, free, factor):
         return ()
     hardly, told = _null_space(factor, WEAK)
-    positions = [*problem.unknowns.camera.values(), *problem.unknowns.fiducial.values()]
-    sigma = np.where(np.isin(free, np.concatenate(positions)), problem.unknowns.sigma[free], np.inf)
-    of_unit_weight = hardly / np.maximum(told, SINGULAR)
+    marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
+    sigma = np.where(
+        np.char.startswith(np.array(problem.unknowns.names)[free], "IO."), problem.unknowns.sigma[free], np.inf
+    )
+    placed = marks & np.isfinite(problem.unknowns.sigma[free])
+    kept = _unseen_by(hardly[placed], MIXED)
+    of_unit_weight = hardly @ kept @ np.linalg.inv(np.linalg.qr(np.maximum(told, SINGULAR)[:, None] * kept, mode="r"))
     _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)
     unsettled = of_unit_weight @ right[weight < SETTLED].T
     return _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
@@ -140,7 +145,7 @@ def _named(
     seen = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest
     chosen = _independent_rows(seen, part, np.array([lead.rank for lead in leads], dtype=np.intp))
     vectors = still @ np.linalg.pinv(seen[chosen])
-    left = still @ _complement(seen[chosen])
+    left = still @ _unseen_by(seen[chosen], PURE)
     sentences += [(leads[i].cause, leads[i].remedy) for i in chosen]
     sentences += [_unknown_direction(names, vector) for vector in left.T]
     return tuple(
@@ -189,9 +194,10 @@ def _independent_rows(rows: Array, part: float, ranks: Indices) -> list[int]:
     return sorted(chosen)
 
 
-def _complement(rows: Array) -> Array:
-    """Orthonormal vectors (d, d - k) that k independent rows (k, d) do not see."""
-    return np.asarray(np.linalg.svd(rows)[2][len(rows) :].T)
+def _unseen_by(rows: Array, part: float) -> Array:
+    """Orthonormal vectors (d, k) of which rows (m, d) see no more than a part."""
+    _, seen, right = np.linalg.svd(np.vstack([rows, np.zeros((rows.shape[1], rows.shape[1]))]))
+    return np.asarray(right[seen <= part].T)
 
 
 def _largest(vector: Array) -> list[int]:

@@ -12,11 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dgeqrf, dormqr
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-ROWS_PER_COLUMN = 3  # rows in the shared unknowns are condensed when there are more of them than this
+LAPACK_BLOCK = 64  # working space for dormqr, in columns
+ROWS_PER_COLUMN = 4  # rows in the shared unknowns are condensed when there are more of them than this
 
 
 @dataclass(frozen=True)
@@ -167,10 +169,22 @@ def _eliminate_block(block: Block, scale: Array, priors: tuple[Array, Array]) ->
     prior_rows = _rows_of(priors, block.own)
     rows[len(block.matrix) :, :own_count] = prior_rows[:, :-1]
     rows[len(block.matrix) :, -1] = prior_rows[:, -1]
-    triangle = _triangle(rows)
-    own = triangle[:own_count]
-    factor = BlockFactor(block.own, block.shared, own[:, :own_count], own[:, own_count:-1], own[:, -1])
-    return factor, triangle[own_count:, own_count:]
+    reflected, tau, _, _ = dgeqrf(rows[:, :own_count])
+    others = _reflected(reflected, tau, rows[:, own_count:])
+    factor = BlockFactor(
+        block.own, block.shared, np.triu(reflected[:own_count]), others[:own_count, :-1], others[:own_count, -1]
+    )
+    rest = others[own_count:]
+    return factor, _triangle(rest) if len(rest) > shared_count + 1 else rest
+
+
+def _reflected(reflectors: Array, tau: Array, columns: Array) -> Array:
+    """Q' times columns (m, k), Q as the Householder vectors of dgeqrf."""
+    if reflectors.shape[1] == 0:
+        return columns
+    work = max(1, columns.shape[1]) * LAPACK_BLOCK
+    result, _, _ = dormqr("L", "T", reflectors, tau, columns, work)
+    return np.asarray(result, dtype=np.float64)
 
 
 def _condensed(rests: Iterable[tuple[Indices, Array]], shared_priors: Array, shared_count: int) -> Array:
