@@ -78,8 +78,7 @@ def _given(quantity: Json) -> str:
         return f"{significant(given['value'], 6)}, free"
     if given["sigma"] == 0.0:
         return f"{significant(given['value'], 8)}, fixed"
-    value, sigma = value_and_sigma(given["value"], given["sigma"])
-    return f"{value} ± {sigma}"
+    return f"{significant(given['value'], 6)} ± {significant(given['sigma'], 2)}"
 
 
 def _origin(quantity: Json, sigma0: float) -> str:

@@ -73,8 +73,8 @@ def suspects(adjustment: Json) -> list[Json]:
 
 def _no_solution(adjustment: Json) -> Iterator[Problem]:
     for null in adjustment["singular"]:
-        moved = _listed(null["parameters"])
-        yield Problem(f"The observations cannot tell these unknowns apart: {moved}. {null['cause']}", null["remedy"])
+        together = _listed(null["parameters"])
+        yield Problem(f"{null['cause']} The observations do not see it (together move {together}).", null["remedy"])
     if not adjustment["converged"] and not adjustment["singular"]:
         how = adjustment.get("termination", "not converged")
         yield Problem(
@@ -178,6 +178,8 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield "No measurement was handed to this report."
     if not data.adjustment:
         yield "There is no adjustment yet: run `reseau adjust`."
+    elif not data.adjustment["converged"]:
+        yield "There is no solution: all values and residuals of this report are those of the last iteration."
     elif not data.check:
         yield "There is no check against OpenCV yet: run `reseau check`."
     elif data.check["verdict"] == "not possible":

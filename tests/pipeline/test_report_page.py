@@ -161,6 +161,8 @@ def test_a_singular_network_names_cause_and_remedy(singular: ReportData) -> None
     assert "There is no calibration: the network is singular." in text
     assert "c and the flying height move together over flat ground." in text
     assert "Fix c." in text
+    assert "all values and residuals of this report are those of the last iteration" in text
+    assert not re.search(r"\bnan\b|\bNone\b", text)
     assert "There is no solution to draw it from." in text
 
 
