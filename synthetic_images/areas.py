@@ -63,9 +63,11 @@ def ring(center: Point, radius: float, line: float) -> Area:
 
 
 def bar(start: Point, end: Point, line: float) -> Area:
-    """A straight line with square ends."""
+    """A straight line with square ends. Raises ValueError where it has no length."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     along = b - a
+    if not along.any():
+        raise ValueError(f"a bar must have two different ends, not {start} twice")
     across = np.array([-along[1], along[0]]) * (line / 2 / np.hypot(*along))
     return (np.stack([a - across, b - across, b + across, a + across]),)
 

@@ -65,7 +65,7 @@ def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Gr
         height = min(STRIP_PX, geometry.height_px - row0)
         shares = _painted(frame, background, row0, height)
         if scene.film.grain > 0.0:
-            seed = [scene.seed, index, 3]
+            seed = (scene.seed, index, 3)
             shares = shares + scene.film.grain * grain(seed, row0, height, geometry.width_px, scene.film.grain_px)
         yield _digitised(shares, scene, index, row0)
 
@@ -98,7 +98,7 @@ def _digitised(shares: Picture, scene: Scene, index: int, row0: int) -> Grey:
         channels = 1.0 - channels
     if scanner.noise > 0.0:
         height, width = shares.shape
-        noise = [white_noise([scene.seed, index, 4, c], row0, height, width) for c in range(channels.shape[2])]
+        noise = [white_noise((scene.seed, index, 4, c), row0, height, width) for c in range(channels.shape[2])]
         channels = channels + scanner.noise * np.stack(noise, axis=2)
     if scanner.white_is_zero:
         channels = 1.0 - channels

@@ -180,6 +180,8 @@ class SceneImage:
     neighbour_gap_mm: float = 3.0
 
     def __post_init__(self) -> None:
+        if not self.name or set(self.name) & set("/\\:"):
+            raise ValueError(f"an image's name becomes its file's: {self.name!r} is empty or holds one of / \\ :")
         one_of(f"image {self.name}: pose", self.pose, POSES)
         if self.neighbour is not None:
             one_of(f"image {self.name}: neighbour", self.neighbour, get_args(Side))

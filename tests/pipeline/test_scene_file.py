@@ -223,6 +223,8 @@ def test_boards_have_the_points_that_the_measurement_names(
         ("bit_depth = 16", "bit_depth = 12", ["bit_depth", "12", "8, 16"]),
         ("# covered = [", "covered = [", ["frame2"]),
         ('name = "frame2"', 'name = "frame1"', ["'frame1'", "twice"]),
+        ('name = "frame2"', 'name = "roll/2"', ["roll/2", "file"]),
+        ("to_mm = [0.36, 0.0]", "to_mm = [-0.36, 0.0]", ["bar", "two different ends"]),
         ("tile_px = 256", "tile_px = 100", ["tile_px", "multiple of 16"]),
         ("up = [0.0, 0.58, 0.0]", "up = [0.58, 0.0, 0.0]", ["field.grid[1]", "up", "parallel"]),
         ("position = [0.1, -0.05, 4.1]", "position = [0.1, -0.05]", ["image[1]", "position", "three numbers"]),
