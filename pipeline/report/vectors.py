@@ -42,12 +42,12 @@ class Plane:
 
 
 def plane(residuals: list[Json], frame_mm: tuple[float, float] | None, width_px: float) -> Plane:
-    """The camera's frame, or where it is not known, what the observations cover."""
+    """The camera's frame, or where it is not known or not about the origin (a digital camera), what is observed."""
     xy = places_mm(residuals)
     low, high = xy.min(axis=0), xy.max(axis=0)
-    if frame_mm is not None:
-        half = 0.5 * np.array(frame_mm)
-        low, high = np.minimum(low, -half), np.maximum(high, half)
+    half = 0.5 * np.array(frame_mm) if frame_mm is not None else np.zeros(2)
+    if np.all(np.abs([low, high]) <= half):
+        low, high = -half, half
     # A single point, or points in a row, still need a plane to stand in.
     room = 0.02 * max(float(np.max(high - low)), 1.0)
     return Plane(np.stack([low - room, high + room]), width_px)

@@ -142,6 +142,13 @@ def test_vectors_over_the_camera_are_to_scale() -> None:
     assert vector_scale([row], 60.0) == 5.0
 
 
+def test_the_vectors_of_a_digital_camera_stand_in_what_was_observed() -> None:
+    """Its coordinates begin at the picture's corner, so that a frame about the origin would be half empty."""
+    rows = [{"camera_x_mm": x, "camera_y_mm": y} for x, y in ((1.0, -20.0), (31.0, -2.0))]
+    (left, low), (right, high) = plane(rows, (36.0, 24.0), 560.0).corners_mm
+    assert (left, right, low, high) == pytest.approx((1.0, 31.0, -20.0, -2.0), abs=0.7)
+
+
 def test_a_thumbnail_refuses_what_is_no_picture() -> None:
     with pytest.raises(ValueError, match="rows and columns"):
         Thumbnail(np.zeros((0, 5)), (0.0, 0.0))

@@ -80,12 +80,9 @@ def test_the_band_of_the_opencv_family_knows_that_c_and_k1_move_together() -> No
     matrix = np.array([[sigma_c**2, off], [off, sigma_k**2]])
     drawn = curves(lens("A", camera("opencv", c, k1=k1)), covariance("A", ("c", "k1"), matrix), 9.0)
     r = drawn.radius_mm[-1]
-    samples = rng.multivariate_normal((c, k1), matrix, 4000)
+    samples = rng.multivariate_normal((c, k1), matrix, 600)
     moved = np.array(
-        [
-            displacement(lens("A", camera("opencv", a, k1=b)), np.array([[r, 0.0]])).value_um[0, 0]
-            for a, b in samples[:600]
-        ]
+        [displacement(lens("A", camera("opencv", a, k1=b)), np.array([[r, 0.0]])).value_um[0, 0] for a, b in samples]
     )
     assert drawn.radial_sigma_um[-1] == pytest.approx(moved.std(), rel=0.1)
 
