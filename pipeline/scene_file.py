@@ -55,7 +55,7 @@ def read_scene(path: Path) -> SceneFile:
         lambda: scene.Scene(
             name=table.text("name", path.stem),
             seed=seed,
-            camera=_scene_camera(camera, scanner.negative),
+            camera=_scene_camera(camera),
             field=field,
             images=tuple(_image(image, laws, g) for image, g in zip(images, generators, strict=True)),
             scanner=scanner,
@@ -93,7 +93,7 @@ def _camera(table: Table) -> CameraFile:
     return camera
 
 
-def _scene_camera(camera: CameraFile, negative: bool) -> scene.SceneCamera:
+def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
     return scene.SceneCamera(
         name=camera.name,
         frame_mm=camera.frame_mm or (0.0, 0.0),
@@ -106,15 +106,15 @@ def _scene_camera(camera: CameraFile, negative: bool) -> scene.SceneCamera:
             camera.distortion.decentering,
         ),
         fiducials=tuple(
-            scene.SceneFiducial(one.id, one.xy_mm, None if one.mark is None else _scene_mark(one.mark, negative))
+            scene.SceneFiducial(one.id, one.xy_mm, None if one.mark is None else _scene_mark(one.mark))
             for one in camera.fiducials
         ),
     )
 
 
-def _scene_mark(mark: shapes.Mark, negative: bool) -> scene.DrawnMark | scene.ChipMark:
-    """The polarity of a camera file is that of the scan: a mark that is light in a negative is dark on the positive."""
-    light = mark.polarity == "auto" or (mark.polarity == "light") != negative
+def _scene_mark(mark: shapes.Mark) -> scene.DrawnMark | scene.ChipMark:
+    """A mark of no polarity is light, as most are. In a scene polarities are those of the positive."""
+    light = mark.polarity != "dark"
     if isinstance(mark, shapes.MarkShape):
         return scene.DrawnMark(tuple(_area(part) for part in mark.parts), light)
     low, high = float(mark.image.min()), float(mark.image.max())

@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +21,8 @@ from synthetic_images.scene import BoardField, Scene, SceneImage
 from synthetic_images.targets import Target, field_targets
 
 Array = NDArray[np.float64]
+
+NEGATIVE: Mapping[shapes.Polarity, shapes.Polarity] = {"light": "dark", "dark": "light", "auto": "auto"}
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> Came
         # Without fiducials the camera frame is the comparator's, and the principal point is left to the points.
         principal_point_mm=_pair(point) if camera.fiducials else None,
         distortion=replace(camera.distortion, parameters=parameters),
-        fiducials=tuple(_given_fiducial(one, given.fiducial_mm, generator) for one in camera.fiducials),
+        fiducials=tuple(_given_fiducial(one, scene_file, generator) for one in camera.fiducials),
     )
 
 
@@ -97,8 +99,13 @@ def _given_parameter(prior: Prior, generator: np.random.Generator) -> Prior:
     return Prior(0.0 if math.isinf(prior.sigma) else float(generator.normal(prior.value, prior.sigma)), prior.sigma)
 
 
-def _given_fiducial(fiducial: GivenFiducial, sigma_mm: float, generator: np.random.Generator) -> GivenFiducial:
-    return replace(fiducial, xy_mm=_pair(np.asarray(fiducial.xy_mm) + generator.normal(0.0, sigma_mm, 2)))
+def _given_fiducial(fiducial: GivenFiducial, scene_file: SceneFile, generator: np.random.Generator) -> GivenFiducial:
+    xy_mm = np.asarray(fiducial.xy_mm) + generator.normal(0.0, scene_file.given.fiducial_mm, 2)
+    mark = fiducial.mark
+    if mark is not None and scene_file.scene.scanner.negative:
+        # The scene tells what the positive shows, the project what its scans show.
+        mark = replace(mark, polarity=NEGATIVE[mark.polarity])
+    return replace(fiducial, xy_mm=_pair(xy_mm), mark=mark)
 
 
 def _pair(values: Array) -> tuple[float, float]:

@@ -182,10 +182,12 @@ def test_a_mark_cut_from_a_scan_is_drawn_and_given(tmp_path: Path) -> None:
     assert np.abs(given.image / 65535 - mark.image).max() < 1e-4
 
 
-def test_a_light_mark_in_a_negative_is_dark_on_the_positive(tmp_path: Path) -> None:
-    text = changed("negative = false", "negative = true")
-    marks = [one.mark for one in read_scene(written(tmp_path, text)).scene.camera.fiducials]
-    assert all(isinstance(mark, DrawnMark) and not mark.light for mark in marks)
+def test_a_mark_that_is_light_on_the_positive_is_dark_in_the_scans_of_a_negative(tmp_path: Path) -> None:
+    scene_file = read_scene(written(tmp_path, changed("negative = false ", "negative = true ")))
+    assert all(isinstance(one.mark, DrawnMark) and one.mark.light for one in scene_file.scene.camera.fiducials)
+    write_project(scene_file, tmp_path)
+    given = read_camera(tmp_path / "camera.toml").fiducials
+    assert {one.mark.polarity for one in given if one.mark is not None} == {"dark"}
 
 
 @pytest.mark.parametrize(
