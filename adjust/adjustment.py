@@ -65,18 +65,10 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     validate(network)
     problem = _problem(network, approximations)
     solved = problem if options.datum == "control" else _minimal(problem)
-    numbering = Numbering(solved)
-    weighting = Weighting(np.ones(len(network.observations)))
-    state = solved.start()
-    for _ in range(REWEIGHTINGS):
-        run = _run(numbering, weighting, state, options.iteration_limit)
-        refined = _reweighted(run, weighting, options)
-        if not refined.differs(weighting):
-            break
-        weighting, state = refined, run.end.state
+    run = _settled_run(Numbering(solved), options)
     if options.datum == "free":
-        run = _freed(problem, run, weighting)
-    return _result(problem, run, weighting, options)
+        run = _freed(problem, run)
+    return _result(problem, run, options)
 
 
 def _problem(network: Network, approximations: Approximations) -> Problem:
@@ -92,13 +84,18 @@ def _minimal(problem: Problem) -> Problem:
 
 @dataclass(frozen=True)
 class _Run:
-    """One adjustment with given weights: where it ended, its cofactor matrix (n, n), its residuals."""
+    """One adjustment with given weights: where it ended, its cofactor matrix (n, n), its residuals.
+
+    settled: whether the residuals ask for no other weights.
+    """
 
     numbering: Numbering
+    weighting: Weighting
     solution: Solution
     singular: tuple[NullDirection, ...]
     cofactor: Array
     residuals: Residuals
+    settled: bool = True
 
     @property
     def end(self) -> Linearised:
@@ -107,6 +104,18 @@ class _Run:
     @property
     def converged(self) -> bool:
         return self.solution.termination == "converged"
+
+
+def _settled_run(numbering: Numbering, options: Options) -> _Run:
+    """Adjust until the weights that robust estimation and variance components ask for are those that were used."""
+    weighting = Weighting(np.ones(len(numbering.problem.network.observations)))
+    run = _run(numbering, weighting, numbering.problem.start(), options.iteration_limit)
+    for _ in range(REWEIGHTINGS):
+        refined = _reweighted(run, options)
+        if not refined.differs(run.weighting):
+            return run
+        run = _run(numbering, refined, run.end.state, options.iteration_limit)
+    return replace(run, settled=False)
 
 
 def _run(numbering: Numbering, weighting: Weighting, state: State, limit: int) -> _Run:
@@ -121,22 +130,26 @@ def _run(numbering: Numbering, weighting: Weighting, state: State, limit: int) -
         )
     singular = singular_directions(problem, state, numbering.free, factorise(numbering, start))
     if singular:
-        return _unsolved(numbering, Solution(start, None, "singular", ()), singular)
+        return _unsolved(numbering, weighting, Solution(start, None, "singular", ()), singular)
     solution = iterate(numbering, covariance, start, limit)
     factor = solution.factor or factorise(numbering, solution.end)
     singular = singular_directions(problem, solution.end.state, numbering.free, factor)
     if singular:
-        return _unsolved(numbering, replace(solution, termination="singular"), singular)
+        return _unsolved(numbering, weighting, replace(solution, termination="singular"), singular)
     if solution.factor is None:
-        return _unsolved(numbering, solution, ())
+        return _unsolved(numbering, weighting, solution, ())
     cofactor = _spread(numbering, solution.factor.cofactor())
-    return _Run(numbering, solution, (), cofactor, residuals(problem, solution.end, solution.factor, covariance))
+    observed = residuals(problem, solution.end, solution.factor, covariance)
+    return _Run(numbering, weighting, solution, (), cofactor, observed)
 
 
-def _unsolved(numbering: Numbering, solution: Solution, singular: tuple[NullDirection, ...]) -> _Run:
+def _unsolved(
+    numbering: Numbering, weighting: Weighting, solution: Solution, singular: tuple[NullDirection, ...]
+) -> _Run:
     count = len(numbering.problem.unknowns)
     nothing = np.zeros_like(solution.end.v_mm)
-    return _Run(numbering, solution, singular, np.zeros((count, count)), Residuals(solution.end.v_mm, nothing, nothing))
+    observed = Residuals(solution.end.v_mm, nothing, nothing)
+    return _Run(numbering, weighting, solution, singular, np.zeros((count, count)), observed)
 
 
 def _spread(numbering: Numbering, cofactor: Array) -> Array:
@@ -147,8 +160,9 @@ def _spread(numbering: Numbering, cofactor: Array) -> Array:
     return spread
 
 
-def _reweighted(run: _Run, weighting: Weighting, options: Options) -> Weighting:
+def _reweighted(run: _Run, options: Options) -> Weighting:
     """The weights that the residuals of a run ask for."""
+    weighting = run.weighting
     if not run.converged:
         return weighting
     problem = run.numbering.problem
@@ -164,12 +178,12 @@ def _reweighted(run: _Run, weighting: Weighting, options: Options) -> Weighting:
     return weighting
 
 
-def _freed(problem: Problem, run: _Run, weighting: Weighting) -> _Run:
+def _freed(problem: Problem, run: _Run) -> _Run:
     """A run with minimal datum, brought to inner constraints over the free points."""
     if not run.converged:
         return run
     state = centered(problem, run.end.state)
-    end = linearise(run.numbering, weighting.covariance(problem), state)
+    end = linearise(run.numbering, run.weighting.covariance(problem), state)
     if end is None:
         return run
     cofactor = _spread(run.numbering, factorise(run.numbering, end).cofactor())
@@ -177,8 +191,8 @@ def _freed(problem: Problem, run: _Run, weighting: Weighting) -> _Run:
     return replace(run, solution=solution, cofactor=inner_constraints(problem, state, cofactor))
 
 
-def _result(problem: Problem, run: _Run, weighting: Weighting, options: Options) -> Adjustment:
-    numbering, unknowns = run.numbering, problem.unknowns
+def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
+    numbering, weighting, unknowns = run.numbering, run.weighting, problem.unknowns
     state = run.end.state
     covariance = weighting.covariance(problem)
     observed = run.residuals
@@ -210,7 +224,10 @@ def _result(problem: Problem, run: _Run, weighting: Weighting, options: Options)
 
 
 def _with_angles(problem: Problem, state: State, cofactor: Array) -> Array:
-    """The cofactor matrix with omega, phi, kappa in the place of the rotation vectors."""
+    """The cofactor matrix with omega, phi, kappa in the place of the rotation vectors.
+
+    Where phi is +-90 degrees, omega and kappa are told by their sum or difference alone (the pseudo-inverse).
+    """
     positions = problem.exterior[:, 3:]
     by_vector = np.linalg.pinv(vector_by_angles(state.values[positions]))
     by_vector[problem.keeps_angles] = np.eye(3)
@@ -231,8 +248,12 @@ def _warnings(run: _Run, cofactor: Array) -> tuple[str, ...]:
         )
     if run.solution.termination == "diverged":
         warnings.append(
-            "The iteration diverged: no step from the last values makes the residuals smaller. Look for wrong point "
-            "numbers and wrong approximations."
+            f"The iteration diverged: no step from the last values makes the residuals smaller. Look for wrong point "
+            f"numbers and wrong approximations; the largest residuals are those of {_worst(run)}."
+        )
+    if not run.settled:
+        warnings.append(
+            f"The weights did not settle within {REWEIGHTINGS} rounds of robust estimation or variance components."
         )
     if run.converged:
         weak = weak_directions(
@@ -248,6 +269,17 @@ def _warnings(run: _Run, cofactor: Array) -> tuple[str, ...]:
                 f"The observations say nothing about {', '.join(blind)}: their standard deviations stay as given."
             )
     return tuple(warnings + _unseen(problem))
+
+
+def _worst(run: _Run) -> str:
+    """The observations with the largest residuals."""
+    observations = run.numbering.problem.network.observations
+    size = np.abs(run.end.v_mm).max(axis=1)
+    rows = np.argsort(-size)[:3]
+    return ", ".join(
+        f"{observations.kind[i]} {observations.point[i]} in image {observations.image[i]} ({size[i]:.3g} mm)"
+        for i in rows
+    )
 
 
 def _unseen(problem: Problem) -> list[str]:

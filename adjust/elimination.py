@@ -89,11 +89,12 @@ class Factor:
         owns = []
         for block in self.blocks:
             own, root[block.own] = _roots(block, shared)
-            owns.append(own)
-        cofactor = root @ root.T
+            owns.append(own / self.scale[block.own, None])
+        root /= self.scale[:, None]
+        cofactor: Array = root @ root.T
         for block, own in zip(self.blocks, owns, strict=True):
             cofactor[np.ix_(block.own, block.own)] += own @ own.T
-        return np.asarray(cofactor / np.outer(self.scale, self.scale))
+        return cofactor
 
     def row_roots(self, blocks: Sequence[Block]) -> list[Array]:
         """Per block G (m, k), where G G' is the cofactor matrix of the block's adjusted rows, matrix times unknowns."""

@@ -41,7 +41,9 @@ class Residuals:
 class Group:
     """A kind of observation: its share of v'Pv over its redundancy (sigma0), rms in um per axis, redundancy.
 
-    sigma0 is 0 and means nothing where the redundancy is 0: there is no check.
+    sigma0 is 0 and means nothing where the redundancy is 0: there is no check. `target`, `fiducial`: in the comparator;
+    `control`: given object coordinates, rms in millionths of the object unit; `datum`: given places of fiducials (F5,
+    F6); `interior`, `exterior`: given values of mixed units, rms 0. The first three are always there.
     """
 
     sigma0: float
@@ -56,7 +58,8 @@ class Adjustment:
 
     names: the unknowns, in the order of values and covariance: `T.<image>.a1`, `EO.<image>.X0` (omega, phi, kappa in
     rad), `IO.<camera>.c` / `.x0` / `.y0` / `.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`; fixed quantities included, with
-    zero rows. cofactor (n, n): a-priori covariance (sigma0 = 1); covariance is sigma0² times that.
+    zero rows. cofactor (n, n): a-priori covariance (sigma0 = 1); covariance is sigma0² times that. Without a solution
+    (termination "singular", "diverged") it is zero and means nothing.
     mirrored: the images whose scan is mirrored, as in `Approximations`.
     weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
     variance_factors: the factors found for the variances of the groups "target" and "fiducial", where asked for.
