@@ -12,11 +12,13 @@ import pytest
 from measure import shapes
 from measure.board_specs import ChessboardSpec, CircleGridSpec
 from measure.scan import open_scan
+from pipeline.adjust_stage import adjust_marks
 from pipeline.camera_file import read_camera
+from pipeline.comparator_file import read_comparator
 from pipeline.errors import InputError
 from pipeline.project_file import read_project
 from pipeline.scene_file import read_scene, render_project
-from pipeline.scene_project import write_project
+from pipeline.scene_project import SceneFile, write_project
 from synthetic_images.frame import make_frame
 from synthetic_images.scene import BoardField, ChipMark, DrawnMark
 from synthetic_images.targets import field_targets
@@ -262,3 +264,48 @@ def test_a_folder_that_cannot_be_made_is_an_input_error(tmp_path: Path) -> None:
     path = written(tmp_path, TEMPLATE)
     with pytest.raises(InputError, match="cannot be written"):
         render_project(path, path / "out")
+
+
+@pytest.mark.parametrize("name", ["demo.toml", "aerial_five.toml"])
+def test_the_adjustment_finds_the_scenes_camera(tmp_path: Path, name: str) -> None:
+    """Renderer and adjustment share no formula: a sign or a unit that one of them has wrong would show here."""
+    scene_file = read_scene(scene_path(name))
+    write_project(scene_file, tmp_path)
+    project_file = tmp_path / "project.toml"
+    lines = project_file.read_text(encoding="utf-8").splitlines(keepends=True)
+    project_file.write_text("".join(line for line in lines if not line.startswith("scans")), encoding="utf-8")
+    (tmp_path / "comparator.csv").write_text(true_comparator(scene_file, 0.05), encoding="utf-8")
+    project = read_project(project_file)
+    adjustment = adjust_marks(project, read_comparator(project.comparator))
+    assert adjustment.converged
+    assert adjustment.sigma0 == pytest.approx(1.0, abs=0.1)
+    camera = scene_file.scene.camera
+    true = {"c": camera.principal_distance_mm, "x0": camera.principal_point_mm[0], "y0": camera.principal_point_mm[1]}
+    true |= camera.distortion.parameters
+    for parameter, value in true.items():
+        found = f"IO.{camera.name}.{parameter}"
+        assert abs(adjustment.value(found) - value) < 3.5 * adjustment.sigma(found), parameter
+    for fiducial in camera.fiducials:
+        for axis, value in zip("xy", fiducial.xy_mm, strict=True):
+            found = f"FID.{camera.name}.{fiducial.id}.{axis}"
+            assert abs(adjustment.value(found) - value) < 3.5 * adjustment.sigma(found), found
+
+
+def true_comparator(scene_file: SceneFile, noise_px: float) -> str:
+    """comparator.csv of everything that can be seen, with noise."""
+    scene = scene_file.scene
+    pitch_mm = scene.scanner.pitch_um[0] / 1000
+    generator = np.random.default_rng(11)
+    lines = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm,rho,col_px,row_px,status,reason"]
+    for index, image in enumerate(scene.images):
+        truth = make_frame(scene, index).truth
+        marks = [("fiducial", *item) for item in truth.fiducials.items()]
+        marks += [("target", *item) for item in truth.targets.items()]
+        for kind, id, position in marks:
+            if not position.hidden:
+                col, row = position.figure_px + generator.normal(0.0, noise_px, 2)
+                sigma = noise_px * pitch_mm
+                lines.append(
+                    f"{image.name},{id},{kind},{col * pitch_mm},{-row * pitch_mm},{sigma},{sigma},0,,,measured,"
+                )
+    return "\n".join(lines) + "\n"
