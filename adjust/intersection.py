@@ -6,12 +6,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-ITERATIONS = 10
+ITERATIONS = 16
+SMALLEST_ANGLE = 1e-12
 WEAKEST = 1e-8  # smallest eigenvalue of the normal matrix that still gives a point: rays 0.01 degrees apart
 
 
 def intersect(centers: Array, directions: Array, point: Index, known: Array) -> tuple[Array, Array]:
-    """Points nearest to their rays in the sum of angles, so that one gross error among several rays does no harm.
+    """Points nearest to their rays by angle, robustly: one gross error among several rays does no harm.
 
     centers, directions (m, 3): a row a ray, directions of any length, pointing away from the camera; point (m,) says
     which point each belongs to; known (p, 3) holds coordinates that are given, nan where they are sought.
@@ -24,13 +25,15 @@ def intersect(centers: Array, directions: Array, point: Index, known: Array) -> 
     determination = _smallest_eigenvalue(across, point, sought)
     usable: NDArray[np.bool_] = determination > WEAKEST
     weights = np.ones(len(point))
-    for _ in range(ITERATIONS):
+    for iteration in range(ITERATIONS):
         points = _nearest(across * weights[:, None, None], centers, point, known, usable)
         offset = points[point] - centers
         distance = np.linalg.norm(offset, axis=1)
         angle = np.linalg.norm(np.einsum("mij,mj->mi", across, offset), axis=1) / distance
-        typical = np.nanmedian(angle) if usable.any() else 1.0
-        weights = np.nan_to_num(1.0 / (distance**2 * np.maximum(angle, 0.1 * typical + 1e-12)), nan=0.0)
+        scale = 2.0 * (np.nanmedian(angle) if usable.any() else 1.0) + SMALLEST_ANGLE
+        # first the sum of angles, which has one minimum, then the Cauchy function, which forgets the gross errors
+        power = 1.0 if iteration < ITERATIONS // 2 else 2.0
+        weights = np.nan_to_num(1.0 / (distance**2 * (angle**power + scale**power)), nan=0.0)
         weights /= np.max(weights, initial=np.finfo(float).tiny)
     in_front = np.einsum("mi,mi->m", points[point] - centers, directions) > 0
     majority = np.bincount(point, np.where(in_front, 1.0, -1.0), len(known)) > 0

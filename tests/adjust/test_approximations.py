@@ -340,6 +340,7 @@ def test_heights_alone_and_two_points_orient_vertical_frames() -> None:
         ("i_five_images_affine_paper_noisefree", 1e-3, 1e-6),
         ("ii_juhl_3photos", 0.5, 1e-3),
         ("iii_selfcal_mixed", 60.0, 0.03),
+        ("iii_selfcal_all_unknown_datum_A", 150.0, 0.1),
         ("iv_planar_board", 0.3, 3e-4),
         ("v_singular_K2D_vert0_affine", 1e-3, 1e-6),
         ("v_singular_K3D_conv_affine", 1e-3, 1e-6),
