@@ -1,13 +1,14 @@
 """The reference adjustments: an independent, dense implementation with complex-step derivatives."""
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from reference_cases import CAMERA, Case, approximations_of, load, network_of, own_name
 
 from adjust.adjustment import Options, adjust
-from adjust.network import Network, Observations
+from adjust.network import Distortion, Network, Observations, Prior
 from adjust.result import Adjustment
 
 CASES = (
@@ -130,3 +131,47 @@ def test_an_iteration_limit_is_told() -> None:
     assert result.termination == "iteration limit"
     assert not result.converged
     assert "not final" in " ".join(result.warnings)
+
+
+def with_distortion(network: Network, distortion: Distortion) -> Network:
+    return replace(network, cameras=(replace(network.cameras[0], distortion=distortion),))
+
+
+def test_brown_is_torlegards_without_r0() -> None:
+    """The planar board with the same polynomial under Brown's names: the reference's result again."""
+    case = load("iv_planar_board")
+    names = {"k1": "k3", "k2": "k5", "k3": "k7", "p1": "p1", "p2": "p2"}
+    network = network_of(case)
+    given = network.cameras[0].distortion.parameters
+    result = adjusted(
+        case, with_distortion(network, Distortion("brown", {brown: given[name] for brown, name in names.items()}))
+    )
+    assert result.vpv == pytest.approx(case["result"]["vpv"], rel=1e-9)
+    for brown, name in names.items():
+        reference = case["result"]["parameters"][f"IO.{name}"]
+        position = result.index(f"IO.{CAMERA}.{brown}")
+        assert result.values[position] == pytest.approx(reference["value"], abs=1e-7 * reference["std_apriori"])
+        assert np.sqrt(result.cofactor[position, position]) == pytest.approx(reference["std_apriori"], rel=1e-7)
+
+
+def test_opencvs_own_calibration_of_the_planar_board() -> None:
+    """The `opencv` family on OpenCV's observations: its parameters, its standard deviations, its rms per point."""
+    case = load("iv_planar_board")
+    opencv, pixel_mm = case["opencv"], case["pixels"]["pixel_mm"]
+    names = ("k1", "k2", "p1", "p2", "k3")
+    free = {name: Prior(0.0, np.inf) for name in names}
+    result = adjusted(case, with_distortion(network_of(case), Distortion("opencv", free)))
+    assert result.converged
+
+    half_width, half_height = (case["pixels"]["width"] - 1) / 2, (case["pixels"]["height"] - 1) / 2
+    expected = {
+        "c": (opencv["fx"] * pixel_mm, opencv["std"]["f"] * pixel_mm),
+        "x0": ((opencv["cx"] - half_width) * pixel_mm, opencv["std"]["cx"] * pixel_mm),
+        "y0": (-(opencv["cy"] - half_height) * pixel_mm, opencv["std"]["cy"] * pixel_mm),
+    }
+    expected |= dict(zip(names, zip(opencv["k1k2p1p2k3"], opencv["std"]["k1k2p1p2k3"], strict=True), strict=True))
+    for name, (value, sigma) in expected.items():
+        assert result.value(f"IO.{CAMERA}.{name}") == pytest.approx(value, abs=1e-3 * sigma)
+        assert result.sigma(f"IO.{CAMERA}.{name}") == pytest.approx(sigma, rel=1e-3)
+    rms_px = np.sqrt((result.residuals.v_mm**2).sum(axis=1).mean()) / pixel_mm
+    assert rms_px == pytest.approx(opencv["rms_px"], rel=1e-6)
