@@ -298,6 +298,7 @@ _QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
 _ADJUSTMENT = {
     "reseau": str,
     "converged": bool,
+    "termination": str,
     "iterations": int,
     "observations": int,
     "conditions": int,
@@ -325,6 +326,7 @@ _ADJUSTMENT = {
     "residuals": _Each(
         list, dict.fromkeys(("image", "point", "kind"), str) | dict.fromkeys(_RESIDUAL_NUMBERS, _NUMBER)
     ),
+    "warnings": _Each(list, str),
     "variance_factors": _Each(dict, _NUMBER),
     "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),
 }

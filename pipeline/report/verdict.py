@@ -42,6 +42,7 @@ def judge(data: ReportData) -> Verdict:
         *data.problems,
         *_frame_problems(shots),
         *_locking(shots),
+        *(Problem(warning) for warning in (data.adjustment["warnings"] if data.adjustment else ())),
         *(_adjustment_problems(data.adjustment) if data.adjustment and not fatal else ()),
         *(_check_problems(data.check) if data.check else ()),
     )
@@ -76,9 +77,8 @@ def _no_solution(adjustment: Json) -> Iterator[Problem]:
         together = _listed(null["parameters"])
         yield Problem(f"{null['cause']} The observations do not see it (together move {together}).", null["remedy"])
     if not adjustment["converged"] and not adjustment["singular"]:
-        how = adjustment.get("termination", "not converged")
         yield Problem(
-            f"The iteration did not come to rest ({how}, {adjustment['iterations']} iterations).",
+            f"The iteration did not come to rest ({adjustment['termination']}, {adjustment['iterations']} iterations).",
             "Look for wrong point numbers and gross errors among the largest residuals, and at the approximate "
             "orientations.",
         )
@@ -130,7 +130,6 @@ def _locking(shots: list[Frame]) -> Iterator[Problem]:
 
 
 def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
-    yield from (Problem(warning) for warning in adjustment.get("warnings", ()))
     if adjustment["redundancy"] > 0:
         yield from _global_test(adjustment["sigma0"], adjustment["redundancy"])
     else:

@@ -114,7 +114,10 @@ def test_the_statuses_are_those_of_the_table(adjusted: ReportData) -> None:
 
 
 def test_no_check_stands_where_the_redundancy_is_zero(adjusted: ReportData) -> None:
-    assert re.search(r"control given object coordinates no check 0\.00 0\.00 0\.0: no check", rendered(adjusted).text)
+    assert re.search(
+        r"control given object coordinates; rms in millionths of their unit no check 0\.00 0\.00 0\.0: no check",
+        rendered(adjusted).text,
+    )
 
 
 def test_an_adjustment_without_any_redundancy_is_not_called_good(adjusted: ReportData) -> None:

@@ -92,10 +92,12 @@ def test_warnings_of_the_adjustment_need_a_look(adjusted: ReportData) -> None:
 
 
 def test_no_convergence_is_no_result(adjusted: ReportData) -> None:
-    verdict = judge(changed(adjusted, converged=False, termination="iteration limit", iterations=50))
+    stopped = {"converged": False, "termination": "iteration limit", "iterations": 50, "warnings": ["Not final."]}
+    verdict = judge(changed(adjusted, **stopped))
     assert verdict.level == "failed"
     assert "There is no calibration: the iteration did not come to rest." in verdict.sentence
     assert "iteration limit, 50 iterations" in verdict.problems[0].what
+    assert verdict.problems[1].what == "Not final."
 
 
 def test_an_assumed_pose_needs_a_look_once_for_all_frames(measured: ReportData) -> None:
