@@ -10,7 +10,7 @@ from synthetic_images.areas import Area, bounds, centroid, disk, polygon, subdiv
 from synthetic_images.damage import damage
 from synthetic_images.film import FrameGeometry, frame_geometry
 from synthetic_images.paint import AreaPaint, ChipPaint, Paint, chip_paint
-from synthetic_images.scene import BoardField, ChipMark, DiskField, Scene, SceneFiducial
+from synthetic_images.scene import BoardField, ChipMark, DiskField, DrawnMark, Scene, SceneFiducial
 from synthetic_images.targets import Target, board_sheet, chessboard_squares, disk_outline, field_targets
 from synthetic_images.truth import FrameTruth, Position
 
@@ -119,7 +119,7 @@ def _hidden(geometry: FrameGeometry, target: Target, outline_px: Array) -> str:
         return beyond
     if not _inside_frame(geometry, outline_px):
         return "not wholly inside of the exposed frame"
-    return "behind a fiducial" if _behind_a_pad(geometry, outline_px) else ""
+    return "behind a fiducial" if _behind_a_fiducial(geometry, outline_px) else ""
 
 
 def _inside_frame(geometry: FrameGeometry, pixels: Array) -> bool:
@@ -127,14 +127,25 @@ def _inside_frame(geometry: FrameGeometry, pixels: Array) -> bool:
     return bool((np.abs(camera[:, :2]) < np.asarray(geometry.scene.camera.frame_mm) / 2).all())
 
 
-def _behind_a_pad(geometry: FrameGeometry, pixels: Array) -> bool:
-    scene = geometry.scene
-    reach_mm = max(scene.pad_mm, TAPE_MM * 1.5 if geometry.image.covered else 0.0)
-    if reach_mm == 0.0 or not scene.camera.fiducials:
-        return False
+def _behind_a_fiducial(geometry: FrameGeometry, pixels: Array) -> bool:
     camera = (np.column_stack([pixels, np.ones(len(pixels))]) @ geometry.camera_from_pixel.T)[:, :2]
-    marks = np.array([fiducial.xy_mm for fiducial in scene.camera.fiducials])
-    return bool((np.linalg.norm(camera[:, None] - marks[None], axis=2) < reach_mm).any())
+    return any(
+        bool((np.linalg.norm(camera - fiducial.xy_mm, axis=1) < _reach_mm(fiducial, geometry)).any())
+        for fiducial in geometry.scene.camera.fiducials
+    )
+
+
+def _reach_mm(fiducial: SceneFiducial, geometry: FrameGeometry) -> float:
+    """How far from its point a fiducial, its pad or its tape hides what the lens shows."""
+    reach = geometry.scene.pad_mm
+    if fiducial.id in geometry.image.covered:
+        reach = max(reach, TAPE_MM * np.sqrt(2))
+    if isinstance(fiducial.mark, ChipMark):
+        return max(reach, float(np.hypot(*fiducial.mark.image.shape)) * fiducial.mark.pitch_um / 1000)
+    if isinstance(fiducial.mark, DrawnMark):
+        outlines = [outline for area in fiducial.mark.areas for outline in area]
+        return max(reach, max(float(np.hypot(*outline.T).max()) for outline in outlines))
+    return reach
 
 
 def _field_paints(geometry: FrameGeometry, positions: dict[str, Position]) -> Iterator[Paint]:

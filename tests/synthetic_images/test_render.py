@@ -231,12 +231,15 @@ def test_what_cannot_be_seen_is_said(tmp_path: Path) -> None:
         DiskTarget("behind it", (0.0, 0.02, -0.5)),
         DiskTarget("from behind", (0.4, 0.0, 0.0), (0.0, 0.0, -1.0)),
         DiskTarget("outside", (1.33, 0.0, 0.0)),
+        DiskTarget("under a mark", (0.9, -0.85, 0.0)),
+        DiskTarget("under tape", (-0.6, -0.85, 0.0)),
         DiskTarget("above", (0.0, 0.0, 9.0)),
     )
     made = scene(
         camera=replace(camera, distortion=Distortion()),
         field=DiskField(targets, 0.12),
         images=(SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0), covered=("b",)),),
+        pad_mm=0.0,
     )
     _, truth = rendered(tmp_path, made)
     frame = truth.frames[0]
@@ -252,6 +255,8 @@ def test_what_cannot_be_seen_is_said(tmp_path: Path) -> None:
         "behind it": "behind another target",
         "from behind": "faces away",
         "outside": "not wholly inside of the exposed frame",
+        "under a mark": "behind a fiducial",
+        "under tape": "behind a fiducial",
     }
     written = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))["images"]["f"]
     assert written["fiducials"]["b"]["visible"] is False
