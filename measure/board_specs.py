@@ -1,0 +1,189 @@
+"""Calibration boards as their makers describe them: what is printed, and where on the board its points lie.
+
+A board's frame: x right, y up, z towards the viewer, seen as it is meant to be seen, origin at its lower left point;
+units are those of the specification.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+Point3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ChessboardSpec:
+    """A chessboard of columns x rows INNER corners; a point's id is r{row}c{column}, row 0 the upper one."""
+
+    columns: int
+    rows: int
+    square_mm: float
+
+    def __post_init__(self) -> None:
+        _check_count(self, "columns", 3)
+        _check_count(self, "rows", 3)
+        _check_length(self, "square_mm")
+
+    def object_points(self) -> dict[str, Point3]:
+        """Id to (X, Y, 0) in mm."""
+        top = (self.rows - 1) * self.square_mm
+        return {
+            f"r{row}c{column}": (column * self.square_mm, top - row * self.square_mm, 0.0)
+            for row in range(self.rows)
+            for column in range(self.columns)
+        }
+
+
+@dataclass(frozen=True)
+class CircleGridSpec:
+    """A grid of columns x rows dots; a point's id is r{row}c{column}.
+
+    spacing_mm: between neighbouring columns and rows. Asymmetric: only the places where row + column is even hold a dot
+    (every other row is moved by one column), columns and rows still counting places. row_spacing_mm: where rows lie at
+    another distance than columns (a hexagonal grid: sqrt(3) times the columns').
+    """
+
+    columns: int
+    rows: int
+    spacing_mm: float
+    diameter_mm: float
+    asymmetric: bool = False
+    row_spacing_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_count(self, "columns", 3)
+        _check_count(self, "rows", 3)
+        _check_length(self, "spacing_mm")
+        _check_length(self, "diameter_mm")
+        if self.row_spacing_mm is not None:
+            _check_length(self, "row_spacing_mm")
+        if self.diameter_mm >= self.shortest_distance_mm:
+            raise ValueError(
+                f"diameter_mm is {self.diameter_mm}; dots less than {self.shortest_distance_mm} wide are right"
+            )
+
+    def places(self) -> list[tuple[int, int]]:
+        """(row, column) of every dot."""
+        return [
+            (row, column)
+            for row in range(self.rows)
+            for column in range(self.columns)
+            if not self.asymmetric or (row + column) % 2 == 0
+        ]
+
+    @property
+    def shortest_distance_mm(self) -> float:
+        """Between the centres of neighbouring dots."""
+        across, down = self.spacing_mm, self._row_step_mm
+        return min(2 * across, 2 * down, float(np.hypot(across, down))) if self.asymmetric else min(across, down)
+
+    @property
+    def _row_step_mm(self) -> float:
+        return self.spacing_mm if self.row_spacing_mm is None else self.row_spacing_mm
+
+    def object_points(self) -> dict[str, Point3]:
+        """Id to (X, Y, 0) in mm."""
+        return {
+            f"r{row}c{column}": (column * self.spacing_mm, (self.rows - 1 - row) * self._row_step_mm, 0.0)
+            for row, column in self.places()
+        }
+
+
+@dataclass(frozen=True)
+class ArucoSpec:
+    """A board of columns x rows ArUco markers, the first in the upper left corner, then row by row.
+
+    dictionary: OpenCV's name, "4X4_50" say. A point's id is {marker}.{corner}, the corner 0 being the marker's upper
+    left one, then clockwise.
+    """
+
+    dictionary: str
+    columns: int
+    rows: int
+    marker_mm: float
+    gap_mm: float
+    first_marker: int = 0
+
+    def __post_init__(self) -> None:
+        _check_count(self, "columns", 1)
+        _check_count(self, "rows", 1)
+        _check_length(self, "marker_mm")
+        _check_length(self, "gap_mm")
+        _check_markers(self.dictionary, self.first_marker, self.columns * self.rows)
+
+    def object_points(self) -> dict[str, Point3]:
+        """Id to (X, Y, 0) in mm."""
+        step, points = self.marker_mm + self.gap_mm, {}
+        top = (self.rows - 1) * step + self.marker_mm
+        corners = ((0.0, 0.0), (self.marker_mm, 0.0), (self.marker_mm, self.marker_mm), (0.0, self.marker_mm))
+        for row in range(self.rows):
+            for column in range(self.columns):
+                marker = self.first_marker + row * self.columns + column
+                for corner, (right, down) in enumerate(corners):
+                    points[f"{marker}.{corner}"] = (column * step + right, top - row * step - down, 0.0)
+        return points
+
+
+@dataclass(frozen=True)
+class CharucoSpec:
+    """A chessboard of columns x rows SQUARES with ArUco markers in its white ones, as OpenCV prints it.
+
+    A point's id is c{number} of the inner corner, row by row from the upper left one.
+    """
+
+    dictionary: str
+    columns: int
+    rows: int
+    square_mm: float
+    marker_mm: float
+
+    def __post_init__(self) -> None:
+        _check_count(self, "columns", 2)
+        _check_count(self, "rows", 2)
+        _check_length(self, "square_mm")
+        _check_length(self, "marker_mm")
+        if self.marker_mm >= self.square_mm:
+            raise ValueError(f"marker_mm is {self.marker_mm}; less than the square's {self.square_mm} is right")
+        _check_markers(self.dictionary, 0, self.columns * self.rows // 2)
+
+    def object_points(self) -> dict[str, Point3]:
+        """Id to (X, Y, 0) in mm."""
+        across, down = self.columns - 1, self.rows - 1
+        return {
+            f"c{row * across + column}": (column * self.square_mm, (down - 1 - row) * self.square_mm, 0.0)
+            for row in range(down)
+            for column in range(across)
+        }
+
+
+BoardSpec = ChessboardSpec | CircleGridSpec | ArucoSpec | CharucoSpec
+
+
+def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
+    """OpenCV's predefined dictionary of that name, with or without DICT_ before it."""
+    code = getattr(cv2.aruco, "DICT_" + name.upper().removeprefix("DICT_"), None)
+    if code is None:
+        known = ", ".join(sorted(known[5:] for known in dir(cv2.aruco) if known.startswith("DICT_")))
+        raise ValueError(f"dictionary is {name!r}; one of {known} is right")
+    return cv2.aruco.getPredefinedDictionary(code)
+
+
+def _check_markers(name: str, first: int, count: int) -> None:
+    size = len(aruco_dictionary(name).bytesList)
+    if first < 0 or first + count > size:
+        raise ValueError(
+            f"the board needs markers {first} to {first + count - 1}; dictionary {name} has 0 to {size - 1}"
+        )
+
+
+def _check_count(spec: object, name: str, least: int) -> None:
+    value = getattr(spec, name)
+    if value < least:
+        raise ValueError(f"{name} is {value}; {least} or more is right")
+
+
+def _check_length(spec: object, name: str) -> None:
+    value = getattr(spec, name)
+    if not (value > 0 and np.isfinite(value)):
+        raise ValueError(f"{name} is {value}; a positive number is right")

@@ -1,0 +1,231 @@
+"""Where two straight edges meet, to the noise of the picture: the crossings of a chessboard, the corners of a marker.
+
+The picture of two crossing edges under a Gaussian blur is known in closed form. With s1, s2 the signs of a point's
+distances from the edges it is the mean of s1 s2 over the blur, a bivariate normal integral: by Owen's T function exact
+for any angle between the edges; a single dark or light quarter is the same integral. Unknown are the point, both
+directions, the blur, and the grey values: contrast, offset, gradient and the bend of the tone curve, which widens light
+squares at the cost of dark ones. A crossing looks the same after a half turn whatever the tone curve, so its place does
+not depend on it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf, ndtr, owens_t
+
+from measure.noise import correlated, noise_model, robust_scale
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Surface = Callable[[Array, Array, float], tuple[Array, Array, Array, Array]]
+
+PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur
+TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
+SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
+MAX_ITERATIONS = 30
+# Plain, then twice robust: the scale of the residuals is taken once before each, so that it settles.
+STAGES_TOLERANCE_PX = (0.05, 0.01, 0.001)
+UNKNOWNS = 10  # point (2), directions (2), blur, contrast, bend, offset, gradient (2)
+
+
+@dataclass(frozen=True, eq=False)
+class Corner:
+    """A corner as fitted; where reason is not empty the fit failed, and the numbers are its last.
+
+    center_px (2,), covariance_px2 (2, 2); contrast_dn: the grey value between the two steps less that beside them,
+    negative where it is dark between them; blur_px: the standard deviation.
+    """
+
+    center_px: Array
+    covariance_px2: Array
+    contrast_dn: float
+    noise_dn: float
+    blur_px: float
+    damaged_fraction: float
+    reason: str = ""
+
+
+def fit_corner(
+    window: NDArray[np.floating],
+    origin_px: tuple[int, int],
+    start_px: Array,
+    steps_px: Array,
+    reach_px: Array,
+    surface: Surface,
+    valid: Mask | None = None,
+) -> Corner:
+    """Fit the corner near start_px (2,).
+
+    window: (height, width) grey values, the top-left pixel's centre at origin_px (col, row) of the scan; valid: which
+    of them are inside of the scan. steps_px (2, 2): its columns run along the two edges; reach_px (2,): how far along
+    either of them, forth and back, grey values are used. surface: `crossing` or `quarter`.
+    """
+    start = np.asarray(start_px, float) - origin_px
+    fit = _CornerFit(np.asarray(window, float), start, np.asarray(steps_px, float), reach_px, surface, valid)
+    fit.run()
+    return fit.result(np.asarray(origin_px, float))
+
+
+def crossing(u: Array, v: Array, correlation: float) -> tuple[Array, Array, Array, Array]:
+    """The mean of sign(u + z1) sign(v + z2) over standard normal z1, z2 of the given correlation, and its derivatives
+    by u, v and the correlation.
+
+    Owen (1956), Tables for computing bivariate normal probabilities, Annals of Mathematical Statistics 27.
+    """
+    root = np.sqrt(max(1 - correlation**2, 1e-12))
+    u, v = (np.where(np.abs(place) < 1e-9, 1e-9, place) for place in (u, v))
+    across_u, across_v = (v - correlation * u) / root, (u - correlation * v) / root
+    value = np.sign(u) * np.sign(v) - 4 * (owens_t(u, across_u / u) + owens_t(v, across_v / v))
+    by_u = 2 * _density(u) * erf(across_u / np.sqrt(2))
+    by_v = 2 * _density(v) * erf(across_v / np.sqrt(2))
+    return value, by_u, by_v, 4 * _density(u) * _density(across_u) / root
+
+
+def quarter(u: Array, v: Array, correlation: float) -> tuple[Array, Array, Array, Array]:
+    """Twice the probability that u + z1 and v + z2 are both positive, less one, and its derivatives: as `crossing`, for
+    a corner that is alone."""
+    value, by_u, by_v, by_correlation = crossing(u, v, correlation)
+    return (
+        0.5 * (value - 1) + ndtr(u) + ndtr(v) - 1,
+        0.5 * by_u + _density(u),
+        0.5 * by_v + _density(v),
+        0.5 * by_correlation,
+    )
+
+
+def _density(place: Array) -> Array:
+    return np.asarray(np.exp(-0.5 * place**2) / np.sqrt(2 * np.pi))
+
+
+class _CornerFit:
+    """One corner's adjustment in progress."""
+
+    def __init__(
+        self, grey: Array, start: Array, steps_px: Array, reach_px: Array, surface: Surface, valid: Mask | None
+    ) -> None:
+        self.grey, self.start, self.surface, self.reach = grey, start, surface, reach_px
+        self.row, self.col = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(float)
+        self.along_from_pixel = np.linalg.inv(steps_px / np.hypot(*steps_px))
+        self.valid = np.ones(grey.shape, bool) if valid is None else valid
+        self.center = start.copy()
+        # An edge along a step has its normal a quarter turn on; the signs make the corner between the steps positive.
+        mirrored = np.linalg.det(steps_px) < 0
+        self.edges = np.arctan2(steps_px[1], steps_px[0]) + np.pi / 2 + np.pi * np.array([mirrored, not mirrored])
+        self.start_edges = self.edges.copy()
+        self.max_shift_px, self.max_turn_rad = 0.6 * float(reach_px.min()), 0.35
+        self.variance = 0.8**2
+        self.max_variance = (float(reach_px.min()) / 2) ** 2 + PIXEL_VARIANCE_PX2
+        self.linear = np.zeros(5)  # half the contrast, bend, offset, gradient
+        self.scale_dn = 0.0
+        self.weights = self._area()
+        self.reason = "" if self.weights.sum() > 2 * UNKNOWNS else "too little of it is inside of the scan"
+
+    def run(self) -> None:
+        """Plain, then robust, until the corner stands still; or a reason why it does not."""
+        for stage, tolerance_px in enumerate(STAGES_TOLERANCE_PX):
+            if not self.reason:
+                self.scale_dn = self._residual_scale() if stage else np.inf
+                self._adjust(tolerance_px)
+
+    def result(self, origin: Array) -> Corner:
+        """The corner in the scan, with the covariance that the residuals' own autocovariance gives."""
+        design, residuals = self._linearised()
+        used = self.weights > 0.05
+        covariance, noise = np.full((2, 2), np.inf), float("nan")
+        if used.sum() > UNKNOWNS and not self.reason:
+            model = noise_model(residuals, used, UNKNOWNS)
+            noise = float(np.sqrt(model.variance_dn2))
+            weighted = design * self.weights
+            inverse = np.linalg.pinv(_products(weighted, design), hermitian=True)
+            covariance = (inverse @ _products(weighted, correlated(weighted, model)) @ inverse)[:2, :2]
+            if not 2 * abs(self.linear[0]) > 4 * noise:
+                self.reason = "no edges stand out from the noise"
+        return Corner(
+            center_px=self.center + origin,
+            covariance_px2=(covariance + covariance.T) / 2,
+            contrast_dn=2 * float(self.linear[0]),
+            noise_dn=noise,
+            blur_px=float(np.sqrt(max(self.variance - PIXEL_VARIANCE_PX2, 0.0))),
+            damaged_fraction=float(1 - self.weights.sum() / max(self._area().sum(), 1e-9)),
+            reason=self.reason,
+        )
+
+    def _adjust(self, tolerance_px: float) -> None:
+        for _ in range(MAX_ITERATIONS):
+            if self.reason:
+                return
+            self.weights = self._area()
+            if np.isfinite(self.scale_dn):
+                relative = np.clip(np.abs(self._linearised()[1]) / (TUKEY * self.scale_dn), 0.0, 1.0)
+                self.weights = self.weights * (1 - relative**2) ** 2
+            if self._step() < tolerance_px:
+                return
+        self.reason = self.reason or "the fit does not settle"
+
+    def _area(self) -> Array:
+        """Weights 0 to 1 of a parallelogram about the corner; its border is smooth, and it moves with the corner: a
+        window that is not centred would prefer one half of an edge."""
+        offset = np.stack([self.col - self.center[0], self.row - self.center[1]])
+        along = np.abs(np.tensordot(self.along_from_pixel, offset, axes=1))
+        inside = np.clip(self.reach[:, None, None] + 0.5 - along, 0.0, 1.0)
+        return np.asarray(self.valid * inside[0] * inside[1])
+
+    def _residual_scale(self) -> float:
+        _, residuals = self._linearised()
+        return max(robust_scale(residuals[self.weights > 0]), SCALE_FLOOR * 2 * abs(float(self.linear[0])), 1e-9)
+
+    def _linearised(self) -> tuple[Array, Array]:
+        """(10, height, width) derivatives and (height, width) residuals, at the best grey-value parameters."""
+        dx, dy = self.col - self.center[0], self.row - self.center[1]
+        sigma = np.sqrt(self.variance)
+        normals = np.stack([np.cos(self.edges), np.sin(self.edges)], axis=-1)
+        tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=-1)
+        u, v = ((normal[0] * dx + normal[1] * dy) / sigma for normal in normals)
+        value, by_u, by_v, by_correlation = self.surface(u, v, float(normals[0] @ normals[1]))
+        grey = np.stack([value, value**2 - 1, np.ones_like(dx), dx, dy])
+        self.linear = self._best_linear(grey)
+        turning = [
+            by * (tangent[0] * dx + tangent[1] * dy) / sigma + by_correlation * (tangent @ other)
+            for by, tangent, other in zip((by_u, by_v), tangents, normals[::-1], strict=True)
+        ]
+        shape = [
+            -(by_u * normals[0, 0] + by_v * normals[1, 0]) / sigma,
+            -(by_u * normals[0, 1] + by_v * normals[1, 1]) / sigma,
+            *turning,
+            -(by_u * u + by_v * v) / (2 * self.variance),
+        ]
+        slope = self.linear[0] + 2 * self.linear[1] * value
+        return np.concatenate([slope * np.stack(shape), grey]), self.grey - np.tensordot(self.linear, grey, axes=1)
+
+    def _best_linear(self, grey: Array) -> Array:
+        normal = _products(grey * self.weights, grey)
+        right = np.tensordot(grey * self.weights, self.grey, axes=2)
+        return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0])
+
+    def _step(self) -> float:
+        """A Gauss-Newton step, shortened to what a linearisation can bear; its length in px."""
+        design, residuals = self._linearised()
+        weighted = design * self.weights
+        normal = _products(weighted, design)
+        size = np.sqrt(np.diag(normal))
+        if not np.all(size > 0):
+            self.reason = "nothing here shows where the edges meet"
+            return 0.0
+        scaled = normal / np.outer(size, size) + 1e-9 * np.eye(UNKNOWNS)
+        step = np.linalg.solve(scaled, np.tensordot(weighted, residuals, axes=2) / size) / size
+        step /= max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / 0.15, 1.0)
+        self.center += step[:2]
+        self.edges += step[2:4]
+        variance = np.clip(self.variance + step[4], self.variance / 2, self.variance * 2)
+        self.variance = float(np.clip(variance, 0.3**2, self.max_variance))
+        if np.hypot(*(self.center - self.start)) > self.max_shift_px:
+            self.reason = "the fit ran away to something else"
+        elif np.abs(self.edges - self.start_edges).max() > self.max_turn_rad:
+            self.reason = "the edges here run otherwise than they should"
+        return float(np.hypot(*step[:2]))
+
+
+def _products(first: Array, second: Array) -> Array:
+    return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)

@@ -1,0 +1,112 @@
+"""Round targets measured to the noise of the film: a blurred ellipse fitted by least-squares matching."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.matching import MatchOptions, match, window_about
+from measure.scan import Scan
+from measure.shapes import Disk, MarkShape
+
+Array = NDArray[np.float64]
+
+UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
+SHORTEST_MARGIN_PX, LONGEST_MARGIN_PX = 4.0, 10.0
+SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
+SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from the disk
+LEAST_SNR = 4.0
+WEAK_DAMAGE, MOST_DAMAGE = 0.1, 0.35
+WORST_MISFIT = 0.2  # residuals over contrast: texture and stains are no disks
+
+
+@dataclass(frozen=True, eq=False)
+class FittedDisk:
+    """An ellipse as fitted. center_px (2,), covariance_px2 (2, 2); pixel_from_disk (2, 2): the unit disk's image, its
+    columns two radius vectors, px; contrast_dn: positive for a light disk. weakness: why it is doubtful; reason: why it
+    is no disk, and then the numbers are the fit's last."""
+
+    center_px: Array
+    covariance_px2: Array
+    pixel_from_disk: Array
+    contrast_dn: float
+    noise_dn: float
+    blur_px: float
+    damaged_fraction: float
+    weakness: str = ""
+    reason: str = ""
+
+    @property
+    def half_axes_px(self) -> Array:
+        """(2,) the longer and the shorter."""
+        return np.asarray(np.linalg.svd(self.pixel_from_disk, compute_uv=False))
+
+    @property
+    def quality(self) -> dict[str, float]:
+        """Named figures for the mark's row."""
+        longer, shorter = self.half_axes_px
+        return {
+            "snr": abs(self.contrast_dn) / max(self.noise_dn, 1e-9),
+            "contrast_dn": self.contrast_dn,
+            "noise_dn": self.noise_dn,
+            "blur_px": self.blur_px,
+            "damaged_fraction": self.damaged_fraction,
+            "longer_half_axis_px": float(longer),
+            "shorter_half_axis_px": float(shorter),
+        }
+
+
+def fit_disk(
+    scan: Scan, center_px: Array, pixel_from_disk: Array, longest_margin_px: float = LONGEST_MARGIN_PX
+) -> FittedDisk:
+    """Fit an ellipse near center_px (2,), which pixel_from_disk (2, 2) describes to some 20 %.
+
+    longest_margin_px: how far about it grey values may be used; less where a neighbour is near.
+    Never raises for what the picture holds: a fit that fails, or shows that there is no disk, has a reason.
+    """
+    start = np.column_stack([pixel_from_disk, center_px])
+    radius = float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
+    margin = max(min(max(radius, SHORTEST_MARGIN_PX), longest_margin_px, LONGEST_MARGIN_PX), 1.5)
+    options = MatchOptions(freedom="ellipse", margin_px=margin, max_shift_px=max(radius, 2.0))
+    col0, row0, width, height = window_about(UNIT_DISK, start, options.margin_px + 2)
+    window = scan.window(col0, row0, width, height)
+    fit = match(window, (col0, row0), UNIT_DISK, start, options, inside(scan, col0, row0, width, height))
+    disk = FittedDisk(
+        center_px=fit.center_px,
+        covariance_px2=fit.covariance_px2,
+        pixel_from_disk=fit.pixel_from_mark[:, :2],
+        contrast_dn=fit.contrast_dn,
+        noise_dn=fit.noise_dn,
+        blur_px=fit.blur_px,
+        damaged_fraction=fit.damaged_fraction,
+        reason="" if fit.converged else fit.reason,
+    )
+    return judged(disk)
+
+
+def inside(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
+    """(height, width): which pixels of a window are pixels of the scan."""
+    cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
+    in_rows = (rows >= 0) & (rows < scan.height_px)
+    return np.asarray(in_rows[:, None] & (cols >= 0) & (cols < scan.width_px))
+
+
+def judged(disk: FittedDisk) -> FittedDisk:
+    """The disk with its reason or weakness, where the fit's figures give one."""
+    if disk.reason:
+        return disk
+    reason = weakness = ""
+    contrast, (_, shorter) = abs(disk.contrast_dn), disk.half_axes_px
+    if not np.all(np.isfinite(disk.covariance_px2)) or contrast < LEAST_SNR * disk.noise_dn:
+        reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
+    elif disk.noise_dn > WORST_MISFIT * contrast:
+        reason = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
+    elif disk.damaged_fraction > MOST_DAMAGE:
+        reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
+    elif shorter < SMALLEST_RADIUS_PX:
+        reason = f"too small: half axis {shorter:.1f} px"
+    elif shorter < SMALL_RADIUS_PX:
+        weakness = f"small: half axis {shorter:.1f} px, dust of its size would look the same"
+    elif disk.damaged_fraction > WEAK_DAMAGE:
+        weakness = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
+    return FittedDisk(**{**vars(disk), "reason": reason, "weakness": weakness})

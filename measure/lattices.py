@@ -1,0 +1,134 @@
+"""Points of a printed grid put in order: which of the points found belongs to which place of the grid."""
+
+from collections import deque
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Place = tuple[int, int]
+
+NEIGHBOURS = 8
+STEP_TOLERANCE = 0.3  # of a step, between where a neighbour is expected and where it is
+SEEDS = 12  # points to begin at, spread over all
+LIKENESS = 0.4  # of the logarithms of size and contrast
+LEAST_SHARE = 0.8  # of the grid's places that must be seen
+
+
+def grid_places(points_px: Array, looks: Array, places: list[Place]) -> list[dict[Place, int]]:
+    """Assignments of points to the places (row, column) of a grid, one for each way to turn the grid so that it fits as
+    well as the best one: {place: index of the point}. Empty where no outline fits; the grid is never mirrored.
+
+    points_px (n, 2) may hold strangers; looks (n, k): figures of a point's looks in which neighbours differ by less
+    than LIKENESS. The grid's outline must be seen, a fifth of its places may be missing.
+    """
+    best: list[dict[Place, int]] = []
+    for lattice in lattices(points_px, looks):
+        for assignment in outlines(lattice, places):
+            if not best or len(assignment) > len(best[0]):
+                best = [assignment]
+            elif len(assignment) == len(best[0]) and assignment not in best:
+                best.append(assignment)
+        if best and len(best[0]) > 0.98 * len(places):
+            break
+    return best
+
+
+def lattices(points_px: Array, looks: Array) -> list[dict[Place, int]]:
+    """Lattices that the points form, {(i, j): index}, the largest first; i to j turns as column to row of a scan."""
+    if len(points_px) < 4:
+        return []
+    tree = cKDTree(points_px)
+    found = [grown(points_px, looks, tree, int(seed)) for seed in np.linspace(0, len(points_px) - 1, SEEDS).astype(int)]
+    return sorted(found, key=len, reverse=True)[:3]
+
+
+def grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Place, int]:
+    """The lattice about a point, grown from neighbour to neighbour; each step is expected to be like the last."""
+    basis = seed_basis(points_px, tree, seed)
+    if basis is None:
+        return {}
+    lattice: dict[Place, int] = {(0, 0): seed}
+    steps = {(0, 0): basis}
+    waiting: deque[Place] = deque([(0, 0)])
+    taken = {seed}
+    while waiting:
+        i, j = waiting.popleft()
+        here, step = points_px[lattice[i, j]], steps[i, j]
+        for along, sign in product((0, 1), (1, -1)):
+            place = (i + sign, j) if along == 0 else (i, j + sign)
+            if place in lattice:
+                continue
+            distance, index = tree.query(here + sign * step[along])
+            unlike = np.abs(looks[index] - looks[lattice[i, j]]).max() > LIKENESS
+            if unlike or distance > STEP_TOLERANCE * np.hypot(*step[along]) or int(index) in taken:
+                continue
+            lattice[place] = int(index)
+            taken.add(int(index))
+            seen = step.copy()
+            seen[along] = sign * (points_px[index] - here)
+            steps[place] = 0.5 * (step + seen)
+            waiting.append(place)
+    return lattice
+
+
+def seed_basis(points_px: Array, tree: cKDTree, seed: int) -> Array | None:
+    """(2, 2) rows: the two shortest steps from a point to neighbours that have a partner on the other side."""
+    _, near = tree.query(points_px[seed], k=np.arange(2, min(NEIGHBOURS + 1, len(points_px)) + 1))
+    steps = points_px[near] - points_px[seed]
+    paired = [step for step in steps if tree.query(points_px[seed] - step)[0] < STEP_TOLERANCE * np.hypot(*step)]
+    for second in paired[1:]:
+        turn = np.linalg.det(np.stack([paired[0], second]))
+        if abs(turn) > 0.3 * np.hypot(*paired[0]) * np.hypot(*second):
+            return np.stack([paired[0], second if turn > 0 else -second])
+    return None
+
+
+def outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place, int]]:
+    """The ways to lay the grid's outline on a lattice, with as many points as possible."""
+    wanted = set(places)
+    nodes = np.array(list(lattice)).reshape(-1, 2)
+    indices = list(lattice.values())
+    found: list[dict[Place, int]] = []
+    for matrix in unit_steps(places):
+        columns_rows = nodes @ matrix
+        for shift in outline_shifts(columns_rows, places):
+            moved = columns_rows + shift
+            assignment = {
+                (int(row), int(column)): index
+                for (column, row), index in zip(moved, indices, strict=True)
+                if (int(row), int(column)) in wanted
+            }
+            if len(assignment) >= LEAST_SHARE * len(places) and assignment not in found:
+                found.append(assignment)
+    most = max((len(assignment) for assignment in found), default=0)
+    return [assignment for assignment in found if len(assignment) == most]
+
+
+def unit_steps(places: list[Place]) -> list[Integers]:
+    """(2, 2) matrices whose rows are the lattice's two steps in (column, row): all pairs of short steps that reach
+    every place of the grid, turning from column to row."""
+    staggered = len({(row + column) % 2 for row, column in places}) == 1
+    short = [np.array(step) for step in product((-2, -1, 0, 1, 2), repeat=2)]
+    if staggered:
+        short = [step for step in short if step.sum() % 2 == 0 and 0 < np.abs(step).sum() <= 2]
+    else:
+        short = [step for step in short if 0 < np.abs(step).max() <= 1]
+    area = 2 if staggered else 1
+    pairs = (np.stack(pair) for pair in product(short, repeat=2))
+    return [pair for pair in pairs if round(np.linalg.det(pair)) == area]
+
+
+def outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integers]:
+    """Shifts that lay the grid's outline about a lattice's nodes. Strangers beside the grid may widen the nodes'
+    outline by a line or two."""
+    grid = np.array([(column, row) for row, column in places])
+    size = grid.max(axis=0) + 1
+    least, greatest = columns_rows.min(axis=0), columns_rows.max(axis=0)
+    extra = greatest - least + 1 - size
+    if np.any(extra < 0) or np.any(extra > 2):
+        return []
+    return [-least - np.array(spare) for spare in product(range(int(extra[0]) + 1), range(int(extra[1]) + 1))]
