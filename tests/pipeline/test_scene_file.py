@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 from measure import shapes
 from measure.board_specs import ChessboardSpec, CircleGridSpec
@@ -81,10 +82,20 @@ def test_juhls_photographs_overlap_by_sixty_and_ninety_per_cent() -> None:
     assert 1 - (x[2] - x[0]) / covered == pytest.approx(0.9, abs=0.01)
 
 
-def test_the_template_becomes_a_project_that_can_be_read(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def rendered_template(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str, int, int]]]:
+    """The template's project, rendered once, and what it told of its progress."""
     calls: list[tuple[str, int, int]] = []
-    render_project(written(tmp_path, TEMPLATE), tmp_path / "out", lambda *call: calls.append(call))
-    project = read_project(tmp_path / "out" / "project.toml")
+    folder = tmp_path_factory.mktemp("template")
+    render_project(written(folder, TEMPLATE), folder / "out", lambda *call: calls.append(call))
+    return folder / "out", calls
+
+
+def test_the_template_becomes_a_project_that_can_be_read(
+    rendered_template: tuple[Path, list[tuple[str, int, int]]],
+) -> None:
+    folder, calls = rendered_template
+    project = read_project(folder / "project.toml")
     assert list(project.scans) == ["frame1", "frame2"]
     assert project.default_camera.name == "small metric camera"
     assert project.given_points is not None
@@ -99,9 +110,10 @@ def test_the_template_becomes_a_project_that_can_be_read(tmp_path: Path) -> None
     assert [done for _, done, _ in calls] == list(range(1, 13))
 
 
-def test_truth_has_the_names_of_the_adjustment(tmp_path: Path) -> None:
-    render_project(written(tmp_path, TEMPLATE), tmp_path / "out")
-    truth = json.loads((tmp_path / "out" / "truth.json").read_text(encoding="utf-8"))
+def test_truth_has_the_names_of_the_adjustment(
+    rendered_template: tuple[Path, list[tuple[str, int, int]]],
+) -> None:
+    truth = json.loads((rendered_template[0] / "truth.json").read_text(encoding="utf-8"))
     camera = truth["cameras"]["small metric camera"]
     assert camera["principal_distance_mm"] == {"value": 60.0}
     assert camera["principal_point_mm"] == {"x": {"value": 0.05}, "y": {"value": -0.03}}
@@ -168,10 +180,11 @@ def test_the_given_camera_draws_the_marks_of_the_true_one(tmp_path: Path) -> Non
 
 
 def test_a_mark_cut_from_a_scan_is_drawn_and_given(tmp_path: Path) -> None:
-    render_project(written(tmp_path, TEMPLATE), tmp_path / "first")
+    chip = np.random.default_rng(1).integers(100, 60000, (19, 16), np.uint16)
+    tifffile.imwrite(tmp_path / "chip.tif", chip)
     text = changed(
         'kind = "ring-cross"\npolarity = "light"\nring_mm = 0.5\nring_line_mm = 0.1\narm_mm = 0.36\nline_mm = 0.1\n',
-        'kind = "template"\nimage = "first/scans/frame1.tif"\npitch_um = 45.0\norigin_px = [7.5, 9.0]\n',
+        'kind = "template"\nimage = "chip.tif"\npitch_um = 45.0\norigin_px = [7.5, 9.0]\n',
     )
     scene_file = read_scene(written(tmp_path, text))
     mark = scene_file.scene.camera.fiducials[1].mark
