@@ -10,7 +10,8 @@ def fixed(value: float | None, decimals: int = 2, sign: bool = False) -> str:
     """A number with so many decimals; a dash where there is none."""
     if value is None or not math.isfinite(value):
         return NONE
-    text = f"{value:+.{decimals}f}" if sign else f"{value:.{decimals}f}"
+    rounded = round(value, decimals) + 0.0  # no minus sign before a zero
+    text = f"{rounded:+.{decimals}f}" if sign else f"{rounded:.{decimals}f}"
     return text.replace("-", "−")
 
 

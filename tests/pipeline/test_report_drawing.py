@@ -40,6 +40,7 @@ def test_a_value_is_printed_to_what_its_sigma_supports(
 def test_plain_numbers() -> None:
     assert fixed(-0.5, 1) == "−0.5"
     assert fixed(0.5, 1, sign=True) == "+0.5"
+    assert fixed(-0.04, 1, sign=True) == "+0.0"
     assert fixed(float("nan")) == "–"
     assert significant(4.1e6, 3) == "4100000"
     assert significant(2.5e-9, 2) == "2.5 × 10⁻⁹"
