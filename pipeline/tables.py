@@ -95,7 +95,7 @@ class Table:
         """One number for both axes, or [x, y]."""
         value = self._get(key, default)
         if isinstance(value, Sequence) and not isinstance(value, str):
-            return self.pair(key)
+            return self.pair(key, default)
         number = self._number(key, value)
         return (number, number)
 
