@@ -139,7 +139,7 @@ def _run(numbering: Numbering, weighting: Weighting, state: State, limit: int) -
     if solution.factor is None:
         return _unsolved(numbering, weighting, solution, ())
     cofactor = _spread(numbering, solution.factor.cofactor())
-    observed = residuals(problem, solution.end, solution.factor, covariance)
+    observed = residuals(numbering, solution.end, solution.factor, covariance)
     return _Run(numbering, weighting, solution, (), cofactor, observed)
 
 

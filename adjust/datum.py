@@ -84,10 +84,11 @@ def minimal_datum(problem: Problem) -> Indices:
 
 
 def _candidates(problem: Problem, state: State) -> list[int]:
-    """Free coordinates in the order in which they are to be fixed."""
+    """Free coordinates, of points that two images show at least, in the order in which they are to be fixed."""
     positions = _point_positions(problem)
-    free = np.isinf(problem.unknowns.sigma[positions])
-    usable = positions[free[:, :2].all(axis=1)]
+    free = np.isinf(problem.unknowns.sigma[positions[:, :2]]).all(axis=1)
+    rays = np.bincount(problem.places[~problem.is_fiducial, 0], minlength=len(problem.unknowns))
+    usable = positions[free & (rays[positions[:, 0]] >= 2)]
     if len(usable) == 0:
         return []
     plan = state.values[usable[:, :2]]

@@ -29,7 +29,7 @@ UNDETERMINED = 0.99  # posterior over prior standard deviation above which the o
 
 def singular_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
     """The null directions of the factor of a state, at its computed observations; none where it is regular."""
-    within = _within_images(problem, free, factor)
+    within = _within_blocks(problem, free, factor)
     return within or _named(problem, state, free, factor, _null_space(factor, SINGULAR)[0], PURE)
 
 
@@ -40,7 +40,7 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     priors weigh less than SETTLED times what the observations do. Directions that move fiducials with priors are no
     cause for alarm: their priors are meant to place them.
     """
-    if _within_images(problem, free, factor):
+    if _within_blocks(problem, free, factor):
         return ()
     hardly, told = _null_space(factor, WEAK)
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
@@ -81,8 +81,8 @@ def collapsed(names: list[str]) -> tuple[str, ...]:
     return tuple(shown)
 
 
-def _within_images(problem: Problem, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
-    """Null directions of images' own unknowns, which the shared ones have no part in."""
+def _within_blocks(problem: Problem, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
+    """Null directions of an image's or a point's own unknowns, which the shared ones have no part in."""
     directions = []
     for block in factor.blocks:
         if len(block.own) == 0:
@@ -90,15 +90,22 @@ def _within_images(problem: Problem, free: Indices, factor: Factor) -> tuple[Nul
         _, singular, right = np.linalg.svd(block.triangle)
         for vector in right[singular <= SINGULAR * singular[0]]:
             names = [problem.unknowns.names[free[block.own[i]]] for i in _largest(vector)]
-            image = names[0].split(".", 1)[1].rsplit(".", 1)[0]
-            directions.append(
-                NullDirection(
-                    tuple(names),
-                    f"The marks of image {image} do not determine its own orientation and transformation.",
-                    "Measure more marks in this image, not all on one line, or leave the image out.",
-                )
-            )
+            directions.append(NullDirection(tuple(names), *_own_sentence(names[0])))
     return tuple(directions)
+
+
+def _own_sentence(name: str) -> tuple[str, str]:
+    """Cause and remedy where the observations do not determine the owner of an unknown."""
+    kind, owner = name.rsplit(".", 1)[0].split(".", 1)
+    if kind == "PT":
+        return (
+            f"The rays to point {owner} do not determine where it lies.",
+            "Measure it in more images, from stations further apart, give its coordinates, or leave it out.",
+        )
+    return (
+        f"The marks of image {owner} do not determine its own orientation and transformation.",
+        "Measure more marks in this image, not all on one line, or leave the image out.",
+    )
 
 
 def _null_space(factor: Factor, below: float) -> tuple[Array, Array]:

@@ -134,7 +134,8 @@ def _interior_leads(problem: Problem, camera: str, positions: NDArray[np.intp]) 
         )
         for name in PARAMETERS[problem.network.camera_by_name[camera].distortion.family]
     ]
-    unit = np.eye(len(problem.unknowns))[positions]
+    unit = np.zeros((len(positions), len(problem.unknowns)))
+    unit[np.arange(len(positions)), positions] = 1.0
     return [
         Lead(1 if number < 3 else 2, functional, cause, remedy)
         for number, (functional, (cause, remedy)) in enumerate(zip(unit, texts, strict=True))

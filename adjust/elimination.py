@@ -1,9 +1,10 @@
-"""Least squares with bordered blocks: every image's own unknowns are eliminated onto those that images share.
+"""Least squares with bordered blocks: every block's own unknowns are eliminated onto those that blocks share.
 
-The rows of an image touch its own unknowns and some shared ones. An orthogonal (Householder) factorisation of these
-rows alone leaves a triangle for its own unknowns and fewer rows in the shared ones; all these are factorised together.
-The cost is linear in the number of images, and the condition is that of the rows, not its square as with normal
-equations (Golub and Van Loan, Matrix Computations, section 5.3; Triggs et al., Bundle adjustment: a modern synthesis).
+The rows of an image, or of a point, touch its own unknowns and some shared ones. An orthogonal (Householder)
+factorisation of these rows alone leaves a triangle for its own unknowns and fewer rows in the shared ones; all these
+are factorised together. The cost is linear in the number of blocks, and the condition is that of the rows, not its
+square as with normal equations (Golub and Van Loan, Matrix Computations, section 5.3; Triggs et al., Bundle
+adjustment: a modern synthesis).
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,7 +24,7 @@ ROWS_PER_COLUMN = 4  # rows in the shared unknowns are condensed when there are 
 
 @dataclass(frozen=True)
 class Block:
-    """The rows of one image: matrix (m, own + shared) times the unknowns = right (m,), of unit weight.
+    """The rows of one block: matrix (m, own + shared) times the unknowns = right (m,), of unit weight.
 
     own: numbers of its own unknowns among all; shared: numbers of the others that it touches, among the shared ones.
     """
@@ -36,7 +37,7 @@ class Block:
 
 @dataclass(frozen=True)
 class BlockFactor:
-    """An image's triangle: triangle own + border shared = right."""
+    """A block's triangle: triangle own + border shared = right."""
 
     own: Indices
     shared: Indices
@@ -47,7 +48,7 @@ class BlockFactor:
 
 @dataclass(frozen=True)
 class Factor:
-    """The square root of the normal equations: the images' triangles, and that of the shared unknowns (s, s).
+    """The square root of the normal equations: the blocks' triangles, and that of the shared unknowns (s, s).
 
     All columns are scaled: the unknowns are those of the rows times `scale` (n,), which makes every column's norm 1.
     The shared unknowns are the first s.

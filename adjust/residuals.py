@@ -9,7 +9,7 @@ from adjust.elimination import Factor
 from adjust.iteration import Linearised
 from adjust.problem import Problem, State
 from adjust.result import Group, Residuals
-from adjust.rows import prior_differences
+from adjust.rows import Numbering, prior_differences
 
 Array = NDArray[np.float64]
 
@@ -17,7 +17,7 @@ UNCHECKED = 1e-9  # an observation of a smaller redundancy is not checked by any
 UM_PER_MM = 1000.0
 
 
-def residuals(problem: Problem, end: Linearised, factor: Factor, covariance_mm2: Array) -> Residuals:
+def residuals(numbering: Numbering, end: Linearised, factor: Factor, covariance_mm2: Array) -> Residuals:
     """The residuals with their redundancy numbers, the diagonal of Q_vv P (Förstner; Baarda's w = v / sigma_v).
 
     With K = C A' L^-T and the whitened rows L^-1 B: Q_vv = K (I - L^-1 B C_xx B' L^-T) K'.
@@ -25,9 +25,9 @@ def residuals(problem: Problem, end: Linearised, factor: Factor, covariance_mm2:
     at, root = end.at, end.rows.root
     roots = factor.row_roots(end.rows.blocks)
     adjusted = np.empty((len(end.v_mm), 2, 2))
-    for rows, g in zip(problem.rows_by_image, roots, strict=True):
-        pairs = g.reshape(len(rows), 2, -1)
-        adjusted[rows] = pairs @ pairs.transpose(0, 2, 1)
+    for touched, g in zip(numbering.touched, roots, strict=True):
+        pairs = g.reshape(len(touched.rows), 2, -1)
+        adjusted[touched.rows] = pairs @ pairs.transpose(0, 2, 1)
     k = np.linalg.solve(root, at.by_observation @ covariance_mm2).transpose(0, 2, 1)
     cofactor = k @ (np.eye(2) - adjusted) @ k.transpose(0, 2, 1)
     redundancy = np.einsum("nij,nji->ni", cofactor, np.linalg.inv(covariance_mm2))

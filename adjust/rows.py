@@ -1,4 +1,4 @@
-"""The weighted rows of an adjustment: whitened pairs F1, F2 and F3, F4 image by image, and the unknowns' priors."""
+"""The weighted rows of an adjustment: whitened pairs F1, F2 and F3, F4 in blocks, and the unknowns' priors."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,12 +16,13 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Touched:
-    """What an image's rows touch: numbers of its own and of shared free unknowns, and where every derivative goes.
+    """What a block's observations touch: numbers of its own and of shared free unknowns, where every derivative goes.
 
-    columns (m, k): the column, own unknowns first, of every derivative of its m observations; one column behind the
-    last for what is fixed or absent.
+    rows (m,): its observations. columns (m, k): the column, own unknowns first, of every derivative; one column behind
+    the last for what is fixed or absent.
     """
 
+    rows: Indices
     own: Indices
     shared: Indices
     columns: Indices
@@ -29,46 +30,82 @@ class Touched:
 
 @dataclass(frozen=True)
 class Numbering:
-    """The free unknowns of a problem, numbered in their order; those of the images come last."""
+    """The free unknowns of a problem, numbered: those that blocks of observations share, then the blocks' own.
+
+    A block is an image, with its orientation and transformation. Where object points have more unknowns than images
+    have, a block is a point with its coordinates, and the images' unknowns are shared: whichever leaves less to share.
+    """
 
     problem: Problem
 
     @cached_property
     def free(self) -> Indices:
         """Positions of the free unknowns."""
-        return np.flatnonzero(self.problem.unknowns.sigma > 0.0)
+        free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
+        own = np.concatenate([positions for _, positions in self._blocks])
+        is_own = np.isin(free, own)
+        return np.concatenate([free[~is_own], free[is_own]])
 
     @cached_property
     def touched(self) -> list[Touched]:
-        """What every image touches."""
-        problem, unknowns = self.problem, self.problem.unknowns
-        numbers = np.full(len(unknowns) + 1, ABSENT, dtype=np.intp)  # the last stands for ABSENT
+        """What every block touches."""
+        problem = self.problem
+        numbers = np.full(len(problem.unknowns) + 1, ABSENT, dtype=np.intp)  # the last stands for ABSENT
         numbers[self.free] = np.arange(len(self.free))
         column_of = np.empty(len(self.free) + 1, dtype=np.intp)
         touched = []
-        for image, rows in zip(problem.network.images, problem.rows_by_image, strict=True):
-            positions = np.concatenate([unknowns.exterior[image.name], unknowns.transformation[image.name]])
-            own = np.unique(numbers[positions])
-            used = np.unique(numbers[problem.columns[rows]])
+        for rows, positions in self._blocks:
+            derivatives = numbers[problem.columns[rows]]
+            own, used = np.unique(numbers[positions]), np.unique(derivatives)
             own, used = own[own != ABSENT], used[used != ABSENT]
             shared = np.setdiff1d(used, own)
             columns = np.concatenate([own, shared])
             column_of[columns] = np.arange(len(columns))
             column_of[ABSENT] = len(columns)
-            touched.append(Touched(own, shared, column_of[numbers[problem.columns[rows]]]))
+            touched.append(Touched(rows, own, shared, column_of[derivatives]))
         return touched
+
+    @cached_property
+    def _blocks(self) -> list[tuple[Indices, Indices]]:
+        """Observations and positions of the own unknowns of every block."""
+        unknowns = self.problem.unknowns
+        points = [positions for positions in unknowns.point.values() if unknowns.sigma[positions].any()]
+        images = [
+            np.concatenate([unknowns.exterior[image.name], unknowns.transformation[image.name]])
+            for image in self.problem.network.images
+        ]
+        if _count(unknowns.sigma, points) > _count(unknowns.sigma, images):
+            return self._blocks_by_point(points)
+        return list(zip(self.problem.rows_by_image, images, strict=True))
+
+    def _blocks_by_point(self, points: list[Indices]) -> list[tuple[Indices, Indices]]:
+        """One block a point with unknowns, and one without own unknowns for all else that an image shows."""
+        number_of = {int(positions[0]): i for i, positions in enumerate(points)}
+        first = np.where(self.problem.is_fiducial, ABSENT, self.problem.places[:, 0])
+        of_point = np.array([number_of.get(int(position), len(points)) for position in first], dtype=np.intp)
+        order = np.argsort(of_point, kind="stable")
+        ends = np.cumsum(np.bincount(of_point, minlength=len(points) + 1))
+        rows = np.split(order, ends[:-1])
+        others = [np.intersect1d(rows[-1], of_image) for of_image in self.problem.rows_by_image]
+        nothing = np.empty(0, dtype=np.intp)
+        return [*zip(rows[:-1], points, strict=True), *((each, nothing) for each in others if len(each))]
+
+
+def _count(sigma: Array, positions: list[Indices]) -> int:
+    """How many of the unknowns at some positions are free."""
+    return int((sigma[np.concatenate(positions)] > 0.0).sum()) if positions else 0
 
 
 @dataclass(frozen=True)
 class WhitenedRows:
-    """Pairs of rows of unit weight: root (n, 2, 2), the factor L of A C A' = L L', and the images' blocks."""
+    """Pairs of rows of unit weight: root (n, 2, 2), the factor L of A C A' = L L', and the blocks."""
 
     root: Array
     blocks: list[Block]
 
 
 def whitened_rows(numbering: Numbering, at: Derivatives, covariance_mm2: Array, v_mm: Array) -> WhitenedRows:
-    """The rows B dx = w of all images, every pair multiplied by L^-1, where A C A' = L L'.
+    """The rows B dx = w of all blocks, every pair multiplied by L^-1, where A C A' = L L'.
 
     At computed observations F is 0, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed less observed.
     """
@@ -76,10 +113,7 @@ def whitened_rows(numbering: Numbering, at: Derivatives, covariance_mm2: Array, 
     root = np.asarray(np.linalg.cholesky(a @ covariance_mm2 @ a.transpose(0, 2, 1)), dtype=np.float64)
     matrix = np.asarray(np.linalg.solve(root, at.by_unknowns), dtype=np.float64)
     right = np.asarray(np.linalg.solve(root, a @ v_mm[..., None])[..., 0], dtype=np.float64)
-    blocks = [
-        _block(touched, matrix[rows], right[rows])
-        for touched, rows in zip(numbering.touched, numbering.problem.rows_by_image, strict=True)
-    ]
+    blocks = [_block(touched, matrix[touched.rows], right[touched.rows]) for touched in numbering.touched]
     return WhitenedRows(root, blocks)
 
 

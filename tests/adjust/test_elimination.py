@@ -6,8 +6,10 @@ from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
 from adjust import elimination
-from adjust.adjustment import adjust
+from adjust.adjustment import _problem, adjust
 from adjust.elimination import Block, eliminate
+from adjust.iteration import factorise, linearise
+from adjust.rows import Numbering, prior_root_weights
 
 Array = NDArray[np.float64]
 
@@ -107,3 +109,26 @@ def test_the_cost_is_linear_in_the_images(monkeypatch: pytest.MonkeyPatch) -> No
         return sum(costs) / result.iterations
 
     assert cost(24) < 2.2 * cost(12)
+
+
+@pytest.mark.parametrize(("count", "own"), [(18, {0, 3}), (9, {12})])
+def test_points_or_images_are_eliminated_first(count: int, own: set[int]) -> None:
+    """Whichever has more unknowns; either way the cofactors are the inverse of the dense normal equations."""
+    rng = np.random.default_rng(12)
+    network, start = simulated(rng, points=field_points(rng, count), point_sigma=0.05, free={"k3": np.inf})
+    problem = _problem(network, start)
+    numbering = Numbering(problem)
+    assert {len(touched.own) for touched in numbering.touched} == own
+    at = linearise(numbering, network.observations.covariance_mm2, problem.start())
+    assert at is not None
+    total = len(numbering.free)
+    matrix = np.zeros((2 * len(network.observations), total))
+    row = 0
+    for block in at.rows.blocks:
+        matrix[row : row + len(block.matrix), np.concatenate([block.own, block.shared])] = block.matrix
+        row += len(block.matrix)
+    normal = matrix.T @ matrix + np.diag(prior_root_weights(numbering) ** 2)
+    scale = np.sqrt(np.diag(normal))
+    expected = np.linalg.inv(normal / np.outer(scale, scale))
+    cofactor = factorise(numbering, at).cofactor() * np.outer(scale, scale)
+    np.testing.assert_allclose(cofactor, expected, atol=1e-6 * np.abs(expected).max())

@@ -144,12 +144,25 @@ def test_points_of_an_image_on_one_line_are_named() -> None:
     assert "do not determine its own orientation" in result.singular[0].cause
 
 
-def test_what_no_image_shows_is_told() -> None:
-    network, start = simulated(np.random.default_rng(4))
+@pytest.mark.parametrize("count", [9, 40])
+def test_a_point_in_one_image_only_is_named(count: int) -> None:
+    """Whether images or points are eliminated first: four images have 48 unknowns, nine points 27, forty 120."""
+    rng = np.random.default_rng(6)
+    network, start = simulated(rng, points=field_points(rng, count), point_sigma=np.inf, noise=False)
     rows = network.observations
-    keep = [
-        i for i, (point, kind) in enumerate(zip(rows.point, rows.kind, strict=True)) if (point, kind) != ("3", "target")
-    ]
+    lonely = [(image, "3", "target") for image in ("f0", "f1", "f2")]
+    keys = list(zip(rows.image, rows.point, rows.kind, strict=True))
+    result = adjust(
+        kept(network, [i for i, key in enumerate(keys) if key not in lonely]), start, Options(datum="minimal")
+    )
+    assert result.termination == "singular"
+    (direction,) = result.singular
+    assert {name.rsplit(".", 1)[0] for name in direction.parameters} == {"PT.3"}
+
+
+def kept(network: Network, keep: list[int]) -> Network:
+    """The network with some of its observations."""
+    rows = network.observations
     shorter = Observations(
         tuple(rows.image[i] for i in keep),
         tuple(rows.point[i] for i in keep),
@@ -157,6 +170,15 @@ def test_what_no_image_shows_is_told() -> None:
         rows.xy_mm[keep],
         rows.covariance_mm2[keep],
     )
-    result = adjust(Network(network.cameras, network.images, network.points, shorter), start)
+    return replace(network, observations=shorter)
+
+
+def test_what_no_image_shows_is_told() -> None:
+    network, start = simulated(np.random.default_rng(4))
+    rows = network.observations
+    keep = [
+        i for i, (point, kind) in enumerate(zip(rows.point, rows.kind, strict=True)) if (point, kind) != ("3", "target")
+    ]
+    result = adjust(kept(network, keep), start)
     assert result.converged
     assert result.warnings == ("No image shows the object points 3: they take no part.",)
