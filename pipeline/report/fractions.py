@@ -10,6 +10,8 @@ Array = NDArray[np.float64]
 
 BINS = 10
 LEAST_MARKS = 50  # five a bin, below which the chi-square test means nothing
+LEAST_PROBABILITY = 1e-4  # grids of targets that lie along the pixels are a little uneven by themselves
+LEAST_BIAS_PX = 0.01  # with very many marks even a bias that harms nobody is beyond chance
 
 
 @dataclass(frozen=True)
@@ -17,15 +19,18 @@ class FractionTest:
     """Counts (BINS,) of the fractional parts over [-0.5, 0.5) of a pixel, about its centre.
 
     probability: how often chance alone gives counts as uneven as these; None where there are too few marks to say.
+    bias_px: the amplitude of the bias that would make them so. Positions f moved to f + b sin(2 pi f) have, to first
+    order, the density 1 - 2 pi b cos(2 pi f), so that b follows from the counts' first harmonic.
     """
 
     counts: NDArray[np.int64]
     probability: float | None
+    bias_px: float
 
     @property
     def is_locked(self) -> bool:
-        """Whether the positions prefer parts of a pixel beyond what chance explains once in a thousand."""
-        return self.probability is not None and self.probability < 1e-3
+        """Whether the positions prefer parts of a pixel, beyond chance and by an amount that matters."""
+        return self.probability is not None and self.probability < LEAST_PROBABILITY and self.bias_px > LEAST_BIAS_PX
 
 
 def fraction_test(position_px: Array) -> FractionTest:
@@ -33,8 +38,9 @@ def fraction_test(position_px: Array) -> FractionTest:
     fractions = position_px - np.floor(position_px + 0.5)
     counts, _ = np.histogram(fractions, bins=BINS, range=(-0.5, 0.5))
     if len(position_px) < LEAST_MARKS:
-        return FractionTest(counts, None)
-    return FractionTest(counts, float(stats.chisquare(counts).pvalue))
+        return FractionTest(counts, None, 0.0)
+    harmonic = 2.0 * np.abs(np.mean(np.exp(2j * np.pi * fractions)))
+    return FractionTest(counts, float(stats.chisquare(counts).pvalue), float(harmonic / (2.0 * np.pi)))
 
 
 def expected_range(total: int) -> tuple[float, float]:

@@ -122,9 +122,11 @@ def _problems_of(frame: Frame) -> Iterator[Problem]:
 def _locking(shots: list[Frame]) -> Iterator[Problem]:
     centers = [m.center_px for f in shots for m in f.marks if m.status.is_observation and m.center_px is not None]
     for axis, positions in zip(("column", "row"), np.reshape(centers, (-1, 2)).T, strict=True):
-        if fraction_test(positions).is_locked:
+        test = fraction_test(positions)
+        if test.is_locked:
             yield Problem(
-                f"The {axis} positions of the marks prefer parts of a pixel, as biased ones do (pixel locking).",
+                f"The {axis} positions of the marks prefer parts of a pixel (pixel locking): they are biased by up to "
+                f"{fixed(test.bias_px)} px.",
                 "Look at the histogram of fractional parts in the report; scan with a finer pitch or in 16 bit.",
             )
 

@@ -172,6 +172,23 @@ def test_even_fractions_pass_and_locked_ones_do_not() -> None:
     assert fraction_test(even).counts.sum() == 800
 
 
+def test_the_bias_of_locked_positions_is_measured() -> None:
+    """0.03 px towards the pixel's centre, as interpolating methods have it."""
+    rng = np.random.default_rng(4)
+    true = rng.uniform(0.0, 4000.0, 20000)
+    test = fraction_test(true - 0.03 * np.sin(2.0 * np.pi * true))
+    assert test.is_locked
+    assert test.bias_px == pytest.approx(0.03, abs=0.003)
+
+
+def test_a_bias_that_harms_nobody_is_left_alone_however_many_marks_show_it() -> None:
+    true = (np.arange(400000) + 0.5) / 1000.0
+    test = fraction_test(true - 0.005 * np.sin(2.0 * np.pi * true))
+    assert test.probability is not None
+    assert test.probability < 1e-9
+    assert not test.is_locked
+
+
 def test_locked_positions_need_a_look(measured: ReportData) -> None:
     assert measured.measurement is not None
     images: Json = {}
