@@ -11,6 +11,7 @@ from adjust.network import (
     EXTERIOR_NAMES,
     Approximations,
     Camera,
+    Distortion,
     Family,
     Image,
     Network,
@@ -23,7 +24,7 @@ from adjust.projection import adjusted_image
 from adjust.result import Adjustment
 from adjust.transformation import affine_gradient
 from pipeline.opencv_calibration import ImagePoints, can_begin
-from pipeline.opencv_model import Freedom
+from pipeline.opencv_model import NAMES, Freedom
 
 Array = NDArray[np.float64]
 
@@ -93,6 +94,27 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
         sigma_spread=float(sigmas.max() / sigmas.min()),
         uncertain_points=sum(not _is_fixed(network.point_by_id[point]) for point in points),
         left_out=tuple(name for name in names if name not in usable),
+    )
+
+
+def in_opencv_model(problem: BareProblem, parameters: Array) -> BareProblem:
+    """The same problem with OpenCV's own distortion, from parameters (16,) in the order of `opencv_model.NAMES`."""
+    values = dict(zip(NAMES, parameters.tolist(), strict=True))
+    values["b1"] = values["fx"] / values["fy"] - 1
+    free = set(problem.freedom.names) - {"fy"} | ({"b1"} if "fy" in problem.freedom.names else set())
+    priors = {name: Prior(value, np.inf if name in free else 0.0) for name, value in values.items()}
+    camera = replace(
+        problem.network.cameras[0],
+        principal_distance_mm=Prior(values["fy"], priors["fx"].sigma),
+        x0_mm=priors["cx"],
+        y0_mm=priors["cy"],
+        distortion=Distortion("opencv", {name: priors[name] for name in PARAMETERS["opencv"]}),
+    )
+    interior = {camera.name: np.array([values["fy"], values["cx"], values["cy"]])}
+    return replace(
+        problem,
+        network=replace(problem.network, cameras=(camera,)),
+        approximations=replace(problem.approximations, interior=interior),
     )
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,9 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from pipeline.check import CameraCheck, Check, check_against_opencv
+from pipeline.check import check_against_opencv
+from pipeline.check_result import CameraCheck, Check
+from pipeline.opencv_calibration import OpenCvCalibration, calibrate
 
 Array = NDArray[np.float64]
 
@@ -42,6 +45,7 @@ CONVERGENT = [
     (-80.0, -650.0, 1650.0, 0.4, -0.05, 0.4),
 ]
 VERTICAL = [(0.0, 0.0, 1530.0, 0.0, 0.0, 0.3)]
+STRONG = (-0.06, 0.02, 1e-4, -5e-5, 0.0)  # 4 mm in the frame's corner
 FREE = np.inf
 NO_DISTORTION = Distortion()
 
@@ -206,7 +210,7 @@ def test_a_prior_that_contradicts_the_observations_differs() -> None:
     camera = replace(network.cameras[0], principal_distance_mm=Prior(C_MM + 0.5, 0.002))
     check = checked(replace(network, cameras=(camera,)))
     assert check.verdict == "differs"
-    assert "priors or weights move c" in check.reason
+    assert "Priors or weights move c" in check.reason
 
 
 def test_wrong_values_in_an_adjustment_differ() -> None:
@@ -215,6 +219,30 @@ def test_wrong_values_in_an_adjustment_differ() -> None:
     values = adjustment.values.copy()
     values[adjustment.index("IO.rc20.c")] += 0.5
     assert check_against_opencv(replace(adjustment, values=values)).verdict == "differs"
+
+
+@pytest.mark.parametrize("family", ["torlegard", "brown"])
+def test_a_strong_lens_agrees_by_way_of_the_same_model(family: Family) -> None:
+    names = {"torlegard": ("k3", "k5", "k7", "p1", "p2"), "brown": ("k1", "k2", "k3", "p1", "p2")}[family]
+    network = simulated(CONVERGENT * 4, film=False, lens=STRONG, noise_mm=0.002, distortion=free(family, *names))
+    check = checked(network)
+    assert check.verdict == "agrees", check.reason
+    assert check.reason.startswith("Given the very same model both programs agree.")
+    assert max(row.difference_sigmas for row in check.rows) > 1.0
+
+
+@pytest.mark.parametrize("what", ["parameters", "sigmas"])
+def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    def shifted(*arguments: Any) -> OpenCvCalibration:
+        found = calibrate(*arguments)
+        if what == "sigmas":
+            return replace(found, sigmas=1.4 * found.sigmas)
+        return replace(found, parameters=found.parameters + 1.5 * found.sigmas)
+
+    monkeypatch.setattr("pipeline.check.calibrate", shifted)
+    check = checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
+    assert check.verdict == "differs"
+    assert ("factor of 1.4" if what == "sigmas" else "by 1.5") in check.reason
 
 
 def test_what_opencv_has_no_model_for() -> None:

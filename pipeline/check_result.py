@@ -1,0 +1,77 @@
+"""What the check against OpenCV hands on: per camera a verdict, its reason and a table; written as check.json."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+Verdict = Literal["agrees", "differs", "not possible"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One parameter of OpenCV's model by both programs: values and a-posteriori standard deviations."""
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+    opencv_value: float
+    opencv_sigma: float
+
+    @property
+    def difference_sigmas(self) -> float:
+        return abs(self.value - self.opencv_value) / self.sigma if self.sigma > 0 else 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "unit": self.unit,
+            "reseau": {"value": self.value, "sigma": self.sigma},
+            "opencv": {"value": self.opencv_value, "sigma": self.opencv_sigma},
+            "difference_sigmas": self.difference_sigmas,
+        }
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """The comparison of one camera. rms in um a point (not an axis); the refit's residual in um, rms over the image."""
+
+    verdict: Verdict
+    reason: str
+    images: int = 0
+    points: int = 0
+    rms_opencv_um: float | None = None
+    rms_reseau_um: float | None = None
+    refit_residual_um: float | None = None
+    rows: tuple[Row, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        return {**asdict(self), "rows": [row.to_json() for row in self.rows]}
+
+
+@dataclass(frozen=True)
+class Check:
+    """The comparison of every camera, and the verdict on the whole."""
+
+    cameras: Mapping[str, CameraCheck] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> Verdict:
+        verdicts = {check.verdict for check in self.cameras.values()}
+        if "differs" in verdicts:
+            return "differs"
+        return "agrees" if verdicts == {"agrees"} else "not possible"
+
+    @property
+    def reason(self) -> str:
+        decisive = {name: check for name, check in self.cameras.items() if check.verdict == self.verdict}
+        if len(self.cameras) == 1:
+            return next(iter(decisive.values())).reason
+        return " ".join(f"Camera {name}: {check.reason}" for name, check in decisive.items())
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "cameras": {name: check.to_json() for name, check in self.cameras.items()},
+        }

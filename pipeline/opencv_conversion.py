@@ -1,0 +1,55 @@
+"""A solution of the bare problem in OpenCV's model, with standard deviations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.distortion import PARAMETERS
+from adjust.network import Family
+from adjust.result import Adjustment
+from pipeline.bare_problem import BareProblem
+from pipeline.opencv_model import NAMES, Freedom, Refit, image_grid, refit, refit_jacobian
+
+Array = NDArray[np.float64]
+
+STEP_SIGMAS = 0.3  # for derivatives of the refit
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A solution in OpenCV's model: the refit and the a-priori standard deviations (16,)."""
+
+    refit: Refit
+    sigmas: Array
+
+
+def converted(problem: BareProblem, solved: Adjustment) -> Converted:
+    camera = problem.network.cameras[0]
+    family = camera.distortion.family
+    rows = [solved.index(f"IO.{camera.name}.{each}") for each in ("c", "x0", "y0", *PARAMETERS[family])]
+    values = solved.values[rows]
+    interior, parameters = values[:3], values[3:]
+    observed = problem.network.observations.xy_mm
+    grid = image_grid(np.array([observed.min(axis=0), observed.max(axis=0)]))
+    whole = refit(camera.distortion, interior, parameters, grid, _whole(family), _start(family, interior, parameters))
+    steps = [STEP_SIGMAS * float(np.sqrt(solved.cofactor[row, row])) for row in rows]
+    jacobian = refit_jacobian(camera.distortion, interior, parameters, steps, grid, problem.freedom, whole.parameters)
+    variances = np.einsum("ij,jk,ik->i", jacobian, solved.cofactor[np.ix_(rows, rows)], jacobian)
+    return Converted(whole, np.sqrt(np.maximum(variances, 0.0)))
+
+
+def _whole(family: Family) -> Freedom:
+    """All parameters that a family can need in OpenCV's model: what is not estimated is held at the refit's values."""
+    fixed_ratio = ("fx", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    return Freedom({"opencv": ("fx", "fy", "cx", "cy"), "brown": ("fy", *fixed_ratio)}.get(family, fixed_ratio))
+
+
+def _start(family: Family, interior: Array, parameters: Array) -> Array:
+    start = np.zeros(len(NAMES))
+    start[:4] = interior[0], interior[0], interior[1], interior[2]
+    if family == "opencv":
+        given = dict(zip(PARAMETERS[family], parameters, strict=True))
+        start[0] *= 1 + given["b1"]
+        start[4:] = [given[name] for name in NAMES[4:]]
+    return start
