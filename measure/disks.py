@@ -57,20 +57,27 @@ class FittedDisk:
 
 
 def fit_disk(
-    scan: Scan, center_px: Array, pixel_from_disk: Array, longest_margin_px: float = LONGEST_MARGIN_PX
+    scan: Scan,
+    center_px: Array,
+    pixel_from_disk: Array,
+    longest_margin_px: float = LONGEST_MARGIN_PX,
+    shape: MarkShape = UNIT_DISK,
 ) -> FittedDisk:
     """Fit an ellipse near center_px (2,), which pixel_from_disk (2, 2) describes to some 20 %.
 
-    longest_margin_px: how far about it grey values may be used; less where a neighbour is near.
+    longest_margin_px: how far about it grey values may be used; less where a neighbour is near. shape: another drawing
+    of radius 1 that is fitted in the disk's place, with a rotation too.
     Never raises for what the picture holds: a fit that fails, or shows that there is no disk, has a reason.
     """
     start = np.column_stack([pixel_from_disk, center_px])
     radius = float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
     margin = max(min(max(radius, SHORTEST_MARGIN_PX), longest_margin_px, LONGEST_MARGIN_PX), 1.5)
-    options = MatchOptions(freedom="ellipse", margin_px=margin, max_shift_px=max(radius, 2.0))
-    col0, row0, width, height = window_about(UNIT_DISK, start, options.margin_px + 2)
+    options = MatchOptions(
+        freedom="ellipse" if shape is UNIT_DISK else "affine", margin_px=margin, max_shift_px=max(radius, 2.0)
+    )
+    col0, row0, width, height = window_about(shape, start, options.margin_px + 2)
     window = scan.window(col0, row0, width, height)
-    fit = match(window, (col0, row0), UNIT_DISK, start, options, inside(scan, col0, row0, width, height))
+    fit = match(window, (col0, row0), shape, start, options, inside(scan, col0, row0, width, height))
     disk = FittedDisk(
         center_px=fit.center_px,
         covariance_px2=fit.covariance_px2,
