@@ -70,7 +70,7 @@ def camera_point(truth: Truth, image: int, xyz: Array) -> Array:
     ideal = np.array([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w])
 
     xy = ideal
-    for _ in range(100):  # the corrections contract: each turn leaves less than a hundredth of the error
+    for _ in range(12):  # the corrections contract: each turn leaves about a hundredth of the error
         xy = ideal + np.array(torlegard(truth, xy[0], xy[1]))
     return xy
 
