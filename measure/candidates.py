@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 _EXTENT_PX = 14.0  # of the reduced mark
-_THINNEST_PX = 0.6  # of its thinnest line: below this the line drowns
+_THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns
 _LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
 _ALIKE = 0.8  # correlation above which two pictures of marks share one response
 _COARSE = 4.0  # times the finest detail: coarser structure is background

@@ -4,7 +4,7 @@ Places are complex numbers here, x + iy in mm of the scan's own axes (right, up)
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import cv2
@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from measure.candidates import Map, Responses, peaks
 from measure.poses import up_from_camera
-from measure.shapes import LayoutMark
+from measure.shapes import LayoutMark, Mark
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_LEAST_RESPONSE = 0.25
+_LEAST_RESPONSE = 0.2  # of a candidate
+_LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
 _CANDIDATES = 100  # of each look
 _PAIRS = 60  # of marks that hypotheses are made from
 _KEPT = 12  # placements of a pose that are refined
@@ -38,8 +39,8 @@ class Bounds:
 class Placement:
     """A frame in its scan. score: how much of the constellation answers; supported: how many marks do.
 
-    pixel_from_camera: (2, 3). polarity: +1 where the marks are lighter than their surroundings, -1 darker. reduction:
-    of the scan that it was found in.
+    pixel_from_camera: (2, 3). polarity: of the marks that are not drawn with one, +1 lighter than their surroundings,
+    -1 darker. reduction: of the scan, and pitch_mm that it was found with.
     """
 
     pose: str
@@ -48,6 +49,19 @@ class Placement:
     supported: int
     polarity: int
     reduction: int
+    pitch_mm: tuple[float, float]
+
+    def same_place(self, other: "Placement") -> bool:
+        """Whether both put the frame at the same place and size, however its marks are named."""
+        shift = np.hypot(*(self.pixel_from_camera[:, 2] - other.pixel_from_camera[:, 2]))
+        sizes = [np.sqrt(abs(np.linalg.det(each.pixel_from_camera[:, :2]))) for each in (self, other)]
+        return bool(shift < 10 * self.reduction and abs(sizes[0] / sizes[1] - 1) < 0.01)
+
+    def posed(self, pose: str) -> "Placement":
+        """The same place of the frame, its marks named as in another pose."""
+        turn = np.linalg.inv(up_from_camera(self.pose)) @ up_from_camera(pose)
+        linear = self.pixel_from_camera[:, :2] @ turn
+        return replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, self.pixel_from_camera[:, 2]]))
 
 
 def placements(
@@ -60,9 +74,33 @@ def placements(
 ) -> list[Placement]:
     """The best placements of one pose that differ from one another, best first; none where no two marks respond."""
     search = _Search(marks, pose, responses, look_of_mark, pitch_mm, bounds)
-    found = [placement for polarity in (1, -1) for placement in search.run(polarity)]
+    unsaid = any(mark.mark.polarity == "auto" for mark in marks)
+    found = [placement for polarity in ((1, -1) if unsaid else (1,)) for placement in search.run(polarity)]
     found.sort(key=lambda placement: -placement.score)
     return _different(found, marks, bounds.misfit_mm / pitch_mm[0])
+
+
+def same_picture(
+    marks: Sequence[LayoutMark],
+    first: tuple[str, Sequence[int]],
+    second: tuple[str, Sequence[int]],
+    bounds: Bounds,
+) -> bool:
+    """Whether two poses, each with the looks of its marks, put like marks in the same places: then one search does
+    for both."""
+    xy = np.array([mark.xy_mm for mark in marks])
+    of_first, of_second = (xy @ up_from_camera(pose).T for pose, _ in (first, second))
+    distance = np.hypot(*np.moveaxis(of_first[:, None] - of_second[None], -1, 0))
+    nearest = distance.argmin(axis=1)
+    close = bool((distance.min(axis=1) < 0.1 * bounds.misfit_mm).all())
+    alike = np.array_equal(np.asarray(first[1]), np.asarray(second[1])[nearest])
+    polarities = [mark.mark.polarity for mark in marks]
+    return close and alike and polarities == [polarities[index] for index in nearest]
+
+
+def sign_of(mark: Mark, assumed: int) -> int:
+    """+1 for a mark lighter than its surroundings, -1 for a darker one: as drawn, or else as assumed."""
+    return {"light": 1, "dark": -1, "auto": assumed}[mark.polarity]
 
 
 def _different(found: Sequence[Placement], marks: Sequence[LayoutMark], tolerance_px: float) -> list[Placement]:
@@ -88,14 +126,16 @@ class _Search:
         bounds: Bounds,
     ) -> None:
         self.marks, self.pose, self.responses, self.bounds = marks, pose, responses, bounds
-        self.looks = np.asarray(look_of_mark)
+        self.looks = self.kinds = np.asarray(look_of_mark)
         self.pitch = np.asarray(pitch_mm)
         turned = np.array([mark.xy_mm for mark in marks]) @ up_from_camera(pose).T
         self.camera: Complex = turned[:, 0] + 1j * turned[:, 1]
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, 1.5)
 
     def run(self, polarity: int) -> list[Placement]:
-        maps = self._maps(polarity)
+        maps = [*self.responses.light, *self.responses.dark]
+        dark = np.array([sign_of(mark.mark, polarity) < 0 for mark in self.marks])
+        self.kinds = self.looks + len(self.responses.light) * dark
         candidates = [self._candidates(map_) for map_ in maps]
         scale, offset = self._hypotheses(candidates)
         if len(scale) == 0:
@@ -115,12 +155,10 @@ class _Search:
                     int(supported[0]),
                     polarity,
                     self.responses.reduction,
+                    (float(self.pitch[0]), float(self.pitch[1])),
                 )
             )
         return result
-
-    def _maps(self, polarity: int) -> list[Map]:
-        return list(self.responses.light if polarity > 0 else self.responses.dark)
 
     def _candidates(self, map_: Map) -> Complex:
         places, _ = peaks(map_, _CANDIDATES, _LEAST_RESPONSE)
@@ -137,7 +175,7 @@ class _Search:
         """Every similarity within bounds that takes two marks to two of their candidates."""
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
         for first, second in self._pairs():
-            of_first, of_second = candidates[self.looks[first]], candidates[self.looks[second]]
+            of_first, of_second = candidates[self.kinds[first]], candidates[self.kinds[second]]
             base = self.camera[second] - self.camera[first]
             scale = (of_second[None, :] - of_first[:, None]) / base
             allowed = (np.abs(np.abs(scale) - 1) < self.bounds.scale_tolerance) & (
@@ -164,8 +202,10 @@ class _Search:
         inside = (nearest >= 0).all(axis=-1) & (nearest[..., 0] < cols) & (nearest[..., 1] < rows)
         stack = np.stack(maps)
         col, row = np.clip(nearest[..., 0], 0, cols - 1), np.clip(nearest[..., 1], 0, rows - 1)
-        response = np.where(inside, stack[self.looks, row, col], 0.0).astype(float)
-        strength = np.maximum(response, 0.0) ** 2 - _LEAST_RESPONSE**2
+        response = np.where(inside, stack[self.kinds, row, col], 0.0).astype(float)
+        # What chance places answer is no support: nineteen in twenty of them stay below their map's own level.
+        chance = np.array([np.percentile(map_[::3, ::3], 95) for map_ in maps])[self.kinds]
+        strength = np.maximum(response, 0.0) ** 2 - np.maximum(chance, 0.0) ** 2
         score = np.maximum(strength, 0.0).sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
         return score, (strength > 0).sum(axis=1)
 
@@ -174,9 +214,9 @@ class _Search:
         for tolerance_px in (self.tolerance_px, max(self.tolerance_px / 2, 1.5)):
             predicted = self.responses.reduced_px(self._scan_px(scale * self.camera + offset))
             found = [
-                _highest(maps[look], place, tolerance_px) for look, place in zip(self.looks, predicted, strict=True)
+                _highest(maps[look], place, tolerance_px) for look, place in zip(self.kinds, predicted, strict=True)
             ]
-            weight = np.array([max(height - _LEAST_RESPONSE, 0.0) for _, height in found])
+            weight = np.array([max(height - _LEAST_WEIGHED, 0.0) for _, height in found])
             if (weight > 0).sum() < 2:
                 break
             places = self._complex(self.responses.scan_px(np.array([place for place, _ in found])))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.candidates import Look, respond
-from measure.constellation import Bounds, Placement, placements
+from measure.constellation import Bounds, Placement, placements, same_picture
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame, measure_frame
 from measure.pose_decision import decide_pose
@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 _SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
 _STEP_TOLERANCE = 0.06
 _SET = ("set in the project",)
+_TRIALS = 2  # placements tried at full resolution after the best one has failed
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
 
@@ -37,30 +38,47 @@ def measure_fiducials(
     picture shows: statuses, reasons and problems say it.
     """
     options = options or FiducialOptions()
-    found, pitch_mm = _find(scan, layout, pitch_um, options)
+    found = _found(scan, layout, pitch_um, options)
     if not found:
         return _nothing(scan, layout, "nothing in the scan looks like two or more of the camera's marks")
-    frame = measure_frame(scan, layout, found[0], pitch_mm, options)
+    frames = [measure_frame(scan, layout, found[0], options)]
+    for placement in _others(found):
+        if frames[-1].accepted:
+            break
+        frames.append(measure_frame(scan, layout, placement, options))
+    frame = max(frames, key=lambda frame: (frame.accepted, frame.belongs.sum()))
     if not frame.accepted:
         return _nothing(scan, layout, frame.misfit())
+    found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
+    found.sort(key=lambda placement: not placement.same_place(frame.placement))
     pose = Pose(options.pose, True, _SET)
     if options.pose == "auto":
-        pose = decide_pose(scan, layout, found, frame.fits, frame.weights, pitch_mm, options)
+        pose = decide_pose(scan, layout, found, frame.fits, frame.weights, options)
         if pose.name != frame.placement.pose:
-            frame = measure_frame(scan, layout, _best(found, pose.name), pitch_mm, options)
+            frame = measure_frame(scan, layout, _best(found, pose.name), options)
     return _measurement(scan, layout, frame, pose, _rivals(found, pose.name))
 
 
-def _find(
+def _found(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> tuple[list[Placement], tuple[float, float]]:
-    """The placements of all poses asked for, best first, and the pitch in mm that they were found with."""
-    best: tuple[list[Placement], tuple[float, float]] = ([], (1.0, 1.0))
+) -> list[Placement]:
+    """The placements of all poses asked for and all pitches possible, best first."""
+    found = []
     for pitch_mm, tolerance in _pitches(scan, layout, pitch_um, options):
-        found = _placements(scan, layout, pitch_mm, tolerance, options)
-        if found and (not best[0] or found[0].score > best[0][0].score):
-            best = found, pitch_mm
-    return best
+        found += _placements(scan, layout, pitch_mm, tolerance, options)
+    # Poses that score alike keep their order: of a symmetric camera's eight, "0" comes first.
+    return sorted(found, key=lambda placement: -round(placement.score, 2))
+
+
+def _others(found: Sequence[Placement]) -> list[Placement]:
+    """The placements next in score that put the frame elsewhere."""
+    others: list[Placement] = []
+    for placement in found[1:]:
+        if not any(placement.same_place(other) for other in (found[0], *others)):
+            others.append(placement)
+        if len(others) == _TRIALS:
+            break
+    return others
 
 
 def _pitches(
@@ -84,12 +102,16 @@ def _placements(
     responses, index = respond(scan, looks)
     bounds = Bounds(tolerance, float(np.deg2rad(options.rotation_deg)), options.misfit_mm)
     count = len(layout.marks)
-    found = []
+    searched: list[tuple[str, tuple[int, ...], list[Placement]]] = []
     for number, pose in enumerate(poses):
         own = index[number * count : (number + 1) * count]
-        found += placements(layout.marks, pose, responses, own, pitch_mm, bounds)
-    # Poses that score alike keep their order: of a symmetric camera's eight, "0" comes first.
-    return sorted(found, key=lambda placement: -round(placement.score, 2))
+        twin = next((s for s in searched if same_picture(layout.marks, (s[0], s[1]), (pose, own), bounds)), None)
+        if twin:
+            found = [placement.posed(pose) for placement in twin[2]]
+        else:
+            found = placements(layout.marks, pose, responses, own, pitch_mm, bounds)
+        searched.append((pose, own, found))
+    return [placement for _, _, found in searched for placement in found]
 
 
 def _best(found: Sequence[Placement], pose: str) -> Placement:

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.channels import best_weights
-from measure.constellation import Placement
+from measure.constellation import Placement, sign_of
 from measure.fiducial_options import FiducialOptions
 from measure.frame_fit import fit_frame, strangers
 from measure.matching import Match
 from measure.poses import up_from_camera
 from measure.refinement import Sighting, sight
 from measure.scan import LUMINANCE, Scan
-from measure.shapes import FiducialLayout
+from measure.shapes import FiducialLayout, Mark
 from measure.status import Status
 
 Array = NDArray[np.float64]
@@ -82,18 +82,16 @@ class Frame:
         return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")
 
 
-def measure_frame(
-    scan: Scan, layout: FiducialLayout, placement: Placement, pitch_mm: tuple[float, float], options: FiducialOptions
-) -> Frame:
+def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Sight all marks from the placement, fit the frame to those that agree, and look again for the others."""
-    sighter = _Sighter(scan, layout, placement, pitch_mm, options)
+    sighter = _Sighter(scan, layout, placement, options)
     sighter.choose_channels()
     everything = range(len(layout.marks))
     sighter.look(everything, sighter.first_search_px)
     sighter.judge()
     if sighter.belongs.sum() >= 2:
         sighter.learn()
-        sighter.look([index for index in everything if not sighter.belongs[index]], sighter.second_search_px())
+        sighter.look([index for index in everything if not sighter.clear(index)], sighter.second_search_px())
         sighter.judge()
     return sighter.frame()
 
@@ -106,12 +104,11 @@ class _Sighter:
         scan: Scan,
         layout: FiducialLayout,
         placement: Placement,
-        pitch_mm: tuple[float, float],
         options: FiducialOptions,
     ) -> None:
         self.scan, self.layout, self.placement, self.options = scan, layout, placement, options
         self.match = options.match
-        self.pitch = np.asarray(pitch_mm)
+        self.pitch = np.asarray(placement.pitch_mm)
         self.camera = np.array([mark.xy_mm for mark in layout.marks])
         self.turn = up_from_camera(placement.pose)
         self.pixel_from_camera = placement.pixel_from_camera
@@ -161,6 +158,12 @@ class _Sighter:
         blurs = [s.fit.blur_px for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s and s.fit]
         self.match = replace(self.match, blur_px=float(np.median(blurs)), estimate_blur=False, linear_sigma=0.01)
 
+    def clear(self, index: int) -> bool:
+        """Whether a mark needs no second look."""
+        sighting = self.sightings[index]
+        fit = sighting.fit if sighting else None
+        return bool(self.belongs[index]) and fit is not None and fit.likeness >= _CLEAR_LIKENESS
+
     def second_search_px(self) -> float:
         """How far a mark can be from where the others put it: the gate, less where many others agree better."""
         if self.belongs.sum() < _MANY:
@@ -183,12 +186,15 @@ class _Sighter:
     def _sight(self, index: int, search_px: float, weights: Sequence[float] | None) -> Sighting:
         pixel_from_mark = np.column_stack([self.pixel_from_camera[:, :2], self._predicted_px()[index]])
         mark = self.layout.marks[index].mark
-        sighting = sight(self.scan, mark, pixel_from_mark, search_px, self.placement.polarity, weights, self.match)
+        sighting = sight(self.scan, mark, pixel_from_mark, search_px, self._sign(mark), weights, self.match)
         least = _FAINT_LIKENESS if self.belongs.sum() >= _MANY else _LEAST_LIKENESS
         if sighting.fit is not None and sighting.fit.likeness < least:
             reason = f"nothing within {search_px:.0f} px of its place looks like it"
             return Sighting(sighting.predicted_px, True, None, reason)
         return sighting
+
+    def _sign(self, mark: Mark) -> int:
+        return sign_of(mark, self.placement.polarity)
 
     def _predicted_px(self) -> Array:
         return self.camera @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2]

@@ -64,10 +64,11 @@ def strangers(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, gate
 
 
 def _gate(size_mm: Array, gate_mm: float) -> float:
-    """With many marks, their own scatter says more than the gate: six times its robust scale."""
+    """With many marks, their own scatter says more than the gate: 4.5 medians of the distances are over five standard
+    deviations."""
     if len(size_mm) < 8:
         return gate_mm
-    return min(gate_mm, max(6 * float(np.median(size_mm)), gate_mm / 5))
+    return min(gate_mm, max(4.5 * float(np.median(size_mm)), gate_mm / 10))
 
 
 def _misfit(kept: NDArray[np.intp], camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array) -> float:

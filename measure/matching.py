@@ -56,7 +56,7 @@ class MatchOptions:
     margin_px: float = 6.0
     damage_sigmas: float = 3.2
     damage_rounds: int = 3
-    max_iterations: int = 20
+    max_iterations: int = 15
     max_shift_px: float = 8.0
     max_distortion: float = 0.3
 

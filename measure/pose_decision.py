@@ -45,13 +45,12 @@ def decide_pose(
     found: Sequence[Placement],
     fits: Sequence[Match | None],
     weights: Sequence[float] | None,
-    pitch_mm: tuple[float, float],
     options: FiducialOptions,
 ) -> Pose:
     """The pose, from all poses' placements (the best first) and the fits of the best one's marks, None where a mark
     was not found."""
     seen = [fit for fit in fits if fit is not None]
-    judge = _Judge(scan, layout, seen, weights, pitch_mm, options)
+    judge = _Judge(scan, layout, seen, weights, found[0].pitch_mm, options)
     best_of_pose: dict[str, Placement] = {}
     for placement in found:
         best_of_pose.setdefault(placement.pose, placement)

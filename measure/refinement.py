@@ -52,6 +52,8 @@ def sight(
     fit = match(window, (col0, row0), mark, start, _options_for(mark, options), valid)
     if not fit.converged:
         return Sighting(predicted, True, None, fit.reason)
+    if abs(fit.contrast_dn) < FAINT * scan.full_scale_dn:
+        return Sighting(predicted, True, None, "there is no contrast at its place")
     if fit.contrast_dn * polarity <= 0:
         return Sighting(predicted, True, None, "what lies there has the other polarity")
     return Sighting(predicted, True, fit)
