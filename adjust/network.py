@@ -7,7 +7,7 @@ inf frees it.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +36,24 @@ class Prior:
 
 @dataclass(frozen=True)
 class Distortion:
-    """A distortion family and its parameters by name; a parameter that is not named is fixed at 0."""
+    """A distortion family and its parameters by name; a parameter that is not named is fixed at 0.
+
+    decentering "paper": Torlegård's decentering terms with x', y' as printed and not reduced to the principal point.
+    r0_mm: radius of zero radial distortion of `torlegard`, of a period of `juhl`.
+    """
 
     family: Family = "none"
     parameters: Mapping[str, Prior] = field(default_factory=dict)
     decentering: Decentering = "reduced"
     r0_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.family not in get_args(Family):
+            raise ValueError(f"a distortion family must be one of {', '.join(get_args(Family))}, not {self.family}")
+        if self.decentering not in get_args(Decentering):
+            raise ValueError(f'the decentering must be "reduced" or "paper", not {self.decentering}')
+        if not 0.0 <= self.r0_mm < np.inf:
+            raise ValueError(f"r0 must be 0 or a positive length in mm, not {self.r0_mm}")
 
 
 @dataclass(frozen=True)
@@ -81,6 +93,15 @@ class Exterior:
 
     values: Array
     sigmas: Array = field(default_factory=lambda: np.full(6, np.inf))
+
+    def __post_init__(self) -> None:
+        if self.values.shape != (6,) or self.sigmas.shape != (6,):
+            raise ValueError(f"an exterior orientation has six elements ({', '.join(EXTERIOR_NAMES)}) and six sigmas")
+        if not np.isfinite(self.values).all() or not (self.sigmas >= 0.0).all():
+            raise ValueError(
+                f"an exterior orientation must be of finite numbers, its standard deviations 0 (fixed), positive or "
+                f"inf (free), not {self.values} and {self.sigmas}"
+            )
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from adjust.network import (
     Camera,
     Distortion,
     Exterior,
+    Family,
     Image,
     Network,
     ObjectPoint,
@@ -174,6 +175,21 @@ def test_bad_options_are_refused() -> None:
         Options(datum=cast(Datum, "fixed"))
     with pytest.raises(ValueError, match="iteration limit must be at least 1"):
         Options(iteration_limit=0)
+
+
+def test_bad_values_are_refused_when_they_are_made() -> None:
+    with pytest.raises(ValueError, match="finite number"):
+        Prior(np.nan)
+    with pytest.raises(ValueError, match=r"0 \(fixed\), positive or inf"):
+        Prior(1.0, -1.0)
+    with pytest.raises(ValueError, match="six elements"):
+        Exterior(np.zeros(5))
+    with pytest.raises(ValueError, match=r"0 \(fixed\), positive or inf"):
+        Exterior(np.zeros(6), np.array([1.0, 1.0, 1.0, 1.0, 1.0, np.nan]))
+    with pytest.raises(ValueError, match="one of none, torlegard"):
+        Distortion(cast(Family, "fisheye"))
+    with pytest.raises(ValueError, match="r0 must be"):
+        Distortion("torlegard", r0_mm=-80.0)
 
 
 def test_a_single_resection() -> None:
