@@ -108,7 +108,7 @@ def _interior(network: Network, camera: Camera, frames: Mapping[str, _Frame]) ->
     if found is None:
         raise AdjustmentError(
             f"the principal distance of camera {camera.name} cannot be found from its images: they see too few known "
-            "points, or only a plane parallel to the image; give an approximate principal_distance_mm"
+            "points, or only a plane parallel to the image. Give an approximate principal_distance_mm."
         )
     return np.array([found, x0, y0])
 

@@ -74,33 +74,37 @@ def _all_points(block: Block) -> dict[str, Array]:
             seen_in[name].append(image)
     for name in sorted(seen_in):
         if np.isnan(points[name]).any():
-            raise AdjustmentError(_why_notintersected(name, seen_in[name]))
+            raise AdjustmentError(_why_not_intersected(name, seen_in[name]))
     return {name: xyz for name, xyz in points.items() if not np.isnan(xyz).any()}
 
 
-def _why_notintersected(point: str, images: Sequence[str]) -> str:
+def _why_not_intersected(point: str, images: Sequence[str]) -> str:
     if len(images) == 1:
         return (
-            f"point {point} is unknown and seen in image {images[0]} only; two images are needed to find it: "
-            "measure it in another image, give its coordinates, or leave it out"
+            f"point {point} is unknown and seen in image {images[0]} only; two images are needed to find it. "
+            "Measure it in another image, give its coordinates, or leave it out."
         )
     return (
-        f"point {point} is unknown, and its rays from images {', '.join(images)} do not meet in front of the cameras: "
-        "check its number in these images, or give approximate coordinates"
+        f"point {point} is unknown, and its rays from images {', '.join(images)} do not meet in front of the cameras. "
+        "Check its number in these images, or give approximate coordinates."
     )
 
 
 def _why_not_oriented(block: Block, image: str) -> str:
     sight = block.sights[image]
     xyz, _ = known_field(sight, {**block.rough, **block.points})
-    remedy = f"measure more known points, or give the orientation of {image} (images.csv)"
-    if len(xyz) < 3:
-        return f"image {image} sees {len(xyz)} known points; resection needs 3, and 4 to be unique: {remedy}"
-    if len(xyz) == 3:
+    remedy = f"measure more known points, or give the orientation of image {image}."
+    if not block.poses and len(xyz) < 3:
         return (
-            f"image {image} sees 3 known points, which leave several orientations or none; a fourth decides: {remedy}"
+            f"image {image} sees {len(xyz)} known points, no other image sees enough either, and the images alone make "
+            "no model that could be placed: that takes 8 common points of two images, and 7 known coordinates (X and Y "
+            f"of two points and three heights, say). Either add these, {remedy}"
         )
+    if len(xyz) < 3:
+        return f"image {image} sees {len(xyz)} known points; resection needs 3, and 4 to be unique. Either {remedy}"
+    if len(xyz) == 3:
+        return f"image {image} sees 3 known points, which leave several orientations or none. Either {remedy}"
     return (
-        f"image {image} sees {len(xyz)} known points, but no orientation brings them where they were measured (or they "
-        f"lie on one line): check the point numbers, the principal distance and the sign of y, or {remedy}"
+        f"image {image} sees {len(xyz)} known points, but no orientation brings them where they were measured, or they "
+        f"lie on one line. Check the point numbers, the principal distance and the sign of y, or {remedy}"
     )

@@ -209,7 +209,7 @@ def test_unknown_principal_distance_from_twenty_boards() -> None:
 def test_a_principal_distance_that_nothing_shows_is_asked_for() -> None:
     station = [(0.0, 0.0, 1500.0, 0.0, 0.0, 0.3)]
     truth = simulated(field(0.0), station)
-    with pytest.raises(AdjustmentError, match=r"principal distance of camera rc20 .* give an approximate"):
+    with pytest.raises(AdjustmentError, match=r"principal distance of camera rc20 .* Give an approximate"):
         approximate(without_interior(truth.network))
 
 
@@ -272,8 +272,23 @@ def test_too_few_known_points_are_named() -> None:
     truth = simulated(field(300.0), CONVERGENT[:1])
     network = with_unknown(truth.network, {f"t{k}" for k in range(2, 40)})
     seen = sum(point in {"t0", "t1"} for point in network.observations.point)
-    with pytest.raises(AdjustmentError, match=f"image f1 sees {seen} known points; resection needs 3"):
+    with pytest.raises(AdjustmentError, match=f"image f1 sees {seen} known points, no other image"):
         approximate(network)
+
+
+def test_an_image_that_the_others_do_not_help_is_named() -> None:
+    truth = simulated(field(300.0), CONVERGENT)
+    observations = truth.network.observations
+    seen = zip(observations.image, observations.point, observations.kind, strict=True)
+    of_f3 = sorted(point for image, point, kind in seen if image == "f3" and kind == "target")
+    network = with_unknown(truth.network, {of_f3[2]})  # seen nowhere else, and so no help
+    rows = [
+        row
+        for row, (image, point) in enumerate(zip(observations.image, observations.point, strict=True))
+        if (point not in of_f3[3:] if image == "f3" else point != of_f3[2])
+    ]
+    with pytest.raises(AdjustmentError, match="image f3 sees 2 known points; resection needs 3"):
+        approximate(replace(network, observations=subset(network.observations, rows)))
 
 
 def test_misnumbered_points_are_not_believed() -> None:
@@ -284,7 +299,7 @@ def test_misnumbered_points_are_not_believed() -> None:
     for i, j in zip(targets, np.random.default_rng(0).permutation(targets), strict=True):
         mixed[i] = points[j]
     network = replace(truth.network, observations=replace(truth.network.observations, point=tuple(mixed)))
-    with pytest.raises(AdjustmentError, match=r"image f1 sees .* check the point numbers"):
+    with pytest.raises(AdjustmentError, match=r"image f1 sees .* Check the point numbers"):
         approximate(network)
 
 
