@@ -245,6 +245,37 @@ def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, wha
     assert ("factor of 1.4" if what == "sigmas" else "by 1.5") in check.reason
 
 
+def test_images_with_too_few_points_are_left_out() -> None:
+    network = simulated(CONVERGENT, distortion=free("opencv", "k1", "k2"))
+    few = replace(network, observations=keeping(network.observations, {"f2": 5}))
+    check = checked(few)
+    assert check.images == 4
+    assert "left out, for too few points: f2" in check.reason
+    none = replace(network, observations=keeping(network.observations, {f"f{n}": 5 for n in range(1, 6)}))
+    check = checked(replace(none, cameras=(replace(none.cameras[0], distortion=NO_DISTORTION),)))
+    assert check.verdict == "not possible"
+    assert "No image shows enough points" in check.reason
+
+
+def keeping(observations: Observations, targets: dict[str, int]) -> Observations:
+    """The given number of targets only, of the images named."""
+    left = dict(targets)
+    rows = []
+    for row, (image, kind) in enumerate(zip(observations.image, observations.kind, strict=True)):
+        if image in left and kind == "target":
+            left[image] -= 1
+            if left[image] < 0:
+                continue
+        rows.append(row)
+    return Observations(
+        tuple(observations.image[row] for row in rows),
+        tuple(observations.point[row] for row in rows),
+        tuple(observations.kind[row] for row in rows),
+        observations.xy_mm[rows],
+        observations.covariance_mm2[rows],
+    )
+
+
 def test_what_opencv_has_no_model_for() -> None:
     network = simulated(VERTICAL, distortion=Distortion("juhl", {"t1": Prior(0.0)}, r0_mm=135.0))
     assert "no counterpart of the distortion family juhl" in checked(network).reason
