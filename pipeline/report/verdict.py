@@ -133,7 +133,7 @@ def _locking(shots: list[Frame]) -> Iterator[Problem]:
 
 def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
     if adjustment["redundancy"] > 0:
-        yield from _global_test(adjustment["sigma0"], adjustment["redundancy"])
+        yield from _global_test(adjustment)
     else:
         yield Problem(
             "Nothing checks the result: there are as many unknowns as observations.",
@@ -150,18 +150,22 @@ def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
         )
 
 
-def _global_test(sigma0: float, redundancy: int) -> Iterator[Problem]:
-    low, high = sigma0_bounds(redundancy)
+def _global_test(adjustment: Json) -> Iterator[Problem]:
+    sigma0 = adjustment["sigma0"]
+    low, high = sigma0_bounds(adjustment["redundancy"])
+    groups = {name: group for name, group in adjustment["groups"].items() if (group["redundancy"] or 0.0) >= 1.0}
+    by_group = ", ".join(f"{name} {fixed(group['sigma0'])}" for name, group in groups.items())
     if sigma0 > high:
         yield Problem(
-            f"σ₀ = {sigma0:.2f} is above {high:.2f}: the residuals are larger than the standard deviations given.",
+            f"σ₀ = {sigma0:.2f} is above {high:.2f}: the residuals are larger than the sigmas given ({by_group}).",
             "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
-            "film_sigma_um or add distortion parameters. All sigmas are already multiplied by σ₀.",
+            "film_sigma_um or add distortion parameters. All sigmas of the result are already multiplied by σ₀.",
         )
     elif sigma0 < low:
         yield Problem(
-            f"σ₀ = {sigma0:.2f} is below {low:.2f}: the marks fit better than the standard deviations given.",
-            "Lower sigma_target_um, sigma_fiducial_um or film_sigma_um. All sigmas are already multiplied by σ₀.",
+            f"σ₀ = {sigma0:.2f} is below {low:.2f}: the marks fit better than the sigmas given ({by_group}).",
+            "Lower the sigmas of the group that is below 1 (sigma_target_um, sigma_fiducial_um, film_sigma_um, or "
+            "comparator.csv). All sigmas of the result are already multiplied by σ₀.",
         )
 
 

@@ -71,6 +71,7 @@ def test_good(adjusted: ReportData) -> None:
 def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
     assert "σ₀ = 1.60 is above 1.11" in told(changed(adjusted, sigma0=1.6))
     assert "film_sigma_um" in told(changed(adjusted, sigma0=1.6))
+    assert "(target 1.02, fiducial 0.97)" in told(changed(adjusted, sigma0=1.6)), "no group without a check"
     assert "σ₀ = 0.50 is below 0.89" in told(changed(adjusted, sigma0=0.5))
 
 
