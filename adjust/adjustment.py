@@ -12,13 +12,12 @@ from adjust.errors import AdjustmentError
 from adjust.functions import blind_target
 from adjust.iteration import Linearised, Solution, factorise, iterate, linearise
 from adjust.network import Approximations, Network
-from adjust.problem import Problem, State
+from adjust.problem import Problem, State, number
 from adjust.residuals import groups, residuals
 from adjust.result import Adjustment, NullDirection, Residuals
 from adjust.reweighting import Weighting, robust_weights, variance_factor
 from adjust.rotation import vector_by_angles
 from adjust.rows import Numbering
-from adjust.unknowns import list_unknowns
 from adjust.validation import validate
 
 Array = NDArray[np.float64]
@@ -63,19 +62,12 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     """
     options = options or Options()
     validate(network)
-    problem = _problem(network, approximations)
+    problem = number(network, approximations)
     solved = problem if options.datum == "control" else _minimal(problem)
     run = _settled_run(Numbering(solved), options)
     if options.datum == "free":
         run = _freed(problem, run)
     return _result(problem, run, options)
-
-
-def _problem(network: Network, approximations: Approximations) -> Problem:
-    cameras = {image.name: image.camera for image in network.images}
-    rows = zip(network.observations.image, network.observations.point, network.observations.kind, strict=True)
-    observed = frozenset((cameras[image] if kind == "fiducial" else "", point) for image, point, kind in rows)
-    return Problem(network, list_unknowns(network, approximations, observed), approximations.mirrored)
 
 
 def _minimal(problem: Problem) -> Problem:

@@ -6,10 +6,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import Network
+from adjust.network import Approximations, Network
 from adjust.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.transformation import affine_by_parameters, affine_from_parameters
-from adjust.unknowns import Unknowns
+from adjust.unknowns import Unknowns, list_unknowns
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -17,6 +17,17 @@ Indices = NDArray[np.intp]
 EXTERIOR, TRANSFORMATION, PLACE = slice(0, 6), slice(6, 12), slice(12, 15)  # columns of an observation's derivatives
 CAMERA = slice(15, None)
 ABSENT = -1  # stands for the unknown of a column that an observation does not have
+
+
+def number(network: Network, approximations: Approximations) -> "Problem":
+    """Number the quantities of a validated network.
+
+    Raises AdjustmentError where a quantity has neither a value nor an approximation.
+    """
+    cameras = {image.name: image.camera for image in network.images}
+    rows = zip(network.observations.image, network.observations.point, network.observations.kind, strict=True)
+    observed = frozenset((cameras[image] if kind == "fiducial" else "", point) for image, point, kind in rows)
+    return Problem(network, list_unknowns(network, approximations, observed), approximations.mirrored)
 
 
 @dataclass(frozen=True)

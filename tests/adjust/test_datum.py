@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from reference_cases import approximations_of, load, network_of
 from simulated import Truth, simulated
 
-from adjust.adjustment import Options, adjust
+from adjust.adjustment import Datum, Options, adjust
 from adjust.network import EXTERIOR_NAMES, Exterior, Image, Network, Prior
 from adjust.network import ObjectPoint as Point
 from adjust.result import Adjustment
@@ -184,3 +184,14 @@ def test_mirrored_scans_are_ordinary() -> None:
         assert np.diag(other.cofactor)[other.index("IO.K.c")] == pytest.approx(
             np.diag(one.cofactor)[one.index("IO.K.c")]
         )
+
+
+@pytest.mark.parametrize("datum", ["minimal", "free"])
+def test_a_datum_that_is_given_is_left_alone(datum: Datum) -> None:
+    """Known points, and points with standard deviations: nothing is free, and nothing more is fixed."""
+    for sigma in (0.0, 0.05):
+        network, start = simulated(np.random.default_rng(13), point_sigma=sigma)
+        plain, other = adjust(network, start), adjust(network, start, Options(datum=datum))
+        assert other.unknowns == plain.unknowns
+        np.testing.assert_allclose(other.values, plain.values, rtol=1e-12)
+        np.testing.assert_allclose(other.cofactor, plain.cofactor, rtol=1e-9)

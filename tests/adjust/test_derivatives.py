@@ -5,11 +5,10 @@ import pytest
 from numpy.typing import NDArray
 from simulated import Truth, simulated
 
-from adjust.adjustment import _problem
 from adjust.distortion import PARAMETERS, image_equations
 from adjust.functions import computed_observations, derivatives
 from adjust.network import Decentering, Distortion, Family, Transformation
-from adjust.problem import Problem
+from adjust.problem import Problem, number
 from adjust.projection import rays
 from adjust.rotation import rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.transformation import affine_by_parameters, affine_design, affine_from_parameters, apply_affine
@@ -39,10 +38,10 @@ def test_image_equations_by_complex_steps(family: Family, decentering: Decenteri
         rng.uniform(-0.7, 0.7, (6, 2)),
     ]
     at = image_equations(distortion, *parts)
-    for number, derivative in enumerate((at.by_interior, at.by_parameters, at.by_xy, at.by_ray)):
+    for part_number, derivative in enumerate((at.by_interior, at.by_parameters, at.by_xy, at.by_ray)):
         for column in range(derivative.shape[2]):
             moved = [part.astype(complex) for part in parts]
-            moved[number][..., column] += 1j * STEP
+            moved[part_number][..., column] += 1j * STEP
             numeric = image_equations(distortion, *moved).value.imag / STEP
             scale = np.abs(numeric).max() or 1.0
             np.testing.assert_allclose(derivative[..., column], numeric, rtol=0, atol=1e-14 * scale)
@@ -107,7 +106,7 @@ def test_functions_by_differences_of_computed_observations(kind: Transformation)
     rng = np.random.default_rng(11)
     truth = Truth(mirrored=(False, kind != "none", False, False))
     network, start = simulated(rng, truth, kind, point_sigma=np.inf, free={"k3": np.inf, "k5": np.inf})
-    problem = _problem(network, start)
+    problem = number(network, start)
     state = problem.start()
     computed = computed_observations(problem, state)
     assert computed is not None

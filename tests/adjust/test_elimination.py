@@ -6,9 +6,10 @@ from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
 from adjust import elimination
-from adjust.adjustment import _problem, adjust
+from adjust.adjustment import adjust
 from adjust.elimination import Block, eliminate
 from adjust.iteration import factorise, linearise
+from adjust.problem import number
 from adjust.rows import Numbering, prior_root_weights
 
 Array = NDArray[np.float64]
@@ -116,7 +117,7 @@ def test_points_or_images_are_eliminated_first(count: int, own: set[int]) -> Non
     """Whichever has more unknowns; either way the cofactors are the inverse of the dense normal equations."""
     rng = np.random.default_rng(12)
     network, start = simulated(rng, points=field_points(rng, count), point_sigma=0.05, free={"k3": np.inf})
-    problem = _problem(network, start)
+    problem = number(network, start)
     numbering = Numbering(problem)
     assert {len(touched.own) for touched in numbering.touched} == own
     at = linearise(numbering, network.observations.covariance_mm2, problem.start())

@@ -8,7 +8,7 @@ import pytest
 from reference_cases import CAMERA, Case, approximations_of, load, network_of
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import Options, adjust
+from adjust.adjustment import Datum, Options, adjust
 from adjust.network import Network, Observations
 from adjust.result import Adjustment
 
@@ -82,9 +82,9 @@ def test_a_singular_result_keeps_the_approximations() -> None:
 
 
 @pytest.mark.parametrize("datum", ["minimal", "free"])
-def test_a_datum_for_the_object_leaves_the_camera_directions(datum: str) -> None:
+def test_a_datum_for_the_object_leaves_the_camera_directions(datum: Datum) -> None:
     case = load("v_singular_U3D_vert0_affine")
-    result = adjusted(dropped(case, {9}), Options(datum="minimal" if datum == "minimal" else "free"))
+    result = adjusted(dropped(case, {9}), Options(datum=datum))
     assert [WORDS["IO.c"] in direction.cause for direction in result.singular] == [True]
 
 
