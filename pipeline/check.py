@@ -144,7 +144,7 @@ def _compared(adjustment: Adjustment, problem: BareProblem, solved: Adjustment, 
         )
     if verdict == "agrees" and sigmas_tell:
         verdict, reason = _with_departure(reason, _departures(adjustment, solved, problem.network.cameras[0]))
-    rms = f"rms {opencv.rms_um:.2f} um a point in OpenCV, {rms_um:.2f} um here."
+    rms = f"The residuals are {opencv.rms_um:.2f} um rms a point in OpenCV, {rms_um:.2f} um here."
     return CameraCheck(verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}", **known)
 
 
@@ -212,16 +212,12 @@ def _with_departure(reason: str, departures: Mapping[str, float]) -> tuple[Verdi
     """The agreement on the bare problem, seen with what separates the adjustment from that problem."""
     farthest = max(departures, key=lambda name: departures[name])
     sigmas = departures[farthest]
+    alone = f"On the observations alone, {reason[0].lower()}{reason[1:]}"
     if sigmas > LARGEST_DEPARTURE:
-        return "differs", (
-            f"Priors or weights move {farthest} by {sigmas:.1f} sigma: they contradict the observations. On the "
-            f"observations alone: {reason}"
-        )
+        return "differs", f"Priors or weights move {farthest} by {sigmas:.1f} sigma, against the observations. {alone}"
     if sigmas > NOTABLE_DEPARTURE:
-        return "agrees", (
-            f"On the observations alone: {reason} Priors and weights, which OpenCV does not know, move {farthest} by "
-            f"{sigmas:.2f} sigma."
-        )
+        moved = f"Priors and weights, which OpenCV does not know, move {farthest} by {sigmas:.2f} sigma."
+        return "agrees", f"{alone} {moved}"
     return "agrees", reason
 
 
