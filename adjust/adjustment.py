@@ -171,8 +171,9 @@ def _reweighted(run: _Run, options: Options) -> Weighting:
 
 
 def _freed(problem: Problem, run: _Run) -> _Run:
-    """A run with minimal datum, brought to inner constraints over the free points."""
-    if not run.converged:
+    """A run with minimal datum, brought to inner constraints over the free points; as it is where nothing was fixed."""
+    fixed = run.numbering.problem.unknowns.sigma != problem.unknowns.sigma
+    if not (run.converged and fixed.any()):
         return run
     state = centered(problem, run.end.state)
     end = linearise(run.numbering, run.weighting.covariance(problem), state)
