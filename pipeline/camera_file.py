@@ -148,7 +148,9 @@ def _placed(mark: shapes.Mark, radial: bool, xy_mm: shapes.Point) -> shapes.Mark
 def _distortion(table: Table) -> network.Distortion:
     family = cast(network.Family, table.text("family", "none", tuple(PARAMETERS)))
     decentering = cast(network.Decentering, table.text("decentering", "reduced", ("reduced", "paper")))
-    r0_mm = table.number("r0_mm", 0.0, least=0.0)
+    # Juhl counts in decimetres.
+    in_dm = family == "juhl"
+    r0_mm = 100.0 * table.number("r0_dm", above=0.0) if in_dm else table.number("r0_mm", 0.0, least=0.0)
     values, sigmas = table.table("value"), table.table("sigma")
     table.done()
     parameters = {name: network.Prior(values.number(name, 0.0), sigmas.sigma(name, 0.0)) for name in PARAMETERS[family]}

@@ -1,5 +1,6 @@
 """From the user's files and the comparator coordinates to the network that is adjusted."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,8 +16,11 @@ from pipeline.spelling import did_you_mean
 Array = NDArray[np.float64]
 
 
-def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> Network:
-    """The network of a project: the images, points and observations that `marks` really hold.
+FEWEST_TARGETS = 3  # in an image whose exterior orientation nobody has observed
+
+
+def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[Network, tuple[str, ...]]:
+    """The network of a project: the images, points and observations that `marks` really hold; and what is left out.
 
     Raises InputError where a mark names a point, a fiducial or an image that the project does not have.
     """
@@ -26,14 +30,16 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> Network
             f"{project.comparator}: holds no observation: no mark has the status measured or weak. "
             "See the reasons in its last column."
         )
-    images = tuple(_image(project, name) for name in dict.fromkeys(mark.image for mark in used))
     _check_fiducials(project, used)
-    return Network(
+    used, left_out = _orientable(project, used)
+    images = tuple(_image(project, name) for name in dict.fromkeys(mark.image for mark in used))
+    network = Network(
         cameras=_cameras(project, images, used),
         images=images,
         points=_points(project, used),
         observations=_observations(project.adjust, used),
     )
+    return network, left_out
 
 
 def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
@@ -41,6 +47,31 @@ def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
     if project.given_points is None:
         return ()
     return tuple(point.id for point in project.given_points.points if point.id not in network.point_by_id)
+
+
+def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
+    """The marks of the images that can be oriented, and a sentence on each of the others."""
+    targets = Counter(mark.image for mark in marks if mark.kind != "fiducial")
+    names = list(dict.fromkeys(mark.image for mark in marks))
+    without = [name for name in names if targets[name] < FEWEST_TARGETS and not _observed(project, name)]
+    if len(without) == len(names):
+        most = max(without, key=lambda name: targets[name])
+        raise InputError(
+            f"{project.comparator}: no image can be oriented: {most!r} shows the most targets, {targets[most]}, and an "
+            f"image needs {FEWEST_TARGETS}. See the status and reason of every mark in that file."
+        )
+    left_out = tuple(
+        f"Image {name!r} has no part in the adjustment: it shows {targets[name]} targets and needs {FEWEST_TARGETS}. "
+        "Look at the reasons of its marks; or observe its orientation in images.csv, with standard deviations."
+        for name in without
+    )
+    return [mark for mark in marks if mark.image not in without], left_out
+
+
+def _observed(project: Project, image: str) -> bool:
+    """Whether the project gives the whole exterior orientation with standard deviations."""
+    exterior = project.given_images.exterior.get(image) if project.given_images else None
+    return exterior is not None and bool(np.isfinite(exterior.sigmas).all())
 
 
 def _image(project: Project, name: str) -> Image:

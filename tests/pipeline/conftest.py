@@ -1,258 +1,35 @@
-"""A made-up calibration of five aerial frames, and its files: result file and report are tested on its numbers."""
+"""The demonstration's scans, rendered and run once for all tests that look at them."""
 
-from dataclasses import replace
+import shutil
+from importlib import resources
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from adjust.network import (
-    Camera,
-    Distortion,
-    Exterior,
-    Fiducial,
-    Image,
-    Network,
-    ObjectPoint,
-    ObservationKind,
-    Observations,
-    Prior,
-)
-from adjust.result import Adjustment, Group, NullDirection, Residuals
-from measure.status import Status
-from pipeline.adjustment_file import read_adjustment, read_covariance, write_adjustment
-from pipeline.comparator_file import ComparatorPoint
-from pipeline.report import ReportData, Thumbnail
-
-Array = NDArray[np.float64]
-Json = dict[str, Any]
-
-PITCH_UM = 20.0
-
-CAMERA = "RC 20"
-FRAMES = tuple(f"f{i}" for i in range(1, 6))
-MARKS = (
-    (106.0, -106.0),
-    (-106.0, -106.0),
-    (-106.0, 106.0),
-    (106.0, 106.0),
-    (0.0, -110.0),
-    (-110.0, 0.0),
-    (0.0, 110.0),
-    (110.0, 0.0),
-)
-INTERIOR = {"c": (153.664, 0.0041), "x0": (0.012, 0.0035), "y0": (-0.008, 0.0036)}
-LENS = {
-    "k3": (1.7427e-7, 3.1e-9),
-    "k5": (-5.4e-12, 2.2e-13),
-    "k7": (0.0, 0.0),
-    "p1": (7.9e-7, 9e-8),
-    "p2": (-0.6e-7, 9e-8),
-    "p3": (0.0, 0.0),
-    "p4": (0.0, 0.0),
-}
-AFFINE = ("a1", "a2", "a3", "b1", "b2", "b3")
-EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
-EXTERIOR_SIGMAS = (0.05, 0.05, 0.05, 3e-5, 3e-5, 3e-5)
-CHECKED = (("fx", "px", 7683.2, 0.21), ("cx", "px", 5701.3, 0.19), ("k1", "", -4.11e-3, 7.3e-5))
-POINTS = 24
-SIGMA_MM = 0.004
+from pipeline.cli import run
+from pipeline.scene_file import render_project
 
 
 @pytest.fixture(scope="session")
-def adjustment() -> Adjustment:
-    """Converged, sigma0 within its bounds, no observation suspect; f2 is mirrored, its film sheared."""
-    rng = np.random.default_rng(7)
-    ids, targets_mm = tuple(str(i + 1) for i in range(POINTS)), rng.uniform(-100.0, 100.0, (POINTS, 2))
-    names, values, sigmas = _unknowns(ids, rng)
-    network = _network(ids, targets_mm, rng)
-    count = len(network.observations)
-    redundancy = rng.uniform(0.4, 0.9, (count, 2))
-    w = np.clip(rng.standard_normal((count, 2)), -3.0, 3.0)
-    v = w * SIGMA_MM * np.sqrt(redundancy)
-    correlation = np.eye(len(names))
-    c, k3 = names.index(f"IO.{CAMERA}.c"), names.index(f"IO.{CAMERA}.k3")
-    correlation[c, k3] = correlation[k3, c] = -0.95
-    return Adjustment(
-        network=network,
-        termination="converged",
-        iterations=6,
-        conditions=340,
-        unknowns=83,
-        redundancy=257,
-        vpv=262.1,
-        names=names,
-        values=values,
-        cofactor=correlation * np.outer(sigmas, sigmas),
-        residuals=Residuals(v, redundancy, w),
-        groups={
-            "target": Group(1.02, 3.1, 3.2, 190.0),
-            "fiducial": Group(0.97, 2.2, 2.1, 67.0),
-            "control": Group(0.0, 0.0, 0.0, 0.0),
-        },
-        singular=(),
-        warnings=(),
-        history=((4.1e6, 5e4), (2113.0, 310.0), (262.2, 0.8), (262.1, 1e-4), (262.1, 2e-8), (262.1, 1e-9)),
-    )
-
-
-def _unknowns(points: tuple[str, ...], rng: np.random.Generator) -> tuple[tuple[str, ...], Array, Array]:
-    """Names, values and a-priori sigmas of all quantities; points are fixed."""
-    quantities: dict[str, tuple[float, float]] = {}
-    quantities |= {f"IO.{CAMERA}.{name}": pair for name, pair in (INTERIOR | LENS).items()}
-    for i, (x, y) in enumerate(MARKS, 1):
-        for axis, given in (("x", x), ("y", y)):
-            quantities[f"FID.{CAMERA}.{i}.{axis}"] = (given + 0.01 * rng.standard_normal(), 0.0021)
-    for image in FRAMES:
-        affine = (0.1, -1.0, 0.02, 0.2, 0.02, 1.0) if image == "f2" else (0.1, 1.0, 0.02, 0.2, -0.02, 1.0)
-        station = (*rng.uniform(-500.0, 500.0, 2), 1500.0, *rng.uniform(-0.1, 0.1, 3))
-        for name, value in zip(AFFINE, affine, strict=True):
-            quantities[f"T.{image}.{name}"] = (value, 1e-4)
-        for name, value, sigma in zip(EXTERIOR, station, EXTERIOR_SIGMAS, strict=True):
-            quantities[f"EO.{image}.{name}"] = (float(value), sigma)
-    for point in points:
-        quantities |= {f"PT.{point}.{axis}": (float(rng.uniform(-900.0, 900.0)), 0.0) for axis in "XYZ"}
-    values, sigmas = np.array(list(quantities.values())).T
-    return tuple(quantities), values, sigmas
-
-
-def _network(points: tuple[str, ...], targets_mm: Array, rng: np.random.Generator) -> Network:
-    camera = Camera(
-        CAMERA,
-        Prior(153.6, 1.0),
-        Prior(0.0, 1.0),
-        Prior(0.0, 1.0),
-        Distortion("torlegard", {name: Prior(0.0, np.inf) for name in ("k3", "k5", "p1", "p2")}),
-        {str(i): Fiducial(Prior(x, 1.0), Prior(y, 1.0)) for i, (x, y) in enumerate(MARKS, 1)},
-    )
-    fiducials = np.array(MARKS)
-    rows: list[tuple[str, str, ObservationKind, Array]] = []
-    for image in FRAMES:
-        turn = -1.0 if image == "f2" else 1.0
-        rows += [(image, str(i), "fiducial", xy * (turn, 1.0)) for i, xy in enumerate(fiducials, 1)]
-        rows += [(image, point, "target", xy * (turn, 1.0)) for point, xy in zip(points, targets_mm, strict=True)]
-    xy = np.array([row[3] for row in rows]) + 0.004 * rng.standard_normal((len(rows), 2))
-    observations = Observations(
-        tuple(row[0] for row in rows),
-        tuple(row[1] for row in rows),
-        tuple(row[2] for row in rows),
-        xy,
-        np.broadcast_to(np.eye(2) * SIGMA_MM**2, (len(rows), 2, 2)),
-    )
-    exterior = Exterior(np.array([0.0, 0.0, 1500.0, 0.0, 0.0, 0.0]), np.array([np.inf] * 3 + [0.5] * 3))
-    return Network(
-        (camera,),
-        tuple(Image(image, CAMERA, "affine", exterior if image == "f1" else None) for image in FRAMES),
-        tuple(ObjectPoint(point, Prior(0.0), Prior(0.0), Prior(0.0)) for point in points),
-        observations,
-    )
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demonstration's project, not yet run. Tests copy it before they change anything."""
+    folder = tmp_path_factory.mktemp("demo")
+    with resources.as_file(resources.files("synthetic_images").joinpath("scenes", "demo.toml")) as scene:
+        render_project(scene, folder)
+    return folder
 
 
 @pytest.fixture(scope="session")
-def singular_adjustment(adjustment: Adjustment) -> Adjustment:
-    """The same without a solution."""
-    null = NullDirection(
-        ("IO.RC 20.c", "EO.f1.Z0"), "c and the flying height move together over flat ground.", "Fix c."
-    )
-    lost = np.full_like(adjustment.cofactor, np.nan)
-    return replace(adjustment, termination="singular", singular=(null,), cofactor=lost)
+def finished(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """The demonstration's project after `reseau run`, and the exit code of that."""
+    folder = tmp_path_factory.mktemp("finished") / "demo"
+    shutil.copytree(rendered, folder)
+    return folder, run(["run", str(folder / "project.toml")])
 
 
 @pytest.fixture
-def measured(adjustment: Adjustment) -> ReportData:
-    """Scans measured, nothing adjusted: every mark found, every pose decided."""
-    observations = adjustment.network.observations
-    pixels = observations.xy_mm * (1e3 / PITCH_UM, -1e3 / PITCH_UM) + 6000.0
-    images: Json = {}
-    rows = []
-    for i in range(len(observations)):
-        image, point, kind = observations.image[i], observations.point[i], observations.kind[i]
-        xy, sigma = observations.xy_mm[i], np.sqrt(np.diag(observations.covariance_mm2[i]))
-        rows.append(ComparatorPoint(image, point, kind, xy, sigma, 0.0, Status.MEASURED, ""))
-        images.setdefault(image, _scan(image))["marks"].append(
-            {
-                "point": point,
-                "kind": kind,
-                "col_px": float(pixels[i, 0]),
-                "row_px": float(pixels[i, 1]),
-                "covariance_px2": [[0.0016, 0.0], [0.0, 0.0025]],
-                "status": "measured",
-                "reason": "",
-                "quality": {"snr": 31.0},
-            }
-        )
-    return ReportData(
-        "Five frames", rows, {"images": images}, thumbnail=_Crosses(images), frame_mm={"RC 20": (228.0, 228.0)}
-    )
-
-
-def _scan(image: str) -> Json:
-    return {
-        "scan": f"../scans/{image}.tif",
-        "width_px": 12000,
-        "height_px": 12000,
-        "pitch_um": [PITCH_UM, PITCH_UM],
-        "pose": {"name": "0", "decided": True, "evidence": ["The dots beside the corner marks say so (41 to 3)."]},
-        "pixel_from_camera": [[50.0, 0.0, 6000.0], [0.0, -50.0, 6000.0]],
-        "problems": [],
-        "marks": [],
-    }
-
-
-class _Crosses:
-    """Pictures of a light cross about the measured centre, in noise."""
-
-    def __init__(self, images: Json) -> None:
-        self._centers = {
-            (name, mark["point"], mark["kind"]): (mark["col_px"], mark["row_px"])
-            for name, scan in images.items()
-            for mark in scan["marks"]
-        }
-
-    def __call__(self, image: str, point: str, kind: str) -> Thumbnail | None:
-        col, row = self._centers[image, point, kind]
-        corner = round(col) - 20, round(row) - 20
-        x, y = np.arange(41) + corner[0] - col, np.arange(41) + corner[1] - row
-        arms = np.maximum(np.exp(-(x**2) / 6.0)[None, :], np.exp(-(y**2) / 6.0)[:, None])
-        noise = np.random.default_rng(round(col)).normal(0.0, 600.0, arms.shape)
-        return Thumbnail(20000.0 + 15000.0 * arms + noise, (float(corner[0]), float(corner[1])))
-
-
-@pytest.fixture
-def adjusted(measured: ReportData, adjustment: Adjustment, tmp_path: Path) -> ReportData:
-    """Measured, adjusted and in agreement with OpenCV."""
-    return _with(measured, adjustment, tmp_path)
-
-
-@pytest.fixture
-def singular(measured: ReportData, singular_adjustment: Adjustment, tmp_path: Path) -> ReportData:
-    return _with(measured, singular_adjustment, tmp_path)
-
-
-def _with(measured: ReportData, adjustment: Adjustment, folder: Path) -> ReportData:
-    path = folder / "adjustment.json"
-    write_adjustment(adjustment, path)
-    rows = [
-        {
-            "name": name,
-            "unit": unit,
-            "reseau": {"value": value, "sigma": sigma},
-            "opencv": {"value": value + 0.1 * sigma, "sigma": sigma},
-            "difference_sigmas": -0.1,
-        }
-        for name, unit, value, sigma in CHECKED
-    ]
-    camera = {
-        "verdict": "agrees",
-        "reason": "All parameters agree within 0.1 sigma.",
-        "rms_opencv_um": 4.61,
-        "rms_reseau_um": 4.60,
-        "refit_residual_um": 0.012,
-        "images": 5,
-        "points": 120,
-        "rows": rows,
-    }
-    check = {"verdict": "agrees", "reason": "All parameters agree within 0.1 sigma.", "cameras": {"RC 20": camera}}
-    return replace(measured, adjustment=read_adjustment(path), covariance=read_covariance(path), check=check)
+def project(finished: tuple[Path, int], tmp_path: Path) -> Path:
+    """A finished project of its own for a test, to spoil."""
+    folder = tmp_path / "project"
+    shutil.copytree(finished[0], folder)
+    return folder

@@ -1,0 +1,148 @@
+"""The command line: arguments in, exit codes and one clear message out."""
+
+import json
+import traceback
+from collections.abc import Callable, Sequence
+from importlib import resources
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from adjust.errors import AdjustmentError
+from measure.errors import MeasurementError
+from pipeline import stages
+from pipeline.demo import run_demo
+from pipeline.errors import InputError
+from pipeline.progress import Reporter
+from pipeline.project_file import Project, read_project
+from pipeline.scene_file import render_project
+from pipeline.summary import Summary, print_summary
+
+DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR = 0, 1, 2, 3
+TEMPLATES = ("project", "camera", "scene")
+
+app = typer.Typer(
+    help="From scanned film photographs to comparator coordinates and a calibrated camera.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+ProjectFile = Annotated[Path, typer.Argument(metavar="PROJECT.toml", help="The project file.", show_default=False)]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")]
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code: 0 done, 1 look at something, 2 wrong input, 3 a fault of ours.
+
+    arguments: what follows the program's name; by default what it was called with.
+    """
+    try:
+        code = app(args=arguments, standalone_mode=False)
+        return code if isinstance(code, int) else DONE
+    except typer.TyperException as error:
+        return _message(error.format_message(), WRONG_INPUT)
+    except (typer.Abort, KeyboardInterrupt):
+        return _message("interrupted; files that were complete stay as they are", WRONG_INPUT)
+    except (InputError, MeasurementError, AdjustmentError) as error:
+        return _message(str(error), WRONG_INPUT)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        return _message(
+            f"{place}{error.strerror or error}. Make room, or check the path and its permissions.", WRONG_INPUT
+        )
+    except Exception:
+        traceback.print_exc()
+        return _message("this is a fault of reseau itself; please report it with the lines above", INTERNAL_ERROR)
+
+
+@app.callback(invoke_without_command=True)
+def root(show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    """Options that go before any command."""
+    if show_version:
+        typer.echo(f"reseau {version('reseau')}")
+        raise typer.Exit
+
+
+@app.command()
+def demo(
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the demonstration goes.")] = Path(
+        "reseau-demo"
+    ),
+    as_json: AsJson = False,
+) -> int:
+    """Render a small scan folder with its truth, run everything on it, print the summary and the report's path."""
+    return _finish(run_demo(folder, Reporter()), as_json)
+
+
+@app.command("run")
+def run_project(project: ProjectFile, as_json: AsJson = False) -> int:
+    """The whole chain: measure, adjust, check, report."""
+    return _with_project(project, stages.run_all, as_json)
+
+
+@app.command()
+def measure(project: ProjectFile, as_json: AsJson = False) -> int:
+    """Scans to comparator coordinates."""
+    return _with_project(project, stages.run_measure, as_json)
+
+
+@app.command()
+def adjust(project: ProjectFile, as_json: AsJson = False) -> int:
+    """Comparator coordinates to the adjusted camera, in adjustment.json."""
+    return _with_project(project, stages.run_adjust, as_json)
+
+
+@app.command()
+def check(project: ProjectFile, as_json: AsJson = False) -> int:
+    """The adjustment against OpenCV's calibration, in check.json."""
+    return _with_project(project, stages.run_check, as_json)
+
+
+@app.command()
+def report(project: ProjectFile, as_json: AsJson = False) -> int:
+    """What the earlier stages found, in report.html."""
+    return _with_project(project, stages.run_report, as_json)
+
+
+@app.command()
+def render(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="The scene file.", show_default=False)],
+    out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the project goes.", show_default=False)],
+) -> int:
+    """Synthetic scans with their truth, as a project that can be run."""
+    with Reporter().stage("rendering") as count:
+        render_project(scene, out_dir, count)
+    typer.echo(f"{out_dir / 'project.toml'}")
+    return DONE
+
+
+@app.command()
+def template(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help=f"One of {', '.join(TEMPLATES)}.", show_default=False)],
+) -> int:
+    """Print a commented file to start from."""
+    if kind not in TEMPLATES:
+        raise InputError(f"there is no template {kind!r}; possible are {', '.join(TEMPLATES)}.")
+    typer.echo(resources.files("pipeline").joinpath("templates", f"{kind}.toml").read_text(encoding="utf-8"), nl=False)
+    return DONE
+
+
+def _with_project(path: Path, stage: Callable[[Project, Reporter], Summary], as_json: bool) -> int:
+    return _finish(stage(read_project(path), Reporter()), as_json)
+
+
+def _finish(summary: Summary, as_json: bool) -> int:
+    if as_json:
+        typer.echo(json.dumps(summary.as_json(), indent=1, ensure_ascii=False))
+    else:
+        print_summary(summary, Console())
+    return LOOK if summary.problems else DONE
+
+
+def _message(text: str, code: int) -> int:
+    typer.echo(f"reseau: {text}", err=True)
+    return code

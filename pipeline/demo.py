@@ -1,0 +1,24 @@
+"""The demonstration: a small scan folder rendered with its truth, and the whole chain run on it."""
+
+from importlib import resources
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.progress import Reporter
+from pipeline.project_file import read_project
+from pipeline.scene_file import render_project
+from pipeline.stages import run_all
+from pipeline.summary import Summary
+
+SCENE = ("scenes", "demo.toml")
+TRUTH = "truth.json"
+
+
+def run_demo(folder: Path, reporter: Reporter) -> Summary:
+    """Render and run. Raises InputError for a folder that holds something else: nothing of it is overwritten."""
+    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not (folder / TRUTH).exists())):
+        raise InputError(f"{folder}: holds something that is no demonstration. Name another folder: reseau demo DIR")
+    scene = resources.as_file(resources.files("synthetic_images").joinpath(*SCENE))
+    with scene as path, reporter.stage("rendering") as count:
+        render_project(path, folder, count)
+    return run_all(read_project(folder / "project.toml"), reporter)

@@ -1,0 +1,104 @@
+"""Scans to marks: the fiducials of every frame first, then the targets that they make predictable."""
+
+import multiprocessing
+import os
+from collections.abc import Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from measure.errors import MeasurementError
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.results import FrameMeasurement
+from measure.scan import Scan, open_scan
+from pipeline.camera_file import CameraFile
+from pipeline.errors import InputError
+from pipeline.measurement_file import MeasuredScan
+from pipeline.progress import Reporter
+from pipeline.project_file import Project
+from pipeline.target_stage import measure_targets
+
+
+def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, ...]:
+    """Measure every scan of the project, in the order of their names.
+
+    All are opened before the first is measured, so that a broken file is known at once. Raises InputError or
+    MeasurementError for scans that cannot be read; a mark that cannot be measured is no error.
+    """
+    if not project.scans:
+        raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
+    _check_readable(list(project.scans.values()))
+    with reporter.stage("measured") as count, _workers(len(project.scans)) as workers:
+        futures = {workers.submit(measure_scan, project, name): name for name in project.scans}
+        for done, future in enumerate(as_completed(futures), 1):
+            future.result()
+            count(futures[future], done, len(futures))
+    return tuple(future.result() for future in futures)
+
+
+def _workers(scans: int) -> Executor:
+    """A process a core, of one thread: a scan is measured alone, so the result does not depend on their number."""
+    processes = min(scans, os.cpu_count() or 1)
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(processes, mp_context=context, initializer=cv2.setNumThreads, initargs=(1,))
+
+
+def _check_readable(paths: Sequence[Path]) -> None:
+    """Name every file that cannot be opened, not just the first."""
+    messages = []
+    for path in paths:
+        try:
+            with open_scan(path):
+                pass
+        except MeasurementError as error:
+            messages.append(str(error))
+    if messages:
+        raise MeasurementError("\n".join(messages))
+
+
+def measure_scan(project: Project, name: str) -> MeasuredScan:
+    """Measure one scan of the project: its fiducials, then its targets."""
+    with open_scan(project.scans[name]) as scan:
+        return _measured(project, name, scan)
+
+
+def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
+    camera = project.camera_of(name)
+    frame = _fiducials(project, name, scan, camera)
+    pitch, notes = _pitch(project, scan, camera, frame)
+    frame = replace(frame, problems=(*frame.problems, *notes))
+    measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame)
+    return measure_targets(project, scan, measured)
+
+
+def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> FrameMeasurement:
+    if not camera.fiducials:
+        return FrameMeasurement(name, ())
+    pitch = project.pitch_um or scan.pitch_um
+    measured = measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=project.pose))
+    return replace(measured, image=name)
+
+
+def _pitch(
+    project: Project, scan: Scan, camera: CameraFile, frame: FrameMeasurement
+) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """The pitch of a scan in um, as the project, the file or the marks say it, and what is to be said of it."""
+    if project.pitch_um is not None:
+        return project.pitch_um, ()
+    if scan.pitch_um is not None:
+        return scan.pitch_um, ()
+    if frame.pixel_from_camera is not None:
+        pitch = 1000.0 / float(np.sqrt(abs(np.linalg.det(frame.pixel_from_camera[:, :2]))))
+        return (pitch, pitch), ()
+    if camera.frame_mm is not None:
+        pitch = 1000.0 * max(camera.frame_mm) / max(scan.width_px, scan.height_px)
+        note = f"The pitch is not known ({scan.pitch_note}); {pitch:.1f} um is taken, as if the frame filled the scan."
+        return (pitch, pitch), (note,)
+    raise InputError(
+        f"{project.path}: pitch_um is missing, and {scan.path.name} does not say it ({scan.pitch_note}). Give the size "
+        "of a pixel in um; for a digital camera that of the sensor's, or any, with the principal distance to match."
+    )

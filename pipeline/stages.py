@@ -1,0 +1,143 @@
+"""The stages of the chain, each from files to files, so that any of them can be run alone and looked at."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from adjust.result import Adjustment
+from pipeline.adjust_stage import adjust_marks
+from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
+from pipeline.atomic import write_atomically
+from pipeline.check import check_against_opencv
+from pipeline.comparator_file import ComparatorPoint, read_comparator, write_comparator
+from pipeline.errors import InputError
+from pipeline.measure_stage import measure_scans
+from pipeline.measurement_file import MeasuredScan, read_measurement, write_measurement
+from pipeline.progress import Reporter
+from pipeline.project_file import Project
+from pipeline.report.data import ReportData
+from pipeline.report.page import write_report
+from pipeline.second_visit import measure_again
+from pipeline.summary import Summary, summarise
+from pipeline.thumbnails import Thumbnails
+
+Json = dict[str, Any]
+
+
+def run_all(project: Project, reporter: Reporter) -> Summary:
+    """Measure (where there are scans), adjust, visit the scans again, check, report."""
+    scans: tuple[MeasuredScan, ...] = ()
+    if project.scans:
+        scans = measure_scans(project, reporter)
+        _write_marks(project, scans)
+        if not _anything_to_adjust(project):
+            return _reported(project, _data(project))
+    adjustment = adjust_marks(project, read_comparator(project.comparator))
+    again = measure_again(project, scans, adjustment, reporter)
+    if again is not None:
+        _write_marks(project, again)
+        adjustment = adjust_marks(project, read_comparator(project.comparator))
+    write_adjustment(adjustment, project.adjustment_path)
+    _write_check(project, adjustment)
+    return _reported(project, _data(project))
+
+
+def run_measure(project: Project, reporter: Reporter) -> Summary:
+    """Scans to comparator.csv."""
+    _write_marks(project, measure_scans(project, reporter))
+    data = ReportData(_title(project), _marks(project), _json(project.measurement_path))
+    return summarise(data, {"comparator coordinates": project.comparator, "measurement": project.measurement_path})
+
+
+def run_adjust(project: Project, reporter: Reporter) -> Summary:
+    """comparator.csv to adjustment.json."""
+    with reporter.stage("adjusting") as count:
+        count(project.comparator.name, 0, 1)
+        adjustment = adjust_marks(project, read_comparator(project.comparator))
+    write_adjustment(adjustment, project.adjustment_path)
+    project.check_path.unlink(missing_ok=True)  # it belongs to an earlier adjustment
+    covariance = covariance_path(project.adjustment_path)
+    return summarise(_data(project), {"adjustment": project.adjustment_path, "covariance": covariance})
+
+
+def run_check(project: Project, reporter: Reporter) -> Summary:
+    """The adjustment, made anew from comparator.csv, against OpenCV's calibration."""
+    with reporter.stage("checking") as count:
+        count(project.comparator.name, 0, 1)
+        adjustment = adjust_marks(project, read_comparator(project.comparator))
+        write_adjustment(adjustment, project.adjustment_path)
+        _write_check(project, adjustment)
+    return summarise(_data(project), {"check": project.check_path})
+
+
+def run_report(project: Project, reporter: Reporter) -> Summary:
+    """What the earlier stages left, in report.html."""
+    if not project.comparator.exists():
+        raise InputError(
+            f"{project.comparator}: there is no such file, and so nothing to report. Run `reseau run` first."
+        )
+    with reporter.stage("reporting") as count:
+        count(project.report_path.name, 0, 1)
+        return _reported(project, _data(project))
+
+
+def _anything_to_adjust(project: Project) -> bool:
+    """Fiducials alone calibrate nothing: without targets and points the measurement is the result."""
+    return project.targets is not None or project.given_points is not None
+
+
+def _write_marks(project: Project, scans: Sequence[MeasuredScan]) -> None:
+    write_measurement(project.measurement_path, scans)
+    write_comparator(project.comparator, [s.frame for s in scans], {s.frame.image: s.pitch_um for s in scans})
+
+
+def _write_check(project: Project, adjustment: Adjustment) -> None:
+    check = check_against_opencv(adjustment).to_json()
+    write_atomically(project.check_path, json.dumps(check, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def _reported(project: Project, data: ReportData) -> Summary:
+    write_report(data, project.report_path)
+    files = {"comparator coordinates": project.comparator, "adjustment": project.adjustment_path}
+    return summarise(data, {**{w: p for w, p in files.items() if p.exists()}, "report": project.report_path})
+
+
+def _data(project: Project) -> ReportData:
+    """What stands in the project's files, for the report and the verdict."""
+    measurement = _json(project.measurement_path)
+    covariance = covariance_path(project.adjustment_path)
+    return ReportData(
+        project=_title(project),
+        comparator=_marks(project),
+        measurement=measurement,
+        adjustment=read_adjustment(project.adjustment_path) if project.adjustment_path.exists() else None,
+        covariance=read_covariance(project.adjustment_path) if covariance.exists() else None,
+        check=_json(project.check_path),
+        frame_mm=_frame_sizes(project),
+        thumbnail=Thumbnails(read_measurement(project.measurement_path)).of if measurement else None,
+    )
+
+
+def _title(project: Project) -> str:
+    """The project's folder, unless the project file has a name of its own."""
+    stem = project.path.stem
+    return project.path.resolve().parent.name if stem == "project" else stem
+
+
+def _marks(project: Project) -> tuple[ComparatorPoint, ...]:
+    return read_comparator(project.comparator)
+
+
+def _json(path: Path) -> Json | None:
+    try:
+        content: Json = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise InputError(f"{path}: is not valid JSON ({error}). Delete it and run the stage again.") from None
+    return content
+
+
+def _frame_sizes(project: Project) -> Mapping[str, tuple[float, float]]:
+    return {camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None}

@@ -1,0 +1,97 @@
+"""What a command says when it is done: the verdict, the problems, the main numbers, where the files are."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from measure.status import Status
+from pipeline.report.data import Problem, ReportData
+from pipeline.report.numbers import value_and_sigma
+from pipeline.report.verdict import judge
+
+STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The end of a command. files: what was written, by a word for it."""
+
+    level: str
+    sentence: str
+    problems: tuple[Problem, ...]
+    frames: Mapping[str, Mapping[str, int]]
+    adjustment: Json | None
+    check: Json | None
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+    def as_json(self) -> Json:
+        return {
+            "reseau": version("reseau"),
+            "verdict": self.level,
+            "sentence": self.sentence,
+            "problems": [{"what": problem.what, "next_step": problem.next_step} for problem in self.problems],
+            "frames": {name: dict(counts) for name, counts in self.frames.items()},
+            "adjustment": self.adjustment and _main_numbers(self.adjustment),
+            "check": self.check and {"verdict": self.check["verdict"], "reason": self.check["reason"]},
+            "files": {word: str(path) for word, path in self.files.items()},
+        }
+
+
+def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
+    """Judge the data as the report does, and add where everything stands."""
+    verdict = judge(data)
+    frames: dict[str, dict[str, int]] = {}
+    for mark in data.comparator:
+        counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
+        counts[mark.status] += 1
+    return Summary(verdict.level, verdict.sentence, verdict.problems, frames, data.adjustment, data.check, files)
+
+
+def print_summary(summary: Summary, console: Console) -> None:
+    """The summary for a person; file paths are never folded."""
+    console.print(Text(summary.sentence, style=STYLES[summary.level]))
+    for problem in summary.problems:
+        console.print(Text(f"- {problem.what}"))
+        if problem.next_step:
+            console.print(Text(f"  {problem.next_step}", style="dim"))
+    if summary.frames:
+        console.print(_frame_table(summary.frames))
+    if summary.adjustment:
+        console.print(_camera_table(summary.adjustment))
+    for word, path in summary.files.items():
+        console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _main_numbers(adjustment: Json) -> Json:
+    keys = ("converged", "termination", "iterations", "observations", "unknowns", "redundancy", "sigma0", "cameras")
+    return {key: adjustment[key] for key in keys}
+
+
+def _frame_table(frames: Mapping[str, Mapping[str, int]]) -> Table:
+    table = Table("image", *(str(status) for status in Status), title="Marks", title_justify="left")
+    for name, counts in frames.items():
+        table.add_row(Text(name), *(str(counts[status]) for status in Status))
+    return table
+
+
+def _camera_table(adjustment: Json) -> Table:
+    title = f"Camera (sigma0 = {adjustment['sigma0']:.3f}, redundancy {adjustment['redundancy']})"
+    table = Table("camera", "parameter", "value", "sigma", title=title, title_justify="left")
+    for name, camera in adjustment["cameras"].items():
+        point = camera["principal_point_mm"]
+        rows = {
+            "principal distance, mm": camera["principal_distance_mm"],
+            "principal point x', mm": point["x"],
+            "principal point y', mm": point["y"],
+            **{word: part for word, part in camera["distortion"].items() if isinstance(part, dict)},
+        }
+        for word, quantity in rows.items():
+            table.add_row(Text(name), word, *value_and_sigma(quantity["value"], quantity["sigma"]))
+    return table

@@ -1,0 +1,61 @@
+"""The pictures of the marks, cut from their scans as the report asks for them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from measure.errors import MeasurementError
+from measure.results import MarkMeasurement
+from measure.scan import Scan, open_scan
+from pipeline.measurement_file import MeasuredScan
+from pipeline.report.data import Thumbnail
+
+_FIDUCIAL_PX, _TARGET_PX = 81, 41  # the least width of a window
+_SHOWN_PX = 96  # a larger window is reduced to about this many pixels
+_REACH_SIZES = 2.5  # a window's half width in the mark's own size, where that is known
+
+
+class Thumbnails:
+    """Windows about marks, by image and point; one scan is open at a time."""
+
+    def __init__(self, scans: Sequence[MeasuredScan]) -> None:
+        self._scans = {scan.frame.image: scan for scan in scans}
+        self._marks = {
+            (s.frame.image, mark.point, mark.kind == "fiducial"): mark for s in scans for mark in s.frame.marks
+        }
+        self._open: tuple[Path, Scan] | None = None
+
+    def of(self, image: str, point: str, kind: str) -> Thumbnail | None:
+        """The picture of a mark; None where it has no place, or its scan cannot be read any more."""
+        mark = self._marks.get((image, point, kind == "fiducial"))
+        if mark is None or mark.center_px is None:
+            return None
+        try:
+            return _cut(self._scan(self._scans[image].scan), mark)
+        except MeasurementError:
+            return None
+
+    def _scan(self, path: Path) -> Scan:
+        if self._open is None or self._open[0] != path:
+            if self._open is not None:
+                self._open[1].close()
+            self._open = (path, open_scan(path))
+        return self._open[1]
+
+
+def _cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
+    assert mark.center_px is not None
+    least = _FIDUCIAL_PX if mark.kind == "fiducial" else _TARGET_PX
+    half = max(least // 2, int(np.ceil(_REACH_SIZES * mark.quality.get("size_px", 0.0) / 2.0)))
+    col0, row0 = (round(float(value)) - half for value in mark.center_px)
+    width = 2 * half + 1
+    if col0 >= scan.width_px or row0 >= scan.height_px or col0 + width <= 0 or row0 + width <= 0:
+        return None
+    window = scan.window(col0, row0, width, width)
+    step = max(1, width // _SHOWN_PX)
+    size = width // step
+    pixels = cv2.resize(window[: size * step, : size * step], (size, size), interpolation=cv2.INTER_AREA)
+    middle = (step - 1) / 2.0
+    return Thumbnail(np.asarray(pixels), (col0 + middle, row0 + middle), float(step))

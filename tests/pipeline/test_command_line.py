@@ -1,0 +1,190 @@
+"""The command line on right and on wrong input: one message, the right code, earlier results untouched."""
+
+import json
+import resource
+import signal
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from pipeline.cli import run
+
+SAID = pytest.CaptureFixture[str]
+
+
+def replaced(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    """Everything that a run writes."""
+    files = [folder / "comparator.csv", *sorted((folder / "out").iterdir())]
+    return {file.name: file.read_bytes() for file in files}
+
+
+def no_project(folder: Path) -> None:
+    (folder / "project.toml").unlink()
+
+
+def no_camera(folder: Path) -> None:
+    (folder / "camera.toml").unlink()
+
+
+def no_scans(folder: Path) -> None:
+    for file in (folder / "scans").iterdir():
+        file.unlink()
+
+
+def text_named_tif(folder: Path) -> None:
+    (folder / "scans" / "frame2.tif").write_text("This is no picture.\n" * 50, encoding="utf-8")
+
+
+def truncated_tiff(folder: Path) -> None:
+    path = folder / "scans" / "frame3.tif"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def toml_typo(folder: Path) -> None:
+    replaced(folder / "project.toml", 'camera = "camera.toml"', 'camera = "camera.toml')
+
+
+def misspelt_key(folder: Path) -> None:
+    replaced(folder / "project.toml", "diameter_mm", "diametre_mm")
+
+
+def duplicated_point(folder: Path) -> None:
+    path = folder / "points.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join([*lines, lines[3]]) + "\n", encoding="utf-8")
+
+
+def no_folder_for_results(folder: Path) -> None:
+    replaced(folder / "project.toml", 'output = "out"', 'output = "points.csv/out"')
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (no_project, ["project.toml", "no such file"]),
+        (no_camera, ["camera.toml", "no such file"]),
+        (no_scans, ["scans/frame1.tif", "finds no file", "It is empty"]),
+        (text_named_tif, ["frame2.tif"]),
+        (truncated_tiff, ["frame3.tif"]),
+        (toml_typo, ["project.toml", "not valid TOML", "line 2"]),
+        (misspelt_key, ["project.toml", "diametre_mm", "diameter_mm"]),
+        (duplicated_point, ["points.csv", "'103'", "line 4"]),
+        (no_folder_for_results, ["cannot be written"]),
+    ],
+)
+def test_wrong_input_gets_one_message_and_code_2_and_leaves_earlier_results(
+    project: Path, capsys: SAID, spoil: Callable[[Path], None], words: list[str]
+) -> None:
+    before = results(project)
+    spoil(project)
+    assert run(["run", str(project / "project.toml")]) == 2
+    said = capsys.readouterr().err
+    for word in words:
+        assert word in said
+    assert "Traceback" not in said
+    assert results(project) == before
+
+
+def test_full_disk_gets_a_message_and_leaves_earlier_results(project: Path, capsys: SAID) -> None:
+    before = results(project)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+        code = run(["adjust", str(project / "project.toml")])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert code == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert results(project) == before
+
+
+def adjusted(project: Path, capsys: SAID, marks: str | None = None) -> tuple[int, dict[str, object], str]:
+    """`reseau adjust --json` on coordinates alone: exit code, summary, what was said on stderr."""
+    replaced(project / "project.toml", "scans = [", "# scans = [")
+    if marks is not None:
+        (project / "comparator.csv").write_text(marks, encoding="utf-8")
+    capsys.readouterr()
+    code = run(["adjust", str(project / "project.toml"), "--json"])
+    out, err = capsys.readouterr()
+    return code, json.loads(out) if out else {}, err
+
+
+def test_point_that_nobody_measured_is_named(project: Path, capsys: SAID) -> None:
+    with (project / "points.csv").open("a", encoding="utf-8") as file:
+        file.write("999,1,2,3,0,0,0,0,0,1\n")
+    code, summary, _ = adjusted(project, capsys)
+    assert code == 1
+    assert any("999" in problem["what"] for problem in summary["problems"])  # type: ignore[attr-defined]
+
+
+def test_measured_point_that_nobody_gave_is_named_with_its_line(project: Path, capsys: SAID) -> None:
+    marks = (project / "comparator.csv").read_text(
+        encoding="utf-8"
+    ) + "frame1,1O1,target,1,2,0.001,0.001,0,,,measured,\n"
+    code, _, said = adjusted(project, capsys, marks)
+    assert code == 2
+    for word in ("'1O1'", "'101'", "line", "comparator.csv"):
+        assert word in said
+
+
+def test_image_with_two_targets_is_left_out_and_named(project: Path, capsys: SAID) -> None:
+    lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    targets = [line for line in lines if line.startswith("frame1,") and ",target," in line and ",measured," in line]
+    kept = [line for line in lines if line not in targets[2:]]
+    code, summary, _ = adjusted(project, capsys, "\n".join(kept) + "\n")
+    assert code == 1
+    what = " ".join(problem["what"] for problem in summary["problems"])  # type: ignore[attr-defined]
+    assert "'frame1'" in what
+    assert "2 targets" in what
+
+
+def test_singular_network_is_named_in_words(project: Path, capsys: SAID) -> None:
+    replaced(project / "camera.toml", "principal_distance_mm = 1.0", 'principal_distance_mm = "free"')
+    replaced(project / "camera.toml", "principal_point_mm = [1.0, 1.0]", 'principal_point_mm = "free"')
+    text = (
+        (project / "camera.toml").read_text(encoding="utf-8").replace("sigma_mm = [0.005, 0.005]", 'sigma_mm = "free"')
+    )
+    (project / "camera.toml").write_text(text, encoding="utf-8")
+    code, summary, _ = adjusted(project, capsys)
+    assert code == 1
+    what = " ".join(problem["what"] for problem in summary["problems"])  # type: ignore[attr-defined]
+    for word in ("rotation", "scale"):
+        assert word in what
+
+
+def test_scan_of_another_camera_is_said_to_be_one(project: Path, capsys: SAID) -> None:
+    rng = np.random.default_rng(1)
+    picture = (20000 + 3000 * rng.standard_normal((1356, 1356))).astype(np.uint16)
+    tifffile.imwrite(
+        project / "scans" / "frame4.tif", picture, resolution=(1e4 / 45, 1e4 / 45), resolutionunit="CENTIMETER"
+    )
+    code = run(["measure", str(project / "project.toml"), "--json"])
+    summary = json.loads(capsys.readouterr().out)
+    assert code == 1
+    assert summary["frames"]["frame4"]["measured"] == 0
+    assert any("frame4" in problem["what"] for problem in summary["problems"])
+
+
+@pytest.mark.parametrize("kind", ["project", "camera", "scene"])
+def test_templates_are_valid_toml(kind: str, capsys: SAID) -> None:
+    assert run(["template", kind]) == 0
+    assert tomllib.loads(capsys.readouterr().out)
+
+
+def test_unknown_command_and_option_have_code_2(capsys: SAID) -> None:
+    assert run(["mesure"]) == 2
+    assert run(["run", "--jason", "p.toml"]) == 2
+    assert run(["template", "cameras"]) == 2
+    assert "Traceback" not in capsys.readouterr().err
