@@ -9,6 +9,8 @@ READY := $(VENV)/ready
 demo: $(READY)
 	$(BIN)/reseau demo demo
 
+# One BLAS thread a worker: two on two cores make the small factorisations ten times slower.
+test: export OPENBLAS_NUM_THREADS = 1
 test: lint types
 	$(BIN)/python -m pytest -n 2
 
