@@ -44,8 +44,8 @@ class BareProblem:
     """The problem for the adjustment (network, approximations), and the same for OpenCV (images, freedom).
 
     sigma_mm: the one standard deviation of all image coordinates; sigma_spread: the largest over the smallest of the
-    observations' own; uncertain_points: how many object points are not held fixed by their priors; left_out: images
-    with too few points for OpenCV.
+    observations' own; gross: observations that robust estimation set aside; uncertain_points: how many object points
+    are not held fixed by their priors; left_out: images with too few points for OpenCV.
     """
 
     network: Network
@@ -54,6 +54,7 @@ class BareProblem:
     freedom: Freedom
     sigma_mm: float
     sigma_spread: float
+    gross: int
     uncertain_points: int
     left_out: tuple[str, ...]
 
@@ -92,6 +93,9 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
         freedom=_freedom(camera, free),
         sigma_mm=sigma_mm,
         sigma_spread=float(sigmas.max() / sigmas.min()),
+        gross=sum(
+            network.observations.image[row] in shown for row in np.flatnonzero(adjustment.weights < GROSS_WEIGHT)
+        ),
         uncertain_points=sum(not _is_fixed(network.point_by_id[point]) for point in points),
         left_out=tuple(name for name in names if name not in usable),
     )

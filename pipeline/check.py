@@ -237,6 +237,8 @@ def _notes(problem: BareProblem, opencv: OpenCvCalibration, sigmas_tell: bool) -
             "all observations have one weight here, though their standard deviations differ up to "
             f"{problem.sigma_spread:.1f}-fold"
         )
+    if problem.gross:
+        notes.append(f"{problem.gross} observations that robust estimation set aside are left out")
     if problem.left_out:
         notes.append(f"left out, for too few points: {', '.join(problem.left_out)}")
     if opencv.rounding_um > NOTABLE_ROUNDING * 1e3 * problem.sigma_mm:

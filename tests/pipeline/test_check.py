@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.adjustment import adjust
+from adjust.adjustment import Options, adjust
 from adjust.approximations import approximate
 from adjust.network import (
     Camera,
@@ -243,6 +243,20 @@ def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, wha
     check = checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
     assert check.verdict == "differs"
     assert ("factor of 1.4" if what == "sigmas" else "by 1.5") in check.reason
+
+
+def test_what_robust_estimation_set_aside_is_left_out() -> None:
+    network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
+    xy_mm = network.observations.xy_mm.copy()
+    targets = [row for row, kind in enumerate(network.observations.kind) if kind == "target"]
+    xy_mm[targets[::40]] += 0.5
+    spoiled = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+    adjustment = adjust(spoiled, approximate(spoiled), Options(robust=True))
+    check = check_against_opencv(adjustment).cameras["rc20"]
+    assert check.verdict == "agrees", check.reason
+    assert f"{len(targets[::40])} observations that robust estimation set aside" in check.reason
+    assert check.rms_opencv_um is not None
+    assert check.rms_opencv_um < 10.0
 
 
 def test_images_with_too_few_points_are_left_out() -> None:
