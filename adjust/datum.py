@@ -13,6 +13,7 @@ Indices = NDArray[np.intp]
 
 EXACT = 1e-9  # what a generator may move of a given quantity and still be unhindered: rounding
 FLAT = 1e-3  # the same where relief, in parts of the field's extent, is too little to carry a datum
+CENTERINGS = 10  # the transformation is all but linear: two or three do
 LEVERAGE = 0.1  # least part of a coordinate's motion that earlier datum values must leave open
 
 
@@ -32,14 +33,15 @@ class ObjectDatum:
 
 def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> ObjectDatum:
     """The similarity transformations that move no fixed and no pseudo-observed coordinate, station or attitude."""
-    points = state.values[_point_positions(problem)]
-    center = points.mean(axis=0)
-    extent = float(np.sqrt(((points - center) ** 2).sum(axis=1).mean())) or 1.0
+    placed = _point_positions(problem) if problem.unknowns.point else problem.exterior[:, :3]
+    center = state.values[placed].mean(axis=0)
+    extent = float(np.sqrt(((state.values[placed] - center) ** 2).sum(axis=1).mean())) or 1.0
     generators = _generators(problem, state, center, extent)
     moved = generators.copy()
     moved[problem.exterior[:, 3:]] *= extent  # an angle's motion as that of a point
     hindered = moved[np.isfinite(problem.unknowns.sigma)]
-    _, singular, right = np.linalg.svd(np.vstack([hindered / np.sqrt(max(len(hindered), 1)), np.zeros((7, 7))]))
+    rows = np.vstack([hindered / np.sqrt(max(len(hindered), 1)), np.zeros((7, 7))])
+    _, singular, right = np.linalg.svd(rows, full_matrices=False)
     return ObjectDatum(center, extent, generators, right[singular <= tolerance].T)
 
 
@@ -103,13 +105,14 @@ def _candidates(problem: Problem, state: State) -> list[int]:
 def centered(problem: Problem, state: State) -> State:
     """The state after the similarity transformation that brings the free points nearest to their approximations."""
     members = free_coordinates(problem)
-    while True:
+    for _ in range(CENTERINGS):
         datum = object_datum(problem, state, FLAT)
         motion = datum.generators[members] @ datum.free
         amount = np.linalg.lstsq(motion, problem.unknowns.start[members] - state.values[members])[0]
         state = _transformed(problem, state, datum, datum.free @ amount)
-        if np.abs(amount).max(initial=0.0) <= 1e-10 * datum.extent:
-            return state
+        if np.abs(amount).max(initial=0.0) <= EXACT * datum.extent:
+            break
+    return state
 
 
 def free_coordinates(problem: Problem) -> Indices:

@@ -20,8 +20,8 @@ SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below w
 WEAK = 1e-4  # below which noise makes the solution
 INVOLVED = 0.01  # part of a null vector's largest component that is worth a name
 PURE = 1e-5  # part that a name must have in an exact null direction, beyond what earlier names took
-SETTLED = 3.0  # how much more than observations priors must weigh to make a weak direction theirs
 MIXED = 0.05  # the same in a direction that is seen just a little, where everything plays a small part
+SETTLED = 3.0  # how much more than observations priors must weigh to make a weak direction theirs
 INSIDE = 1e-6  # what a known direction may stick out of the null space: rounding
 NAMES_SHOWN = 3  # more names of one kind than this are shown as one, with a star
 UNDETERMINED = 0.99  # posterior over prior standard deviation above which the observations say nothing
@@ -203,7 +203,8 @@ def _independent_rows(rows: Array, part: float, ranks: Indices) -> list[int]:
 
 def _unseen_by(rows: Array, part: float) -> Array:
     """Orthonormal vectors (d, k) of which rows (m, d) see no more than a part."""
-    _, seen, right = np.linalg.svd(np.vstack([rows, np.zeros((rows.shape[1], rows.shape[1]))]))
+    square = np.zeros((rows.shape[1], rows.shape[1]))
+    _, seen, right = np.linalg.svd(np.vstack([rows, square]), full_matrices=False)
     return np.asarray(right[seen <= part].T)
 
 

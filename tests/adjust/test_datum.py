@@ -1,5 +1,7 @@
 """The datum of the object space: minimal, free, observed stations and attitudes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -7,7 +9,7 @@ from reference_cases import approximations_of, load, network_of
 from simulated import Truth, simulated
 
 from adjust.adjustment import Datum, Options, adjust
-from adjust.network import EXTERIOR_NAMES, Exterior, Image, Network, Prior
+from adjust.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, Prior
 from adjust.network import ObjectPoint as Point
 from adjust.result import Adjustment
 from adjust.transformation import NAMES
@@ -195,3 +197,23 @@ def test_a_datum_that_is_given_is_left_alone(datum: Datum) -> None:
         assert other.unknowns == plain.unknowns
         np.testing.assert_array_equal(other.values, plain.values)
         np.testing.assert_allclose(other.cofactor, plain.cofactor, rtol=1e-9)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_fiducials_alone_are_adjusted(held: bool) -> None:
+    """No object point at all, orientations known: the films' transformations and the mean of the fiducials."""
+    truth = Truth()
+    network, start = simulated(np.random.default_rng(14), truth, points=np.zeros((0, 3)))
+    camera = network.cameras[0]
+    if not held:
+        free = {
+            id_: Fiducial(Prior(m.x_mm.value, np.inf), Prior(m.y_mm.value, np.inf))
+            for id_, m in camera.fiducials.items()
+        }
+        network = replace(network, cameras=(replace(camera, fiducials=free),))
+    result = adjust(with_exteriors(network, np.zeros(6), truth), start)
+    if held:
+        assert result.converged
+        assert result.groups["fiducial"].redundancy == pytest.approx(4 * 10 - 4 * 6 - 10 + 6, abs=0.1)
+    else:
+        assert len(result.singular) == 6
