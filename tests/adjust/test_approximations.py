@@ -338,13 +338,28 @@ def subset(observations: Observations, rows: Sequence[int]) -> Observations:
 
 def test_heights_alone_and_two_points_orient_vertical_frames() -> None:
     truth = simulated(field(20.0, n=60), VERTICAL)
-    points = tuple(
-        p if p.id in {"t3", "t7"} else ObjectPoint(p.id, None, None, Prior(p.Z.value, 0.02))
-        for p in truth.network.points
-        if p.Z is not None
-    )
-    found = approximate(replace(truth.network, points=points))
+    found = approximate(heights_only(truth.network, planimetry={"t3", "t7"}))
     assert_near(found, truth, meters=120.0, radians=0.08)
+
+
+def test_heights_alone_orient_vertical_frames_to_a_scale() -> None:
+    truth = simulated(field(0.0, n=60), VERTICAL)
+    found = approximate(heights_only(truth.network, planimetry=set()))
+    stations = np.array([found.exterior[image][:3] for image in truth.centers])
+    expected = np.array(list(truth.centers.values()))
+    scale = stations[:, 2].mean() / expected[:, 2].mean()
+    bases, expected_bases = (np.linalg.norm(each[1:] - each[0], axis=1) for each in (stations, expected))
+    np.testing.assert_allclose(bases / scale, expected_bases, atol=120.0)
+    np.testing.assert_allclose(stations[:, 2] / scale, expected[:, 2], atol=120.0)
+
+
+def heights_only(network: Network, planimetry: set[str]) -> Network:
+    """Every point with its height alone, known to 2 cm, but for the points named."""
+    points = (
+        p if p.id in planimetry or p.Z is None else ObjectPoint(p.id, None, None, Prior(p.Z.value, 0.02))
+        for p in network.points
+    )
+    return replace(network, points=tuple(points))
 
 
 @pytest.mark.parametrize(
