@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from simulated import Truth, field_points, simulated
 
 from adjust.adjustment import Options, adjust
-from adjust.network import Network, ObservationKind, Observations
+from adjust.network import Camera, Exterior, Fiducial, Network, ObservationKind, Observations, Prior
 from adjust.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -236,3 +236,65 @@ def test_two_cameras_are_adjusted_together() -> None:
     assert result.value("IO.K.c") == pytest.approx(153.0, abs=1e-6)
     assert result.value("IO.W.c") == pytest.approx(90.0, abs=1e-6)
     assert result.value("IO.W.x0") == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_an_affine_on_three_marks_has_no_check() -> None:
+    """Its residuals are 0 because they must be: the redundancy says so, and neither sigma0 nor w pretend otherwise."""
+    truth = Truth()
+    network, start = simulated(np.random.default_rng(10), truth, points=np.zeros((0, 3)))
+    camera = network.cameras[0]
+    marks = {
+        id_: Fiducial(Prior(m.x_mm.value), Prior(m.y_mm.value)) for id_, m in camera.fiducials.items() if id_ in "123"
+    }
+    known = Camera("K", Prior(truth.c), Prior(truth.x0), Prior(truth.y0), camera.distortion, marks)
+    rows = network.observations
+    keep = [i for i, point in enumerate(rows.point) if point in marks]
+    three = Observations(
+        tuple(rows.image[i] for i in keep),
+        tuple(rows.point[i] for i in keep),
+        tuple(rows.kind[i] for i in keep),
+        rows.xy_mm[keep],
+        rows.covariance_mm2[keep],
+    )
+    images = tuple(
+        replace(image, exterior=Exterior(np.array([*station, *attitude]), np.zeros(6)))
+        for image, station, attitude in zip(network.images, truth.stations, truth.attitudes, strict=True)
+    )
+    result = adjust(replace(network, cameras=(known,), images=images, observations=three), start)
+    assert result.converged
+    assert result.redundancy == 0
+    assert result.sigma0 == 1.0
+    group = result.groups["fiducial"]
+    assert group.redundancy == pytest.approx(0.0, abs=1e-9)
+    assert group.rms_x_um == pytest.approx(0.0, abs=1e-6)
+    assert group.sigma0 == 0.0
+    assert (result.residuals.w == 0.0).all()
+
+
+def test_names_do_not_matter() -> None:
+    """Renamed with dots, spaces and digits, in another order of the alphabet: the same values and sigmas."""
+    network, start = simulated(np.random.default_rng(11), free={"k3": np.inf})
+    new = {f"f{i}": f"roll 7.frame.{9 - i}.tif" for i in range(4)}
+    points = {point.id: f"P.{20 - int(point.id)}" for point in network.points}
+    rows = network.observations
+    renamed = Network(
+        network.cameras,
+        tuple(replace(image, name=new[image.name]) for image in network.images),
+        tuple(replace(point, id=points[point.id]) for point in network.points),
+        replace(
+            rows,
+            image=tuple(new[name] for name in rows.image),
+            point=tuple(points[p] if kind == "target" else p for p, kind in zip(rows.point, rows.kind, strict=True)),
+        ),
+    )
+    other_start = replace(
+        start,
+        exterior={new[name]: values for name, values in start.exterior.items()},
+        transformation={new[name]: values for name, values in start.transformation.items()},
+        points={points[name]: values for name, values in start.points.items()},
+    )
+    plain, other = adjust(network, start), adjust(renamed, other_start)
+    assert other.value("EO.roll 7.frame.8.tif.Z0") == pytest.approx(plain.value("EO.f1.Z0"), rel=1e-12)
+    assert other.sigma("EO.roll 7.frame.8.tif.Z0") == pytest.approx(plain.sigma("EO.f1.Z0"), rel=1e-9)
+    assert other.value("PT.P.17.X") == plain.value("PT.3.X")
+    assert other.vpv == pytest.approx(plain.vpv, rel=1e-12)
