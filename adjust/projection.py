@@ -121,7 +121,7 @@ def camera_from_ray(distortion: Distortion, interior: Array, parameters: Array, 
             at = image_equations(distortion, interior, parameters, xy_mm, ray)
             step, regular = _solved(at.by_xy, at.value)
             xy_mm = xy_mm - step
-            found = regular & (np.abs(step).max(axis=1) <= 4 * tolerance_mm)
+            found = regular & _unfolded(at.by_ray) & (np.abs(step).max(axis=1) <= 4 * tolerance_mm)
             if found.all():
                 break
     return xy_mm, found
@@ -140,6 +140,12 @@ def ideal_from_observed(distortion: Distortion, interior: Array, parameters: Arr
             if found.all():
                 break
     return interior[1:] + interior[0] * ray, found
+
+
+def _unfolded(by_ray: Array) -> Mask:
+    """Which rays (n,) have neighbours that are imaged on the right side of them."""
+    determinant = np.asarray(np.linalg.det(by_ray))
+    return np.asarray(np.isfinite(determinant) & (determinant > 0.0))
 
 
 def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:

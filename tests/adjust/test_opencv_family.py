@@ -153,6 +153,11 @@ def test_what_has_no_image_is_told() -> None:
     parameters = np.array([4e-5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # x - k3 x³ turns back at 91 mm
     _, found = camera_from_ray(fold, np.array([100.0, 0.0, 0.0]), parameters, np.array([[0.3, 0.0], [2.0, 0.0]]))
     assert list(found) == [True, False]
+    barrel = np.array([-0.3] + [0.0] * 12)  # OpenCV's k1: the image of a ray turns back at a slope of 1.05
+    _, found = camera_from_ray(
+        Distortion("opencv"), np.array([100.0, 0.0, 0.0]), barrel, np.array([[0.9, 0], [1.2, 0]])
+    )
+    assert list(found) == [True, False]
     model = ImageModel(
         Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0), np.eye(3), np.zeros(3), np.array([0.0, 1, 0, 0, 0, 1])
     )
