@@ -116,7 +116,7 @@ def _half_plane(distance: Array, normal_col: Array | float, normal_row: Array | 
     """The share of a unit square on the inner side of a straight edge, whose signed distance from the square's centre
     is positive inwards: the distribution function of a sum of two uniform variables, |normal_col| and |normal_row|
     wide."""
-    wide = np.maximum(normal_col, normal_row) / 2
+    wide = np.maximum(np.maximum(normal_col, normal_row) / 2, 1e-6)
     narrow = np.maximum(np.minimum(normal_col, normal_row) / 2, 1e-6)
 
     def ramp(shift: Array) -> Array:

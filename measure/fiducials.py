@@ -174,6 +174,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame) -> MarkMeasurement:
         "blur_px": fit.blur_px,
         "damaged_fraction": fit.damaged_fraction,
         "likeness": fit.likeness,
+        "significance": fit.significance,
         "redundancy": float(fit.redundancy),
         "neighbour_correlation": fit.neighbour_correlation,
     }

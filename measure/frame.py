@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well...
-_FAINT_LIKENESS = 0.2  # ...unless this many others say within a few pixels where it must be
+_FAINT_LIKENESS = 0.25  # ...unless this many others say within a few pixels where it must be
+_LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
 _MANY = 8
 _CLEAR_LIKENESS = 0.5
 _CLEAR_SNR = 3.0
@@ -51,10 +52,12 @@ class Frame:
 
     @property
     def accepted(self) -> bool:
-        """Whether enough marks agree for the frame not to be chance: three, and three in ten of those in the scan."""
+        """Whether enough marks agree for the frame not to be chance: three, and three in ten of those in the scan, and
+        three of them clear ones."""
         inside = sum(sighting.inside for sighting in self.sightings)
-        needed = max(min(3, len(self.sightings)), 2, int(np.ceil(0.3 * inside)))
-        return int(self.belongs.sum()) >= needed
+        least = max(min(3, len(self.sightings)), 2)
+        clear = sum(fit is not None and fit.likeness >= _CLEAR_LIKENESS for fit in self.fits)
+        return int(self.belongs.sum()) >= max(least, int(np.ceil(0.3 * inside))) and clear >= least
 
     def misfit(self) -> str:
         """A sentence for a frame that is not accepted."""
@@ -159,10 +162,9 @@ class _Sighter:
         self.match = replace(self.match, blur_px=float(np.median(blurs)), estimate_blur=False, linear_sigma=0.01)
 
     def clear(self, index: int) -> bool:
-        """Whether a mark needs no second look."""
+        """Whether a mark needs no second look: it is plainly there, be it where the others put it or not."""
         sighting = self.sightings[index]
-        fit = sighting.fit if sighting else None
-        return bool(self.belongs[index]) and fit is not None and fit.likeness >= _CLEAR_LIKENESS
+        return sighting is not None and sighting.fit is not None and sighting.fit.likeness >= _CLEAR_LIKENESS
 
     def second_search_px(self) -> float:
         """How far a mark can be from where the others put it: the gate, less where many others agree better."""
@@ -188,7 +190,8 @@ class _Sighter:
         mark = self.layout.marks[index].mark
         sighting = sight(self.scan, mark, pixel_from_mark, search_px, self._sign(mark), weights, self.match)
         least = _FAINT_LIKENESS if self.belongs.sum() >= _MANY else _LEAST_LIKENESS
-        if sighting.fit is not None and sighting.fit.likeness < least:
+        fit = sighting.fit
+        if fit is not None and (fit.likeness < least or fit.significance < _LEAST_SIGNIFICANCE):
             reason = f"nothing within {search_px:.0f} px of its place looks like it"
             return Sighting(sighting.predicted_px, True, None, reason)
         return sighting

@@ -87,6 +87,7 @@ class Match:
     one pixel. damaged_fraction: share of the pixels about the mark that were cut out. redundancy: pixels used less
     unknowns. neighbour_correlation: of the residuals; they were taken as white where covariance_is_white. likeness:
     correlation of the fitted picture with the window, less its plane background: 1 for a perfect mark, 0 for none.
+    significance: the contrast over its own standard deviation.
     """
 
     converged: bool
@@ -102,6 +103,7 @@ class Match:
     neighbour_correlation: float
     covariance_is_white: bool
     likeness: float
+    significance: float
     residuals_dn: Array
 
     @property
@@ -213,7 +215,7 @@ class _Fit:
     def result(self) -> Match:
         """The match in the window's own pixels."""
         noise = noise_model(self.residuals, self.used, len(self.design))
-        covariance = np.full((2, 2), np.inf)
+        covariance, gain_sigma = np.full((2, 2), np.inf), np.inf
         if not self.reason:
             masked = self.design * self.used
             normal = _normal(masked, masked) + np.diag(self._prior_weights() * max(noise.variance_dn2, 1e-12))
@@ -223,6 +225,7 @@ class _Fit:
             inverse = np.linalg.inv(normal)
             full = inverse @ middle @ inverse
             covariance = (full[:2, :2] + full[:2, :2].T) / 2
+            gain_sigma = float(np.sqrt(max(full[-_GREY, -_GREY], 1e-12)))
             if not np.all(np.linalg.eigvalsh(covariance) > 0):
                 covariance = (inverse * noise.variance_dn2)[:2, :2]
         return Match(
@@ -239,6 +242,7 @@ class _Fit:
             neighbour_correlation=noise.neighbour_correlation,
             covariance_is_white=noise.is_white,
             likeness=self._likeness(),
+            significance=abs(float(self.grey_parameters[0])) / gain_sigma,
             residuals_dn=np.where(self.area, self.residuals, np.nan),
         )
 

@@ -1,0 +1,98 @@
+"""The coverage of drawn marks against brute force and against areas and centroids known in closed form."""
+
+import numpy as np
+import pytest
+from brute_marks import Array, brute_picture, placed
+
+from measure.coverage import coverage
+from measure.rendering import picture, render
+from measure.shapes import Disk, MarkShape, MarkTemplate, Part, cross, dot, polygon, ring_cross, ring_dot
+
+SHEARED = np.array([[8.1, 0.9, 20.3], [-0.4, -8.6, 19.7]])
+MARKS = {
+    "cross": cross(1.5, 0.15),
+    "open diagonal cross": cross(1.5, 0.15, 0.3, 45.0),
+    "dot": dot(0.6),
+    "small dot": dot(0.15),
+    "ring-cross": ring_cross(1.0, 0.15, 1.7, 0.1, 0.2),
+    "ring-dot": ring_dot(1.0, 0.15, 0.3),
+    "notch": polygon([(-1, -1), (1.2, -0.8), (0.1, 0.2), (0.3, 1.5)]),
+}
+
+
+@pytest.mark.parametrize("name", MARKS)
+def test_coverage_equals_brute_force(name: str) -> None:
+    mark = MarkShape(MARKS[name])
+    exact, brute = coverage(mark, SHEARED, 41, 41), brute_picture(mark, SHEARED, 41, 41, 0.0)
+    assert np.abs(exact - brute).max() < 0.02  # half a line of its points
+    assert np.abs(_centroid(exact) - _centroid(brute)).max() < 0.002  # its points are 0.03 px apart
+    assert exact.sum() == pytest.approx(brute.sum(), rel=0.01)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.17, 0.5, 0.83])
+def test_a_blurred_disks_centroid_and_area_are_exact(phase: float) -> None:
+    """Blurred, for pixels alias the centroid of a sharp one."""
+    shown = picture(MarkShape(dot(0.5)), placed(10.0, (15 + phase, 14 - phase)), 31, 31, 0.8)
+    np.testing.assert_allclose(_centroid(shown), [15 + phase, 14 - phase], atol=0.001)
+    assert shown.sum() == pytest.approx(np.pi * 25, rel=5e-4)
+
+
+def test_a_polygons_area_is_exact() -> None:
+    triangle = MarkShape(polygon([(0.0, 0.0), (1.1, 0.2), (0.3, 0.9)]))
+    area_mm2 = 0.5 * (1.1 * 0.9 - 0.2 * 0.3)
+    shown = coverage(triangle, SHEARED, 41, 41)
+    assert shown.sum() == pytest.approx(area_mm2 * abs(np.linalg.det(SHEARED[:, :2])), rel=1e-6)
+
+
+def test_overlapping_parts_count_once() -> None:
+    twice: tuple[Part, ...] = (*dot(0.5), Disk((0.0, 0.0), 0.5))
+    once = coverage(MarkShape(dot(0.5)), SHEARED, 41, 41)
+    both = coverage(MarkShape(twice), SHEARED, 41, 41)
+    inside = once > 0.999
+    np.testing.assert_allclose(both[inside], once[inside], atol=1e-3)
+    assert both.max() <= 1.0
+
+
+def test_y_points_up_in_the_mark_and_down_in_the_picture() -> None:
+    above = MarkShape((Disk((0.0, 1.0), 0.2),))
+    assert _centroid(coverage(above, placed(10.0, (20.0, 20.0)), 41, 41))[1] == pytest.approx(10.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("blur_px", [0.4, 0.8, 1.7])
+def test_the_blurred_picture_equals_brute_force(blur_px: float) -> None:
+    mark = MarkShape(MARKS["ring-cross"])
+    brute = brute_picture(mark, SHEARED, 41, 41, blur_px)
+    np.testing.assert_allclose(picture(mark, SHEARED, 41, 41, blur_px), brute, atol=0.006)
+
+
+def test_derivatives_are_those_of_the_picture() -> None:
+    mark, blur_px, step = MarkShape(MARKS["ring-cross"]), 1.0, 0.02
+    shown = render(mark, SHEARED, 41, 41, blur_px)
+    for axis, cell_values in enumerate((shown.by_col, shown.by_row)):
+        ahead, behind = SHEARED.copy(), SHEARED.copy()
+        ahead[axis, 2] += step
+        behind[axis, 2] -= step
+        change = picture(mark, ahead, 41, 41, blur_px) - picture(mark, behind, 41, 41, blur_px)
+        np.testing.assert_allclose(-shown.pixels(cell_values), change / (2 * step), atol=0.02)
+    wider = picture(mark, SHEARED, 41, 41, np.sqrt(blur_px**2 + 0.02))
+    sharper = picture(mark, SHEARED, 41, 41, np.sqrt(blur_px**2 - 0.02))
+    np.testing.assert_allclose(shown.pixels(shown.laplacian) / 2, (wider - sharper) / 0.04, atol=0.02)
+
+
+def test_a_chip_is_shown_at_its_own_pixels_unchanged() -> None:
+    chip = np.random.default_rng(1).normal(100, 10, (21, 25))
+    template = MarkTemplate(chip, 50.0, (12.0, 10.0))
+    shown = picture(template, placed(20.0, (12.0, 10.0)), 25, 21, 0.001)
+    np.testing.assert_allclose(shown, chip, atol=1e-3)
+
+
+def test_a_turned_chip_turns_counter_clockwise() -> None:
+    chip = np.zeros((21, 21))
+    chip[10, 16] = 1.0  # right of the origin
+    shown = picture(MarkTemplate(chip, 50.0, (10.0, 10.0), turn_deg=90.0), placed(20.0, (10.0, 10.0)), 21, 21, 0.001)
+    assert divmod(int(shown.argmax()), 21) == (4, 10)  # above it
+
+
+def _centroid(shown: Array) -> Array:
+    row, col = np.mgrid[: shown.shape[0], : shown.shape[1]]
+    return np.asarray(np.array([(shown * col).sum(), (shown * row).sum()]) / shown.sum())

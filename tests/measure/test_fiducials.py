@@ -1,0 +1,234 @@
+"""Fiducial marks of whole frames drawn by brute force: the right names in every pose, and honest words where not."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from brute_marks import Array, brute_picture, scan_of
+from scipy.ndimage import gaussian_filter
+
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.poses import POSES
+from measure.results import FrameMeasurement
+from measure.shapes import Disk, FiducialLayout, LayoutMark, Mark, MarkShape, Part, cross, ring_cross
+from measure.status import Status
+
+PITCH_UM, PX_PER_MM = 50.0, 20.0
+FRAME_PX = 520
+CORNERS = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))
+RING_CROSS = ring_cross(0.5, 0.1, 0.8, 0.1)
+NOISE_DN = 200.0
+
+
+def layout_of(marks: Sequence[MarkShape], places: Sequence[tuple[float, float]] = CORNERS) -> FiducialLayout:
+    given = [
+        LayoutMark(str(index + 1), place, (0.01, 0.01), mark)
+        for index, (mark, place) in enumerate(zip(marks, places, strict=True))
+    ]
+    return FiducialLayout(tuple(given), (23.0, 23.0))
+
+
+def numbered(count: int) -> MarkShape:
+    """A ring-cross with so many identification dots to its right and above it."""
+    dots: tuple[Part, ...] = tuple(Disk((1.0, 0.3 * k - 0.3), 0.08) for k in range(count))
+    return MarkShape((*RING_CROSS, *dots))
+
+
+NUMBERED = layout_of([numbered(count) for count in range(4)])
+ALIKE = layout_of([MarkShape(RING_CROSS)] * 4)
+
+
+def pixel_from_camera(pose: str, turn_rad: float = 0.008, center: tuple[float, float] = (262.3, 257.6)) -> Array:
+    """By the definition of a pose: mirror x', then turn counter-clockwise, then look at it with rows downwards."""
+    angle = np.deg2rad(float(pose.rstrip("m"))) + turn_rad
+    c, s = np.cos(angle), np.sin(angle)
+    right, up = np.array([c, -s]), np.array([s, c])
+    if pose.endswith("m"):
+        right, up = right * (-1, 1), up * (-1, 1)
+    return np.column_stack([PX_PER_MM * np.stack([right, -up]), center])
+
+
+def frame_picture(layout: FiducialLayout, matrix: Array, seed: int = 1, size: int = FRAME_PX) -> Array:
+    """A textured, exposed frame with light marks on its dark corners."""
+    rng = np.random.default_rng(seed)
+    grey = 8000 + 2500 * gaussian_filter(rng.normal(0, 1, (size, size)), 2.0) / 0.14
+    for mark in layout.marks:
+        col, row = np.rint(matrix @ (*mark.xy_mm, 1.0)).astype(int)
+        top, left, bottom, right = (int(np.clip(v, 0, size)) for v in (row - 40, col - 40, row + 41, col + 41))
+        grey[top:bottom, left:right] = 3000
+        paint(grey, mark.mark, mark.xy_mm, matrix, 9000.0)
+    return np.asarray(grey + rng.normal(0, NOISE_DN, grey.shape))
+
+
+def paint(grey: Array, mark: Mark, xy_mm: tuple[float, float], matrix: Array, contrast: float) -> None:
+    assert isinstance(mark, MarkShape)
+    center = matrix @ (*xy_mm, 1.0)
+    col0, row0 = np.rint(center).astype(int) - 30
+    place = np.column_stack([matrix[:, :2], center - (col0, row0)])
+    shown = brute_picture(mark, place, 61, 61, 0.8)
+    rows, cols = np.mgrid[row0 : row0 + 61, col0 : col0 + 61]
+    inside = (rows >= 0) & (cols >= 0) & (rows < grey.shape[0]) & (cols < grey.shape[1])
+    grey[rows[inside], cols[inside]] += contrast * shown[inside]
+
+
+def measured(
+    grey: Array, layout: FiducialLayout, folder: Path, options: FiducialOptions | None = None, pitch: bool = True
+) -> FrameMeasurement:
+    with scan_of(grey, folder) as scan:
+        result = measure_fiducials(scan, layout, (PITCH_UM, PITCH_UM) if pitch else None, options)
+    assert [mark.point for mark in result.marks] == [mark.id for mark in layout.marks]
+    return result
+
+
+def assert_right(result: FrameMeasurement, layout: FiducialLayout, matrix: Array) -> None:
+    """All marks measured, with the right names, within their standard deviations."""
+    for mark, given in zip(result.marks, layout.marks, strict=True):
+        assert mark.status is Status.MEASURED, mark.reason
+        assert mark.center_px is not None
+        assert mark.covariance_px2 is not None
+        error = mark.center_px - matrix @ (*given.xy_mm, 1.0)
+        assert error @ np.linalg.solve(mark.covariance_px2, error) < 20
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_identification_dots_decide_each_of_eight_poses(pose: str, tmp_path: Path) -> None:
+    matrix = pixel_from_camera(pose)
+    result = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path)
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided) == (pose, True), result.pose.evidence
+    assert_right(result, NUMBERED, matrix)
+    assert result.pixel_from_camera is not None
+    np.testing.assert_allclose(result.pixel_from_camera, matrix, atol=0.02)
+    assert result.problems == ()
+
+
+def test_like_marks_leave_the_pose_assumed_and_say_so(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("0")
+    result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path)
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided) == ("0", False)
+    assert "alike" in result.pose.evidence[0]
+    assert any("pose assumed" in problem for problem in result.problems)
+    assert_right(result, ALIKE, matrix)
+
+
+def test_the_users_pose_is_taken(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("270m")
+    result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, FiducialOptions(pose="270m"))
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided, result.pose.evidence) == ("270m", True, ("set in the project",))
+    assert_right(result, ALIKE, matrix)
+
+
+def test_marks_places_decide_where_they_are_not_symmetric(tmp_path: Path) -> None:
+    uneven = layout_of([MarkShape(RING_CROSS)] * 4, ((10.0, -10.0), (-10.0, -10.0), (-10.0, 9.0), (9.5, 10.0)))
+    matrix = pixel_from_camera("90")
+    result = measured(frame_picture(uneven, matrix), uneven, tmp_path)
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided) == ("90", True), result.pose.evidence
+    assert_right(result, uneven, matrix)
+
+
+def test_dark_marks_and_an_unknown_pitch(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("0")
+    negative = 20000 - frame_picture(NUMBERED, matrix)
+    result = measured(negative, NUMBERED, tmp_path, pitch=False)
+    assert result.pose is not None
+    assert result.pose.name == "0"
+    assert_right(result, NUMBERED, matrix)
+
+
+def test_zero_marks_give_no_silent_identity(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    for grey in (np.full((300, 300), 700.0), 8000 + rng.normal(0, 2000, (400, 400))):
+        result = measured(grey, ALIKE, tmp_path)
+        assert result.pixel_from_camera is None
+        assert {mark.status for mark in result.marks} == {Status.ABSENT}
+        assert all(mark.center_px is None and mark.reason for mark in result.marks)
+        assert "no fiducial was measured" in result.problems[0]
+
+
+def test_a_scan_of_another_camera_is_refused_with_a_count(tmp_path: Path) -> None:
+    smaller = layout_of([MarkShape(RING_CROSS)] * 4, ((8.0, -8.0), (-8.0, -8.5), (-7.0, 8.0), (8.3, 8.0)))
+    result = measured(frame_picture(smaller, pixel_from_camera("0")), ALIKE, tmp_path)
+    assert result.pixel_from_camera is None
+    assert not any(mark.status.is_observation for mark in result.marks)
+    assert "does not fit: only" in result.problems[0]
+
+
+def test_predicted_marks_are_not_written_as_measured(tmp_path: Path) -> None:
+    """And an affine on three marks is not printed as good."""
+    matrix = pixel_from_camera("0")
+    grey = frame_picture(ALIKE, matrix)
+    col, row = np.rint(matrix @ (-10.0, 10.0, 1.0)).astype(int)
+    rng = np.random.default_rng(3)
+    grey[row - 30 : row + 31, col - 30 : col + 31] = 3000 + rng.normal(0, NOISE_DN, (61, 61))
+    result = measured(grey, ALIKE, tmp_path)
+    covered = result.marks[2]
+    assert covered.status is Status.PREDICTED
+    assert covered.reason
+    assert covered.covariance_px2 is None
+    assert covered.center_px is not None
+    np.testing.assert_allclose(covered.center_px, matrix @ (-10.0, 10.0, 1.0), atol=0.3)
+    assert [mark.status.is_observation for mark in result.marks] == [True, True, False, True]
+    assert any("no check" in problem for problem in result.problems)
+
+
+def test_a_mark_beyond_the_edge_is_absent(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("0", center=(262.3, 183.0))
+    result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path)
+    upper = [mark for mark, given in zip(result.marks, ALIKE.marks, strict=True) if given.xy_mm[1] > 0]
+    assert all(not mark.status.is_observation and mark.reason for mark in upper)
+
+
+def test_the_neighbouring_frames_marks_are_not_taken_for_this_frames(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("0", turn_rad=0.0)
+    grey = frame_picture(ALIKE, matrix, size=700)
+    beside = matrix.copy()
+    beside[0, 2] += 25.0 * PX_PER_MM
+    for place in ((-10.0, -10.0), (-10.0, 10.0)):  # its left marks reach into this scan, brighter than our own
+        paint(grey, MarkShape(RING_CROSS), place, beside, 14000.0)
+    result = measured(grey, ALIKE, tmp_path)
+    assert_right(result, ALIKE, matrix)
+
+
+def test_a_mark_off_the_constellation_is_rejected_with_its_distance(tmp_path: Path) -> None:
+    places = (*CORNERS, (0.0, -10.0), (0.0, 10.0))
+    marks = [MarkShape(RING_CROSS)] * 6
+    given = layout_of(marks, places)
+    moved = layout_of(marks, (*places[:5], (0.55, 10.0)))
+    matrix = pixel_from_camera("0")
+    result = measured(frame_picture(moved, matrix), given, tmp_path)
+    assert [mark.status for mark in result.marks[:5]] == [Status.MEASURED] * 5
+    assert result.marks[5].status in (Status.REJECTED, Status.PREDICTED)
+    assert result.marks[5].reason
+
+
+def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> None:
+    mark = MarkShape(cross(0.5, 0.1), "dark")
+    index = range(-2, 3)
+    lattice = FiducialLayout(
+        tuple(LayoutMark(f"{i},{j}", (5.0 * i, 5.0 * j), (0.005, 0.005), mark) for j in index for i in index),
+        (24.0, 24.0),
+    )
+    matrix = pixel_from_camera("0", turn_rad=0.004)
+    rng = np.random.default_rng(9)
+    grey = 12000 + 1200 * gaussian_filter(rng.normal(0, 1, (FRAME_PX, FRAME_PX)), 3.0) / 0.094
+    dark = {"-2,2", "0,1", "1,1", "2,-2"}
+    for given in lattice.marks:
+        if given.id not in dark:
+            paint(grey, mark, given.xy_mm, matrix, -6000.0)
+    result = measured(grey + rng.normal(0, NOISE_DN, grey.shape), lattice, tmp_path)
+    found = {mark.point for mark in result.marks if mark.status.is_observation}
+    assert found <= {given.id for given in lattice.marks} - dark
+    assert len(found) >= 18
+    for mark_found, given in zip(result.marks, lattice.marks, strict=True):
+        if mark_found.point in found and mark_found.center_px is not None:
+            assert np.abs(mark_found.center_px - matrix @ (*given.xy_mm, 1.0)).max() < 0.5
+
+
+def test_a_pose_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="auto or one of 0, 90"):
+        FiducialOptions(pose="45")

@@ -1,0 +1,257 @@
+"""Least-squares matching against marks drawn by brute force: at the bound, with honest standard deviations."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from brute_marks import Array, brute_picture, placed
+from scipy.ndimage import gaussian_filter
+
+from measure.matching import Match, MatchOptions, match
+from measure.shapes import Mark, MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
+
+SIZE, SCALE, CONTRAST, GROUND = 41, 10.0, 500.0, 1000.0
+MARKS = {
+    "cross": MarkShape(cross(1.5, 0.15)),
+    "ring-cross": MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15, angle_deg=45.0)),
+    "ring-dot": MarkShape(ring_dot(1.0, 0.15, 0.25)),
+    "dot": MarkShape(dot(0.5)),
+}
+PHASES = 6
+
+
+@cache
+def drawn(name: str, blur_px: float) -> tuple[tuple[Array, Array], ...]:
+    """Noise-free windows of a mark at several phases, slightly turned and scaled, with the places of the mark.
+
+    Turned, for an upright edge falls between the rows of points that brute force asks.
+    """
+    rng = np.random.default_rng(3)
+    result = []
+    for _ in range(PHASES):
+        center = tuple((SIZE - 1) / 2 + rng.uniform(-0.5, 0.5, 2))
+        place = placed(SCALE * (1 + rng.normal(0, 0.004)), (center[0], center[1]), rng.uniform(0.02, 0.05))
+        result.append((brute_picture(MARKS[name], place, SIZE, SIZE, blur_px), place))
+    return tuple(result)
+
+
+def measured(
+    grey: Array, mark: Mark, place: Array, rng: np.random.Generator, options: MatchOptions | None = None
+) -> Match:
+    """The match from a start that is off by up to 0.7 px, with the drawn size and no turn."""
+    start = placed(SCALE, tuple(place[:, 2] + rng.uniform(-0.7, 0.7, 2)))
+    return match(grey, (0, 0), mark, start, options)
+
+
+def errors_and_sigmas(name: str, blur_px: float, snr: float, count: int) -> tuple[Array, Array, list[Match]]:
+    rng = np.random.default_rng(5)
+    errors, sigmas, fits = [], [], []
+    for index in range(count):
+        shown, place = drawn(name, blur_px)[index % PHASES]
+        grey = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / snr, shown.shape)
+        fit = measured(grey, MARKS[name], place, rng)
+        assert fit.converged, fit.reason
+        errors.append(fit.center_px - place[:, 2])
+        sigmas.append(np.sqrt(np.diag(fit.covariance_px2)))
+        fits.append(fit)
+    return np.array(errors), np.array(sigmas), fits
+
+
+@pytest.mark.parametrize(("name", "blur_px"), [("cross", 0.7), ("ring-cross", 1.0), ("ring-dot", 1.0), ("dot", 0.8)])
+def test_sigmas_are_those_of_the_errors(name: str, blur_px: float) -> None:
+    errors, sigmas, _ = errors_and_sigmas(name, blur_px, 25.0, 90)
+    ratio = np.sqrt(np.mean((errors / sigmas) ** 2))
+    assert 0.88 < ratio < 1.13  # 180 numbers: 5.3 % standard deviation
+    assert np.abs(errors.mean(axis=0)).max() < 4 * sigmas.mean() / np.sqrt(len(errors))
+
+
+def test_errors_are_at_the_cramer_rao_bound() -> None:
+    name, blur_px, snr = "ring-cross", 1.0, 25.0
+    errors, sigmas, _ = errors_and_sigmas(name, blur_px, snr, 120)
+    bound = bound_px(MARKS[name], drawn(name, blur_px)[0][1], blur_px, snr)
+    assert np.sqrt(np.mean(errors**2)) < 1.12 * bound
+    assert sigmas.mean() == pytest.approx(bound, rel=0.04)
+
+
+def bound_px(mark: MarkShape, place: Array, blur_px: float, snr: float) -> float:
+    """The Cramér-Rao bound of a coordinate, every nuisance unknown, by differences of brute-force pictures."""
+
+    def shown(shift: tuple[float, float] = (0, 0), turn: float = 0.0, scale: float = 1.0, blur: float = 0.0) -> Array:
+        c, s = np.cos(turn), np.sin(turn)
+        linear = scale * np.array([[c, -s], [s, c]]) @ place[:, :2]
+        return brute_picture(mark, np.column_stack([linear, place[:, 2] + shift]), SIZE, SIZE, blur_px + blur)
+
+    step = 0.1
+    row, col = np.mgrid[:SIZE, :SIZE] / SIZE
+    columns = [
+        (shown((step, 0)) - shown((-step, 0))) / (2 * step),
+        (shown((0, step)) - shown((0, -step))) / (2 * step),
+        (shown(turn=0.01) - shown(turn=-0.01)) / 0.02,
+        (shown(scale=1.01) - shown(scale=0.99)) / 0.02,
+        (shown(blur=0.05) - shown(blur=-0.05)) / 0.1,
+        shown(),
+        np.ones_like(col),
+        col,
+        row,
+    ]
+    design = np.stack([column.ravel() for column in columns], axis=1) * snr
+    return float(np.sqrt(np.trace(np.linalg.inv(design.T @ design)[:2, :2]) / 2))
+
+
+@pytest.mark.parametrize("name", MARKS)
+@pytest.mark.parametrize("blur_px", [0.6, 1.2])
+def test_clean_marks_are_unbiased_at_every_phase(name: str, blur_px: float) -> None:
+    """Trap: a 0.1 px grid left by sub-pixel refinement, and a half pixel lost in refining."""
+    rng = np.random.default_rng(7)
+    for shown, place in drawn(name, blur_px):
+        fit = measured(GROUND + CONTRAST * shown + rng.normal(0, 0.5, shown.shape), MARKS[name], place, rng)
+        assert np.abs(fit.center_px - place[:, 2]).max() < 0.003
+        assert fit.blur_px == pytest.approx(blur_px, abs=0.03)
+        assert fit.contrast_dn == pytest.approx(CONTRAST, rel=0.03)
+
+
+def test_the_windows_origin_counts() -> None:
+    shown, place = drawn("cross", 1.0)[0]
+    here = match(shown * CONTRAST, (0, 0), MARKS["cross"], placed(SCALE, tuple(place[:, 2])))
+    moved = placed(SCALE, tuple(place[:, 2] + (1000, 2000)))
+    there = match(shown * CONTRAST, (1000, 2000), MARKS["cross"], moved)
+    np.testing.assert_allclose(there.center_px - here.center_px, [1000, 2000], atol=1e-6)
+
+
+@pytest.mark.parametrize("disturbance", ["dark mark", "gradient", "8 bit"])
+def test_disturbances_that_cost_nothing(disturbance: str) -> None:
+    rng = np.random.default_rng(11)
+    ratios = []
+    for index in range(36):
+        shown, place = drawn("ring-cross", 1.0)[index % PHASES]
+        grey = GROUND + CONTRAST * shown + rng.normal(0, 20, shown.shape)
+        if disturbance == "dark mark":
+            grey = 3000 - grey
+        elif disturbance == "gradient":
+            grey = grey + np.linspace(0, 0.7 * CONTRAST, SIZE)[None, :]
+        else:
+            grey = np.rint(grey / 10)
+        fit = measured(grey, MARKS["ring-cross"], place, rng)
+        assert fit.converged, fit.reason
+        assert (fit.contrast_dn < 0) == (disturbance == "dark mark")
+        ratios.append((fit.center_px - place[:, 2]) / np.sqrt(np.diag(fit.covariance_px2)))
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.22
+
+
+def test_dust_is_cut_out() -> None:
+    rng = np.random.default_rng(13)
+    clean, dusty, ratios, fractions = [], [], [], []
+    for index in range(30):
+        shown, place = drawn("ring-cross", 1.0)[index % PHASES]
+        grey = GROUND + CONTRAST * shown + rng.normal(0, 25, shown.shape)
+        clean.append(measured(grey, MARKS["ring-cross"], place, rng).center_px - place[:, 2])
+        for _ in range(3):
+            speck = brute_picture(MarkShape(dot(0.2)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 0.7)
+            grey = grey + 1.5 * CONTRAST * speck
+        fit = measured(grey, MARKS["ring-cross"], place, rng)
+        dusty.append(fit.center_px - place[:, 2])
+        ratios.append(dusty[-1] / np.sqrt(np.diag(fit.covariance_px2)))
+        fractions.append(fit.damaged_fraction)
+    assert np.sqrt(np.mean(np.square(dusty))) < 1.6 * np.sqrt(np.mean(np.square(clean)))
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.35
+    assert 0.02 < np.mean(fractions) < 0.25
+
+
+@pytest.mark.parametrize("grain_px", [0.8, 1.3])
+def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
+    rng = np.random.default_rng(17)
+    ratios, naive = [], []
+    for index in range(60):
+        shown, place = drawn("ring-cross", 1.0)[index % PHASES]
+        grain = gaussian_filter(rng.normal(0, 1, (SIZE, SIZE)), grain_px, mode="wrap")
+        fit = measured(GROUND + CONTRAST * shown + 25 * grain / grain.std(), MARKS["ring-cross"], place, rng)
+        assert fit.converged, fit.reason
+        assert not fit.covariance_is_white
+        error = fit.center_px - place[:, 2]
+        ratios.append(error / np.sqrt(np.diag(fit.covariance_px2)))
+        naive.append(error / bound_of(fit.snr))
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert np.sqrt(np.mean(np.square(naive))) > 1.5  # white noise of that size would be far too hopeful
+
+
+@cache
+def reference_bound() -> float:
+    return bound_px(MARKS["ring-cross"], drawn("ring-cross", 1.0)[0][1], 1.0, 1.0)
+
+
+def bound_of(snr: float) -> float:
+    return reference_bound() / snr
+
+
+def test_a_chip_is_matched_by_the_same_core() -> None:
+    rng = np.random.default_rng(19)
+    mark = MARKS["ring-cross"]
+    chip = brute_picture(mark, placed(SCALE, (20.0, 20.0)), 41, 41, 0.8)
+    template = MarkTemplate(chip, 100.0, (20.0, 20.0))
+    place = placed(SCALE, (27.37, 26.81))
+    shown = brute_picture(mark, place, 55, 55, 0.8)
+    errors = []
+    for _ in range(12):
+        grey = GROUND + CONTRAST * shown + rng.normal(0, 10, shown.shape)
+        options = MatchOptions(freedom="shift", estimate_blur=False)
+        fit = match(grey, (0, 0), template, placed(SCALE, (27.0, 27.0)), options)
+        assert fit.converged, fit.reason
+        errors.append(fit.center_px - place[:, 2])
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.006
+    assert np.sqrt(np.mean(np.square(errors))) < 0.015
+
+
+def test_an_ellipse_takes_five_parameters() -> None:
+    stretched = np.column_stack([np.array([[12.0, 1.5], [-1.5, -9.0]]), (20.3, 19.8)])
+    shown = brute_picture(MarkShape(dot(0.5)), stretched, SIZE, SIZE, 0.8)
+    rng = np.random.default_rng(23)
+    grey = GROUND + CONTRAST * shown + rng.normal(0, 5, shown.shape)
+    fit = match(grey, (0, 0), MARKS["dot"], placed(SCALE, (20.0, 20.0)), MatchOptions(freedom="ellipse"))
+    assert fit.converged, fit.reason
+    assert np.abs(fit.center_px - stretched[:, 2]).max() < 0.01
+    found, true = (m[:, :2] @ m[:, :2].T for m in (fit.pixel_from_mark, stretched))
+    np.testing.assert_allclose(found, true, rtol=0.02, atol=0.7)
+
+
+def test_a_notch_is_matched_by_shift_alone() -> None:
+    mark = MarkShape(polygon([(-1.2, 0.0), (0.0, -1.0), (1.2, 0.0), (1.2, 1.2), (-1.2, 1.2)]))
+    place = placed(SCALE, (20.31, 19.62))
+    grey = GROUND + CONTRAST * brute_picture(mark, place, SIZE, SIZE, 0.8)
+    grey = grey + np.random.default_rng(29).normal(0, 10, grey.shape)
+    fit = match(grey, (0, 0), mark, placed(SCALE, (20.0, 20.0)), MatchOptions(freedom="shift"))
+    assert np.abs(fit.center_px - place[:, 2]).max() < 4 * np.sqrt(fit.covariance_px2.max())
+
+
+def test_nothing_is_not_a_mark() -> None:
+    rng = np.random.default_rng(31)
+    place = placed(SCALE, (20.0, 20.0))
+    flat = match(np.full((SIZE, SIZE), 7.0), (0, 0), MARKS["cross"], place)
+    assert not flat.converged
+    assert flat.reason
+    noise = match(rng.normal(0, 10, (SIZE, SIZE)), (0, 0), MARKS["ring-cross"], place)
+    assert not noise.converged or noise.likeness < 0.35
+    outside = match(np.zeros((SIZE, SIZE)), (500, 500), MARKS["cross"], place)
+    assert "outside" in outside.reason
+
+
+def test_half_of_a_mark_outside_of_the_scan_is_said() -> None:
+    shown, place = drawn("ring-cross", 1.0)[0]
+    valid = np.zeros(shown.shape, dtype=bool)
+    valid[:, 24:] = True
+    fit = match(shown, (0, 0), MARKS["ring-cross"], place, valid=valid)
+    assert "outside of the scan" in fit.reason
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: MatchOptions(blur_px=0.0),
+        lambda: MatchOptions(margin_px=-1.0),
+        lambda: MatchOptions(linear_sigma=float("nan")),
+        lambda: MatchOptions(damage_rounds=-1),
+    ],
+)
+def test_bad_options_are_refused(make: Callable[[], MatchOptions]) -> None:
+    with pytest.raises(ValueError, match="is right"):
+        make()
