@@ -1,0 +1,83 @@
+"""The search for the frame's place, on responses made up point by point."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.candidates import Responses, peaks
+from measure.constellation import Bounds, Placement, placements, same_picture
+from measure.poses import POSES, up_from_camera
+from measure.shapes import LayoutMark, MarkShape, dot
+
+DOT = MarkShape(dot(0.3), "light")
+PLACES = ((100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0), (0.0, -103.0), (0.0, 95.0))
+MARKS = [LayoutMark(str(index), place, (0.01, 0.01), DOT) for index, place in enumerate(PLACES)]
+BOUNDS = Bounds(0.04, 0.1, 0.6)
+PITCH_MM = 0.5
+
+
+def responses(places_px: NDArray[np.float64], heights: NDArray[np.float64], seed: int = 1) -> Responses:
+    """A faint noisy map with peaks two pixels wide."""
+    rng = np.random.default_rng(seed)
+    light = rng.normal(0, 0.06, (520, 540)).astype(np.float32)
+    for (col, row), height in zip(np.rint(places_px).astype(int), heights, strict=True):
+        light[row - 1 : row + 2, col - 1 : col + 2] = 0.6 * height
+        light[row, col] = height
+    return Responses((light,), (-light,), 1)
+
+
+def seen(pose: str, scale: float = 1.015, angle: float = 0.03) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    up = np.array(PLACES) @ (scale * np.array([[c, -s], [s, c]]) @ up_from_camera(pose)).T
+    return np.asarray(up * (1, -1) / PITCH_MM + (265.0, 255.0))
+
+
+def predicted(placement: Placement) -> NDArray[np.float64]:
+    return np.asarray(np.array(PLACES) @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2])
+
+
+def test_the_place_is_found_among_brighter_false_answers() -> None:
+    """Text, dials and trees answer more strongly than the marks; only the marks answer together."""
+    rng = np.random.default_rng(3)
+    for pose in POSES:
+        true = seen(pose)
+        false = rng.uniform(20, 500, (40, 2))
+        places = np.concatenate([true, false])
+        heights = np.concatenate([np.full(6, 0.6), rng.uniform(0.5, 0.9, 40)])
+        found = placements(MARKS, pose, responses(places, heights), [0] * 6, (PITCH_MM, PITCH_MM), BOUNDS)
+        assert np.abs(predicted(found[0]) - true).max() < 1.5
+        assert found[0].supported == 6
+
+
+def test_missing_marks_do_not_hinder() -> None:
+    true = seen("0")
+    found = placements(MARKS, "0", responses(true[:4], np.full(4, 0.5)), [0] * 6, (PITCH_MM, PITCH_MM), BOUNDS)
+    assert np.abs(predicted(found[0]) - true).max() < 2.0
+
+
+def test_nothing_that_answers_gives_no_placement() -> None:
+    empty = Responses((np.zeros((300, 300), np.float32),), (np.zeros((300, 300), np.float32),), 1)
+    assert placements(MARKS, "0", empty, [0] * 6, (PITCH_MM, PITCH_MM), BOUNDS) == []
+
+
+def test_peaks_come_in_order_and_apart() -> None:
+    map_ = np.zeros((50, 60), np.float32)
+    for col, row, height in ((10, 20, 0.5), (40, 30, 0.9), (12, 20, 0.4)):
+        map_[row, col] = height
+    places, heights = peaks(map_, 10, 0.1)
+    assert places.tolist() == [[40, 30], [10, 20]]
+    np.testing.assert_allclose(heights, [0.9, 0.5], rtol=1e-6)
+
+
+def test_a_square_looks_alike_in_all_poses_and_six_marks_do_not() -> None:
+    first = ("0", [0] * 4)
+    assert all(same_picture(MARKS[:4], first, (pose, [0] * 4), BOUNDS) for pose in POSES)
+    others = [pose for pose in POSES if not same_picture(MARKS, ("0", [0] * 6), (pose, [0] * 6), BOUNDS)]
+    assert set(others) == set(POSES) - {"0", "0m"}
+
+
+def test_a_posed_placement_keeps_its_place() -> None:
+    placement = Placement("0", np.array([[2.0, 0.1, 50.0], [0.1, -2.0, 60.0]]), 1.0, 4, 1, 1, (0.5, 0.5))
+    turned = placement.posed("90m")
+    assert turned.same_place(placement)
+    center = turned.pixel_from_camera @ (10.0, 0.0, 1.0)
+    np.testing.assert_allclose(center, placement.pixel_from_camera @ (*(up_from_camera("90m") @ (10.0, 0.0)), 1.0))

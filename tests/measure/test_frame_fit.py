@@ -1,0 +1,78 @@
+"""The frame through its marks, and the pose: against closed forms and by simulation."""
+
+import numpy as np
+import pytest
+from brute_marks import Array
+
+from measure.frame_fit import fit_frame, strangers
+from measure.poses import POSES, up_from_camera
+
+SQUARE = np.array([(100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0)])
+EIGHT = np.array([*SQUARE, (100.0, 0.0), (-100.0, 0.0), (0.0, 100.0), (0.0, -100.0)])
+
+
+def seen(camera: Array, turn: Array, scale: float = 1.01, angle: float = 0.02) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.asarray(camera @ (scale * np.array([[c, -s], [s, c]]) @ turn).T + (12.0, -34.0))
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_a_similarity_is_found_without_residuals_in_every_pose(pose: str) -> None:
+    turn = up_from_camera(pose)
+    fit = fit_frame(EIGHT, seen(EIGHT, turn), np.full(8, 0.005), turn)
+    np.testing.assert_allclose(fit.residuals_mm, 0.0, atol=1e-9)
+    assert fit.chi_square == pytest.approx(0.0, abs=1e-9)
+    assert fit.redundancy == 12
+    assert np.sign(np.linalg.det(fit.up_from_camera[:, :2])) == (-1 if pose.endswith("m") else 1)
+
+
+def test_a_pose_mirrors_first_and_then_turns() -> None:
+    np.testing.assert_allclose(up_from_camera("90m") @ (1.0, 0.0), (0.0, -1.0))
+    np.testing.assert_allclose(up_from_camera("90m") @ (0.0, 1.0), (-1.0, 0.0))
+    np.testing.assert_allclose(up_from_camera("90") @ (1.0, 0.0), (0.0, 1.0))
+
+
+def test_halving_a_marks_sigma_changes_its_share_of_the_residual() -> None:
+    """Trap: a weight matrix that is the covariance instead of its inverse."""
+    turn, disturbed = up_from_camera("0"), seen(EIGHT, up_from_camera("0"))
+    disturbed[0] += (0.05, 0.0)
+    sizes = []
+    for sigma in (0.02, 0.01, 0.005):
+        sigmas = np.full(8, 0.01)
+        sigmas[0] = sigma
+        sizes.append(np.hypot(*fit_frame(EIGHT, disturbed, sigmas, turn).residuals_mm[0]))
+    assert sizes[0] > 1.1 * sizes[1] > 1.2 * sizes[2]
+
+
+def test_chi_square_is_that_of_its_redundancy() -> None:
+    rng, turn = np.random.default_rng(2), up_from_camera("0")
+    values = [
+        fit_frame(EIGHT, seen(EIGHT, turn) + rng.normal(0, 0.004, (8, 2)), np.full(8, 0.004), turn) for _ in range(300)
+    ]
+    # Two of the twelve are the affinity's pseudo-observations, here exactly at their expectation.
+    assert np.mean([fit.chi_square for fit in values]) == pytest.approx(10.3, abs=1.2)
+
+
+def test_one_mark_does_not_determine_a_frame() -> None:
+    with pytest.raises(ValueError, match="two or more"):
+        fit_frame(EIGHT[:1], EIGHT[:1], np.ones(1), np.eye(2))
+
+
+def test_the_strangers_are_found_and_no_others() -> None:
+    rng, turn = np.random.default_rng(4), up_from_camera("180")
+    up = seen(EIGHT, turn) + rng.normal(0, 0.005, (8, 2))
+    assert not strangers(EIGHT, up, np.full(8, 0.005), turn, 0.3).any()
+    up[2] += (0.9, -0.4)
+    up[5] += (0.0, 0.6)
+    assert np.flatnonzero(strangers(EIGHT, up, np.full(8, 0.005), turn, 0.3)).tolist() == [2, 5]
+    four = seen(SQUARE, turn)
+    four[1] += (1.5, 0.0)
+    assert np.flatnonzero(strangers(SQUARE, four, np.full(4, 0.005), turn, 0.3)).size == 1
+
+
+def test_with_many_marks_their_own_scatter_is_the_gate() -> None:
+    grid = np.array([(10.0 * i, 10.0 * j) for i in range(-2, 3) for j in range(-2, 3)])
+    rng, turn = np.random.default_rng(6), up_from_camera("0")
+    up = seen(grid, turn) + rng.normal(0, 0.005, grid.shape)
+    up[7] += (0.1, 0.0)  # well inside of the gate, far outside of the others' scatter
+    assert np.flatnonzero(strangers(grid, up, np.full(25, 0.005), turn, 0.3)).tolist() == [7]
