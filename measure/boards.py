@@ -67,7 +67,7 @@ def fit_found(
     if isinstance(spec, ArucoSpec):
         reach = marker_reach_px(found.steps_px, spec)
     else:
-        reach = reach_px(found.steps_px, board_reach_px)
+        reach = reach_px(found.steps_px, board_reach_px, spec)
     half = np.ceil(np.abs(found.steps_px / np.hypot(*found.steps_px)) @ reach).astype(int) + 2
     col0, row0 = np.round(found.center_px).astype(int) - half
     width, height = 2 * half + 1
@@ -78,9 +78,12 @@ def fit_found(
     return FittedCorner(corner, float(np.hypot(*(corner.center_px - found.center_px))))
 
 
-def reach_px(steps_px: Array, board_reach_px: float) -> Array:
-    """(2,) how far along the square's sides grey values are used."""
-    return np.full(2, min(board_reach_px, FARTHEST_REACH * float(np.hypot(*steps_px).min())))
+def reach_px(steps_px: Array, board_reach_px: float, spec: ChessboardSpec | CharucoSpec) -> Array:
+    """(2,) how far along the square's sides grey values are used: not into a marker in one of the squares."""
+    farthest = FARTHEST_REACH
+    if isinstance(spec, CharucoSpec):
+        farthest = (spec.square_mm - spec.marker_mm) / (2 * spec.square_mm)
+    return np.full(2, min(board_reach_px, farthest * float(np.hypot(*steps_px).min())))
 
 
 def common_reach_px(corners: Iterable[FoundCorner]) -> float:

@@ -3,9 +3,9 @@
 The picture of two crossing edges under a Gaussian blur is known in closed form. With s1, s2 the signs of a point's
 distances from the edges it is the mean of s1 s2 over the blur, a bivariate normal integral: by Owen's T function exact
 for any angle between the edges; a single dark or light quarter is the same integral. Unknown are the point, both
-directions, the blur, and the grey values: contrast, offset, gradient and the bend of the tone curve, which widens light
-squares at the cost of dark ones. A crossing looks the same after a half turn whatever the tone curve, so its place does
-not depend on it.
+directions, the blur, and the grey values: contrast, offset, gradient and, of a crossing, the bend of the tone curve,
+which widens light squares at the cost of dark ones. A crossing looks the same after a half turn whatever the tone
+curve, so its place does not depend on it; a quarter's does, by as much as the edges are moved.
 """
 
 from collections.abc import Callable
@@ -25,9 +25,9 @@ PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little
 TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
 MAX_ITERATIONS = 30
-# Plain, then twice robust: the scale of the residuals is taken once before each, so that it settles.
-STAGES_TOLERANCE_PX = (0.05, 0.01, 0.001)
-UNKNOWNS = 10  # point (2), directions (2), blur, contrast, bend, offset, gradient (2)
+# Plain, then thrice robust: the scale of the residuals is taken once before each, so that it settles.
+STAGES_TOLERANCE_PX = (0.05, 0.05, 0.01, 0.001)
+SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +117,12 @@ class _CornerFit:
         self.max_shift_px, self.max_turn_rad = 0.6 * float(reach_px.min()), 0.35
         self.variance = 0.8**2
         self.max_variance = (float(reach_px.min()) / 2) ** 2 + PIXEL_VARIANCE_PX2
-        self.linear = np.zeros(5)  # half the contrast, bend, offset, gradient
+        self.bends = surface is crossing
+        self.linear = np.zeros(5 if self.bends else 4)  # half the contrast, offset, gradient (2), bend
+        self.unknowns = SHAPE_UNKNOWNS + len(self.linear)
         self.scale_dn = 0.0
         self.weights = self._area()
-        self.reason = "" if self.weights.sum() > 2 * UNKNOWNS else "too little of it is inside of the scan"
+        self.reason = "" if self.weights.sum() > 2 * self.unknowns else "too little of it is inside of the scan"
 
     def run(self) -> None:
         """Plain, then robust, until the corner stands still; or a reason why it does not."""
@@ -134,8 +136,8 @@ class _CornerFit:
         design, residuals = self._linearised()
         used = self.weights > 0.05
         covariance, noise = np.full((2, 2), np.inf), float("nan")
-        if used.sum() > UNKNOWNS and not self.reason:
-            model = noise_model(residuals, used, UNKNOWNS)
+        if used.sum() > self.unknowns and not self.reason:
+            model = noise_model(residuals, used, self.unknowns)
             noise = float(np.sqrt(model.variance_dn2))
             weighted = design * self.weights
             inverse = np.linalg.pinv(_products(weighted, design), hermitian=True)
@@ -156,10 +158,9 @@ class _CornerFit:
         for _ in range(MAX_ITERATIONS):
             if self.reason:
                 return
-            self.weights = self._area()
-            if np.isfinite(self.scale_dn):
-                relative = np.clip(np.abs(self._linearised()[1]) / (TUKEY * self.scale_dn), 0.0, 1.0)
-                self.weights = self.weights * (1 - relative**2) ** 2
+            _, residuals = self._linearised()
+            relative = np.clip(np.abs(residuals) / (TUKEY * self.scale_dn), 0.0, 1.0)
+            self.weights = self._area() * (1 - relative**2) ** 2
             if self._step() < tolerance_px:
                 return
         self.reason = self.reason or "the fit does not settle"
@@ -177,14 +178,14 @@ class _CornerFit:
         return max(robust_scale(residuals[self.weights > 0]), SCALE_FLOOR * 2 * abs(float(self.linear[0])), 1e-9)
 
     def _linearised(self) -> tuple[Array, Array]:
-        """(10, height, width) derivatives and (height, width) residuals, at the best grey-value parameters."""
+        """(unknowns, height, width) derivatives and (height, width) residuals, at the best grey-value parameters."""
         dx, dy = self.col - self.center[0], self.row - self.center[1]
         sigma = np.sqrt(self.variance)
         normals = np.stack([np.cos(self.edges), np.sin(self.edges)], axis=-1)
         tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=-1)
         u, v = ((normal[0] * dx + normal[1] * dy) / sigma for normal in normals)
         value, by_u, by_v, by_correlation = self.surface(u, v, float(normals[0] @ normals[1]))
-        grey = np.stack([value, value**2 - 1, np.ones_like(dx), dx, dy])
+        grey = np.stack([value, np.ones_like(dx), dx, dy, *([value**2 - 1] if self.bends else [])])
         self.linear = self._best_linear(grey)
         turning = [
             by * (tangent[0] * dx + tangent[1] * dy) / sigma + by_correlation * (tangent @ other)
@@ -196,7 +197,7 @@ class _CornerFit:
             *turning,
             -(by_u * u + by_v * v) / (2 * self.variance),
         ]
-        slope = self.linear[0] + 2 * self.linear[1] * value
+        slope = self.linear[0] + (2 * self.linear[4] * value if self.bends else 0.0)
         return np.concatenate([slope * np.stack(shape), grey]), self.grey - np.tensordot(self.linear, grey, axes=1)
 
     def _best_linear(self, grey: Array) -> Array:
@@ -213,7 +214,7 @@ class _CornerFit:
         if not np.all(size > 0):
             self.reason = "nothing here shows where the edges meet"
             return 0.0
-        scaled = normal / np.outer(size, size) + 1e-9 * np.eye(UNKNOWNS)
+        scaled = normal / np.outer(size, size) + 1e-9 * np.eye(self.unknowns)
         step = np.linalg.solve(scaled, np.tensordot(weighted, residuals, axes=2) / size) / size
         step /= max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / 0.15, 1.0)
         self.center += step[:2]

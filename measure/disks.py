@@ -17,7 +17,9 @@ SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size can
 SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from the disk
 LEAST_SNR = 4.0
 WEAK_DAMAGE, MOST_DAMAGE = 0.1, 0.35
-WORST_MISFIT = 0.2  # residuals over contrast: texture and stains are no disks
+MOST_BLUR = 0.7  # of the shorter half axis
+WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.2, 0.08  # residuals over contrast: texture and stains are no disks
+SMOOTH = 0.5  # correlation of neighbouring residuals, from which on they are no noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,7 @@ def fit_disk(
         damaged_fraction=fit.damaged_fraction,
         reason="" if fit.converged else fit.reason,
     )
-    return judged(disk)
+    return judged(disk, fit.neighbour_correlation)
 
 
 def inside(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
@@ -98,16 +100,19 @@ def inside(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray
     return np.asarray(in_rows[:, None] & (cols >= 0) & (cols < scan.width_px))
 
 
-def judged(disk: FittedDisk) -> FittedDisk:
-    """The disk with its reason or weakness, where the fit's figures give one."""
+def judged(disk: FittedDisk, residual_correlation: float) -> FittedDisk:
+    """The disk with its reason or weakness, where the fit's figures give one; residuals of a picture of something else
+    are alike in neighbouring pixels."""
     if disk.reason:
         return disk
     reason = weakness = ""
     contrast, (_, shorter) = abs(disk.contrast_dn), disk.half_axes_px
     if not np.all(np.isfinite(disk.covariance_px2)) or contrast < LEAST_SNR * disk.noise_dn:
         reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
-    elif disk.noise_dn > WORST_MISFIT * contrast:
+    elif disk.noise_dn > (WORST_SMOOTH_MISFIT if residual_correlation > SMOOTH else WORST_MISFIT) * contrast:
         reason = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
+    elif disk.blur_px > MOST_BLUR * shorter:
+        reason = f"no disk: its edge is as soft as a spot's, blur {disk.blur_px:.1f} px, half axis {shorter:.1f} px"
     elif disk.damaged_fraction > MOST_DAMAGE:
         reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
     elif shorter < SMALLEST_RADIUS_PX:

@@ -1,0 +1,247 @@
+"""Boards drawn from their specification, and boards photographed by others with a calibration that was published."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from drawn import drawn, scan_of
+from numpy.typing import NDArray
+
+from measure.board_specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
+from measure.boards import BoardMeasurement, measure_board
+from measure.scan import open_scan
+from measure.status import Status
+
+Array = NDArray[np.float64]
+DATA = Path(__file__).parents[2].parent / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.exists(), reason="the photographs are not beside the project")
+WIDTH, HEIGHT = 320, 260
+
+
+def board_from_pixel(turn_deg: float = 7.0, tilt: float = 4e-4) -> Array:
+    """A homography from pixels to mm of the board, y up: about 1 mm a pixel, turned and seen at an angle."""
+    c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
+    back: Array = np.array([[1.0, 0, WIDTH / 2], [0, 1.0, HEIGHT / 2], [0, 0, 1]])
+    tilted = np.array([[1.0, 0, 0], [0, 1.0, 0], [tilt, -tilt / 2, 1]])
+    turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ np.diag([1.0, -1.0, 1.0])
+    return np.asarray(np.linalg.inv(back @ tilted @ turned))
+
+
+def mapped(homography: Array, points: Array) -> Array:
+    """(n, 2) points through a homography."""
+    x, y, w = homography @ np.vstack([points.T, np.ones(len(points))])
+    return np.asarray(np.stack([x / w, y / w], axis=-1))
+
+
+def picture_of(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1) -> Array:
+    """A board whose middle lies on the homography's origin; is_dark says so of board coordinates in mm."""
+    middle = np.mean([point[:2] for point in spec.object_points().values()], axis=0)
+
+    def light(col: Array, row: Array) -> Array:
+        x, y = mapped(homography, np.stack([col.ravel(), row.ravel()], -1)).T + np.asarray(middle)[:, None]
+        return np.asarray(1.0 - is_dark(x, y).reshape(col.shape))
+
+    rng = np.random.default_rng(seed)
+    clean = drawn(light, WIDTH, HEIGHT, 0.8, fineness=6)
+    return 8000 + 30000 * clean + rng.normal(0, 300, clean.shape)
+
+
+def truth_of(spec: BoardSpec, homography: Array) -> dict[str, Array]:
+    points = spec.object_points()
+    flat = np.array([point[:2] for point in points.values()])
+    places = mapped(np.asarray(np.linalg.inv(homography)), np.asarray(flat - flat.mean(axis=0)))
+    return dict(zip(points, places, strict=True))
+
+
+def errors_px(board: BoardMeasurement, truth: dict[str, Array]) -> Array:
+    """(n, 2) of the points that were measured."""
+    seen = [mark for mark in board.marks if mark.status.is_observation]
+    return np.asarray([np.asarray(mark.center_px) - truth[mark.point] for mark in seen], float)
+
+
+def chessboard_dark(spec: ChessboardSpec) -> Any:
+    """Dark is the square whose upper left corner is r0c0, and every other one."""
+
+    def dark(x: Array, y: Array) -> Array:
+        column, row = np.floor(x / spec.square_mm), np.floor((spec.rows - 1) - y / spec.square_mm)
+        inside = (column >= -1) & (column < spec.columns) & (row >= -1) & (row < spec.rows)
+        return np.asarray(inside & ((column + row) % 2 == 0))
+
+    return dark
+
+
+@pytest.mark.parametrize("turn_deg", [4.0, 100.0, 187.0, 275.0])
+def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
+    spec = ChessboardSpec(6, 5, 24.0)
+    homography = board_from_pixel(turn_deg)
+    board = measure_board(scan_of(picture_of(spec, homography, chessboard_dark(spec))), spec)
+    assert board.reason == ""
+    assert all(mark.status is Status.MEASURED for mark in board.marks)
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) == 30
+    assert np.sqrt(np.mean(errors**2)) < 0.012
+
+
+def test_trap_half_a_pixel_lost() -> None:
+    """The mean error of a whole board is a few thousandths of a pixel, at full size and searched at a reduced one."""
+    spec = ChessboardSpec(6, 5, 24.0)
+    homography = board_from_pixel(3.0)
+    picture = picture_of(spec, homography, chessboard_dark(spec))
+    board = measure_board(scan_of(picture), spec)
+    assert np.abs(errors_px(board, truth_of(spec, homography)).mean(axis=0)).max() < 0.006
+    large = np.asarray(np.kron(picture, np.ones((8, 8))), float)
+    board = measure_board(scan_of(large), spec)
+    centers = {mark.point: mark.center_px for mark in board.marks if mark.center_px is not None}
+    errors = np.array([(centers[name] - 3.5) / 8 - place for name, place in truth_of(spec, homography).items()])
+    assert np.abs(errors.mean(axis=0)).max() < 0.01
+
+
+def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_so() -> None:
+    spec = ChessboardSpec(6, 4, 24.0)
+    homography = board_from_pixel(10.0)
+    board = measure_board(scan_of(picture_of(spec, homography, chessboard_dark(spec))), spec)
+    assert "looks the same after a half turn" in board.notes[0]
+    assert np.abs(errors_px(board, truth_of(spec, homography))).max() < 0.05
+
+
+def circles_dark(spec: CircleGridSpec) -> Any:
+    places = np.array([point[:2] for point in spec.object_points().values()])
+
+    def dark(x: Array, y: Array) -> Array:
+        inside = np.zeros(x.shape, bool)
+        for place in places:
+            inside |= (x - place[0]) ** 2 + (y - place[1]) ** 2 < (spec.diameter_mm / 2) ** 2
+        return inside
+
+    return dark
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        CircleGridSpec(6, 5, 30.0, 14.0),
+        CircleGridSpec(9, 7, 16.0, 14.0, asymmetric=True),
+        CircleGridSpec(8, 9, 24.0, 15.0, asymmetric=True, row_spacing_mm=13.9),
+    ],
+)
+def test_circle_grids(spec: CircleGridSpec) -> None:
+    homography = board_from_pixel(tilt=5e-5)
+    board = measure_board(scan_of(picture_of(spec, homography, circles_dark(spec))), spec)
+    assert board.reason == ""
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) == len(spec.places())
+    assert np.abs(errors).max() < 0.06
+
+
+def printed(board: Any, spec: BoardSpec, size_mm: tuple[float, float], corner_mm: Array) -> Any:
+    """Darkness from OpenCV's own drawing of a board, 4 px a mm, whose upper left corner lies at corner_mm."""
+    drawing = board.generateImage((round(size_mm[0] * 4), round(size_mm[1] * 4)), marginSize=0, borderBits=1)
+
+    def dark(x: Array, y: Array) -> Array:
+        col, row = np.floor((x - corner_mm[0]) * 4).astype(int), np.floor((corner_mm[1] - y) * 4).astype(int)
+        inside = (col >= 0) & (row >= 0) & (col < drawing.shape[1]) & (row < drawing.shape[0])
+        clipped = drawing[np.clip(row, 0, drawing.shape[0] - 1), np.clip(col, 0, drawing.shape[1] - 1)]
+        return np.asarray(inside & (clipped < 128))
+
+    return dark
+
+
+@pytest.mark.parametrize("turn_deg", [5.0, 95.0])
+def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
+    spec = CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+    drawing = cv2.aruco.CharucoBoard((6, 5), 32.0, 24.0, aruco_dictionary("4X4_50"))
+    homography = board_from_pixel(turn_deg, 2e-4)
+    corner = np.array([-32.0, 4 * 32.0])
+    picture = picture_of(spec, homography, printed(drawing, spec, (192, 160), corner))
+    board = measure_board(scan_of(picture), spec)
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) >= 16
+    assert np.abs(errors).max() < 0.06
+    assert np.abs(errors.mean(axis=0)).max() < 0.01
+
+
+def test_aruco_corners() -> None:
+    spec = ArucoSpec("5X5_100", 3, 2, 63.0, 21.0, first_marker=7)
+    drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary("5X5_100"), np.arange(7, 13))
+    homography = board_from_pixel(4.0, 1e-4)
+    picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
+    board = measure_board(scan_of(picture), spec)
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) == 24
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        ChessboardSpec(9, 6, 25.0),
+        CircleGridSpec(6, 5, 30.0, 14.0),
+        ArucoSpec("4X4_50", 3, 2, 30.0, 10.0),
+        CharucoSpec("4X4_50", 6, 5, 32.0, 24.0),
+    ],
+)
+@pytest.mark.parametrize("level", [0.0, 30.0])
+def test_why_a_board_was_not_found(spec: BoardSpec, level: float) -> None:
+    rng = np.random.default_rng(3)
+    board = measure_board(scan_of(level + rng.normal(0, level / 10, (480, 640))), spec)
+    assert board.reason
+    assert {mark.point for mark in board.marks} == set(spec.object_points())
+    assert all(mark.status is Status.ABSENT and mark.reason for mark in board.marks)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ChessboardSpec(2, 6, 25.0), "columns is 2"),
+        (lambda: ChessboardSpec(9, 6, 0.0), "square_mm"),
+        (lambda: CircleGridSpec(6, 5, 10.0, 12.0), "dots less than"),
+        (lambda: CharucoSpec("4X4_50", 6, 5, 20.0, 24.0), "less than the square's"),
+        (lambda: ArucoSpec("4X4_49", 3, 2, 30.0, 10.0), "one of"),
+        (lambda: ArucoSpec("4X4_50", 3, 2, 30.0, 10.0, first_marker=47), "0 to 49"),
+    ],
+)
+def test_bad_specifications_are_refused(make: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def calibrated(spec: BoardSpec, paths: list[Path], flags: int) -> tuple[float, Array, Array, list[int]]:
+    """OpenCV's rms, (fx, fy, cx, cy), distortion from the boards in the pictures, and the points measured in each."""
+    points = spec.object_points()
+    objects, images, counts = [], [], []
+    for path in paths:
+        with open_scan(path) as scan:
+            board, size = measure_board(scan, spec), (scan.width_px, scan.height_px)
+        seen = [mark for mark in board.marks if mark.status.is_observation]
+        counts.append(len(seen))
+        objects.append(np.array([points[mark.point] for mark in seen], np.float32))
+        images.append(np.array([mark.center_px for mark in seen], np.float32))
+    rms, matrix, distortion, *_ = cv2.calibrateCamera(objects, images, size, None, None, flags=flags)
+    return (
+        float(rms),
+        np.asarray(matrix, float)[[0, 1, 0, 1], [0, 1, 2, 2]],
+        np.asarray(distortion, float).ravel(),
+        counts,
+    )
+
+
+@needs_data
+def test_published_calibration_of_a_chessboard() -> None:
+    """Focal lengths and principal point within three of the published standard deviations."""
+    folder = DATA / "chessboards" / "bouguet"
+    paths = [folder / f"Image{number}.tif" for number in range(1, 21)]
+    rms, interior, _, counts = calibrated(ChessboardSpec(13, 12, 30.0), paths, cv2.CALIB_FIX_K3)
+    published, three_sigma = [657.64375, 658.04113, 303.19239, 242.55566], [0.402, 0.431, 0.819, 0.749]
+    assert sum(counts) >= 3110
+    assert rms < 0.15
+    assert np.all(np.abs(interior - published) < three_sigma)
+
+
+@needs_data
+def test_hexagonal_circle_grids_of_another_project() -> None:
+    spec = CircleGridSpec(24, 28, 1.2 * np.sqrt(3) / 2, 1.0, asymmetric=True, row_spacing_mm=0.6)
+    with open_scan(DATA / "circles" / "boofcv" / "Sony_DSC-HX5V_CircleHexagonal" / "image01.jpg") as scan:
+        board = measure_board(scan, spec)
+    assert sum(mark.status.is_observation for mark in board.marks) >= 334

@@ -1,0 +1,114 @@
+"""Corners against pictures drawn by brute force, and the closed form against scipy's bivariate normal."""
+
+import numpy as np
+import pytest
+from drawn import drawn, whitened
+from numpy.typing import NDArray
+from scipy.special import ndtr
+from scipy.stats import multivariate_normal
+
+from measure.corners import Corner, Surface, crossing, fit_corner, quarter
+
+Array = NDArray[np.float64]
+SIZE, NOISE, CONTRAST = 25, 4.0, 100.0
+
+
+@pytest.mark.parametrize("correlation", [-0.7, 0.0, 0.4])
+@pytest.mark.parametrize("surface", [crossing, quarter])
+def test_the_closed_form_and_its_derivatives(correlation: float, surface: Surface) -> None:
+    rng = np.random.default_rng(1)
+    u, v = rng.normal(0, 2, (2, 6))
+    both = [multivariate_normal([0, 0], [[1, correlation], [correlation, 1]]).cdf(place) for place in np.c_[u, v]]
+    truth = 4 * np.array(both) - 2 * ndtr(u) - 2 * ndtr(v) + 1 if surface is crossing else 2 * np.array(both) - 1
+    value, *slopes = surface(u, v, correlation)
+    np.testing.assert_allclose(value, truth, atol=1e-12)
+    e = 1e-5
+    steps = ((e, 0, 0), (0, e, 0), (0, 0, e))
+    for slope, (du, dv, dc) in zip(slopes, steps, strict=True):
+        ahead, behind = surface(u + du, v + dv, correlation + dc)[0], surface(u - du, v - dv, correlation - dc)[0]
+        np.testing.assert_allclose(slope, (ahead - behind) / (2 * e), atol=1e-8)
+
+
+def board_steps(rng: np.random.Generator) -> Array:
+    """Sides of a square seen at an angle."""
+    first = rng.uniform(0, np.pi)
+    second = first + np.pi / 2 + rng.uniform(-0.4, 0.4)
+    return np.array([[np.cos(first), np.cos(second)], [np.sin(first), np.sin(second)]]) * (16.0, 14.0)
+
+
+def square_picture(center: Array, steps: Array, blur_px: float, alone: bool) -> Array:
+    """Squares about a corner, light between the steps; alone: that one square only."""
+    inverse = np.linalg.inv(steps)
+
+    def light(col: Array, row: Array) -> Array:
+        s, t = np.tensordot(inverse, np.stack([col - center[0], row - center[1]]), axes=1)
+        return np.asarray((s > 0) & (t > 0) if alone else (np.floor(s) + np.floor(t)) % 2 == 0)
+
+    return 50 + CONTRAST * drawn(light, SIZE, SIZE, blur_px)
+
+
+def fitted(window: Array, start: Array, steps: Array, alone: bool) -> Corner:
+    return fit_corner(window, (0, 0), start, steps, np.array([6.0, 6.0]), quarter if alone else crossing)
+
+
+@pytest.mark.parametrize(("blur_px", "alone"), [(0.5, False), (0.9, False), (1.5, False), (0.8, True)])
+def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) -> None:
+    rng = np.random.default_rng(2)
+    errors = []
+    for _ in range(8):
+        center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
+        clean = square_picture(center, steps, blur_px, alone)
+        for _ in range(12):
+            noisy = clean + rng.normal(0, NOISE, clean.shape)
+            corner = fitted(noisy, center + rng.normal(0, 0.3, 2), steps, alone)
+            assert not corner.reason
+            errors.append(whitened(corner.center_px - center, corner.covariance_px2))
+            assert corner.noise_dn == pytest.approx(NOISE, rel=0.35)
+    assert 0.87 < np.sqrt(np.mean(np.square(errors))) < 1.13
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.4
+
+
+def test_trap_pixel_locking() -> None:
+    """Without noise the error stays below 0.004 px wherever the corner lies in its pixel: no grid of any kind."""
+    rng = np.random.default_rng(3)
+    steps = board_steps(rng)
+    for phase in np.linspace(-0.5, 0.5, 9):
+        center = SIZE // 2 + np.array([phase, -phase / 2])
+        corner = fitted(square_picture(center, steps, 0.7, False), center + 0.2, steps, False)
+        assert np.abs(corner.center_px - center).max() < 0.004
+
+
+def test_a_bent_tone_curve_and_sharpening_do_not_move_a_crossing() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(4):
+        center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
+        linear = square_picture(center, steps, 0.8, False)
+        bent = 255 * (np.clip(linear - 45, 0, None) / 255) ** 0.45
+        corner = fitted(bent, center + rng.normal(0, 0.3, 2), steps, False)
+        assert np.abs(corner.center_px - center).max() < 0.01
+
+
+def test_contrast_says_which_square_is_light() -> None:
+    steps = np.diag([14.0, 14.0])
+    center = np.array([12.2, 12.3])
+    light = square_picture(center, steps, 0.8, False)
+    assert fitted(light, center, steps, False).contrast_dn == pytest.approx(CONTRAST, rel=0.05)
+    assert fitted(200 - light, center, steps, False).contrast_dn == pytest.approx(-CONTRAST, rel=0.05)
+
+
+def test_a_stain_is_left_out() -> None:
+    rng = np.random.default_rng(5)
+    center, steps = np.array([12.1, 11.8]), np.diag([14.0, 14.0])
+    window = square_picture(center, steps, 0.8, False) + rng.normal(0, 1.0, (SIZE, SIZE))
+    window[7:9, 14:17] = 255
+    corner = fitted(window, center, steps, False)
+    assert not corner.reason
+    assert 0.02 < corner.damaged_fraction < 0.1
+    assert np.abs(corner.center_px - center).max() < 0.03
+
+
+def test_where_no_corner_is_the_reason_is_said() -> None:
+    rng = np.random.default_rng(6)
+    start, steps = np.array([12.0, 12.0]), np.diag([14.0, 14.0])
+    assert fitted(rng.normal(100, 4, (SIZE, SIZE)), start, steps, False).reason
+    assert fitted(np.full((SIZE, SIZE), 7.0), start, steps, False).reason

@@ -1,0 +1,104 @@
+"""Disks against pictures drawn by brute force."""
+
+import numpy as np
+import pytest
+from drawn import drawn, ellipse, scan_of, whitened
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from measure.disk_search import DiskSearch, disk_candidates, find_disks
+from measure.disks import fit_disk
+
+Array = NDArray[np.float64]
+CONTRAST, NOISE, GROUND = 20000.0, 600.0, 12000.0
+
+
+def some_ellipse(rng: np.random.Generator, radius_px: float, flatness: float) -> Array:
+    turn = rng.uniform(0, np.pi)
+    axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return axes @ np.diag([radius_px, radius_px * flatness])
+
+
+@pytest.mark.parametrize(("radius_px", "flatness"), [(3.0, 1.0), (5.0, 0.6), (9.0, 0.8)])
+def test_errors_are_as_large_as_their_sigmas_say(radius_px: float, flatness: float) -> None:
+    rng = np.random.default_rng(1)
+    size = int(2 * radius_px + 31) | 1
+    errors, offsets = [], []
+    for _ in range(8):
+        center, shape = size // 2 + rng.uniform(-0.5, 0.5, 2), some_ellipse(rng, radius_px, flatness)
+        clean = GROUND + CONTRAST * drawn(ellipse(center, shape), size, size, 0.9)
+        for _ in range(8):
+            scan = scan_of(clean + rng.normal(0, NOISE, clean.shape))
+            disk = fit_disk(scan, center + rng.normal(0, 0.4, 2), shape * rng.uniform(0.9, 1.1))
+            assert not disk.reason
+            offsets.append(disk.center_px - center)
+            errors.append(whitened(offsets[-1], disk.covariance_px2))
+            assert disk.contrast_dn == pytest.approx(CONTRAST, rel=0.1)
+            np.testing.assert_allclose(np.sort(disk.half_axes_px), [radius_px * flatness, radius_px], atol=0.25)
+    assert 0.85 < np.sqrt(np.mean(np.square(errors))) < 1.15
+    assert np.abs(np.mean(offsets, axis=0)).max() < 0.01
+
+
+def test_dark_disks_at_the_edge_of_the_scan_and_large_coordinates() -> None:
+    rng = np.random.default_rng(2)
+    picture = 30000 + rng.normal(0, 300, (60, 3000))
+    center, shape = np.array([2990.3, 30.4]), some_ellipse(rng, 6.0, 0.8)
+    picture[:, 2960:] -= CONTRAST * drawn(ellipse(center - (2960, 0), shape), 40, 60, 0.9)
+    disk = fit_disk(scan_of(picture), center + 0.5, shape)
+    assert disk.contrast_dn < 0
+    assert np.abs(disk.center_px - center).max() < 0.03
+
+
+def field(rng: np.random.Generator, count: int) -> tuple[Array, list[Array]]:
+    """A textured ground with light disks of many sizes, some dark ones, and streaks that are no disks."""
+    height, width = 500, 1800
+    picture = (
+        GROUND + 9000 * gaussian_filter(rng.normal(size=(height, width)), 4) + rng.normal(0, NOISE, (height, width))
+    )
+    centers = []
+    for number in range(count):
+        place = np.array([60 + 105 * (number % 16), 60 + 90 * (number // 16)]) + rng.uniform(-9, 9, 2)
+        corner = np.round(place).astype(int) - 24
+        shape = some_ellipse(rng, rng.uniform(3, 12), rng.uniform(0.6, 1.0))
+        window = picture[corner[1] : corner[1] + 49, corner[0] : corner[0] + 49]
+        window += CONTRAST * drawn(ellipse(place - corner, shape), 49, 49, 0.9)
+        centers.append(place)
+    for row in range(20, 490, 60):
+        picture[row : row + 3, 10:400] += 0.6 * CONTRAST
+    return picture, centers
+
+
+def test_all_disks_of_a_frame_and_nothing_else() -> None:
+    picture, centers = field(np.random.default_rng(3), 64)
+    found = find_disks(scan_of(picture), DiskSearch((5.0, 30.0), "light"))
+    nearest = [min(float(np.hypot(*(disk.center_px - center))) for center in centers) for disk in found]
+    hit = {int(np.argmin([np.hypot(*(disk.center_px - center)) for center in centers])) for disk in found}
+    assert max(nearest) < 0.5
+    assert len(found) == len(hit)
+    assert len(hit) >= 62
+
+
+def test_a_disk_on_the_border_of_two_blocks_is_found_once() -> None:
+    rng = np.random.default_rng(4)
+    picture = GROUND + rng.normal(0, NOISE, (1700, 120))
+    center = np.array([60.2, 1535.9])
+    picture[1500:1570] += CONTRAST * drawn(ellipse(center - (0, 1500), np.eye(2) * 7), 120, 70, 0.9)
+    found = find_disks(scan_of(picture), DiskSearch((8.0, 24.0)))
+    assert len(found) == 1
+    assert np.abs(found[0].center_px - center).max() < 0.03
+
+
+def test_texture_holds_hardly_any_disks() -> None:
+    """Of all the patches that stand out of a cloudy ground like disks, a tenth at most passes for one."""
+    rng = np.random.default_rng(5)
+    picture = GROUND + 30000 * gaussian_filter(rng.normal(size=(160, 200)), 2) + rng.normal(0, NOISE, (160, 200))
+    scan, search = scan_of(picture), DiskSearch((6.0, 30.0))
+    patches = disk_candidates(scan, search)
+    assert len(patches) > 50
+    assert len(find_disks(scan, search)) <= 0.1 * len(patches)
+
+
+@pytest.mark.parametrize("diameter_px", [(1.0, 5.0), (9.0, 5.0)])
+def test_bad_diameters_are_refused(diameter_px: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="the smallest first"):
+        DiskSearch(diameter_px)
