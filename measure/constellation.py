@@ -22,6 +22,7 @@ _LEAST_RESPONSE = 0.2  # of a candidate
 _LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
 _CANDIDATES = 100  # of each look
 _PAIRS = 60  # of marks that hypotheses are made from
+_NARROWED = 0.7  # of the tolerance, once a placement is refined
 _KEPT = 12  # placements of a pose that are refined
 _OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
 
@@ -142,7 +143,7 @@ class _Search:
             return []
         wide = [_dilated(map_, self.tolerance_px) for map_ in maps]
         scores, _ = self._scores(wide, scale, offset)
-        near = [_dilated(map_, max(self.tolerance_px / 2, 1.5)) for map_ in maps]
+        near = [_dilated(map_, max(_NARROWED * self.tolerance_px, 1.5)) for map_ in maps]
         result: list[Placement] = []
         for index in np.argsort(-scores, kind="stable")[:_KEPT]:
             a, b = self._refined(maps, complex(scale[index]), complex(offset[index]))
@@ -211,7 +212,7 @@ class _Search:
 
     def _refined(self, maps: Sequence[Map], scale: complex, offset: complex) -> tuple[complex, complex]:
         """The similarity through the responses about its predictions, each weighed by its strength."""
-        for tolerance_px in (self.tolerance_px, max(self.tolerance_px / 2, 1.5)):
+        for tolerance_px in (self.tolerance_px, max(_NARROWED * self.tolerance_px, 1.5)):
             predicted = self.responses.reduced_px(self._scan_px(scale * self.camera + offset))
             found = [
                 _highest(maps[look], place, tolerance_px) for look, place in zip(self.kinds, predicted, strict=True)

@@ -19,7 +19,7 @@ class FiducialOptions:
     pose: str = "auto"
     rotation_deg: float = 6.0
     scale_tolerance: float = 0.04
-    misfit_mm: float = 0.6
+    misfit_mm: float = 1.0
     gate_mm: float = 0.3
     film_sigma_mm: float = 0.005
     match: MatchOptions = field(default_factory=lambda: MatchOptions(linear_sigma=0.05))

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well...
-_FAINT_LIKENESS = 0.25  # ...unless this many others say within a few pixels where it must be
+_FAINT_LIKENESS, _FAINT_SIGNIFICANCE = 0.25, 3.5  # ...unless this many others say within a few pixels where it must be
 _LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
 _MANY = 8
 _CLEAR_LIKENESS = 0.5
@@ -119,7 +119,7 @@ class _Sighter:
         self.belongs: Mask = np.zeros(len(layout.marks), dtype=bool)
         self.weights: tuple[float, ...] | None = None
         gate_px = options.gate_mm / float(self.pitch.mean())
-        self.first_search_px = _REDUCED_PX * placement.reduction + gate_px
+        self.first_search_px = _REDUCED_PX * placement.reduction + options.misfit_mm / float(self.pitch.mean())
         self.gate_px = gate_px
 
     def choose_channels(self) -> None:
@@ -189,9 +189,10 @@ class _Sighter:
         pixel_from_mark = np.column_stack([self.pixel_from_camera[:, :2], self._predicted_px()[index]])
         mark = self.layout.marks[index].mark
         sighting = sight(self.scan, mark, pixel_from_mark, search_px, self._sign(mark), weights, self.match)
-        least = _FAINT_LIKENESS if self.belongs.sum() >= _MANY else _LEAST_LIKENESS
+        many = self.belongs.sum() >= _MANY
+        least, significance = (_FAINT_LIKENESS, _FAINT_SIGNIFICANCE) if many else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
         fit = sighting.fit
-        if fit is not None and (fit.likeness < least or fit.significance < _LEAST_SIGNIFICANCE):
+        if fit is not None and (fit.likeness < least or fit.significance < significance):
             reason = f"nothing within {search_px:.0f} px of its place looks like it"
             return Sighting(sighting.predicted_px, True, None, reason)
         return sighting

@@ -1,4 +1,4 @@
-"""The frame through its marks: a similarity, with the little affinity that film has, by weighted least squares."""
+"""The frame through its marks: a similarity, with the little affinity that film and scanner have, by weighted least squares."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-AFFINITY_SIGMA = 1e-3  # film stretches and shears by a few parts in ten thousand; a milli is generous
+AFFINITY_SIGMA = 5e-3  # film stretches by a few parts in ten thousand, an office scanner by several thousandths
 
 
 @dataclass(frozen=True, eq=False)
