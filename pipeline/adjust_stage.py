@@ -13,7 +13,7 @@ from adjust.projection import adjusted_image
 from adjust.result import Adjustment
 from pipeline.comparator_file import ComparatorPoint
 from pipeline.disks import disk_normals, eccentricity_mm, plane_normal
-from pipeline.network import build_network, unmeasured_points
+from pipeline.network import build_network, listed, unmeasured_points
 from pipeline.project_file import Project
 
 Array = NDArray[np.float64]
@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 _ROUNDS = 4  # the correction changes by its own relative error, so the second round is already below the noise
 _SETTLED_SIGMAS = 0.01
 _NOTICEABLE_SIGMAS = 0.2  # of the coordinate: an eccentricity that is not corrected and as large deserves a word
-_LISTED = 8
 
 
 def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
@@ -114,9 +113,8 @@ def _unmeasured(project: Project, network: Network) -> tuple[str, ...]:
     lost = unmeasured_points(project, network)
     if not lost:
         return ()
-    named = ", ".join(lost[:_LISTED]) + (f" and {len(lost) - _LISTED} more" if len(lost) > _LISTED else "")
     return (
-        f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {named}. "
+        f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {listed(lost)}. "
         "Look for a wrong point number; a point that no image shows has no part in the adjustment.",
     )
 

@@ -16,6 +16,7 @@ from pipeline.spelling import did_you_mean
 Array = NDArray[np.float64]
 
 
+LISTED = 8
 FEWEST_TARGETS = 3  # in an image whose exterior orientation nobody has observed
 
 
@@ -31,6 +32,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
             "See the reasons in its last column."
         )
     _check_fiducials(project, used)
+    used, lonely = _locatable(project, used)
     used, left_out = _orientable(project, used)
     images = tuple(_image(project, name) for name in dict.fromkeys(mark.image for mark in used))
     network = Network(
@@ -39,7 +41,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         points=_points(project, used),
         observations=_observations(project.adjust, used),
     )
-    return network, left_out
+    return network, (*lonely, *left_out)
 
 
 def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
@@ -47,6 +49,25 @@ def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
     if project.given_points is None:
         return ()
     return tuple(point.id for point in project.given_points.points if point.id not in network.point_by_id)
+
+
+def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
+    """The marks of the points that can be located: of which something is given, or which two images show."""
+    given = {id for id, point in given_points(project).items() if any((point.X, point.Y, point.Z))}
+    images = Counter(mark.point for mark in marks if mark.kind != "fiducial")
+    lonely = {point for point, count in images.items() if count < 2 and point not in given}
+    sentence = (
+        f"Unknown and shown by one image only, and so left out: {listed(sorted(lonely))}. Measure each such point in a "
+        "second image, or give its coordinates."
+    )
+    kept = [mark for mark in marks if mark.kind == "fiducial" or mark.point not in lonely]
+    return kept, (sentence,) if lonely else ()
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names, and how many there are beyond them."""
+    more = len(names) - LISTED
+    return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
