@@ -158,10 +158,10 @@ class _CornerFit:
         for _ in range(MAX_ITERATIONS):
             if self.reason:
                 return
-            _, residuals = self._linearised()
+            design, residuals = self._linearised()
             relative = np.clip(np.abs(residuals) / (TUKEY * self.scale_dn), 0.0, 1.0)
             self.weights = self._area() * (1 - relative**2) ** 2
-            if self._step() < tolerance_px:
+            if self._step(design, residuals) < tolerance_px:
                 return
         self.reason = self.reason or "the fit does not settle"
 
@@ -205,9 +205,8 @@ class _CornerFit:
         right = np.tensordot(grey * self.weights, self.grey, axes=2)
         return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0])
 
-    def _step(self) -> float:
+    def _step(self, design: Array, residuals: Array) -> float:
         """A Gauss-Newton step, shortened to what a linearisation can bear; its length in px."""
-        design, residuals = self._linearised()
         weighted = design * self.weights
         normal = _products(weighted, design)
         size = np.sqrt(np.diag(normal))
