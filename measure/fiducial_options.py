@@ -2,8 +2,11 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from measure.matching import MatchOptions
 from measure.poses import POSES
+from measure.shapes import FiducialLayout
 
 
 @dataclass(frozen=True)
@@ -11,15 +14,17 @@ class FiducialOptions:
     """How fiducial marks are measured.
 
     pose: "auto", or one of the eight where the user knows it. rotation_deg, scale_tolerance: how far the frame may be
-    turned and scaled against its pose and the pitch. misfit_mm: how far a mark may lie from its given place when it is
-    searched. gate_mm: how far a measured mark may lie from where the others put it. film_sigma_mm: scatter of marks by
-    film and scanner. match: of the fit at full resolution; a polygon is always matched by its shift alone.
+    turned and scaled against its pose and the pitch. misfit_mm, affinity: how far a mark may lie from its given place
+    when it is searched, plus what share of the constellation's span. gate_mm: how far a measured mark may lie from
+    where the others put it. film_sigma_mm: scatter of marks by film and scanner. match: of the fit at full resolution;
+    a polygon is always matched by its shift alone.
     """
 
     pose: str = "auto"
     rotation_deg: float = 6.0
     scale_tolerance: float = 0.04
-    misfit_mm: float = 1.0
+    misfit_mm: float = 0.15
+    affinity: float = 0.003
     gate_mm: float = 0.3
     film_sigma_mm: float = 0.005
     match: MatchOptions = field(default_factory=lambda: MatchOptions(linear_sigma=0.05))
@@ -27,6 +32,11 @@ class FiducialOptions:
     def __post_init__(self) -> None:
         if self.pose != "auto" and self.pose not in POSES:
             raise ValueError(f"pose is {self.pose!r}; auto or one of {', '.join(POSES)} is right")
-        for name in ("rotation_deg", "scale_tolerance", "misfit_mm", "gate_mm", "film_sigma_mm"):
+        for name in ("rotation_deg", "scale_tolerance", "misfit_mm", "affinity", "gate_mm", "film_sigma_mm"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
+
+    def search_mm(self, layout: FiducialLayout) -> float:
+        """How far from its given place a mark of the layout is searched."""
+        places = np.array([mark.xy_mm for mark in layout.marks])
+        return self.misfit_mm + self.affinity * float(np.hypot(*np.ptp(places, axis=0)))

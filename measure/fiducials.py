@@ -100,7 +100,7 @@ def _placements(
     flip = np.diag([1 / pitch_mm[0], -1 / pitch_mm[1]])
     looks = [Look(mark.mark, flip @ up_from_camera(pose)) for pose in poses for mark in layout.marks]
     responses, index = respond(scan, looks)
-    bounds = Bounds(tolerance, float(np.deg2rad(options.rotation_deg)), options.misfit_mm)
+    bounds = Bounds(tolerance, float(np.deg2rad(options.rotation_deg)), options.search_mm(layout))
     count = len(layout.marks)
     searched: list[tuple[str, tuple[int, ...], list[Placement]]] = []
     for number, pose in enumerate(poses):

@@ -119,7 +119,7 @@ class _Sighter:
         self.belongs: Mask = np.zeros(len(layout.marks), dtype=bool)
         self.weights: tuple[float, ...] | None = None
         gate_px = options.gate_mm / float(self.pitch.mean())
-        self.first_search_px = _REDUCED_PX * placement.reduction + options.misfit_mm / float(self.pitch.mean())
+        self.first_search_px = _REDUCED_PX * placement.reduction + options.search_mm(layout) / float(self.pitch.mean())
         self.gate_px = gate_px
 
     def choose_channels(self) -> None:

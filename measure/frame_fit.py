@@ -1,4 +1,4 @@
-"""The frame through its marks: a similarity, with the little affinity that film and scanner have, by weighted least squares."""
+"""The frame through its marks: by weighted least squares a similarity, with the affinity that film and scanner have."""
 
 from dataclasses import dataclass
 
