@@ -8,6 +8,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from measure.disks import FittedDisk, fit_disk
 from measure.noise import robust_scale
@@ -216,9 +217,9 @@ def ellipse_of(patch: NDArray[np.bool_], origin: Array, contrast: float) -> Cand
 
 def separate(found: list[Candidate]) -> list[Candidate]:
     """The strongest of candidates that lie within one another."""
-    kept: list[Candidate] = []
-    for patch in found:
-        near = (np.hypot(*(patch.center_px - other.center_px)) < 0.7 * patch.radius_px for other in kept)
-        if not any(near):
-            kept.append(patch)
-    return kept
+    centers = np.array([patch.center_px for patch in found]).reshape(-1, 2)
+    radii = np.array([patch.radius_px for patch in found])
+    kept = np.zeros(len(found), bool)
+    for index, near in enumerate(cKDTree(centers).query_ball_point(centers, 0.7 * radii) if found else ()):
+        kept[index] = not kept[near].any()
+    return [patch for patch, is_kept in zip(found, kept, strict=True) if is_kept]
