@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from measure.noise import correlated, is_textured, noise_model, robust_scale
 from measure.rendering import chip_mask, extent_px, render
+from measure.robust import damage, solution, tukey_loss, tukey_weights
 from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
 
 Array = NDArray[np.float64]
@@ -31,7 +32,6 @@ _GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]]
     "ellipse": (_SCALE, _STRETCH, _SHEAR),
 }
 _GREY = 4  # gain, offset and two slopes
-_TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
 _SPARE_PX = 2.0  # beyond the margin: room for the mark to move
 _BLUR_RANGE_PX = (0.3, 6.0)
@@ -278,7 +278,7 @@ class _Fit:
         self.scale_dn2 = self._tukey_scale() ** 2
         scale_dn = self._tukey_scale() if robust else np.inf
         for _ in range(self.options.max_iterations):
-            step = self._solve(self.used * _tukey_weights(self.residuals, scale_dn))
+            step = self._solve(self.used * tukey_weights(self.residuals, scale_dn))
             if step is None:
                 self.reason = "the picture does not determine the mark's place"
                 return
@@ -310,10 +310,9 @@ class _Fit:
     def _cost(self, scale_dn: float) -> float:
         """What the adjustment makes small: Tukey's loss, squares where the scale is infinite, and the priors'."""
         residuals = self.residuals[self.used]
-        if np.isfinite(scale_dn):
-            limit = _TUKEY * scale_dn
-            residuals = limit * np.sqrt((1 - np.clip(1 - (residuals / limit) ** 2, 0.0, None) ** 3) / 3)
-        return float(np.sum(residuals**2) + self.scale_dn2 * np.sum(self._prior_weights() * self._departures() ** 2))
+        return float(
+            tukey_loss(residuals, scale_dn) + self.scale_dn2 * np.sum(self._prior_weights() * self._departures() ** 2)
+        )
 
     def _linearise(self) -> None:
         """The design (unknowns, height, width) and residuals of the present state, the gain from a linear fit at
@@ -367,13 +366,13 @@ class _Fit:
         normal = _normal(self.design, weighted) + np.diag(priors)
         right = np.tensordot(weighted, self.residuals, axes=2) - priors * self._departures()
         free = np.ones(len(right), dtype=bool)
-        step = _solution(normal, right, free)
+        step = solution(normal, right, free)
         blur = 2 + len(self.generators)
         if step is not None and self.options.estimate_blur:
             low, high = self._variance_range()
             if (self.variance_px2 <= low and step[blur] < 0) or (self.variance_px2 >= high and step[blur] > 0):
                 free[blur] = False
-                step = _solution(normal, right, free)
+                step = solution(normal, right, free)
         return step
 
     def _variance_range(self) -> tuple[float, float]:
@@ -419,35 +418,6 @@ class _Fit:
         elif np.abs(self._distortion()).max() > self.options.max_distortion:
             self.reason = "the fit wants a mark of another size or direction than the one drawn"
         return bool(self.reason)
-
-
-def _tukey_weights(residuals: Array, scale_dn: float) -> Array:
-    return np.asarray((1 - np.clip(np.abs(residuals) / (_TUKEY * scale_dn), 0.0, 1.0) ** 2) ** 2)
-
-
-def _solution(normal: Array, right: Array, free: Mask) -> Array | None:
-    """The solution for the free unknowns, 0 for the others; None where the equations are singular."""
-    size = np.sqrt(np.diag(normal))[free]
-    if not np.all(size > 0) or not np.all(np.isfinite(size)):
-        return None
-    scaled = normal[np.ix_(free, free)] / np.outer(size, size)
-    if np.linalg.cond(scaled) > 1e10:
-        return None
-    result = np.zeros(len(right))
-    result[free] = np.linalg.solve(scaled, right[free] / size) / size
-    return result
-
-
-def damage(residuals: Array, area: Mask, sigmas: float) -> Mask:
-    """Pixels of dust and scratches: where smoothed residuals exceed so many of their standard deviations over more
-    than a speck, and a pixel about it."""
-    weight = cv2.GaussianBlur(area.astype(float), (0, 0), 0.8)
-    smooth = cv2.GaussianBlur(np.where(area, residuals, 0.0), (0, 0), 0.8) / np.maximum(weight, 0.1)
-    smooth = np.where(area, smooth, 0.0)
-    scale = robust_scale(smooth[area])
-    large = (np.abs(smooth) > sigmas * scale).astype(np.uint8)
-    opened = cv2.morphologyEx(large, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    return np.asarray(cv2.dilate(opened, np.ones((3, 3), np.uint8)) > 0)
 
 
 def _background_px(mark: Mark, pixel_from_mark: Array) -> float:

@@ -1,0 +1,50 @@
+"""Least squares that hold against dust: Tukey's biweight, the search for damage, and a guarded solution."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.noise import robust_scale
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
+
+
+def tukey_weights(residuals: Array, scale_dn: float) -> Array:
+    """Weights between 0 and 1, all 1 where the scale is infinite."""
+    return np.asarray((1 - np.clip(np.abs(residuals) / (_TUKEY * scale_dn), 0.0, 1.0) ** 2) ** 2)
+
+
+def tukey_loss(residuals: Array, scale_dn: float) -> float:
+    """Tukey's loss, in units of squares; the sum of squares itself where the scale is infinite."""
+    if not np.isfinite(scale_dn):
+        return float(np.sum(residuals**2))
+    limit = _TUKEY * scale_dn
+    return float(np.sum(1 - np.clip(1 - (residuals / limit) ** 2, 0.0, None) ** 3) * limit**2 / 3)
+
+
+def solution(normal: Array, right: Array, free: Mask) -> Array | None:
+    """The solution for the free unknowns, 0 for the others; None where the equations are singular."""
+    size = np.sqrt(np.diag(normal))[free]
+    if not np.all(size > 0) or not np.all(np.isfinite(size)):
+        return None
+    scaled = normal[np.ix_(free, free)] / np.outer(size, size)
+    if np.linalg.cond(scaled) > 1e10:
+        return None
+    result = np.zeros(len(right))
+    result[free] = np.linalg.solve(scaled, right[free] / size) / size
+    return result
+
+
+def damage(residuals: Array, area: Mask, sigmas: float) -> Mask:
+    """Pixels of dust and scratches: where smoothed residuals exceed so many of their standard deviations over more
+    than a speck, and a pixel about it."""
+    weight = cv2.GaussianBlur(area.astype(float), (0, 0), 0.8)
+    smooth = cv2.GaussianBlur(np.where(area, residuals, 0.0), (0, 0), 0.8) / np.maximum(weight, 0.1)
+    smooth = np.where(area, smooth, 0.0)
+    scale = robust_scale(smooth[area])
+    large = (np.abs(smooth) > sigmas * scale).astype(np.uint8)
+    opened = cv2.morphologyEx(large, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return np.asarray(cv2.dilate(opened, np.ones((3, 3), np.uint8)) > 0)
