@@ -12,7 +12,9 @@ from measure.shapes import Disk, MarkShape
 Array = NDArray[np.float64]
 
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
-SHORTEST_MARGIN_PX, LONGEST_MARGIN_PX = 4.0, 10.0
+SHORTEST_MARGIN_PX, LONGEST_MARGIN_PX = 2.5, 10.0
+MARGIN = 0.3  # of the radius: the ground is not plain for long, where the pad ends that a target is painted on, say
+LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
 SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
 SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from the disk
 LEAST_SNR = 4.0
@@ -73,7 +75,8 @@ def fit_disk(
     """
     start = np.column_stack([pixel_from_disk, center_px])
     radius = float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
-    margin = max(min(max(radius, SHORTEST_MARGIN_PX), longest_margin_px, LONGEST_MARGIN_PX), 1.5)
+    margin = max(MARGIN * radius, SHORTEST_MARGIN_PX, LEAST_REACH_PX - radius)
+    margin = max(min(margin, longest_margin_px, LONGEST_MARGIN_PX), 1.5)
     options = MatchOptions(
         freedom="ellipse" if shape is UNIT_DISK else "affine", margin_px=margin, max_shift_px=max(radius, 2.0)
     )

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.grain import grain_model
 from measure.noise import correlated, is_textured, noise_model, robust_scale
 from measure.rendering import chip_mask, extent_px, render
 from measure.robust import damage, solution, tukey_loss, tukey_weights
@@ -218,6 +219,8 @@ class _Fit:
         covariance, gain_sigma = np.full((2, 2), np.inf), np.inf
         if not self.reason:
             masked = self.design * self.used
+            if not noise.is_white:
+                noise = grain_model(self.residuals, self.used, masked, noise.neighbour_correlation)
             normal = _normal(masked, masked) + np.diag(self._prior_weights() * max(noise.variance_dn2, 1e-12))
             middle = normal * noise.variance_dn2
             if not noise.is_white:
