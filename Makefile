@@ -12,7 +12,7 @@ demo: $(READY)
 # One BLAS thread a worker: two on two cores make the small factorisations ten times slower.
 test: export OPENBLAS_NUM_THREADS = 1
 test: lint types
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -61,43 +61,43 @@ def _fiducial_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
     positions = np.array(pairs)
     x, y = (state.values[positions] - state.values[positions].mean(axis=0)).T
     one, zero = np.ones_like(x), np.zeros_like(x)
-    marks = f"All fiducial marks of camera {camera}"
+    marks = f"all fiducial marks of camera {camera}"
     follow = "and the transformation of every image follows"
     texts = (
         (
             one,
             zero,
-            f"{marks} can shift together in x', {follow}.",
+            f"Shift x: {marks} can shift together in x', {follow}.",
             "x' of one fiducial mark (F5), or to x0' (F7) where it is named here",
         ),
         (
             zero,
             one,
-            f"{marks} can shift together in y', {follow}.",
+            f"Shift y: {marks} can shift together in y', {follow}.",
             "y' of one fiducial mark (F6), or to y0' (F8) where it is named here",
         ),
         (
             -y,
             x,
-            f"{marks} can turn together about the principal point, {follow} with kappa.",
+            f"Rotation: {marks} can turn together about the principal point, {follow} with kappa.",
             "one coordinate of a fiducial mark that has a lever arm (F5, F6)",
         ),
         (
             x,
             y,
-            f"{marks} can grow together, {follow} with the principal distance or the stations' distance.",
+            f"Scale: {marks} can grow together, {follow} with the principal distance or the stations' distance.",
             "two fiducial marks (F5, F6), or to the principal distance (F9) where it is named here",
         ),
         (
             x,
             -y,
-            f"{marks} can stretch in x' against y', {follow} with stations and object.",
+            f"Affinity: {marks} can stretch in x' against y', {follow} with stations and object.",
             "three fiducial marks (F5, F6), or take images that converge or are turned by 90 degrees about their axes",
         ),
         (
             y,
             x,
-            f"{marks} can shear, {follow} with stations and object.",
+            f"Shear: {marks} can shear, {follow} with stations and object.",
             "three fiducial marks (F5, F6), or take images that converge or are turned by 90 degrees about their axes",
         ),
     )

@@ -36,3 +36,10 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def check_writable(folder: Path) -> None:
+    """Know before long work whether its results can be written. Raises InputError where they cannot."""
+    with atomic_path(folder / "trial") as temporary:
+        temporary.touch()
+    (folder / "trial").unlink()

@@ -13,7 +13,8 @@ import numpy as np
 from measure.errors import MeasurementError
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.results import FrameMeasurement
+from measure.rendering import extent_px
+from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scan import Scan, open_scan
 from pipeline.camera_file import CameraFile
 from pipeline.errors import InputError
@@ -80,7 +81,24 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
         return FrameMeasurement(name, ())
     pitch = project.pitch_um or scan.pitch_um
     measured = measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=project.pose))
-    return replace(measured, image=name)
+    return replace(measured, image=name, marks=_with_sizes(measured, camera, scan, pitch))
+
+
+def _with_sizes(
+    measured: FrameMeasurement, camera: CameraFile, scan: Scan, pitch_um: tuple[float, float] | None
+) -> tuple[MarkMeasurement, ...]:
+    """The marks with how large each is drawn in the scan, px, for whoever shows a picture of it."""
+    if measured.pixel_from_camera is not None:
+        px_per_mm = float(np.sqrt(abs(np.linalg.det(measured.pixel_from_camera[:, :2]))))
+    elif pitch_um is not None:
+        px_per_mm = 1000.0 / pitch_um[0]
+    else:
+        px_per_mm = scan.width_px / camera.layout().frame_mm[0]
+    drawn = np.array([[px_per_mm, 0.0, 0.0], [0.0, -px_per_mm, 0.0]])
+    extents = {mark.id: np.ptp(np.stack(extent_px(mark.mark, drawn)), axis=0).max() for mark in camera.layout().marks}
+    return tuple(
+        replace(mark, quality={**mark.quality, "size_px": float(extents[mark.point])}) for mark in measured.marks
+    )
 
 
 def _pitch(

@@ -32,6 +32,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
             "See the reasons in its last column."
         )
     _check_fiducials(project, used)
+    _check_points(project, used)
     used, lonely = _locatable(project, used)
     used, left_out = _orientable(project, used)
     images = tuple(_image(project, name) for name in dict.fromkeys(mark.image for mark in used))
@@ -127,6 +128,18 @@ def _check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None
             )
 
 
+def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:
+    """A target is one of the given points, where any are given; a tie point need not be."""
+    given = given_points(project)
+    for mark in marks:
+        if mark.kind == "target" and given and mark.point not in given:
+            raise InputError(
+                f"{project.comparator}, line {mark.line}: image {mark.image!r} shows the target {mark.point!r}, which "
+                f"the given points do not hold.{did_you_mean(mark.point, given)} Add it to them (coordinates may be "
+                "blank), or make it a point of kind tie."
+            )
+
+
 def _cameras(project: Project, images: Sequence[Image], marks: Sequence[ComparatorPoint]) -> tuple[Camera, ...]:
     cameras = []
     for file in project.cameras.values():
@@ -145,12 +158,7 @@ def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectP
     for mark in marks:
         if mark.kind == "fiducial" or mark.point in points:
             continue
-        if mark.point in given:
-            points[mark.point] = given[mark.point]
-        elif mark.kind == "tie" or not given:
-            points[mark.point] = ObjectPoint(mark.point, None, None, None)
-        else:
-            raise InputError(_unknown_point(project, mark, given))
+        points[mark.point] = given.get(mark.point, ObjectPoint(mark.point, None, None, None))
     return tuple(points.values())
 
 
@@ -163,14 +171,6 @@ def given_points(project: Project) -> Mapping[str, ObjectPoint]:
     scale = 1.0 / project.unit_mm
     board = project.targets.board.object_points()
     return {id: ObjectPoint(id, *(Prior(scale * value) for value in xyz)) for id, xyz in board.items()}
-
-
-def _unknown_point(project: Project, mark: ComparatorPoint, given: Mapping[str, ObjectPoint]) -> str:
-    return (
-        f"{project.comparator}, line {mark.line}: image {mark.image!r} shows the target {mark.point!r}, which the "
-        f"given points do not hold.{did_you_mean(mark.point, given)} Add it to them (coordinates may be blank), or "
-        "make it a point of kind tie."
-    )
 
 
 def _observations(settings: AdjustSettings, marks: Sequence[ComparatorPoint]) -> Observations:

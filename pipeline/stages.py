@@ -2,15 +2,16 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from adjust.result import Adjustment
 from pipeline.adjust_stage import adjust_marks
 from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
-from pipeline.atomic import write_atomically
+from pipeline.atomic import check_writable, write_atomically
 from pipeline.check import check_against_opencv
-from pipeline.comparator_file import ComparatorPoint, read_comparator, write_comparator
+from pipeline.comparator_file import read_comparator, write_comparator
 from pipeline.errors import InputError
 from pipeline.measure_stage import measure_scans
 from pipeline.measurement_file import MeasuredScan, read_measurement, write_measurement
@@ -28,11 +29,13 @@ Json = dict[str, Any]
 def run_all(project: Project, reporter: Reporter) -> Summary:
     """Measure (where there are scans), adjust, visit the scans again, check, report."""
     scans: tuple[MeasuredScan, ...] = ()
+    for folder in (project.output, project.comparator.parent):
+        check_writable(folder)
     if project.scans:
         scans = measure_scans(project, reporter)
         _write_marks(project, scans)
         if not _anything_to_adjust(project):
-            return _reported(project, _data(project))
+            return _reported(project, _measured(project))
     adjustment = adjust_marks(project, read_comparator(project.comparator))
     again = measure_again(project, scans, adjustment, reporter)
     if again is not None:
@@ -40,14 +43,15 @@ def run_all(project: Project, reporter: Reporter) -> Summary:
         adjustment = adjust_marks(project, read_comparator(project.comparator))
     write_adjustment(adjustment, project.adjustment_path)
     _write_check(project, adjustment)
-    return _reported(project, _data(project))
+    return _reported(project, _adjusted(project))
 
 
 def run_measure(project: Project, reporter: Reporter) -> Summary:
     """Scans to comparator.csv."""
     _write_marks(project, measure_scans(project, reporter))
-    data = ReportData(_title(project), _marks(project), _json(project.measurement_path))
-    return summarise(data, {"comparator coordinates": project.comparator, "measurement": project.measurement_path})
+    return summarise(
+        _measured(project), {"comparator coordinates": project.comparator, "measurement": project.measurement_path}
+    )
 
 
 def run_adjust(project: Project, reporter: Reporter) -> Summary:
@@ -58,7 +62,7 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
     write_adjustment(adjustment, project.adjustment_path)
     project.check_path.unlink(missing_ok=True)  # it belongs to an earlier adjustment
     covariance = covariance_path(project.adjustment_path)
-    return summarise(_data(project), {"adjustment": project.adjustment_path, "covariance": covariance})
+    return summarise(_adjusted(project), {"adjustment": project.adjustment_path, "covariance": covariance})
 
 
 def run_check(project: Project, reporter: Reporter) -> Summary:
@@ -68,7 +72,7 @@ def run_check(project: Project, reporter: Reporter) -> Summary:
         adjustment = adjust_marks(project, read_comparator(project.comparator))
         write_adjustment(adjustment, project.adjustment_path)
         _write_check(project, adjustment)
-    return summarise(_data(project), {"check": project.check_path})
+    return summarise(_adjusted(project), {"check": project.check_path})
 
 
 def run_report(project: Project, reporter: Reporter) -> Summary:
@@ -79,7 +83,7 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
         )
     with reporter.stage("reporting") as count:
         count(project.report_path.name, 0, 1)
-        return _reported(project, _data(project))
+        return _reported(project, _adjusted(project))
 
 
 def _anything_to_adjust(project: Project) -> bool:
@@ -98,24 +102,33 @@ def _write_check(project: Project, adjustment: Adjustment) -> None:
 
 
 def _reported(project: Project, data: ReportData) -> Summary:
-    write_report(data, project.report_path)
+    scans = read_measurement(project.measurement_path) if data.measurement else ()
+    with Thumbnails(scans) as pictures:
+        write_report(replace(data, thumbnail=pictures.of), project.report_path)
     files = {"comparator coordinates": project.comparator, "adjustment": project.adjustment_path}
     return summarise(data, {**{w: p for w, p in files.items() if p.exists()}, "report": project.report_path})
 
 
-def _data(project: Project) -> ReportData:
-    """What stands in the project's files, for the report and the verdict."""
-    measurement = _json(project.measurement_path)
-    covariance = covariance_path(project.adjustment_path)
+def _measured(project: Project) -> ReportData:
+    """What the measurement left in the project's files."""
     return ReportData(
         project=_title(project),
-        comparator=_marks(project),
-        measurement=measurement,
-        adjustment=read_adjustment(project.adjustment_path) if project.adjustment_path.exists() else None,
-        covariance=read_covariance(project.adjustment_path) if covariance.exists() else None,
-        check=_json(project.check_path),
+        comparator=read_comparator(project.comparator),
+        measurement=_json(project.measurement_path),
         frame_mm=_frame_sizes(project),
-        thumbnail=Thumbnails(read_measurement(project.measurement_path)).of if measurement else None,
+    )
+
+
+def _adjusted(project: Project) -> ReportData:
+    """The same with the adjustment and its check, as far as there are any."""
+    path = project.adjustment_path
+    if not path.exists():
+        return _measured(project)
+    return replace(
+        _measured(project),
+        adjustment=read_adjustment(path),
+        covariance=read_covariance(path),
+        check=_json(project.check_path),
     )
 
 
@@ -123,10 +136,6 @@ def _title(project: Project) -> str:
     """The project's folder, unless the project file has a name of its own."""
     stem = project.path.stem
     return project.path.resolve().parent.name if stem == "project" else stem
-
-
-def _marks(project: Project) -> tuple[ComparatorPoint, ...]:
-    return read_comparator(project.comparator)
 
 
 def _json(path: Path) -> Json | None:

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
 from measure.results import MarkMeasurement
@@ -14,11 +16,11 @@ from pipeline.report.data import Thumbnail
 
 _FIDUCIAL_PX, _TARGET_PX = 81, 41  # the least width of a window
 _SHOWN_PX = 96  # a larger window is reduced to about this many pixels
-_REACH_SIZES = 2.5  # a window's half width in the mark's own size, where that is known
+_REACH_SIZES = 2.0  # a window's width in the mark's own
 
 
 class Thumbnails:
-    """Windows about marks, by image and point; one scan is open at a time."""
+    """Windows about marks, by image, point and kind; one scan is open at a time, none behind the `with` block."""
 
     def __init__(self, scans: Sequence[MeasuredScan]) -> None:
         self._scans = {scan.frame.image: scan for scan in scans}
@@ -27,13 +29,20 @@ class Thumbnails:
         }
         self._open: tuple[Path, Scan] | None = None
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._open is not None:
+            self._open[1].close()
+
     def of(self, image: str, point: str, kind: str) -> Thumbnail | None:
         """The picture of a mark; None where it has no place, or its scan cannot be read any more."""
         mark = self._marks.get((image, point, kind == "fiducial"))
         if mark is None or mark.center_px is None:
             return None
         try:
-            return _cut(self._scan(self._scans[image].scan), mark)
+            return _cut(self._scan(self._scans[image].scan), mark.center_px, _half_px(mark))
         except MeasurementError:
             return None
 
@@ -45,11 +54,14 @@ class Thumbnails:
         return self._open[1]
 
 
-def _cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
-    assert mark.center_px is not None
+def _half_px(mark: MarkMeasurement) -> int:
+    """Half the width of the window about a mark."""
     least = _FIDUCIAL_PX if mark.kind == "fiducial" else _TARGET_PX
-    half = max(least // 2, int(np.ceil(_REACH_SIZES * mark.quality.get("size_px", 0.0) / 2.0)))
-    col0, row0 = (round(float(value)) - half for value in mark.center_px)
+    return max(least // 2, int(np.ceil(_REACH_SIZES * mark.quality.get("size_px", 0.0) / 2.0)))
+
+
+def _cut(scan: Scan, center_px: NDArray[np.float64], half: int) -> Thumbnail | None:
+    col0, row0 = (round(float(value)) - half for value in center_px)
     width = 2 * half + 1
     if col0 >= scan.width_px or row0 >= scan.height_px or col0 + width <= 0 or row0 + width <= 0:
         return None

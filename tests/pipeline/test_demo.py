@@ -4,7 +4,11 @@ import json
 from html.parser import HTMLParser
 from pathlib import Path
 
+import pytest
+
 from pipeline.against_truth import compare_with_truth
+
+pytestmark = pytest.mark.xdist_group("demonstration")  # one run of it serves all
 
 
 def test_demo_is_measured_right_and_calibrated_within_its_sigmas(finished: tuple[Path, int]) -> None:
