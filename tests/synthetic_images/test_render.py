@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import skimage.measure
 import tifffile
 from numpy.typing import NDArray
 
@@ -82,9 +83,8 @@ def centroid(picture: Array, near_px: Array, half: int) -> Array:
     col, row = np.rint(near_px).astype(int)
     window = picture[row - half : row + half + 1, col - half : col + half + 1]
     weights = window - np.median(np.concatenate([window[0], window[-1], window[:, 0], window[:, -1]]))
-    rows, columns = np.indices(window.shape)
-    total = weights.sum()
-    return np.array([(weights * columns).sum() / total + col - half, (weights * rows).sum() / total + row - half])
+    down, right = skimage.measure.centroid(weights)
+    return np.array([right + col - half, down + row - half])
 
 
 def test_disks_lie_where_the_truth_says(tmp_path: Path) -> None:
