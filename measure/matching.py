@@ -33,6 +33,7 @@ _GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]]
     "ellipse": (_SCALE, _STRETCH, _SHEAR),
 }
 _GREY = 4  # gain, offset and two slopes
+_DAMAGE_FLOOR = 0.005  # of the contrast, under the scale of smoothed residuals, for the same reason
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
 _SPARE_PX = 2.0  # beyond the margin: room for the mark to move
 _BLUR_RANGE_PX = (0.3, 6.0)
@@ -195,6 +196,8 @@ class _Fit:
     def run(self) -> None:
         """Plain, then robust, then on what is undamaged; stops with a reason where something gives way."""
         self._choose_area()
+        if not self.reason and np.ptp(self.grey[self.area]) == 0.0:
+            self.reason = "the picture is even there: nothing stands out"
         if not self.reason:
             self._adjust(robust=False, tolerance_px=0.05)
         if not self.reason:
@@ -204,7 +207,8 @@ class _Fit:
         for round_ in range(self.options.damage_rounds):
             if self.reason:
                 return
-            undamaged = self.area & ~damage(self.residuals, self.area, self.options.damage_sigmas)
+            floor_dn = _DAMAGE_FLOOR * abs(float(self.grey_parameters[0]))
+            undamaged = self.area & ~damage(self.residuals, self.area, self.options.damage_sigmas, floor_dn)
             if round_ > 0 and np.array_equal(undamaged, self.used):
                 return
             self.used = undamaged

@@ -38,13 +38,13 @@ def solution(normal: Array, right: Array, free: Mask) -> Array | None:
     return result
 
 
-def damage(residuals: Array, area: Mask, sigmas: float) -> Mask:
+def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float) -> Mask:
     """Pixels of dust and scratches: where smoothed residuals exceed so many of their standard deviations over more
-    than a speck, and a pixel about it."""
+    than a speck, and a pixel about it. floor_dn: under that standard deviation, for clean data have none."""
     weight = cv2.GaussianBlur(area.astype(float), (0, 0), 0.8)
     smooth = cv2.GaussianBlur(np.where(area, residuals, 0.0), (0, 0), 0.8) / np.maximum(weight, 0.1)
     smooth = np.where(area, smooth, 0.0)
-    scale = robust_scale(smooth[area])
+    scale = max(robust_scale(smooth[area]), floor_dn)
     large = (np.abs(smooth) > sigmas * scale).astype(np.uint8)
     opened = cv2.morphologyEx(large, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     return np.asarray(cv2.dilate(opened, np.ones((3, 3), np.uint8)) > 0)
