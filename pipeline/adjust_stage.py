@@ -12,7 +12,7 @@ from adjust.network import Network
 from adjust.projection import adjusted_image
 from adjust.result import Adjustment
 from pipeline.comparator_file import ComparatorPoint
-from pipeline.disks import disk_normals, eccentricity_mm, plane_normal
+from pipeline.disks import across, disk_normals, eccentricity_mm, plane_normal
 from pipeline.network import build_network, listed, unmeasured_points
 from pipeline.project_file import Project
 
@@ -91,10 +91,7 @@ def _eccentricities(project: Project, adjustment: Adjustment) -> tuple[Array, Ar
 def _slanted(normals: Array, coordinates: Array, station: Array) -> Array:
     """Normals turned 45 degrees away from the line of sight, where the eccentricity is largest."""
     sight = (station - coordinates) / np.linalg.norm(station - coordinates, axis=1, keepdims=True)
-    helper = np.where(np.abs(sight[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    across = np.cross(sight, helper)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    slanted: Array = (sight + across) / np.sqrt(2.0)
+    slanted: Array = (sight + across(sight)[0]) / np.sqrt(2.0)
     return slanted
 
 

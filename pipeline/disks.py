@@ -41,7 +41,7 @@ def disk_images(
     model: ImageModel, pitch_um: tuple[float, float], centers: Array, normals: Array, radius: float
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Predicted centres (n, 2) px, maps (n, 2, 2) from each disk's two radius vectors to pixels, what is visible."""
-    first, second = _in_plane(normals)
+    first, second = across(normals)
     place, visible = model.comparator_from_object(centers)
     columns = []
     for direction in (first, second):
@@ -79,8 +79,8 @@ def plane_normal(coordinates: Array) -> Array | None:
     return np.asarray(spread.Vh[2], dtype=np.float64) if flat else None
 
 
-def _in_plane(normals: Array) -> tuple[Array, Array]:
-    """Two unit vectors across each normal."""
+def across(normals: Array) -> tuple[Array, Array]:
+    """Two unit vectors at right angles to each of the unit vectors (n, 3) and to one another."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

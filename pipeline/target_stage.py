@@ -65,7 +65,7 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
     if settings.board is not None:
         board = measure_board(scan, settings.board)
         problems = (f"The board was not found: {board.reason}.",) if board.reason else ()
-        # A board that is the same after a half turn may be named either way, unless its points were surveyed one by one.
+        # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
         notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
         return with_targets(measured, board.marks, (*problems, *notes))
     field = target_field(project)
