@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 _SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
 _STEP_TOLERANCE = 0.06
-_SET = ("set in the project",)
+_SET = ("set in the project.",)
 _TRIALS = 2  # placements tried at full resolution after the best one has failed
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
@@ -149,9 +149,13 @@ def _measurement(
     marks = tuple(_row(mark, index, frame) for index, mark in enumerate(layout.marks))
     problems = [f"{scan.name}: {sentence}" for sentence in rivals]
     if rivals:
-        pose = Pose(pose.name, False, (*pose.evidence, *rivals)) if pose.evidence != _SET else pose
+        pose = (
+            Pose(pose.name, False, (*pose.evidence, *(f"{sentence}." for sentence in rivals)))
+            if pose.evidence != _SET
+            else pose
+        )
     if not pose.decided:
-        problems.append(f"{scan.name}: pose assumed: {pose.evidence[0]}")
+        problems.append(f"{scan.name}: pose assumed: {pose.evidence[0].rstrip('.')}")
     used = int(frame.belongs.sum())
     if used < len(layout.marks):
         problems.append(f"{scan.name}: {used} of {len(layout.marks)} fiducials measured")

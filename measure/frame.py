@@ -1,7 +1,7 @@
 """One frame in one placement: its marks sighted at full resolution, and those told apart that do not belong."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,10 @@ from measure.channels import best_weights
 from measure.constellation import Placement, sign_of
 from measure.fiducial_options import FiducialOptions
 from measure.frame_fit import fit_frame, strangers
+from measure.glimpse import Glimpse, glimpse
 from measure.matching import Match
 from measure.poses import up_from_camera
-from measure.refinement import Sighting, sight
+from measure.refinement import Sighting, sight, strongest
 from measure.scan import LUMINANCE, Scan
 from measure.shapes import FiducialLayout, Mark
 from measure.status import Status
@@ -20,28 +21,39 @@ from measure.status import Status
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well...
-_FAINT_LIKENESS, _FAINT_SIGNIFICANCE = 0.25, 3.5  # ...unless this many others say within a few pixels where it must be
+_LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well
 _LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
-_MANY = 6
+_MANY = 6  # marks that agree and tell where a faint one must be
 _CLEAR_LIKENESS = 0.5
+_CLEAR_RESPONSE = 0.25  # correlation of the same marks before they are fitted
 _CLEAR_SNR = 3.0
 _CLEAR_DAMAGE = 0.25
 _CLEAR_SIGMA_PX = 0.3
 _GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
 _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
 _REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
+_CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
+_FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
+_FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
+_LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
+_SAME_PX = 1.0
+_ROUNDS = 2  # of looking for faint marks: the first ones tell where the others are
+_REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
+_FAR = 5.0  # times the scatter of the others
+_EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
     """belongs: (n,) marks that were found and agree. misfit_mm: (n,) how far each mark found is from where the frame
-    puts it, nan without one. pixel_from_camera: (2, 3), the placement's own where fewer than two marks belong."""
+    puts it, nan without one; scatter_mm: the median of those that belong. pixel_from_camera: (2, 3), the placement's
+    own where fewer than two marks belong."""
 
     placement: Placement
     sightings: tuple[Sighting, ...]
     belongs: Mask
     misfit_mm: Array
+    scatter_mm: float
     pixel_from_camera: Array
     weights: tuple[float, ...] | None
 
@@ -72,7 +84,7 @@ class Frame:
         if fit is None or not self.belongs[index]:
             off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.belongs.sum())} marks put it"
             return Status.REJECTED, f"what was measured lies {off}"
-        reasons = []
+        reasons = [self.sightings[index].reason] if self.sightings[index].reason else []
         if fit.likeness < _CLEAR_LIKENESS:
             reasons.append(f"it correlates with its drawing by only {fit.likeness:.2f}")
         if fit.snr < _CLEAR_SNR:
@@ -82,6 +94,8 @@ class Frame:
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
         if sigma_px > _CLEAR_SIGMA_PX:
             reasons.append(f"its standard deviation is {sigma_px:.2f} px")
+        if self.misfit_mm[index] > _FAR * max(self.scatter_mm, 0.01):
+            reasons.append(f"it lies {self.misfit_mm[index]:.2f} mm from where the others put it: the film is deformed")
         return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")
 
 
@@ -92,10 +106,17 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
     everything = range(len(layout.marks))
     sighter.look(everything, sighter.first_search_px)
     sighter.judge()
-    if sighter.belongs.sum() >= 2:
-        sighter.learn()
-        sighter.look([index for index in everything if not sighter.clear(index)], sighter.second_search_px())
+    if sighter.belongs.sum() >= 2 and not sighter.sure():
+        if len(layout.marks) > _MANY:
+            sighter.glimpse_faint(sighter.gate_px)
+            sighter.vouched[:] = False  # so far from its place a mark still has to agree with the others
+        else:
+            sighter.look([index for index in everything if not sighter.clear(index)], sighter.gate_px)
         sighter.judge()
+    for _ in range(_ROUNDS):
+        if sighter.sure():
+            sighter.glimpse_faint(sighter.reach_px())
+            sighter.judge()
     return sighter.frame()
 
 
@@ -110,13 +131,13 @@ class _Sighter:
         options: FiducialOptions,
     ) -> None:
         self.scan, self.layout, self.placement, self.options = scan, layout, placement, options
-        self.match = options.match
         self.pitch = np.asarray(placement.pitch_mm)
         self.camera = np.array([mark.xy_mm for mark in layout.marks])
         self.turn = up_from_camera(placement.pose)
         self.pixel_from_camera = placement.pixel_from_camera
         self.sightings: list[Sighting | None] = [None] * len(layout.marks)
         self.belongs: Mask = np.zeros(len(layout.marks), dtype=bool)
+        self.vouched: Mask = np.zeros(len(layout.marks), dtype=bool)
         self.weights: tuple[float, ...] | None = None
         gate_px = options.gate_mm / float(self.pitch.mean())
         self.first_search_px = _REDUCED_PX * placement.reduction + options.search_mm(layout) / float(self.pitch.mean())
@@ -128,14 +149,17 @@ class _Sighter:
         if self.scan.channels == 1:
             return
         step = max(1, len(self.layout.marks) // _CHANNEL_TRIALS)
-        fits = []
+        places = []
         for index in range(0, len(self.layout.marks), step):
-            tried = [self._sight(index, self.first_search_px, weights).fit for weights in (LUMINANCE, *_SINGLE)]
-            good = [fit for fit in tried if fit is not None and fit.likeness > _CLEAR_LIKENESS]
-            if good:
-                best = max(good, key=lambda fit: fit.likeness)
-                fits.append((self.layout.marks[index].mark, best.pixel_from_mark))
-        self.weights = best_weights(self.scan, fits)
+            mark, start = self.layout.marks[index].mark, self._start(index)
+            answers = [
+                strongest(self.scan, mark, start, self.first_search_px, self._sign(mark), weights)
+                for weights in (LUMINANCE, *_SINGLE)
+            ]
+            place, height = max(answers, key=lambda answer: answer[1])
+            if height > _CLEAR_RESPONSE:
+                places.append((mark, np.column_stack([start[:, :2], place])))
+        self.weights = best_weights(self.scan, places)
 
     def look(self, indices: Sequence[int], search_px: float) -> None:
         for index in indices:
@@ -149,33 +173,86 @@ class _Sighter:
             return
         index = np.flatnonzero(found)
         up, sigma = self._up_mm(index), self._sigma_mm(index)
-        out = strangers(self.camera[index], up, sigma, self.turn, self.options.gate_mm)
+        out = strangers(self.camera[index], up, sigma, self.turn, self.options.gate_mm) & ~self.vouched[index]
         self.belongs[index[out]] = False
         fit = fit_frame(self.camera[index[~out]], up[~out], sigma[~out], self.turn)
         self.pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / self.pitch[:, None]
 
-    def learn(self) -> None:
-        """Many marks tell blur, rotation and scale better than a faint mark does itself."""
-        if self.belongs.sum() < _MANY:
-            return
-        blurs = [s.fit.blur_px for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s and s.fit]
-        self.match = replace(self.match, blur_px=float(np.median(blurs)), estimate_blur=False, linear_sigma=0.01)
+    def sure(self) -> bool:
+        """Whether so many marks agree, some of them clear ones, that they tell where every other must be."""
+        clear = sum(self.clear(index) for index in np.flatnonzero(self.belongs).tolist())
+        return bool(self.belongs.sum() >= _MANY and clear >= _MANY / 2)
+
+    def glimpse_faint(self, reach_px: float) -> None:
+        """Look again at every mark that is not clear or lies off, where the others put it: what stands out of its
+        texture there is this mark, the film being deformed where it lies off."""
+        extremes = np.percentile(self.scan.reduced(self.placement.reduction, self.weights), _EXTREMES)
+        blur_px = self._blur_px()
+        for index in range(len(self.sightings)):
+            sighting = self.sightings[index]
+            if sighting is None or not sighting.inside or (self.clear(index) and self.belongs[index]):
+                continue
+            mark = self.layout.marks[index].mark
+            sign = self._sign(mark)
+            seen = glimpse(
+                self.scan,
+                mark,
+                self._start(index),
+                reach_px,
+                sign,
+                float(extremes[int(sign > 0)]),
+                blur_px,
+                self.weights,
+            )
+            self._take(index, sighting, seen if seen is not None and self._certain(seen) else None, reach_px)
+
+    def _take(self, index: int, sighting: Sighting, seen: Glimpse | None, reach_px: float) -> None:
+        """Keep a clear fit where the glimpse is of the same; else the glimpse counts, or that there was none."""
+        clear = self.clear(index)
+        self.vouched[index] = seen is not None
+        if seen is None and not clear:
+            reason = f"nothing within {reach_px:.0f} px of its place stands out of the texture like it"
+            self.sightings[index] = Sighting(sighting.predicted_px, True, None, reason)
+        elif seen is not None:
+            off = np.inf if sighting.fit is None else np.hypot(*(sighting.fit.center_px - seen.fit.center_px))
+            if not clear or off > _SAME_PX:
+                reason = (
+                    f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
+                )
+                self.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
+
+    def _blur_px(self) -> float:
+        """The marks that agree tell it better than a faint mark does itself."""
+        return float(np.median([s.fit.blur_px for s in np.array(self.sightings)[self.belongs] if s.fit is not None]))
+
+    def _certain(self, seen: Glimpse) -> bool:
+        sigma_px = float(np.sqrt(np.linalg.eigvalsh(seen.fit.covariance_px2)[-1]))
+        strong = abs(seen.fit.contrast_dn) >= _FAINT_CONTRAST * self.scan.full_scale_dn
+        return seen.chance <= _CHANCE and sigma_px <= _FAINT_SIGMA_PX and strong
 
     def clear(self, index: int) -> bool:
         """Whether a mark needs no second look: it is plainly there, be it where the others put it or not."""
         sighting = self.sightings[index]
         return sighting is not None and sighting.fit is not None and sighting.fit.likeness >= _CLEAR_LIKENESS
 
-    def second_search_px(self) -> float:
-        """How far a mark can be from where the others put it: the gate, less where many others agree better."""
-        if self.belongs.sum() < _MANY:
-            return self.gate_px
-        scatter_px = float(np.median(self._misfit_mm()[self.belongs])) / float(self.pitch.mean())
-        return min(self.gate_px, max(6 * scatter_px, 3.0))
+    def reach_px(self) -> float:
+        """How far a faint mark can be from where many others put it."""
+        return min(self.gate_px, max(_REACH * self._scatter_mm() / float(self.pitch.mean()), _LEAST_REACH_PX))
+
+    def _scatter_mm(self) -> float:
+        return float(np.median(self._misfit_mm()[self.belongs])) if self.belongs.any() else 0.0
 
     def frame(self) -> Frame:
         sightings = tuple(sighting for sighting in self.sightings if sighting is not None)
-        return Frame(self.placement, sightings, self.belongs, self._misfit_mm(), self.pixel_from_camera, self.weights)
+        return Frame(
+            self.placement,
+            sightings,
+            self.belongs,
+            self._misfit_mm(),
+            self._scatter_mm(),
+            self.pixel_from_camera,
+            self.weights,
+        )
 
     def _misfit_mm(self) -> Array:
         misfit = np.full(len(self.sightings), np.nan)
@@ -186,16 +263,16 @@ class _Sighter:
         return misfit
 
     def _sight(self, index: int, search_px: float, weights: Sequence[float] | None) -> Sighting:
-        pixel_from_mark = np.column_stack([self.pixel_from_camera[:, :2], self._predicted_px()[index]])
         mark = self.layout.marks[index].mark
-        sighting = sight(self.scan, mark, pixel_from_mark, search_px, self._sign(mark), weights, self.match)
-        many = self.belongs.sum() >= _MANY
-        least, significance = (_FAINT_LIKENESS, _FAINT_SIGNIFICANCE) if many else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
+        sighting = sight(self.scan, mark, self._start(index), search_px, self._sign(mark), weights, self.options.match)
         fit = sighting.fit
-        if fit is not None and (fit.likeness < least or fit.significance < significance):
+        if fit is not None and (fit.likeness < _LEAST_LIKENESS or fit.significance < _LEAST_SIGNIFICANCE):
             reason = f"nothing within {search_px:.0f} px of its place looks like it"
             return Sighting(sighting.predicted_px, True, None, reason)
         return sighting
+
+    def _start(self, index: int) -> Array:
+        return np.column_stack([self.pixel_from_camera[:, :2], self._predicted_px()[index]])
 
     def _sign(self, mark: Mark) -> int:
         return sign_of(mark, self.placement.polarity)

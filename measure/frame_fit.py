@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_STRANGE = 1e-3  # probability of taking any true mark for a stranger, were the film's deformation random
+_MANY = 8  # marks whose scatter says more than the gate
+_LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most agree
 AFFINITY_SIGMA = 5e-3  # film stretches by a few parts in ten thousand, an office scanner by several thousandths
 
 
@@ -49,27 +52,38 @@ def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array) -> F
 
 
 def strangers(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, gate_mm: float) -> NDArray[np.bool_]:
-    """(n,) which marks do not belong: one by one, the mark without which the others agree best is taken out, until
-    none is off by more than the gate, or only three are left."""
+    """(n,) which marks do not belong: one by one, the mark that disagrees most with the others is taken out, until
+    none is off by more than the gate or by what the others' own scatter allows, or only three are left."""
     out = np.zeros(len(camera_mm), dtype=bool)
     while (~out).sum() > 3:
         kept = np.flatnonzero(~out)
-        fit = fit_frame(camera_mm[kept], up_mm[kept], sigma_mm[kept], turn)
-        size = np.hypot(*fit.residuals_mm.T)
-        if size.max() <= _gate(size, gate_mm):
+        size = np.hypot(*fit_frame(camera_mm[kept], up_mm[kept], sigma_mm[kept], turn).residuals_mm.T)
+        rest = [np.delete(kept, index) for index in range(len(kept))]
+        fits = [fit_frame(camera_mm[others], up_mm[others], sigma_mm[others], turn) for others in rest]
+        if len(kept) >= _MANY:
+            predicted = np.array(
+                [fit.up_from_camera @ (*camera_mm[index], 1.0) for fit, index in zip(fits, kept, strict=True)]
+            )
+            off = np.hypot(*(up_mm[kept] - predicted).T)
+            chance = np.array([_chance(*pair) for pair in zip(size * off, fits, strict=True)])
+            strange = (size > _LEAST_GATE * gate_mm) & (chance < _STRANGE / len(kept)) | (size > gate_mm)
+            worst = int(np.where(strange, chance, 2.0).argmin())
+        else:
+            strange = size > gate_mm
+            worst = int(np.argmin([fit.chi_square for fit in fits]))
+        if not strange.any():
             break
-        rest = [_misfit(np.delete(kept, index), camera_mm, up_mm, sigma_mm, turn) for index in range(len(kept))]
-        out[kept[int(np.argmin(rest))]] = True
+        out[kept[worst]] = True
     return out
 
 
-def _gate(size_mm: Array, gate_mm: float) -> float:
-    """With many marks, their own scatter says more than the gate: 4.5 medians of the distances are over five standard
-    deviations."""
-    if len(size_mm) < 8:
-        return gate_mm
-    return min(gate_mm, max(4.5 * float(np.median(size_mm)), gate_mm / 10))
+def _chance(product_mm2: float, others: FrameFit) -> float:
+    """The probability of a misfit: of the residual times the distance from where the others alone put the mark, over
+    the others' variance, which is the square of the residual studentised without it, on two degrees of freedom.
 
-
-def _misfit(kept: NDArray[np.intp], camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array) -> float:
-    return fit_frame(camera_mm[kept], up_mm[kept], sigma_mm[kept], turn).chi_square
+    The variance is from the median, which other strangers do not widen: half of Rayleigh's squares are below 2 ln 2.
+    """
+    free = others.redundancy
+    squares = np.sum(others.residuals_mm**2, axis=1)
+    variance = float(np.median(squares)) / (2 * np.log(2)) * 2 * len(squares) / free
+    return float((1 + product_mm2 / max(free * variance, 1e-12)) ** (-free / 2))

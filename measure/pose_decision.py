@@ -147,7 +147,7 @@ def _reach_px(mark: Mark, linear: Array) -> float:
 def _decision(verdicts: Sequence[_Verdict], seen: int) -> Pose:
     """Compare the poses, after scaling coordinate misfits by what the best pose itself leaves unexplained."""
     if not verdicts:
-        return Pose("0", False, (f"no pose names the {seen} marks that were found",))
+        return Pose("0", False, (f"no pose names the {seen} marks that were found.",))
     first = max(verdicts, key=lambda verdict: verdict.pictures - verdict.chi_square / 2)
     unexplained = max(1.0, first.chi_square / max(first.redundancy, 1))
 
@@ -162,12 +162,12 @@ def _decision(verdicts: Sequence[_Verdict], seen: int) -> Pose:
             False,
             (
                 f"nothing in the {seen} marks found tells the poses {', '.join(alike)} apart: "
-                f"their pictures and given coordinates are alike; {alike[0]} is assumed",
+                f"their pictures and given coordinates are alike; {alike[0]} is assumed.",
             ),
         )
     others = [verdict for verdict in verdicts if verdict is not best]
     if not others:
-        return Pose(best.pose, True, (f"no other pose explains the {seen} marks found",))
+        return Pose(best.pose, True, (f"no other pose explains the {seen} marks found.",))
     rival = max(others, key=total)
     pictures = best.pictures - rival.pictures
     coordinates = (rival.chi_square - best.chi_square) / 2 / unexplained
@@ -175,7 +175,7 @@ def _decision(verdicts: Sequence[_Verdict], seen: int) -> Pose:
         best.pose,
         True,
         (
-            f"the marks' pictures speak for it against the next best pose {rival.pose} with log-odds {pictures:.1f}",
-            f"their given coordinates with log-odds {coordinates:.1f}",
+            f"the marks' pictures speak for it against the next best pose {rival.pose} with log-odds {pictures:.1f}.",
+            f"their given coordinates with log-odds {coordinates:.1f}.",
         ),
     )

@@ -14,6 +14,8 @@ from measure.shapes import Mark, MarkShape, Polygon
 
 Array = NDArray[np.float64]
 
+_LEAST_RESPONSE = 0.15  # correlation below it is not worth a fit: bare texture answers as well
+
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
@@ -43,12 +45,13 @@ def sight(
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
         return Sighting(predicted, False, None, "its place is outside of the scan")
-    margin_px = search_px + options.margin_px + 4
-    col0, row0, width, height = window_about(mark, pixel_from_mark, margin_px)
-    window = scan.window(col0, row0, width, height, weights).astype(float)
-    valid = _inside_scan(scan, col0, row0, width, height)
     start = np.array(pixel_from_mark)
-    start[:, 2] = _strongest(window, mark, start, (col0, row0), search_px, polarity, scan.full_scale_dn)
+    start[:, 2], height = strongest(scan, mark, pixel_from_mark, search_px, polarity, weights)
+    if height < _LEAST_RESPONSE:
+        return Sighting(predicted, True, None, f"nothing within {search_px:.0f} px of its place looks like it")
+    col0, row0, width, tall = window_about(mark, start, options.margin_px + 4)
+    window = scan.window(col0, row0, width, tall, weights).astype(float)
+    valid = _inside_scan(scan, col0, row0, width, tall)
     fit = match(window, (col0, row0), mark, start, _options_for(mark, options), valid)
     if not fit.converged:
         return Sighting(predicted, True, None, fit.reason)
@@ -59,35 +62,31 @@ def sight(
     return Sighting(predicted, True, fit)
 
 
+def strongest(
+    scan: Scan, mark: Mark, pixel_from_mark: Array, search_px: float, polarity: int, weights: Sequence[float] | None
+) -> tuple[Array, float]:
+    """The scan's pixel (col, row) within the search radius where the mark correlates best, and how well."""
+    col0, row0, width, tall = window_about(mark, pixel_from_mark, search_px + 4)
+    window = scan.window(col0, row0, width, tall, weights)
+    centred = np.column_stack([pixel_from_mark[:, :2], np.zeros(2)])
+    least, greatest = extent_px(mark, centred)
+    low, high = np.floor(least).astype(int) - 2, np.ceil(greatest).astype(int) + 2
+    centred[:, 2] = -low
+    size = high - low + 1
+    template = picture(mark, centred, int(size[0]), int(size[1]), 1.0)
+    faint_dn = scan.full_scale_dn * FAINT
+    response = polarity * correlate(window, template, detail_px(mark, pixel_from_mark[:, :2]), faint_dn)
+    place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)
+    place += np.array([col0, row0]) - low
+    near = np.hypot(*np.moveaxis(place - pixel_from_mark[:, 2], -1, 0)) <= search_px
+    best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
+    return np.asarray(place[best]), float(response[best])
+
+
 def _inside_scan(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
     col, row = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
     inside_col, inside_row = (col >= 0) & (col < scan.width_px), (row >= 0) & (row < scan.height_px)
     return inside_row[:, None] & inside_col[None, :]
-
-
-def _strongest(
-    window: Array,
-    mark: Mark,
-    pixel_from_mark: Array,
-    origin: tuple[int, int],
-    search_px: float,
-    polarity: int,
-    full_scale_dn: float,
-) -> Array:
-    """The scan's pixel (col, row) within the search radius where the mark correlates best."""
-    centred = np.array(pixel_from_mark)
-    centred[:, 2] = 0.0
-    least, greatest = extent_px(mark, centred)
-    low, high = np.floor(least).astype(int) - 2, np.ceil(greatest).astype(int) + 2
-    centred[:, 2] = -low
-    width, height = high - low + 1
-    template = picture(mark, centred, int(width), int(height), 1.0)
-    response = polarity * correlate(window, template, detail_px(mark, pixel_from_mark[:, :2]), full_scale_dn * FAINT)
-    place = np.stack(np.meshgrid(*(np.arange(size, dtype=float) for size in response.shape[::-1])), axis=-1) - low
-    place = place + np.asarray(origin)
-    near = np.hypot(*np.moveaxis(place - pixel_from_mark[:, 2], -1, 0)) <= search_px
-    best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
-    return np.asarray(place[best])
 
 
 def _options_for(mark: Mark, options: MatchOptions) -> MatchOptions:

@@ -118,7 +118,7 @@ def test_the_users_pose_is_taken(tmp_path: Path) -> None:
     matrix = pixel_from_camera("270m")
     result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, FiducialOptions(pose="270m"))
     assert result.pose is not None
-    assert (result.pose.name, result.pose.decided, result.pose.evidence) == ("270m", True, ("set in the project",))
+    assert (result.pose.name, result.pose.decided, result.pose.evidence) == ("270m", True, ("set in the project.",))
     assert_right(result, ALIKE, matrix)
 
 
