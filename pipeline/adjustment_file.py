@@ -19,7 +19,7 @@ from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
 from adjust.projection import adjusted_image
 from adjust.result import Adjustment
 from adjust.transformation import NAMES
-from pipeline.atomic import write_atomically
+from pipeline.atomic import atomic_path
 from pipeline.errors import InputError
 
 Array = NDArray[np.float64]
@@ -70,8 +70,10 @@ def write_adjustment(adjustment: Adjustment, path: Path) -> None:
         values=adjustment.values,
         matrix=adjustment.sigma0**2 * adjustment.cofactor,
     )
-    write_atomically(covariance_path(path), arrays.getvalue())
-    write_atomically(path, text + "\n")
+    # Both are whole before either takes its place: a covariance belongs to its adjustment.
+    with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
+        covariance.write_bytes(arrays.getvalue())
+        result.write_text(text + "\n", encoding="utf-8")
 
 
 def adjustment_json(adjustment: Adjustment) -> Json:

@@ -26,7 +26,6 @@ TEMPLATES = ("project", "camera", "scene")
 
 app = typer.Typer(
     help="From scanned film photographs to comparator coordinates and a calibrated camera.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -60,10 +59,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 @app.callback(invoke_without_command=True)
-def root(show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
-    """Options that go before any command."""
+def root(
+    context: typer.Context,
+    show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Options that go before any command; without one, the help."""
     if show_version:
         typer.echo(f"reseau {version('reseau')}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
         raise typer.Exit
 
 
