@@ -76,3 +76,12 @@ def test_with_many_marks_their_own_scatter_is_the_gate() -> None:
     up = seen(grid, turn) + rng.normal(0, 0.005, grid.shape)
     up[7] += (0.1, 0.0)  # well inside of the gate, far outside of the others' scatter
     assert np.flatnonzero(strangers(grid, up, np.full(25, 0.005), turn, 0.3)).tolist() == [7]
+
+
+def test_two_strangers_do_not_hide_each_other() -> None:
+    grid = np.array([(10.0 * i, 10.0 * j) for i in range(-2, 3) for j in range(-2, 2)])
+    rng, turn = np.random.default_rng(7), up_from_camera("0")
+    up = seen(grid, turn) + rng.normal(0, 0.005, grid.shape)
+    up[3] += (0.28, 0.0)
+    up[16] += (-0.25, 0.05)
+    assert np.flatnonzero(strangers(grid, up, np.full(20, 0.005), turn, 0.3)).tolist() == [3, 16]

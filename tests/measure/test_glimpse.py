@@ -1,0 +1,60 @@
+"""Faint marks on texture: seen where they are, with honest sigmas, and nowhere else."""
+
+from pathlib import Path
+
+import numpy as np
+from brute_marks import Array, brute_picture, scan_of
+from scipy.ndimage import gaussian_filter
+
+from measure.glimpse import Glimpse, glimpse
+from measure.shapes import MarkShape, cross
+
+CROSS = MarkShape(cross(0.5, 0.05), "dark")
+LINEAR = 36.0 * np.diag([1.0, -1.0])
+SIDE_PX, STEP_PX = 5, 110
+
+
+def textured(seed: int) -> Array:
+    """Ground of brightness 20000 with a texture of 2000, correlated over two to three pixels."""
+    rng = np.random.default_rng(seed)
+    field = gaussian_filter(rng.normal(0, 1, (SIDE_PX * STEP_PX,) * 2), 1.0)
+    return np.asarray(20000 + 2000 * field / field.std())
+
+
+def places(seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(*(np.arange(SIDE_PX) * STEP_PX + STEP_PX / 2,) * 2), axis=-1).reshape(-1, 2)
+    return np.asarray(grid + rng.uniform(-0.5, 0.5, grid.shape))
+
+
+def seen_at(grey: Array, predicted: Array, folder: Path) -> list[Glimpse | None]:
+    with scan_of(grey, folder) as scan:
+        return [glimpse(scan, CROSS, np.column_stack([LINEAR, place]), 3.0, -1, 0.0, 0.7, None) for place in predicted]
+
+
+def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma(tmp_path: Path) -> None:
+    squares = []
+    for seed in range(2):
+        grey, true = textured(seed), places(seed)
+        for place in true:
+            col0, row0 = np.rint(place).astype(int) - 25
+            shown = brute_picture(CROSS, np.column_stack([LINEAR, place - (col0, row0)]), 51, 51, 0.7)
+            grey[row0 : row0 + 51, col0 : col0 + 51] -= 5000 * shown
+        for found, place in zip(seen_at(grey, np.rint(true), tmp_path), true, strict=True):
+            assert found is not None
+            assert found.chance < 1e-4
+            error = found.fit.center_px - place
+            squares.append(float(error @ np.linalg.solve(found.fit.covariance_px2, error)) / 2)
+    assert 0.7 < float(np.sqrt(np.mean(squares))) < 1.4
+
+
+def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
+    answers = [found for seed in range(4) for found in seen_at(textured(seed + 50), places(seed), tmp_path)]
+    chances = np.array([found.chance for found in answers if found is not None])
+    assert (chances < 1e-3).sum() <= 2  # of a hundred places
+    assert 5 <= (chances < 0.1).sum() <= 45  # the strongest of those within three pixels, not one drawn blindly
+
+
+def test_where_the_ground_is_black_nothing_is_seen(tmp_path: Path) -> None:
+    black = np.zeros((SIDE_PX * STEP_PX,) * 2)
+    assert all(found is None for found in seen_at(black, places(1)[:3], tmp_path))
