@@ -39,7 +39,7 @@ _LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
 _SAME_PX = 1.0
 _ROUNDS = 2  # of looking for faint marks: the first ones tell where the others are
 _REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
-_FAR = 5.0  # times the scatter of the others
+_FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
 
 
