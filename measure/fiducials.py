@@ -139,7 +139,7 @@ def _nothing(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasuremen
     marks = tuple(
         MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}") for mark in layout.marks
     )
-    problem = f"{scan.name}: no fiducial was measured: {reason}; look whether the scan and the camera belong together"
+    problem = f"no fiducial was measured: {reason}; look whether the scan and the camera belong together."
     return FrameMeasurement(scan.name, marks, None, None, (problem,))
 
 
@@ -147,20 +147,16 @@ def _measurement(
     scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, rivals: Sequence[str]
 ) -> FrameMeasurement:
     marks = tuple(_row(mark, index, frame) for index, mark in enumerate(layout.marks))
-    problems = [f"{scan.name}: {sentence}" for sentence in rivals]
+    problems = [f"{sentence}." for sentence in rivals]
     if rivals:
         pose = (
             Pose(pose.name, False, (*pose.evidence, *(f"{sentence}." for sentence in rivals)))
             if pose.evidence != _SET
             else pose
         )
-    if not pose.decided:
-        problems.append(f"{scan.name}: pose assumed: {pose.evidence[0].rstrip('.')}")
     used = int(frame.belongs.sum())
-    if used < len(layout.marks):
-        problems.append(f"{scan.name}: {used} of {len(layout.marks)} fiducials measured")
     if used <= 3:
-        problems.append(f"{scan.name}: an affine transformation on {used} fiducials has no redundancy: no check")
+        problems.append(f"an affine transformation on {used} fiducials has no redundancy: no check.")
     return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, tuple(problems))
 
 

@@ -97,7 +97,6 @@ def test_a_nearly_black_frame_says_what_became_of_every_mark() -> None:
     given, seen = observations(result, layout)
     assert len(seen) < 15  # the others lie in the dark
     assert len(seen) < 4 or affine_rms_px(given, seen) < 1.0
-    assert any("fiducial" in problem for problem in result.problems)
 
 
 def test_a_reseau_is_not_seen_in_a_frame_of_another_camera() -> None:
