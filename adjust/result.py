@@ -1,6 +1,6 @@
 """What an adjustment hands on."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -102,6 +102,11 @@ class Adjustment:
 
     def value(self, name: str) -> float:
         return float(self.values[self.index(name)])
+
+    def cofactor_of(self, names: Sequence[str]) -> Array:
+        """The cofactor matrix (k, k) of some unknowns."""
+        at = [self.index(name) for name in names]
+        return self.cofactor[np.ix_(at, at)]
 
     def sigma(self, name: str) -> float:
         """A-posteriori standard deviation."""

@@ -27,15 +27,15 @@ class Converted:
 def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     camera = problem.network.cameras[0]
     family = camera.distortion.family
-    rows = [solved.index(f"IO.{camera.name}.{each}") for each in ("c", "x0", "y0", *PARAMETERS[family])]
-    values = solved.values[rows]
+    names = [f"IO.{camera.name}.{each}" for each in ("c", "x0", "y0", *PARAMETERS[family])]
+    values = np.array([solved.value(name) for name in names])
     interior, parameters = values[:3], values[3:]
     observed = problem.network.observations.xy_mm
     grid = image_grid(np.array([observed.min(axis=0), observed.max(axis=0)]))
     whole = refit(camera.distortion, interior, parameters, grid, _whole(family), _start(family, interior, parameters))
-    steps = [STEP_SIGMAS * float(np.sqrt(solved.cofactor[row, row])) for row in rows]
+    steps = [STEP_SIGMAS * float(sigma) for sigma in np.sqrt(np.diag(solved.cofactor_of(names)))]
     jacobian = refit_jacobian(camera.distortion, interior, parameters, steps, grid, problem.freedom, whole.parameters)
-    variances = np.einsum("ij,jk,ik->i", jacobian, solved.cofactor[np.ix_(rows, rows)], jacobian)
+    variances = np.einsum("ij,jk,ik->i", jacobian, solved.cofactor_of(names), jacobian)
     return Converted(whole, np.sqrt(np.maximum(variances, 0.0)))
 
 

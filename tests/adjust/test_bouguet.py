@@ -68,7 +68,7 @@ def in_pixels(adjustment: Adjustment) -> tuple[Array, Array]:
     by_own[:4, :4] = 0.0
     by_own[0, :2], by_own[1, 0], by_own[2, 2], by_own[3, 3] = (1 + b1, c), 1.0, 1.0, -1.0
     by_own[:4] /= PITCH_MM
-    covariance = by_own @ (adjustment.sigma0**2 * adjustment.cofactor[np.ix_(rows, rows)]) @ by_own.T
+    covariance = by_own @ (adjustment.sigma0**2 * adjustment.cofactor_of(names)) @ by_own.T
     values = np.array([c * (1 + b1) / PITCH_MM, c / PITCH_MM, x0 / PITCH_MM, -y0 / PITCH_MM, *distortion])
     return values, np.sqrt(np.diag(covariance))
 
