@@ -6,7 +6,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.datum import centered, inner_constraints, minimal_datum
+from adjust.cofactor import NoCofactor, free_cofactor, inner_cofactor
+from adjust.datum import centered, minimal_datum
 from adjust.diagnosis import singular_directions, undetermined, weak_directions
 from adjust.errors import AdjustmentError
 from adjust.functions import blind_target
@@ -14,9 +15,8 @@ from adjust.iteration import Linearised, Solution, factorise, iterate, linearise
 from adjust.network import Approximations, Network
 from adjust.problem import Problem, State, number
 from adjust.residuals import groups, residuals
-from adjust.result import Adjustment, NullDirection, Residuals
+from adjust.result import Adjustment, Cofactor, NullDirection, Residuals
 from adjust.reweighting import Weighting, robust_weights, variance_factor
-from adjust.rotation import vector_by_angles
 from adjust.rows import Numbering
 from adjust.validation import validate
 
@@ -76,7 +76,7 @@ def _minimal(problem: Problem) -> Problem:
 
 @dataclass(frozen=True)
 class _Run:
-    """One adjustment with given weights: where it ended, its cofactor matrix (n, n), its residuals.
+    """One adjustment with given weights: where it ended, its cofactor matrix, its residuals.
 
     settled: whether the residuals ask for no other weights.
     """
@@ -85,7 +85,7 @@ class _Run:
     weighting: Weighting
     solution: Solution
     singular: tuple[NullDirection, ...]
-    cofactor: Array
+    cofactor: Cofactor
     residuals: Residuals
     settled: bool = True
 
@@ -130,7 +130,7 @@ def _run(numbering: Numbering, weighting: Weighting, state: State, limit: int) -
         return _unsolved(numbering, weighting, replace(solution, termination="singular"), singular)
     if solution.factor is None:
         return _unsolved(numbering, weighting, solution, ())
-    cofactor = _spread(numbering, solution.factor.cofactor())
+    cofactor = free_cofactor(numbering, solution.end.state, solution.factor)
     observed = residuals(numbering, solution.end, solution.factor, covariance)
     return _Run(numbering, weighting, solution, (), cofactor, observed)
 
@@ -141,15 +141,7 @@ def _unsolved(
     count = len(numbering.problem.unknowns)
     nothing = np.zeros_like(solution.end.v_mm)
     observed = Residuals(solution.end.v_mm, nothing, nothing)
-    return _Run(numbering, weighting, solution, singular, np.zeros((count, count)), observed)
-
-
-def _spread(numbering: Numbering, cofactor: Array) -> Array:
-    """The cofactor matrix of all quantities (n, n): rows of zeros for fixed ones."""
-    count = len(numbering.problem.unknowns)
-    spread = np.zeros((count, count))
-    spread[np.ix_(numbering.free, numbering.free)] = cofactor
-    return spread
+    return _Run(numbering, weighting, solution, singular, NoCofactor(count), observed)
 
 
 def _reweighted(run: _Run, options: Options) -> Weighting:
@@ -179,9 +171,9 @@ def _freed(problem: Problem, run: _Run) -> _Run:
     end = linearise(run.numbering, run.weighting.covariance(problem), state)
     if end is None:
         return run
-    cofactor = _spread(run.numbering, factorise(run.numbering, end).cofactor())
-    solution = replace(run.solution, end=end)
-    return replace(run, solution=solution, cofactor=inner_constraints(problem, state, cofactor))
+    factor = factorise(run.numbering, end)
+    solution = replace(run.solution, end=end, factor=factor)
+    return replace(run, solution=solution, cofactor=inner_cofactor(problem, run.numbering, state, factor))
 
 
 def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
@@ -191,7 +183,6 @@ def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
     observed = run.residuals
     # The test w of a mark that robust estimation has lost is that of the mark as it was given.
     given = replace(observed, w=observed.w / np.sqrt(weighting.weights)[:, None])
-    cofactor = _with_angles(problem, state, run.cofactor)
     conditions = 2 * len(problem.network.observations) + int(unknowns.has_prior.sum())
     factors = {"target": weighting.target, "fiducial": weighting.fiducial} if options.variance_components else {}
     return Adjustment(
@@ -204,11 +195,11 @@ def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
         vpv=run.end.vpv,
         names=unknowns.names,
         values=state.values,
-        cofactor=cofactor,
+        cofactor=run.cofactor,
         residuals=given,
-        groups=groups(problem, state, cofactor, observed, covariance),
+        groups=groups(problem, state, run.cofactor.variances, observed, covariance),
         singular=run.singular,
-        warnings=_warnings(run, cofactor),
+        warnings=_warnings(run),
         history=run.solution.history,
         mirrored=problem.mirrored,
         weights=weighting.weights,
@@ -216,22 +207,7 @@ def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
     )
 
 
-def _with_angles(problem: Problem, state: State, cofactor: Array) -> Array:
-    """The cofactor matrix with omega, phi, kappa in the place of the rotation vectors.
-
-    Where phi is +-90 degrees, omega and kappa are told by their sum or difference alone (the pseudo-inverse).
-    """
-    positions = problem.exterior[:, 3:]
-    by_vector = np.linalg.pinv(vector_by_angles(state.values[positions]))
-    by_vector[problem.keeps_angles] = np.eye(3)
-    result = cofactor.copy()
-    result[positions] = by_vector @ result[positions]
-    columns = result[:, positions]
-    result[:, positions] = np.einsum("nik,ilk->nil", columns, by_vector)
-    return result
-
-
-def _warnings(run: _Run, cofactor: Array) -> tuple[str, ...]:
+def _warnings(run: _Run) -> tuple[str, ...]:
     """What the user should look at in a result."""
     problem = run.numbering.problem
     warnings = []
@@ -256,7 +232,7 @@ def _warnings(run: _Run, cofactor: Array) -> tuple[str, ...]:
             f"Practically singular without priors: {', '.join(each.parameters)}. {each.cause} {each.remedy}"
             for each in weak
         ]
-        blind = undetermined(problem, cofactor)
+        blind = undetermined(problem, run.cofactor.variances)
         if blind:
             warnings.append(
                 f"The observations say nothing about {', '.join(blind)}: their standard deviations stay as given."

@@ -140,14 +140,7 @@ def _held(problem: Problem) -> NDArray[np.bool_]:
     return np.asarray((problem.unknowns.sigma[problem.exterior[:, 3:]] == 0.0).all(axis=1))
 
 
-def inner_constraints(problem: Problem, state: State, cofactor: Array) -> Array:
-    """A cofactor matrix (n, n) of minimal datum transformed to that of inner constraints over the free points.
-
-    Baarda's S-transformation: S = I - G (G_p' G_p)^-1 G_p', with G_p the rows of the free points' coordinates.
-    """
+def free_motion(problem: Problem, state: State) -> tuple[Array, Indices]:
+    """How all quantities move (n, d) with what is free of the datum, and the positions of the free coordinates."""
     datum = object_datum(problem, state, FLAT)
-    motion = datum.generators @ datum.free
-    members = free_coordinates(problem)
-    part = np.linalg.pinv(motion[members])
-    once = cofactor - motion @ (part @ cofactor[members])
-    return np.asarray(once - (once[:, members] @ part.T) @ motion.T)
+    return datum.generators @ datum.free, free_coordinates(problem)

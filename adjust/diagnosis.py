@@ -55,7 +55,7 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     return _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
 
 
-def undetermined(problem: Problem, cofactor: Array) -> tuple[str, ...]:
+def undetermined(problem: Problem, variances: Array) -> tuple[str, ...]:
     """Cameras' and images' quantities that the observations say nothing about: their priors alone place them.
 
     A fiducial that no image shows is not among them: nobody expects otherwise.
@@ -65,7 +65,7 @@ def undetermined(problem: Problem, cofactor: Array) -> tuple[str, ...]:
     told[np.unique(problem.columns[problem.columns >= 0])] = True
     told[[i for point in unknowns.point.values() for i in point]] = False
     prior = np.where(unknowns.has_prior & told, unknowns.sigma, np.inf)
-    blind = np.sqrt(np.diag(cofactor)) > UNDETERMINED * prior
+    blind = np.sqrt(variances) > UNDETERMINED * prior
     return collapsed([unknowns.names[i] for i in np.flatnonzero(blind)])
 
 

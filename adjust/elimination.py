@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dgeqrf, dormqr
+from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -82,20 +83,36 @@ class Factor:
             variances[block.own] = (own**2).sum(axis=1) + (through**2).sum(axis=1)
         return variances / self.scale**2
 
-    def cofactor(self) -> Array:
-        """The cofactor matrix (n, n) of all unknowns, the inverse of the normal equations."""
-        shared = self._shared_root()
-        root = np.empty((len(self.scale), self.shared_count))
-        root[: self.shared_count] = shared
-        owns = []
+    def cofactor_of(self, functions: csr_array) -> Array:
+        """The cofactor matrix (k, k) of linear functions (k, n) of the unknowns."""
+        columns = (functions / self.scale).tocsc()
+        shared = np.asarray(columns[:, : self.shared_count].toarray(), dtype=np.float64)
+        used = np.diff(columns.indptr) > 0
+        cofactor = np.zeros((len(shared), len(shared)))
         for block in self.blocks:
-            own, root[block.own] = _roots(block, shared)
-            owns.append(own / self.scale[block.own, None])
-        root /= self.scale[:, None]
-        cofactor: Array = root @ root.T
-        for block, own in zip(self.blocks, owns, strict=True):
-            cofactor[np.ix_(block.own, block.own)] += own @ own.T
-        return cofactor
+            if used[block.own].any():
+                own = columns[:, block.own].toarray()
+                rows = np.flatnonzero(own.any(axis=1))
+                root = np.asarray(solve_triangular(block.triangle, own[rows].T, trans="T"), dtype=np.float64)
+                cofactor[np.ix_(rows, rows)] += root.T @ root
+                shared[np.ix_(rows, block.shared)] -= root.T @ block.border
+        through = solve_triangular(self.triangle, shared.T, trans="T")
+        return np.asarray(cofactor + through.T @ through)
+
+    def cofactor_times(self, columns: Array) -> Array:
+        """The cofactor matrix times columns (n, d)."""
+        scaled = columns / self.scale[:, None]
+        shared = scaled[: self.shared_count].copy()
+        own = []
+        for block in self.blocks:
+            own.append(solve_triangular(block.triangle, scaled[block.own], trans="T"))
+            shared[block.shared] -= block.border.T @ own[-1]
+        result = np.empty_like(scaled)
+        shared = solve_triangular(self.triangle, solve_triangular(self.triangle, shared, trans="T"))
+        result[: self.shared_count] = shared
+        for block, root in zip(self.blocks, own, strict=True):
+            result[block.own] = solve_triangular(block.triangle, root - block.border @ shared[block.shared])
+        return result / self.scale[:, None]
 
     def row_roots(self, blocks: Sequence[Block]) -> list[Array]:
         """Per block G (m, k), where G G' is the cofactor matrix of the block's adjusted rows, matrix times unknowns."""

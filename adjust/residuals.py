@@ -38,9 +38,9 @@ def residuals(numbering: Numbering, end: Linearised, factor: Factor, covariance_
 
 
 def groups(
-    problem: Problem, state: State, cofactor: Array, observed: Residuals, covariance_mm2: Array
+    problem: Problem, state: State, variances: Array, observed: Residuals, covariance_mm2: Array
 ) -> dict[str, Group]:
-    """The groups of observations: target and fiducial in the comparator, and the priors.
+    """The groups of observations: target and fiducial in the comparator, and the priors; variances (n,) of all.
 
     control: object coordinates, whose rms is in millionths of the object unit; datum: the fiducials' given places
     (F5, F6); interior: c, x0', y0' and distortion; exterior. The last two mix units and have no rms. target, fiducial
@@ -51,15 +51,15 @@ def groups(
     for name, rows in (("target", ~problem.is_fiducial), ("fiducial", problem.is_fiducial)):
         rms_um = UM_PER_MM * _rms(observed.v_mm[rows, 0]), UM_PER_MM * _rms(observed.v_mm[rows, 1])
         result[name] = _group(float(weighted[rows].sum()), float(observed.redundancy[rows].sum()), *rms_um)
-    result.update(_prior_groups(problem, state, cofactor))
+    result.update(_prior_groups(problem, state, variances))
     return result
 
 
-def _prior_groups(problem: Problem, state: State, cofactor: Array) -> Iterator[tuple[str, Group]]:
+def _prior_groups(problem: Problem, state: State, variances: Array) -> Iterator[tuple[str, Group]]:
     unknowns = problem.unknowns
     v = -prior_differences(problem, state)
-    variance = np.where(unknowns.has_prior, unknowns.sigma, 1.0) ** 2
-    redundancy = 1.0 - np.diag(cofactor) / variance
+    given = np.where(unknowns.has_prior, unknowns.sigma, 1.0) ** 2
+    redundancy = 1.0 - variances / given
     kinds = {"control": "PT.", "datum": "FID.", "interior": "IO.", "exterior": "EO."}
     names = np.array(unknowns.names)
     for group, prefix in kinds.items():
@@ -71,7 +71,7 @@ def _prior_groups(problem: Problem, state: State, cofactor: Array) -> Iterator[t
             scale = 1e6 if group == "control" else UM_PER_MM
             axes = ("X", "Y") if group == "control" else ("x", "y")
             rms = [scale * _rms(v[members & np.char.endswith(names, f".{axis}")]) for axis in axes]
-        vpv = float((v[members] ** 2 / variance[members]).sum())
+        vpv = float((v[members] ** 2 / given[members]).sum())
         yield group, _group(vpv, float(redundancy[members].sum()), *rms)
 
 

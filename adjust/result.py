@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from adjust.network import Network
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 Termination = Literal["converged", "singular", "iteration limit", "diverged"]
 
@@ -52,14 +53,25 @@ class Group:
     redundancy: float
 
 
+class Cofactor(Protocol):
+    """The a-priori covariance (sigma0 = 1) of n quantities: their variances (n,) and, as asked for, any part of it."""
+
+    @property
+    def variances(self) -> Array: ...
+
+    def of(self, at: Indices) -> Array:
+        """The matrix (k, k) of some quantities, by their positions."""
+        ...
+
+
 @dataclass(frozen=True)
 class Adjustment:
     """The result: values, covariance, residuals, and how it came about.
 
     names: the unknowns, in the order of values and covariance: `T.<image>.a1`, `EO.<image>.X0` (omega, phi, kappa in
     rad), `IO.<camera>.c` / `.x0` / `.y0` / `.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`; fixed quantities included, with
-    zero rows. cofactor (n, n): a-priori covariance (sigma0 = 1); covariance is sigma0² times that. Without a solution
-    (termination "singular", "diverged") it is zero and means nothing.
+    zero rows. cofactor: a-priori covariance (sigma0 = 1), computed where it is asked for; covariance is sigma0² times
+    that. Without a solution (termination "singular", "diverged") it is zero and means nothing.
     mirrored: the images whose scan is mirrored, as in `Approximations`.
     weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
     variance_factors: the factors found for the variances of the groups "target" and "fiducial", where asked for.
@@ -74,7 +86,7 @@ class Adjustment:
     vpv: float
     names: tuple[str, ...]
     values: Array
-    cofactor: Array
+    cofactor: Cofactor
     residuals: Residuals
     groups: Mapping[str, Group]
     singular: tuple[NullDirection, ...]
@@ -105,10 +117,8 @@ class Adjustment:
 
     def cofactor_of(self, names: Sequence[str]) -> Array:
         """The cofactor matrix (k, k) of some unknowns."""
-        at = [self.index(name) for name in names]
-        return self.cofactor[np.ix_(at, at)]
+        return self.cofactor.of(np.array([self.index(name) for name in names], dtype=np.intp))
 
     def sigma(self, name: str) -> float:
         """A-posteriori standard deviation."""
-        i = self.index(name)
-        return self.sigma0 * float(np.sqrt(max(self.cofactor[i, i], 0.0)))
+        return self.sigma0 * float(np.sqrt(self.cofactor.variances[self.index(name)]))

@@ -68,7 +68,7 @@ def write_adjustment(adjustment: Adjustment, path: Path) -> None:
         arrays,
         names=np.array(adjustment.names, dtype=np.str_),
         values=adjustment.values,
-        matrix=adjustment.sigma0**2 * adjustment.cofactor,
+        matrix=adjustment.sigma0**2 * adjustment.cofactor_of(adjustment.names),
     )
     # Both are whole before either takes its place: a covariance belongs to its adjustment.
     with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
@@ -178,10 +178,9 @@ def _sigma(adjustment: Adjustment, name: str) -> float:
 
 
 def _correlation(adjustment: Adjustment, name_x: str, name_y: str) -> float:
-    x, y = adjustment.index(name_x), adjustment.index(name_y)
-    q = adjustment.cofactor
-    product = q[x, x] * q[y, y]
-    return float(q[x, y] / math.sqrt(product)) if product > 0.0 and _has_solution(adjustment) else 0.0
+    q = adjustment.cofactor_of([name_x, name_y])
+    product = q[0, 0] * q[1, 1]
+    return float(q[0, 1] / math.sqrt(product)) if product > 0.0 and _has_solution(adjustment) else 0.0
 
 
 def _has_solution(adjustment: Adjustment) -> bool:

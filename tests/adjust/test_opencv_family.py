@@ -120,7 +120,7 @@ def test_adjustment_recovers_opencvs_parameters() -> None:
     expected = dict(zip(NAMES, DISTORTION, strict=True)) | {"c": c, "x0": x0, "y0": y0, "b1": FX / FY - 1}
     for name, value in expected.items():
         i = result.index(f"IO.D.{name}")
-        assert result.values[i] == pytest.approx(value, abs=1e-3 * np.sqrt(result.cofactor[i, i]))
+        assert result.values[i] == pytest.approx(value, abs=1e-3 * np.sqrt(result.cofactor.variances[i]))
 
 
 def test_torlegard_is_inverted() -> None:

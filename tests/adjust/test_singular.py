@@ -109,7 +109,7 @@ def test_a_prior_that_nothing_else_determines_is_told() -> None:
     (warning,) = [text for text in result.warnings if "say nothing" in text]
     for name in ("c", "x0", "y0"):
         assert f"IO.{CAMERA}.{name}" in warning
-        assert result.cofactor[(result.index(f"IO.{CAMERA}.{name}"),) * 2] == pytest.approx(1.0, rel=1e-6)
+        assert result.cofactor.variances[result.index(f"IO.{CAMERA}.{name}")] == pytest.approx(1.0, rel=1e-6)
 
 
 def test_a_good_network_has_no_warning() -> None:

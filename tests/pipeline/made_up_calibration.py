@@ -1,6 +1,6 @@
 """A made-up calibration of five aerial frames, and its files: result file and report are tested on its numbers."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -62,6 +62,20 @@ POINTS = 24
 SIGMA_MM = 0.004
 
 
+@dataclass(frozen=True)
+class Dense:
+    """A cofactor matrix that is there as a whole."""
+
+    matrix: Array
+
+    @property
+    def variances(self) -> Array:
+        return np.diag(self.matrix)
+
+    def of(self, at: NDArray[np.intp]) -> Array:
+        return self.matrix[np.ix_(at, at)]
+
+
 @cache
 def adjustment() -> Adjustment:
     """Converged, sigma0 within its bounds, no observation suspect; f2 is mirrored, its film sheared."""
@@ -86,7 +100,7 @@ def adjustment() -> Adjustment:
         vpv=262.1,
         names=names,
         values=values,
-        cofactor=correlation * np.outer(sigmas, sigmas),
+        cofactor=Dense(correlation * np.outer(sigmas, sigmas)),
         residuals=Residuals(v, redundancy, w),
         groups={
             "target": Group(1.02, 3.1, 3.2, 190.0),
@@ -157,8 +171,10 @@ def singular_adjustment() -> Adjustment:
     null = NullDirection(
         ("IO.RC 20.c", "EO.f1.Z0"), "c and the flying height move together over flat ground.", "Fix c."
     )
-    lost = np.full_like(adjustment().cofactor, np.nan)
-    return replace(adjustment(), termination="singular", singular=(null,), cofactor=lost)
+    count = len(adjustment().names)
+    return replace(
+        adjustment(), termination="singular", singular=(null,), cofactor=Dense(np.full((count, count), np.nan))
+    )
 
 
 @cache

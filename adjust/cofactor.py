@@ -1,0 +1,120 @@
+"""The cofactor matrix of a result, the covariance at sigma0 = 1: computed from the factor where it is asked for."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from adjust.datum import free_motion
+from adjust.elimination import Factor
+from adjust.problem import Problem, State
+from adjust.rotation import vector_by_angles
+from adjust.rows import Numbering
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+AT_ONCE = 300  # quantities whose cofactors are computed together
+
+
+@dataclass(frozen=True)
+class NoCofactor:
+    """What stands for the cofactor matrix where there is no solution: zeros, which mean nothing."""
+
+    count: int
+
+    @property
+    def variances(self) -> Array:
+        return np.zeros(self.count)
+
+    def of(self, at: Indices) -> Array:
+        return np.zeros((len(at), len(at)))
+
+
+@dataclass(frozen=True)
+class Datum:
+    """Baarda's S-transformation of cofactors: with V = Q P', Q becomes Q - M V' - V M' + M P V M'.
+
+    motion M (n, d): how the quantities move with the free datum; through V (n, d); inner P V (d, d).
+    """
+
+    motion: Array
+    through: Array
+    inner: Array
+
+    def of(self, at: Indices) -> Array:
+        """What is added (k, k) to the cofactors of some quantities."""
+        motion, through = self.motion[at], self.through[at]
+        crossed = motion @ through.T
+        return np.asarray(motion @ self.inner @ motion.T - crossed - crossed.T)
+
+    @property
+    def variances(self) -> Array:
+        """What is added (n,) to the variances."""
+        return np.asarray(((self.motion @ self.inner - 2.0 * self.through) * self.motion).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class FactorCofactor:
+    """The cofactor matrix of all quantities (n, n) from the factor of the free unknowns (f).
+
+    by_free (n, f): the quantities as they are reported by the unknowns: omega, phi, kappa by rotation vectors, rows
+    without an entry for what is fixed.
+    """
+
+    factor: Factor
+    by_free: csr_array
+    datum: Datum | None = None
+
+    def of(self, at: Indices) -> Array:
+        """The cofactor matrix (k, k) of some quantities, by their positions in the result."""
+        cofactor = self.factor.cofactor_of(self.by_free[at])
+        return cofactor if self.datum is None else cofactor + self.datum.of(at)
+
+    @cached_property
+    def variances(self) -> Array:
+        """The diagonal (n,)."""
+        plain = self.factor.variances()
+        entries = np.diff(self.by_free.indptr)
+        variances = self.by_free.multiply(self.by_free) @ plain
+        several = np.flatnonzero(entries > 1)  # the angles of one image stand together, and so do their parts here
+        for part in np.split(several, range(AT_ONCE, len(several), AT_ONCE)):
+            variances[part] = np.diag(self.factor.cofactor_of(self.by_free[part]))
+        return np.asarray(variances if self.datum is None else np.maximum(variances + self.datum.variances, 0.0))
+
+
+def free_cofactor(numbering: Numbering, state: State, factor: Factor) -> FactorCofactor:
+    """The cofactor matrix of a network solved in the datum of its numbering."""
+    return FactorCofactor(factor, _reported(numbering.problem, state)[:, numbering.free])
+
+
+def inner_cofactor(problem: Problem, numbering: Numbering, state: State, factor: Factor) -> FactorCofactor:
+    """That of a minimal datum, the numbering's, transformed to inner constraints over the problem's free points.
+
+    With G the motions of the free datum and G_p their rows of the free points, P = (G_p' G_p)^-1 G_p'.
+    """
+    reported = _reported(problem, state)
+    by_free = reported[:, numbering.free]
+    motion, members = free_motion(problem, state)
+    part = np.zeros((len(problem.unknowns), motion.shape[1]))
+    part[members] = np.linalg.pinv(motion[members]).T
+    through = factor.cofactor_times(part[numbering.free])
+    datum = Datum(reported @ motion, by_free @ through, part[numbering.free].T @ through)
+    return FactorCofactor(factor, by_free, datum)
+
+
+def _reported(problem: Problem, state: State) -> csr_array:
+    """The quantities as they are reported by those that are moved (n, n): omega, phi, kappa by rotation vectors.
+
+    Where phi is +-90 degrees, omega and kappa are told by their sum or difference alone (the pseudo-inverse).
+    """
+    count = len(problem.unknowns)
+    angles = problem.exterior[~problem.keeps_angles, 3:]
+    by_vector = np.linalg.pinv(vector_by_angles(state.values[angles]))
+    others = np.setdiff1d(np.arange(count), angles)
+    rows = np.concatenate([others, np.repeat(angles, 3, axis=1).ravel()])
+    columns = np.concatenate([others, np.tile(angles, 3).ravel()])
+    values = np.concatenate([np.ones(len(others)), by_vector.ravel()])
+    return csr_array((values, (rows, columns)), shape=(count, count))
