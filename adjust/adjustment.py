@@ -1,5 +1,6 @@
 """The simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -60,17 +61,23 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     Raises AdjustmentError where the network is empty or contradictory, or where the approximations put a point where it
     has no image.
     """
-    options = options or Options()
     validate(network)
-    problem = number(network, approximations)
-    solved = problem if options.datum == "control" else _minimal(problem)
-    run = _settled_run(Numbering(solved), options)
+    return adjust_problem(number(network, approximations), options or Options())
+
+
+def adjust_problem(problem: Problem, options: Options, held: Iterable[int] = ()) -> Adjustment:
+    """The same with a network whose quantities are numbered; those at the positions `held` stay where they start."""
+    solved = with_datum(problem, options.datum)
+    run = _settled_run(Numbering(replace(solved, unknowns=solved.unknowns.fixed(held))), options)
     if options.datum == "free":
         run = _freed(problem, run)
     return _result(problem, run, options)
 
 
-def _minimal(problem: Problem) -> Problem:
+def with_datum(problem: Problem, datum: Datum) -> Problem:
+    """The problem that is solved: with a minimal datum held fixed, unless what is given is to be the datum."""
+    if datum == "control":
+        return problem
     return replace(problem, unknowns=problem.unknowns.fixed(minimal_datum(problem)))
 
 

@@ -55,6 +55,19 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     return _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
 
 
+def null_vectors(factor: Factor) -> Array:
+    """Orthonormal vectors (n, d) of the scaled unknowns that no row sees.
+
+    Where blocks do not determine their own unknowns, these vectors alone: the others cannot be told before.
+    """
+    within = []
+    for block in factor.blocks:
+        for vector in _own_null_vectors(block):
+            within.append(np.zeros(len(factor.scale)))
+            within[-1][block.own] = vector
+    return np.array(within).T if within else _null_space(factor, SINGULAR)[0]
+
+
 def undetermined(problem: Problem, variances: Array) -> tuple[str, ...]:
     """Cameras' and images' quantities that the observations say nothing about: their priors alone place them.
 
@@ -85,13 +98,18 @@ def _within_blocks(problem: Problem, free: Indices, factor: Factor) -> tuple[Nul
     """Null directions of an image's or a point's own unknowns, which the shared ones have no part in."""
     directions = []
     for block in factor.blocks:
-        if len(block.own) == 0:
-            continue
-        _, singular, right = np.linalg.svd(block.triangle)
-        for vector in right[singular <= SINGULAR * singular[0]]:
+        for vector in _own_null_vectors(block):
             names = [problem.unknowns.names[free[block.own[i]]] for i in _largest(vector)]
             directions.append(NullDirection(tuple(names), *_own_sentence(names[0])))
     return tuple(directions)
+
+
+def _own_null_vectors(block: BlockFactor) -> Array:
+    """The vectors (k, own) of a block's own unknowns that its rows do not see."""
+    if len(block.own) == 0:
+        return np.empty((0, 0))
+    _, singular, right = np.linalg.svd(block.triangle)
+    return np.asarray(right[singular <= SINGULAR * singular[0]])
 
 
 def _own_sentence(name: str) -> tuple[str, str]:
