@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.cofactor import NoCofactor, free_cofactor, inner_cofactor
-from adjust.datum import centered, minimal_datum
+from adjust.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
+from adjust.datum_choice import chosen_coordinates, chosen_points
 from adjust.diagnosis import singular_directions, undetermined, weak_directions
 from adjust.errors import AdjustmentError
 from adjust.functions import blind_target
@@ -22,6 +23,7 @@ from adjust.rows import Numbering
 from adjust.validation import validate
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 Datum = Literal["control", "minimal", "free"]
 
@@ -33,12 +35,16 @@ class Options:
     """How to adjust.
 
     datum: "control", what is given of points and stations and nothing else; "minimal", as many coordinates fixed as
-    these leave free, chosen automatically; "free", inner constraints over the points of which nothing is given.
+    these leave free; "free", inner constraints over points of which nothing is given.
+    datum_coordinates: those that "minimal" fixes, at their given values: "12.X" and so on; none: chosen automatically.
+    datum_points: the points that carry the inner constraints of "free"; none: all.
     robust: marks with large residuals lose weight (Huber). variance_components: the variances of targets and fiducials
     are each multiplied by what their residuals say.
     """
 
     datum: Datum = "control"
+    datum_coordinates: tuple[str, ...] = ()
+    datum_points: tuple[str, ...] = ()
     robust: bool = False
     variance_components: bool = False
     iteration_limit: int = 50
@@ -46,6 +52,9 @@ class Options:
     def __post_init__(self) -> None:
         if self.datum not in get_args(Datum):
             raise ValueError(f"the datum must be one of {', '.join(get_args(Datum))}, not {self.datum}")
+        for key, datum in (("datum_coordinates", "minimal"), ("datum_points", "free")):
+            if getattr(self, key) and self.datum != datum:
+                raise ValueError(f'{key} is for the datum "{datum}", not for "{self.datum}"')
         if self.iteration_limit < 1:
             raise ValueError(f"the iteration limit must be at least 1, not {self.iteration_limit}")
 
@@ -58,8 +67,8 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     deviation of 0 fixes. A singular network is a result with its null directions, not an error: its values are the
     approximations, its cofactor matrix is zero and means nothing.
 
-    Raises AdjustmentError where the network is empty or contradictory, or where the approximations put a point where it
-    has no image.
+    Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
+    has no image, or where the chosen datum does not hold the object space.
     """
     validate(network)
     return adjust_problem(number(network, approximations), options or Options())
@@ -67,18 +76,22 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
 
 def adjust_problem(problem: Problem, options: Options, held: Iterable[int] = ()) -> Adjustment:
     """The same with a network whose quantities are numbered; those at the positions `held` stay where they start."""
-    solved = with_datum(problem, options.datum)
+    members = chosen_points(problem, options.datum_points)
+    solved = with_datum(problem, options)
     run = _settled_run(Numbering(replace(solved, unknowns=solved.unknowns.fixed(held))), options)
     if options.datum == "free":
-        run = _freed(problem, run)
+        run = _freed(problem, run, members, options)
     return _result(problem, run, options)
 
 
-def with_datum(problem: Problem, datum: Datum) -> Problem:
+def with_datum(problem: Problem, options: Options) -> Problem:
     """The problem that is solved: with a minimal datum held fixed, unless what is given is to be the datum."""
-    if datum == "control":
-        return problem
-    return replace(problem, unknowns=problem.unknowns.fixed(minimal_datum(problem)))
+    unknowns = problem.unknowns
+    if options.datum_coordinates:
+        unknowns = unknowns.fixed_as_given(chosen_coordinates(problem, options.datum_coordinates))
+    elif options.datum != "control":
+        unknowns = unknowns.fixed(minimal_datum(problem))
+    return replace(problem, unknowns=unknowns)
 
 
 @dataclass(frozen=True)
@@ -169,18 +182,29 @@ def _reweighted(run: _Run, options: Options) -> Weighting:
     return weighting
 
 
-def _freed(problem: Problem, run: _Run) -> _Run:
-    """A run with minimal datum, brought to inner constraints over the free points; as it is where nothing was fixed."""
+def _freed(problem: Problem, run: _Run, members: Indices, options: Options) -> _Run:
+    """A run with minimal datum, brought to inner constraints over some coordinates; as it is where nothing was fixed.
+
+    Where priors leave only some of the similarity transformations free, these are so to the first order alone: after
+    each the network is adjusted again.
+    """
     fixed = run.numbering.problem.unknowns.sigma != problem.unknowns.sigma
-    if not (run.converged and fixed.any()):
+    if not fixed.any():
         return run
-    state = centered(problem, run.end.state)
-    end = linearise(run.numbering, run.weighting.covariance(problem), state)
-    if end is None:
+    extent = object_datum(problem, run.end.state).extent
+    for _ in range(CENTERINGS):
+        if not run.converged:
+            return run
+        state, before = centered(problem, run.end.state, members), run
+        if np.abs(state.values - before.end.state.values)[members].max(initial=0.0) <= EXACT * extent:
+            break
+        run = _run(before.numbering, before.weighting, state, options.iteration_limit)
+        history = before.solution.history + run.solution.history
+        run = replace(run, settled=before.settled, solution=replace(run.solution, history=history))
+    factor = run.solution.factor
+    if factor is None:
         return run
-    factor = factorise(run.numbering, end)
-    solution = replace(run.solution, end=end, factor=factor)
-    return replace(run, solution=solution, cofactor=inner_cofactor(problem, run.numbering, state, factor))
+    return replace(run, cofactor=inner_cofactor(problem, run.numbering, run.end.state, factor, members))
 
 
 def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:

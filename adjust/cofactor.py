@@ -90,14 +90,16 @@ def free_cofactor(numbering: Numbering, state: State, factor: Factor) -> FactorC
     return FactorCofactor(factor, _reported(numbering.problem, state)[:, numbering.free])
 
 
-def inner_cofactor(problem: Problem, numbering: Numbering, state: State, factor: Factor) -> FactorCofactor:
-    """That of a minimal datum, the numbering's, transformed to inner constraints over the problem's free points.
+def inner_cofactor(
+    problem: Problem, numbering: Numbering, state: State, factor: Factor, members: Indices
+) -> FactorCofactor:
+    """That of a minimal datum, the numbering's, transformed to inner constraints over some coordinates.
 
-    With G the motions of the free datum and G_p their rows of the free points, P = (G_p' G_p)^-1 G_p'.
+    With G the motions of the free datum and G_p their rows of these coordinates, P = (G_p' G_p)^-1 G_p'.
     """
     reported = _reported(problem, state)
     by_free = reported[:, numbering.free]
-    motion, members = free_motion(problem, state)
+    motion = free_motion(problem, state)
     part = np.zeros((len(problem.unknowns), motion.shape[1]))
     part[members] = np.linalg.pinv(motion[members]).T
     through = factor.cofactor_times(part[numbering.free])

@@ -1,5 +1,6 @@
 """The datum of the object space: the similarity transformations that no observation sees, and how they are fixed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,9 +103,8 @@ def _candidates(problem: Problem, state: State) -> list[int]:
     return [int(position) for position in order if np.isinf(problem.unknowns.sigma[position])]
 
 
-def centered(problem: Problem, state: State) -> State:
-    """The state after the similarity transformation that brings the free points nearest to their approximations."""
-    members = free_coordinates(problem)
+def centered(problem: Problem, state: State, members: Indices) -> State:
+    """The state after the similarity transformation that brings some coordinates nearest to their approximations."""
     for _ in range(CENTERINGS):
         datum = object_datum(problem, state, FLAT)
         motion = datum.generators[members] @ datum.free
@@ -115,9 +115,10 @@ def centered(problem: Problem, state: State) -> State:
     return state
 
 
-def free_coordinates(problem: Problem) -> Indices:
-    """Positions of the object coordinates of which nothing is given: they carry the inner constraints."""
-    positions = _point_positions(problem).ravel()
+def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:
+    """Positions of the object coordinates, of some points or of all, of which nothing is given."""
+    of = problem.unknowns.point
+    positions = np.concatenate([of[point] for point in points]) if points else _point_positions(problem).ravel()
     return np.asarray(positions[np.isinf(problem.unknowns.sigma[positions])])
 
 
@@ -140,7 +141,7 @@ def _held(problem: Problem) -> NDArray[np.bool_]:
     return np.asarray((problem.unknowns.sigma[problem.exterior[:, 3:]] == 0.0).all(axis=1))
 
 
-def free_motion(problem: Problem, state: State) -> tuple[Array, Indices]:
-    """How all quantities move (n, d) with what is free of the datum, and the positions of the free coordinates."""
+def free_motion(problem: Problem, state: State) -> Array:
+    """How all quantities move (n, d) with what is free of the datum."""
     datum = object_datum(problem, state, FLAT)
-    return datum.generators @ datum.free, free_coordinates(problem)
+    return np.asarray(datum.generators @ datum.free)

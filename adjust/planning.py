@@ -70,7 +70,7 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     singular = result.singular
     null = np.zeros((len(problem.unknowns), 0))
     if singular:
-        held, null = _held(with_datum(problem, options.datum))
+        held, null = _held(with_datum(problem, options))
         result = adjust_problem(problem, options, held)
     expected = replace(result, vpv=sigma0**2 * result.redundancy)
     return Plan(expected, sigma0, singular, null)

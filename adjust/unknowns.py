@@ -59,6 +59,12 @@ class Unknowns:
         sigma[list(positions)] = 0.0
         return replace(self, sigma=sigma)
 
+    def fixed_as_given(self, positions: Indices) -> "Unknowns":
+        """The same, with some quantities fixed at their given values; where they start if none is given."""
+        start = self.start.copy()
+        start[positions] = np.where(np.isnan(self.given[positions]), start[positions], self.given[positions])
+        return replace(self.fixed(positions), start=start)
+
 
 def list_unknowns(network: Network, approximations: Approximations, observed: frozenset[tuple[str, str]]) -> Unknowns:
     """Take down all quantities: cameras with their fiducials, points, images.

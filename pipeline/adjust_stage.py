@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.adjustment import Options, adjust
 from adjust.approximations import approximate
+from adjust.datum_choice import with_held
 from adjust.network import Network
 from adjust.projection import adjusted_image
 from adjust.result import Adjustment
@@ -31,15 +32,21 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     network, left_out = build_network(project, marks)
     options = Options(
         datum=project.adjust.datum,
+        datum_coordinates=project.adjust.datum_coordinates,
+        datum_points=project.adjust.datum_points,
         robust=project.adjust.robust,
         variance_components=project.adjust.variance_components,
     )
-    adjustment = adjust(network, approximate(network), options)
+    adjustment = _adjusted(network, options)
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
     warnings = (*left_out, *_unmeasured(project, network), *_not_corrected(network, uncorrected))
     return replace(adjustment, warnings=(*adjustment.warnings, *warnings))
+
+
+def _adjusted(network: Network, options: Options) -> Adjustment:
+    return adjust(network, approximate(with_held(network, options.datum_coordinates)), options)
 
 
 def _without_eccentricity(
@@ -54,8 +61,7 @@ def _without_eccentricity(
         if _in_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
             break
         applied = wanted
-        corrected = _shifted(network, -applied)
-        adjustment = adjust(corrected, approximate(corrected), options)
+        adjustment = _adjusted(_shifted(network, -applied), options)
     return adjustment, uncorrected
 
 

@@ -31,6 +31,8 @@ class AdjustSettings:
 
     transformation: Transformation | None
     datum: Datum
+    datum_coordinates: tuple[str, ...]
+    datum_points: tuple[str, ...]
     sigma_target_um: float
     sigma_fiducial_um: float
     film_sigma_um: float
@@ -187,9 +189,12 @@ def _pitch(table: Table) -> tuple[float, float] | None:
 
 
 def _adjust_settings(table: Table) -> AdjustSettings:
+    datum = cast(Datum, table.text("datum", "control", get_args(Datum)))
     settings = AdjustSettings(
         transformation=_transformation(table),
-        datum=cast(Datum, table.text("datum", "control", get_args(Datum))),
+        datum=datum,
+        datum_coordinates=_datum_choice(table, "datum_coordinates", datum, "minimal"),
+        datum_points=_datum_choice(table, "datum_points", datum, "free"),
         sigma_target_um=table.number("sigma_target_um", 5.0, above=0.0),
         sigma_fiducial_um=table.number("sigma_fiducial_um", 5.0, above=0.0),
         film_sigma_um=table.number("film_sigma_um", 0.0, least=0.0),
@@ -198,6 +203,21 @@ def _adjust_settings(table: Table) -> AdjustSettings:
     )
     table.done()
     return settings
+
+
+def _datum_choice(table: Table, key: str, datum: Datum, wanted: Datum) -> tuple[str, ...]:
+    """The coordinates or points that a datum names; none where the program is to choose."""
+    if key not in table:
+        return ()
+    if datum != wanted:
+        raise table.error(key, f'goes with datum = "{wanted}", and the datum here is "{datum}". Change one of the two.')
+    names = table.texts(key)
+    if not names:
+        raise table.error(key, "is an empty list. Leave it out where the program is to choose.")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise table.error(key, f"names {twice[0]!r} twice.")
+    return names
 
 
 def _transformation(table: Table) -> Transformation | None:

@@ -9,8 +9,8 @@ from reference_cases import approximations_of, load, network_of
 from simulated import Truth, simulated
 
 from adjust.adjustment import Datum, Options, adjust
+from adjust.errors import AdjustmentError
 from adjust.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, Prior
-from adjust.network import ObjectPoint as Point
 from adjust.result import Adjustment
 from adjust.transformation import NAMES
 
@@ -34,31 +34,118 @@ def free_network() -> tuple[Network, Adjustment, Adjustment]:
     return network, adjust(network, start, Options(datum="minimal")), adjust(network, start, Options(datum="free"))
 
 
-def test_the_calibration_does_not_depend_on_the_minimal_constraints() -> None:
-    """Two planimetric and three height values, chosen automatically and chosen by hand; inner constraints as well."""
-    network, minimal, free = free_network()
-    known = {"0": (True, True, True), "1": (True, True, True), "2": (False, False, True)}
-    by_hand = tuple(
-        Point(
-            point.id,
-            *(
-                Prior(prior.value, 0.0 if held else np.inf)
-                for prior, held in zip((point.X, point.Y, point.Z), known.get(point.id, (False,) * 3), strict=True)
-                if prior is not None
-            ),
-        )
-        for point in network.points
+CHOICES = (
+    Options(datum="minimal"),
+    Options(datum="minimal", datum_coordinates=("0.X", "0.Y", "0.Z", "1.X", "1.Y", "1.Z", "2.Z")),
+    Options(datum="minimal", datum_coordinates=("3.X", "4.Y", "5.Z", "6.X", "7.Y", "8.Z", "9.X")),
+    Options(datum="free"),
+    Options(datum="free", datum_points=("1", "5", "7")),
+)
+HEIGHTS_CHOICES = (
+    Options(datum="minimal"),
+    Options(datum="minimal", datum_coordinates=("3.X", "4.Y", "5.X")),
+    Options(datum="free"),
+    Options(datum="free", datum_points=("1", "5")),
+)
+
+
+@pytest.mark.parametrize(("heights", "choices"), [(np.inf, CHOICES), (0.0, HEIGHTS_CHOICES), (0.02, HEIGHTS_CHOICES)])
+def test_every_choice_of_the_datum_gives_the_same_calibration(heights: float, choices: tuple[Options, ...]) -> None:
+    """To 1e-9 of the standard deviations, in self-calibration and with known heights only (Juhl)."""
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf, free={"k3": np.inf, "p1": np.inf})
+    points = tuple(replace(p, Z=replace(p.Z, sigma=heights)) for p in network.points if p.Z is not None)
+    network = replace(network, points=points)
+    results = [adjust(network, start, options) for options in choices]
+    values, sigmas = camera_part(results[0])
+    for result in results:
+        assert result.converged
+        assert result.redundancy == results[0].redundancy
+        other_values, other_sigmas = camera_part(result)
+        np.testing.assert_allclose((other_values - values) / np.where(sigmas > 0, sigmas, 1.0), 0.0, atol=1e-9)
+        np.testing.assert_allclose(other_sigmas, sigmas, rtol=1e-9)
+
+
+def test_chosen_coordinates_are_held_where_they_are_given() -> None:
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
+    moved = replace(start, points={name: xyz + 0.3 for name, xyz in start.points.items()})
+    result = adjust(network, moved, CHOICES[2])
+    for name in CHOICES[2].datum_coordinates:
+        point, axis = name.split(".")
+        given = getattr(network.point_by_id[point], axis).value
+        assert (result.value(f"PT.{name}"), result.sigma(f"PT.{name}")) == (given, 0.0)
+
+
+def test_inner_constraints_over_chosen_points() -> None:
+    """Their part of the cofactor matrix is that of least trace; their centre, turn and size stay."""
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
+    chosen, other = adjust(network, start, CHOICES[4]), adjust(network, start, CHOICES[3])
+    points = [f"PT.{point}.{axis}" for point in CHOICES[4].datum_points for axis in "XYZ"]
+    assert np.trace(chosen.cofactor_of(points)) < np.trace(other.cofactor_of(points))
+    given = np.array([start.points[point] for point in CHOICES[4].datum_points])
+    values = np.array([chosen.value(name) for name in points]).reshape(-1, 3)
+    lever, change = given - given.mean(axis=0), values - given
+    np.testing.assert_allclose(change.mean(axis=0), 0.0, atol=1e-8)
+    np.testing.assert_allclose(np.cross(lever, change).sum(axis=0), 0.0, atol=1e-5 * np.abs(lever).max())
+    assert abs((lever * change).sum()) < 1e-5 * np.abs(lever).max()
+
+
+@pytest.mark.parametrize(
+    ("known", "open_directions"),
+    [
+        ({"f0": np.array([0.05, 0.05, 0.05, np.inf, np.inf, np.inf])}, 4),  # one station: turns and scale are free
+        ({f"f{i}": np.array([np.inf, np.inf, 0.05, np.inf, np.inf, np.inf]) for i in range(3)}, 4),
+        ({f"f{i}": np.array([0.05, 0.05, 0.05, np.inf, np.inf, np.inf]) for i in range(2)}, 1),
+        ({"f0": np.array([np.inf, np.inf, np.inf, 1e-4, 1e-4, 1e-4])}, 4),
+    ],
+)
+def test_mixtures_of_observed_stations_and_a_free_network(known: dict[str, Array], open_directions: int) -> None:
+    """What observed stations leave free is fixed minimally or by inner constraints: the same fit, the same camera."""
+    truth = Truth()
+    network, start = simulated(np.random.default_rng(6), truth, point_sigma=np.inf)
+    rng = np.random.default_rng(8)
+    images = tuple(
+        replace(image, exterior=Exterior(np.array([*station, *attitude]) + rng.normal(0, 1e-4, 6), known[image.name]))
+        if image.name in known
+        else image
+        for image, station, attitude in zip(network.images, truth.stations, truth.attitudes, strict=True)
     )
-    _, start = simulated(np.random.default_rng(5), point_sigma=np.inf, free={"k3": np.inf})
-    manual = adjust(Network(network.cameras, network.images, by_hand, network.observations), start)
+    network = replace(network, images=images)
+    plain = adjust(network, start)
+    assert len(plain.singular) == open_directions
+    minimal, free = adjust(network, start, Options(datum="minimal")), adjust(network, start, Options(datum="free"))
+    assert plain.unknowns - minimal.unknowns == open_directions
+    assert free.redundancy == minimal.redundancy
     values, sigmas = camera_part(minimal)
-    for other in (manual, free):
-        assert other.converged
-        assert other.vpv == pytest.approx(minimal.vpv, rel=1e-9)
-        assert other.redundancy == minimal.redundancy
-        other_values, other_sigmas = camera_part(other)
-        np.testing.assert_allclose((other_values - values) / np.where(sigmas > 0, sigmas, 1.0), 0.0, atol=1e-6)
-        np.testing.assert_allclose(other_sigmas, sigmas, rtol=1e-7)
+    np.testing.assert_allclose((camera_part(free)[0] - values) / sigmas.clip(1e-30), 0.0, atol=1e-9)
+    np.testing.assert_allclose(camera_part(free)[1], sigmas, rtol=1e-9)
+    assert free.vpv == pytest.approx(minimal.vpv, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (Options("minimal", ("0.X", "0.Y", "0.Z", "1.X", "1.Y", "1.Z")), ("can turn about", "leave the choice")),
+        (Options("minimal", ("0.X", "0.Y", "0.Z")), ("can turn about X", "can turn about Y", "can grow or shrink")),
+        (Options("minimal", (*CHOICES[1].datum_coordinates, "3.Z")), ("over-constrained", "3.Z", "7 values", "strain")),
+        (Options("minimal", ("0.X", "0.Y", "0.X")), ("over-constrained", "hold 0.X already")),
+        (Options("minimal", ("0.W",)), ("0.W", "12.X")),
+        (Options("minimal", ("99.X",)), ("Point 99", "not among the object points")),
+        (Options("free", (), ("0", "1")), ("datum points 0, 1", "can turn about")),
+        (Options("free", (), ("0", "no")), ("Point no",)),
+    ],
+)
+def test_a_datum_that_cannot_be_is_refused(options: Options, words: tuple[str, ...]) -> None:
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
+    with pytest.raises(AdjustmentError) as error:
+        adjust(network, start, options)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_a_coordinate_that_is_given_needs_no_holding() -> None:
+    network, start = simulated(np.random.default_rng(5), point_sigma=0.05)
+    with pytest.raises(AdjustmentError, match="X is given with the standard deviation"):
+        adjust(network, start, Options("minimal", ("0.X",)))
 
 
 def test_seven_values_are_fixed() -> None:
