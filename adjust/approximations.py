@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS
 from adjust.errors import AdjustmentError
+from adjust.families import parameter_names
 from adjust.fiducial_fit import fit_transformation
 from adjust.network import Approximations, Camera, Image, Network
 from adjust.orientation import orient
@@ -127,7 +127,7 @@ def _known_field(network: Network, frame: _Frame, x0: float, y0: float) -> Known
 def _sight(camera: Camera, frame: _Frame, interior: Array) -> Sight:
     """Freed of the distortion as it is known beforehand; a coordinate that it cannot have produced stays as it is."""
     known = camera.distortion.parameters
-    names = PARAMETERS[camera.distortion.family]
+    names = parameter_names(camera.distortion.family)
     parameters = np.array([known[name].value if name in known else 0.0 for name in names])
     ideal, found = ideal_from_observed(camera.distortion, interior, parameters, frame.xy_mm)
     xy_mm = np.where(found[:, np.newaxis], ideal, frame.xy_mm) - interior[1:]

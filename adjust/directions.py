@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS
+from adjust.families import parameter_names
 from adjust.problem import Problem, State
 
 Array = NDArray[np.float64]
@@ -132,7 +132,7 @@ def _interior_leads(problem: Problem, camera: str, positions: NDArray[np.intp]) 
             f"The distortion parameter {name} of camera {camera} cannot be told from the other unknowns.",
             f"Fix {name} or give it a standard deviation, or spread the targets better over the frame.",
         )
-        for name in PARAMETERS[problem.network.camera_by_name[camera].distortion.family]
+        for name in parameter_names(problem.network.camera_by_name[camera].distortion.family)
     ]
     unit = np.zeros((len(positions), len(problem.unknowns)))
     unit[np.arange(len(positions)), positions] = 1.0

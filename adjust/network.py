@@ -12,9 +12,10 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.families import parameter_names
+
 Array = NDArray[np.float64]
 
-Family = Literal["none", "torlegard", "brown", "opencv", "juhl"]
 Decentering = Literal["reduced", "paper"]
 Transformation = Literal["none", "congruent", "similarity", "affine"]
 ObservationKind = Literal["target", "fiducial", "tie"]
@@ -36,24 +37,27 @@ class Prior:
 
 @dataclass(frozen=True)
 class Distortion:
-    """A distortion family and its parameters by name; a parameter that is not named is fixed at 0.
+    """A distortion family, a name in `adjust.families`, and its parameters; one that is not named is fixed at 0.
 
     decentering "paper": Torlegård's decentering terms with x', y' as printed and not reduced to the principal point.
     r0_mm: radius of zero radial distortion of `torlegard`, of a period of `juhl`.
+    half_mm: half the frame in x' and y', the length 1 of `ebner`, `gruen`, `legendre(n)` and `fourier(n)`; 0 not given.
     """
 
-    family: Family = "none"
+    family: str = "none"
     parameters: Mapping[str, Prior] = field(default_factory=dict)
     decentering: Decentering = "reduced"
     r0_mm: float = 0.0
+    half_mm: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if self.family not in get_args(Family):
-            raise ValueError(f"a distortion family must be one of {', '.join(get_args(Family))}, not {self.family}")
+        parameter_names(self.family)  # refuses a family that there is not
         if self.decentering not in get_args(Decentering):
             raise ValueError(f'the decentering must be "reduced" or "paper", not {self.decentering}')
         if not 0.0 <= self.r0_mm < np.inf:
             raise ValueError(f"r0 must be 0 or a positive length in mm, not {self.r0_mm}")
+        if not all(0.0 <= half < np.inf for half in self.half_mm):
+            raise ValueError(f"half the frame must be two lengths in mm, not {self.half_mm}")
 
 
 @dataclass(frozen=True)

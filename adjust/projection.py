@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS, image_equations
+from adjust.distortion import image_equations
+from adjust.families import parameter_names
 from adjust.network import EXTERIOR_NAMES, Approximations, Distortion, Network
 from adjust.result import Adjustment
 from adjust.rotation import rotation_from_angles
@@ -22,7 +23,7 @@ NEWTON_TOLERANCE = 1e-14  # of the principal distance
 class ImageModel:
     """One image as it is known at a time: interior and exterior orientation, distortion, film transformation.
 
-    interior (3,): c, x0', y0' in mm; parameters (k,) of the distortion in the order of `adjust.distortion.PARAMETERS`;
+    interior (3,): c, x0', y0' in mm; parameters (k,) of the distortion in the order of `families.parameter_names`;
     rotation (3, 3) object to camera; station (3,) in object units; affine (6,): a1, a2, a3, b1, b2, b3.
     """
 
@@ -71,7 +72,7 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
     return ImageModel(
         distortion=camera.distortion,
         interior=values(f"IO.{camera.name}", ("c", "x0", "y0")),
-        parameters=values(f"IO.{camera.name}", PARAMETERS[camera.distortion.family]),
+        parameters=values(f"IO.{camera.name}", parameter_names(camera.distortion.family)),
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
         affine=affine_from_parameters(image.transformation, transformation, name in adjustment.mirrored),
@@ -83,7 +84,7 @@ def approximate_image(network: Network, approximations: Approximations, name: st
     image = network.image_by_name[name]
     camera = network.camera_by_name[image.camera]
     given = camera.distortion.parameters
-    names = PARAMETERS[camera.distortion.family]
+    names = parameter_names(camera.distortion.family)
     exterior = approximations.exterior[name]
     transformation = approximations.transformation.get(name, np.empty(0))
     return ImageModel(

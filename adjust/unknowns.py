@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS
 from adjust.errors import AdjustmentError
+from adjust.families import parameter_names
 from adjust.network import EXTERIOR_NAMES, Approximations, Camera, Image, Network, ObjectPoint, Prior
 from adjust.transformation import NAMES
 
@@ -140,7 +140,7 @@ def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Q
     starts = (None, None, None) if interior is None else tuple(float(value) for value in interior)
     priors = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
     quantities: list[Quantity] = list(zip(("c", "x0", "y0"), priors, starts, strict=True))
-    names = PARAMETERS[camera.distortion.family]
+    names = parameter_names(camera.distortion.family)
     given = camera.distortion.parameters
     strangers = sorted(set(given) - set(names))
     if strangers:

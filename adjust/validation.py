@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from adjust.errors import AdjustmentError
+from adjust.families import family
 from adjust.network import Image, Network, Observations
 
 FIDUCIALS_NEEDED = {"none": 0, "congruent": 2, "similarity": 2, "affine": 3}
@@ -60,8 +61,14 @@ def _check_cameras(network: Network) -> None:
         c = camera.principal_distance_mm
         if c is not None and c.value <= 0.0:
             raise AdjustmentError(f"camera {camera.name}: the principal distance must be positive, not {c.value} mm.")
-        if camera.distortion.family == "juhl" and camera.distortion.r0_mm <= 0.0:
+        needed = family(camera.distortion.family).needs
+        if needed == "r0_mm" and camera.distortion.r0_mm <= 0.0:
             raise AdjustmentError(f"camera {camera.name}: the distortion family juhl needs r0 > 0, Juhl's is 1.35 dm.")
+        if needed == "half_mm" and min(camera.distortion.half_mm) <= 0.0:
+            raise AdjustmentError(
+                f"camera {camera.name}: the distortion family {camera.distortion.family} counts in halves of the "
+                f"frame. Give half_mm, two positive lengths, such as (115.0, 115.0) for an aerial camera."
+            )
 
 
 def _check_shapes(observations: Observations) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS
+from adjust.families import family, parameter_names
 from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
 from adjust.projection import adjusted_image
 from adjust.result import Adjustment
@@ -121,7 +121,9 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
     distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
     if camera.distortion.family == "torlegard":
         distortion["decentering"] = camera.distortion.decentering
-    for parameter in PARAMETERS[camera.distortion.family]:
+    if family(camera.distortion.family).needs == "half_mm":
+        distortion["half_mm"] = list(camera.distortion.half_mm)
+    for parameter in parameter_names(camera.distortion.family):
         given = camera.distortion.parameters.get(parameter, Prior(0.0))
         distortion[parameter] = _quantity(adjustment, interior + parameter, given)
     return {

@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS
+from adjust.families import parameter_names
 from adjust.network import (
     EXTERIOR_NAMES,
     Approximations,
     Camera,
     Distortion,
-    Family,
     Image,
     Network,
     ObjectPoint,
@@ -31,12 +30,14 @@ Array = NDArray[np.float64]
 GROSS_WEIGHT = 0.5  # observations that robust estimation left less of their weight are no observations here
 
 # A family's parameters beside those of OpenCV; what has no counterpart is held at its adjusted value.
-COUNTERPARTS: Mapping[Family, Mapping[str, str]] = {
+COUNTERPARTS: Mapping[str, Mapping[str, str]] = {
     "none": {},
     "torlegard": {"k3": "k1", "k5": "k2", "k7": "k3", "p1": "p1", "p2": "p2"},
     "brown": {"k1": "k1", "k2": "k2", "k3": "k3", "p1": "p1", "p2": "p2", "b1": "fy"},
-    "opencv": {name: name for name in PARAMETERS["opencv"] if name != "b1"} | {"b1": "fy"},
+    "opencv": {name: name for name in parameter_names("opencv") if name != "b1"} | {"b1": "fy"},
 }
+# What OpenCV estimates together or not at all.
+FREE_TOGETHER = (frozenset({"p1", "p2"}), frozenset({"s1", "s2", "s3", "s4"}), frozenset({"tau_x", "tau_y"}))
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
     free = free_parameters(camera)
     values = {
         name: adjustment.value(f"IO.{camera_name}.{name}")
-        for name in ("c", "x0", "y0", *PARAMETERS[camera.distortion.family])
+        for name in ("c", "x0", "y0", *parameter_names(camera.distortion.family))
     }
     return BareProblem(
         network=Network(
@@ -102,7 +103,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
 
 
 def in_opencv_model(problem: BareProblem, parameters: Array) -> BareProblem:
-    """The same problem with OpenCV's own distortion, from parameters (16,) in the order of `opencv_model.NAMES`."""
+    """The same problem with OpenCV's own distortion, from parameters (18,) in the order of `opencv_model.NAMES`."""
     values = dict(zip(NAMES, parameters.tolist(), strict=True))
     values["b1"] = values["fx"] / values["fy"] - 1
     free = set(problem.freedom.names) - {"fy"} | ({"b1"} if "fy" in problem.freedom.names else set())
@@ -112,7 +113,7 @@ def in_opencv_model(problem: BareProblem, parameters: Array) -> BareProblem:
         principal_distance_mm=Prior(values["fy"], priors["fx"].sigma),
         x0_mm=priors["cx"],
         y0_mm=priors["cy"],
-        distortion=Distortion("opencv", {name: priors[name] for name in PARAMETERS["opencv"]}),
+        distortion=Distortion("opencv", {name: priors[name] for name in parameter_names("opencv")}),
     )
     interior = {camera.name: np.array([values["fy"], values["cx"], values["cy"]])}
     return replace(
@@ -127,10 +128,9 @@ def free_parameters(camera: Camera) -> set[str]:
     given = camera.distortion.parameters
     counterparts = COUNTERPARTS[camera.distortion.family]
     free = {name for name in counterparts if name in given and given[name].sigma > 0}
-    if free & {"p1", "p2"}:
-        free |= {"p1", "p2"}
-    if free & {"s1", "s2", "s3", "s4"}:
-        free |= {"s1", "s2", "s3", "s4"}
+    for together in FREE_TOGETHER:
+        if free & together:
+            free |= together
     interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
     return free | {name for name, prior in interior.items() if prior is None or prior.sigma > 0}
 
@@ -148,7 +148,7 @@ def _freed(camera: Camera, values: Mapping[str, float], free: set[str]) -> Camer
         x0_mm=priors["x0"],
         y0_mm=priors["y0"],
         distortion=replace(
-            camera.distortion, parameters={name: priors[name] for name in PARAMETERS[camera.distortion.family]}
+            camera.distortion, parameters={name: priors[name] for name in parameter_names(camera.distortion.family)}
         ),
         fiducials={},
     )

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import cast
 
 from adjust import network
-from adjust.distortion import PARAMETERS
+from adjust.families import FAMILY_NAMES, family, parameter_names
 from measure import shapes
 from pipeline.errors import InputError
 from pipeline.mark_table import read_mark
+from pipeline.spelling import did_you_mean
 from pipeline.tables import Table, read_toml
 
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
@@ -106,7 +107,7 @@ def parse_camera(table: Table) -> CameraFile:
         principal_point_mm=point,
         principal_distance_sigma_mm=sigma.sigma("principal_distance_mm", default_sigma),
         principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (default_sigma, default_sigma)),
-        distortion=_distortion(table.table("distortion")),
+        distortion=_distortion(table.table("distortion"), frame),
         fiducials=fiducials,
     )
     sigma.done()
@@ -145,16 +146,44 @@ def _placed(mark: shapes.Mark, radial: bool, xy_mm: shapes.Point) -> shapes.Mark
     return shapes.turned(mark, math.degrees(math.atan2(xy_mm[1], xy_mm[0]))) if radial else mark
 
 
-def _distortion(table: Table) -> network.Distortion:
-    family = cast(network.Family, table.text("family", "none", tuple(PARAMETERS)))
+def _distortion(table: Table, frame_mm: tuple[float, float] | None) -> network.Distortion:
+    name = _family(table)
     decentering = cast(network.Decentering, table.text("decentering", "reduced", ("reduced", "paper")))
     # Juhl counts in decimetres.
-    in_dm = family == "juhl"
+    in_dm = name == "juhl"
     r0_mm = 100.0 * table.number("r0_dm", above=0.0) if in_dm else table.number("r0_mm", 0.0, least=0.0)
+    half_mm = _half(table, name, frame_mm) if family(name).needs == "half_mm" else (0.0, 0.0)
     values, sigmas = table.table("value"), table.table("sigma")
     table.done()
-    parameters = {name: network.Prior(values.number(name, 0.0), sigmas.sigma(name, 0.0)) for name in PARAMETERS[family]}
+    known = parameter_names(name)
+    of_all = sigmas.sigma("all", 0.0)  # a set of 44 parameters is not named one by one
+    parameters = {each: network.Prior(values.number(each, 0.0), sigmas.sigma(each, of_all)) for each in known}
     values.done()
     sigmas.done()
-    named = {name: prior for name, prior in parameters.items() if name in values or name in sigmas}
-    return network.Distortion(family, named, decentering, r0_mm)
+    named = {each: prior for each, prior in parameters.items() if each in values or each in sigmas or of_all > 0.0}
+    return network.Distortion(name, named, decentering, r0_mm, half_mm)
+
+
+def _family(table: Table) -> str:
+    name = table.text("family", "none")
+    try:
+        family(name)
+    except ValueError as error:
+        raise table.error("family", f"{error}.{did_you_mean(name, FAMILY_NAMES)}") from None
+    return name
+
+
+def _half(table: Table, name: str, frame_mm: tuple[float, float] | None) -> tuple[float, float]:
+    """Half the frame, the unit of length of a self-calibration set."""
+    if "half_mm" in table:
+        half = table.number_or_pair("half_mm")
+        if min(half) <= 0.0:
+            raise table.error("half_mm", f"must be positive, not {list(half)}.")
+        return half
+    if frame_mm is None:
+        raise table.error(
+            "family",
+            f"{name} counts in halves of the frame, and its size is not known. Give the camera's frame_mm, or half_mm "
+            "in this table.",
+        )
+    return (frame_mm[0] / 2.0, frame_mm[1] / 2.0)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 
+from adjust.families import family
 from adjust.network import Prior
 from measure import shapes
 from pipeline.camera_file import CameraFile, GivenFiducial
@@ -43,7 +44,11 @@ def _mark_names(fiducials: tuple[GivenFiducial, ...]) -> Mapping[shapes.Mark, st
 def _distortion_lines(camera: CameraFile) -> list[str]:
     distortion = camera.distortion
     lines = ["", "[distortion]", f"family = {_quoted(distortion.family)}"]
-    lines += [f"decentering = {_quoted(distortion.decentering)}", f"r0_mm = {distortion.r0_mm!r}"]
+    lines.append(f"decentering = {_quoted(distortion.decentering)}")
+    r0_mm = distortion.r0_mm
+    lines.append(f"r0_dm = {r0_mm / 100.0!r}" if distortion.family == "juhl" else f"r0_mm = {r0_mm!r}")
+    if family(distortion.family).needs == "half_mm":
+        lines.append(f"half_mm = {_list(distortion.half_mm)}")
     lines += ["[distortion.value]", *_prior_lines(distortion.parameters, lambda prior: repr(prior.value))]
     return [*lines, "[distortion.sigma]", *_prior_lines(distortion.parameters, lambda prior: _sigma(prior.sigma))]
 

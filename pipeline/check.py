@@ -157,7 +157,7 @@ def _rows(freedom: Freedom, conversion: Converted, sigma0: float, opencv: OpenCv
     return tuple(
         Row(
             name,
-            "mm" if name in NAMES[:4] else "1",
+            "mm" if name in NAMES[:4] else "rad" if name in NAMES[-2:] else "1",
             *(float(each[NAMES.index(name)]) for each in (conversion.refit.parameters, sigma0 * conversion.sigmas)),
             *(float(each[NAMES.index(name)]) for each in (opencv.parameters, opencv.sigmas)),
         )

@@ -36,7 +36,7 @@ class ImagePoints:
 
 @dataclass(frozen=True)
 class OpenCvCalibration:
-    """Parameters (16,) and standard deviations (16,) in the order of `opencv_model.NAMES`; rms a point in um.
+    """Parameters (18,) and standard deviations (18,) in the order of `opencv_model.NAMES`; rms a point in um.
 
     rounding_um: rms of what the rounding to single precision, which OpenCV demands, changes an image coordinate by.
     """
@@ -58,7 +58,7 @@ def can_begin(xyz: Array) -> bool:
 
 
 def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
-    """OpenCV's least squares from `start` (16,); what `freedom` does not name is held at its start.
+    """OpenCV's least squares from `start` (18,); what `freedom` does not name is held at its start.
 
     Its points are single precision: object points are taken about their mean, and the frame about its middle.
     Raises cv2.error where OpenCV refuses.
@@ -76,8 +76,10 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
     matrix[2, 2] = 1.0
     matrix[:2, 2] -= offset
     size = tuple(int(extent) + 2 for extent in np.ceil((corners[1] - corners[0]) / pixel_mm))
+    tilted = "tau_x" in freedom.names or bool(start[-2:].any())
+    lens = start[4:] if tilted else start[4:-2]
     rms_px, adjusted_matrix, distortion, _, _, sigmas, _, _ = cv2.calibrateCameraExtended(
-        objects, pixels, (size[0], size[1]), matrix, start[4:].copy(), flags=_flags(freedom), criteria=CRITERIA
+        objects, pixels, (size[0], size[1]), matrix, lens.copy(), flags=_flags(freedom, tilted), criteria=CRITERIA
     )
     rounding_px = np.concatenate([a - b for a, b in zip(exact, pixels, strict=True)])
     return OpenCvCalibration(
@@ -88,9 +90,11 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
     )
 
 
-def _flags(freedom: Freedom) -> int:
+def _flags(freedom: Freedom, tilted: bool) -> int:
     free = set(freedom.names)
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL
+    flags |= cv2.CALIB_TILTED_MODEL if tilted else 0
+    flags |= 0 if "tau_x" in free else cv2.CALIB_FIX_TAUX_TAUY
     flags |= 0 if "fx" in free else cv2.CALIB_FIX_FOCAL_LENGTH
     flags |= 0 if {"fx", "fy"} <= free else cv2.CALIB_FIX_ASPECT_RATIO
     flags |= 0 if "cx" in free else cv2.CALIB_FIX_PRINCIPAL_POINT
@@ -103,7 +107,9 @@ def _flags(freedom: Freedom) -> int:
 
 def _parameters(matrix: Array, distortion: Array, offset: Array, pixel_mm: float) -> Array:
     principal_point = (matrix[:2, 2] + offset) * pixel_mm * Y_UP
-    return np.concatenate([np.diag(matrix)[:2] * pixel_mm, principal_point, distortion[: len(NAMES) - 4]])
+    lens = np.zeros(len(NAMES) - 4)
+    lens[: len(distortion)] = distortion[: len(lens)]  # without a tilt OpenCV gives none
+    return np.concatenate([np.diag(matrix)[:2] * pixel_mm, principal_point, lens])
 
 
 def _sigmas(sigmas: Array, freedom: Freedom, start: Array, pixel_mm: float) -> Array:

@@ -1,7 +1,8 @@
 """OpenCV's camera model beside the adjustment's: conversion by a refit over the image, with propagated sigmas.
 
 Parameters are those of cv2.calibrateCamera in the camera frame's unit: fx, fy, cx, cy in mm, cx and cy being the
-principal point x0', y0' (y up); k1 to s4 without unit and in OpenCV's own signs.
+principal point x0', y0' (y up); k1 to s4 without unit and the sensor's tilt tau_x, tau_y in rad, in
+OpenCV's own signs.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,9 @@ from adjust.projection import ideal_from_observed
 
 Array = NDArray[np.float64]
 
-NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+NAMES = (
+    "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
+)  # fmt: skip
 GRID = 25  # points a side of the grid over the image on which the refit is made
 ITERATIONS = 30
 Y_UP = np.array([1.0, -1.0])
@@ -29,7 +32,7 @@ class Freedom:
     names: tuple[str, ...]
 
     def basis(self, start: Array) -> Array:
-        """(16, k): what a change of each estimated parameter changes."""
+        """(18, k): what a change of each estimated parameter changes."""
         basis = np.eye(len(NAMES))[:, [NAMES.index(name) for name in self.names]]
         if "fx" in self.names and "fy" not in self.names:
             basis[NAMES.index("fy"), self.names.index("fx")] = start[1] / start[0]
@@ -38,7 +41,7 @@ class Freedom:
 
 @dataclass(frozen=True)
 class Refit:
-    """OpenCV's parameters (16,) that image the same rays to the same places; what is left, rms a point, in mm."""
+    """OpenCV's parameters (18,) that image the same rays to the same places; what is left, rms a point, in mm."""
 
     parameters: Array
     residual_mm: float
@@ -57,8 +60,8 @@ def refit(
 ) -> Refit:
     """The OpenCV model nearest to the adjustment's over a grid of observed camera points.
 
-    interior (3,): c, x0', y0' in mm; parameters in the order of `adjust.distortion.PARAMETERS`. fixed (16,): the values
-    of the parameters that are not estimated, and the start for the others. Both models are given the same rays: the
+    interior (3,): c, x0', y0' in mm; parameters in the order of `families.parameter_names`. fixed (18,): the values of
+    the parameters that are not estimated, and the start for the others. Both models are given the same rays: the
     adjustment's corrects the observed point, OpenCV's distorts the ideal one, and no finite conversion is exact.
     """
     ideal_mm, found = ideal_from_observed(distortion, interior, parameters, grid_mm)
@@ -85,7 +88,7 @@ def refit_jacobian(
     freedom: Freedom,
     fixed: Array,
 ) -> Array:
-    """Derivative (16, 3 + k) of the refit by c, x0', y0' and the distortion parameters, by central differences.
+    """Derivative (18, 3 + k) of the refit by c, x0', y0' and the distortion parameters, by central differences.
 
     steps (3 + k): how far each is moved, a part of its standard deviation; 0 where it is fixed.
     """
@@ -104,7 +107,7 @@ def refit_jacobian(
 
 
 def project(values: Array, rays: Array) -> tuple[Array, Array]:
-    """Camera coordinates (n, 2) in mm, y up, of rays (n, 2), and their derivatives (n, 2, 16), by cv2.projectPoints."""
+    """Camera coordinates (n, 2) in mm, y up, of rays (n, 2), and their derivatives (n, 2, 18), by cv2.projectPoints."""
     points = np.column_stack([rays * Y_UP, np.ones(len(rays))])
     projected, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera_matrix(values), values[4:])
     by_values = jacobian[:, 6 : 6 + len(NAMES)].reshape(-1, 2, len(NAMES)) * Y_UP[:, None]

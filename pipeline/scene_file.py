@@ -100,7 +100,7 @@ def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
         principal_distance_mm=camera.principal_distance_mm or 0.0,
         principal_point_mm=camera.principal_point_mm or (0.0, 0.0),
         distortion=scene.Distortion(
-            camera.distortion.family,
+            cast(scene.Family, camera.distortion.family),
             {name: prior.value for name, prior in camera.distortion.parameters.items()},
             camera.distortion.r0_mm,
             camera.distortion.decentering,

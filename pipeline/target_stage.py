@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS
+from adjust.families import parameter_names
 from adjust.network import Exterior
 from adjust.projection import ImageModel
 from adjust.resection import resect
@@ -130,7 +130,7 @@ def _model(camera: CameraFile, exterior: Exterior, affine: Array, measured: Meas
     middle = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0, measured.pitch_um)
     x0, y0 = middle if camera.principal_point_mm is None else camera.principal_point_mm
     distortion = camera.distortion
-    given = [distortion.parameters.get(name) for name in PARAMETERS[distortion.family]]
+    given = [distortion.parameters.get(name) for name in parameter_names(distortion.family)]
     return ImageModel(
         distortion,
         np.array([camera.principal_distance_mm, x0, y0], dtype=np.float64),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from adjust.distortion import PARAMETERS
+from adjust.families import parameter_names
 from pipeline.adjustment_file import Covariance
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import Json, ReportData
@@ -123,7 +123,7 @@ def _curves(
     """Out to the frame's corner where its size is known, else to the outermost target."""
     corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
     largest = max(radius_mm, corner_mm)
-    if not PARAMETERS[camera["distortion"]["family"]] or largest == 0.0:
+    if not parameter_names(camera["distortion"]["family"]) or largest == 0.0:
         return None
     return lens.curves(lens.lens(name, camera), covariance, largest)
 

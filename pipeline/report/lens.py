@@ -6,7 +6,8 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from adjust.distortion import PARAMETERS, image_equations
+from adjust.distortion import image_equations
+from adjust.families import parameter_names
 from adjust.network import Distortion
 from adjust.projection import ideal_from_observed
 from pipeline.adjustment_file import Covariance
@@ -32,7 +33,7 @@ class Lens:
     @property
     def unknowns(self) -> tuple[str, ...]:
         """The names of c and of the parameters, on which a displacement about the principal point depends."""
-        return tuple(f"IO.{self.name}.{name}" for name in ("c", *PARAMETERS[self.distortion.family]))
+        return tuple(f"IO.{self.name}.{name}" for name in ("c", *parameter_names(self.distortion.family)))
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,16 @@ class Curves:
 def lens(name: str, camera: Json) -> Lens:
     """From a camera's entry in adjustment.json."""
     stored = camera["distortion"]
+    half = stored.get("half_mm", (0.0, 0.0))
     distortion = Distortion(
-        stored["family"], decentering=stored.get("decentering", "reduced"), r0_mm=stored.get("r0_mm", 0.0)
+        stored["family"],
+        decentering=stored.get("decentering", "reduced"),
+        r0_mm=stored.get("r0_mm", 0.0),
+        half_mm=(half[0], half[1]),
     )
     point = camera["principal_point_mm"]
     interior = [camera["principal_distance_mm"]["value"], point["x"]["value"], point["y"]["value"]]
-    values = [stored.get(parameter, {"value": 0.0})["value"] for parameter in PARAMETERS[distortion.family]]
+    values = [stored.get(parameter, {"value": 0.0})["value"] for parameter in parameter_names(distortion.family)]
     return Lens(name, distortion, np.array(interior, dtype=float), np.array(values, dtype=float))
 
 
@@ -117,7 +122,7 @@ def largest_effects_um(of: Lens, radius_mm: float) -> dict[str, float]:
     """By parameter: the largest displacement at a radius that a change of 1 of the parameter makes."""
     moved = displacement(of, radius_mm * _directions())
     sizes = np.hypot(moved.by_unknowns_um[:, 0, 1:], moved.by_unknowns_um[:, 1, 1:]).max(axis=0)
-    return dict(zip(PARAMETERS[of.distortion.family], sizes.tolist(), strict=True))
+    return dict(zip(parameter_names(of.distortion.family), sizes.tolist(), strict=True))
 
 
 def curves_plot(drawn: Curves, observed_radius_mm: float) -> Markup:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.distortion import PARAMETERS
+from adjust.families import parameter_names
 from pipeline.adjustment_file import Covariance
 from pipeline.report.data import Json
 from pipeline.report.lens import largest_effects_um, lens
@@ -40,9 +40,9 @@ def parameter_rows(name: str, camera: Json, sigma0: float, radius_mm: float) -> 
     point, distance = camera["principal_point_mm"], camera["principal_distance_mm"]
     interior = [("c", distance), ("x₀′", point["x"]), ("y₀′", point["y"])]
     family = camera["distortion"]["family"]
-    effects = largest_effects_um(lens(name, camera), radius_mm) if PARAMETERS[family] else {}
+    effects = largest_effects_um(lens(name, camera), radius_mm) if parameter_names(family) else {}
     rows = [_row(symbol, "mm", quantity, "", _origin(quantity, sigma0)) for symbol, quantity in interior]
-    for parameter in PARAMETERS[family]:
+    for parameter in parameter_names(family):
         quantity = camera["distortion"].get(parameter)
         if quantity is not None and (quantity["value"] != 0.0 or quantity["sigma"] != 0.0):
             effect = _effect(quantity, effects[parameter])
@@ -52,7 +52,7 @@ def parameter_rows(name: str, camera: Json, sigma0: float, radius_mm: float) -> 
 
 def high_correlations(name: str, camera: Json, covariance: Covariance) -> list[tuple[str, str, float]]:
     """Pairs of parameters that the observations hardly tell apart, the highest correlation first."""
-    parameters = ["c", "x0", "y0", *PARAMETERS[camera["distortion"]["family"]]]
+    parameters = ["c", "x0", "y0", *parameter_names(camera["distortion"]["family"])]
     block = covariance.of(f"IO.{name}.{parameter}" for parameter in parameters)
     sigma = np.sqrt(np.maximum(np.diag(block), 0.0))
     free = np.flatnonzero(sigma > 0.0)

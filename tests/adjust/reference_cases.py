@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adjust.distortion import PARAMETERS
+from adjust.families import parameter_names
 from adjust.network import (
     EXTERIOR_NAMES,
     Approximations,
@@ -49,7 +49,7 @@ def network_of(case: Case) -> Network:
         interior["y0"],
         Distortion(
             family,
-            {name: interior[name] for name in PARAMETERS[family]},
+            {name: interior[name] for name in parameter_names(family)},
             decentering="paper" if case["decentering_mode"] == "paper" else "reduced",
             r0_mm=case["r0"] * (100.0 if family == "juhl" else 1.0),
         ),

@@ -10,7 +10,6 @@ from adjust.network import (
     Camera,
     Decentering,
     Distortion,
-    Family,
     Fiducial,
     Image,
     Network,
@@ -34,7 +33,7 @@ class Truth:
     c: float = 153.0
     x0: float = 0.4
     y0: float = -0.3
-    family: Family = "torlegard"
+    family: str = "torlegard"
     decentering: Decentering = "reduced"
     distortion: dict[str, float] = field(default_factory=lambda: {"k3": 1.5e-7, "k5": -4e-12, "p1": 8e-7, "p2": -6e-7})
     stations: tuple[tuple[float, float, float], ...] = STATIONS

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from simulated import Truth, camera_point, field_points, simulated
 
 from adjust.adjustment import adjust
-from adjust.distortion import PARAMETERS
+from adjust.families import parameter_names
 from adjust.network import Approximations, Camera, Distortion, Image, Network, ObjectPoint, Observations, Prior
 from adjust.projection import ImageModel, adjusted_image, approximate_image, camera_from_ray, ideal_from_observed
 from adjust.rotation import angles_from_rotation, rotation_from_angles
@@ -18,8 +18,10 @@ Array = NDArray[np.float64]
 PIXEL_MM = 0.005
 SIZE_PX = np.array([4000.0, 3000.0])
 FX, FY, CX, CY = 4810.0, 4800.0, 2010.0, 1490.0
-DISTORTION = np.array([-0.12, 0.09, 0.0012, -0.0008, -0.03, 0.02, -0.01, 0.004, 0.0011, -0.0007, 0.0005, 0.0009])
-NAMES = PARAMETERS["opencv"][:12]
+LENS = [-0.12, 0.09, 0.0012, -0.0008, -0.03, 0.02, -0.01, 0.004, 0.0011, -0.0007, 0.0005, 0.0009]
+TILT = [0.02, -0.015]
+DISTORTION = np.array([*LENS, *TILT])
+NAMES = parameter_names("opencv")[:14]
 FLIP = np.diag([1.0, -1.0, -1.0])  # from the camera's axes, y up and z backward, to OpenCV's
 
 
@@ -43,7 +45,7 @@ def camera(free: bool) -> Camera:
     values = [*DISTORTION, FX / FY - 1.0]
     parameters = {
         name: Prior(value, 0.0 if name in ("k4", "k5", "k6") else sigma)
-        for name, value in zip(PARAMETERS["opencv"], values, strict=True)
+        for name, value in zip(parameter_names("opencv"), values, strict=True)
     }
     c, x0, y0 = FY * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM
     return Camera("D", Prior(c, sigma), Prior(x0, sigma), Prior(y0, sigma), Distortion("opencv", parameters))
@@ -130,7 +132,7 @@ def test_torlegard_is_inverted() -> None:
     model = ImageModel(
         Distortion("torlegard"),
         np.array([truth.c, truth.x0, truth.y0]),
-        np.array([truth.distortion.get(name, 0.0) for name in PARAMETERS["torlegard"]]),
+        np.array([truth.distortion.get(name, 0.0) for name in parameter_names("torlegard")]),
         rotation_from_angles(angles),
         station,
         np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
@@ -153,7 +155,7 @@ def test_what_has_no_image_is_told() -> None:
     parameters = np.array([4e-5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # x - k3 x³ turns back at 91 mm
     _, found = camera_from_ray(fold, np.array([100.0, 0.0, 0.0]), parameters, np.array([[0.3, 0.0], [2.0, 0.0]]))
     assert list(found) == [True, False]
-    barrel = np.array([-0.3] + [0.0] * 12)  # OpenCV's k1: the image of a ray turns back at a slope of 1.05
+    barrel = np.array([-0.3] + [0.0] * 14)  # OpenCV's k1: the image of a ray turns back at a slope of 1.05
     _, found = camera_from_ray(
         Distortion("opencv"), np.array([100.0, 0.0, 0.0]), barrel, np.array([[0.9, 0], [1.2, 0]])
     )

@@ -16,7 +16,6 @@ from adjust.approximations import approximate
 from adjust.network import (
     Camera,
     Distortion,
-    Family,
     Fiducial,
     Image,
     Network,
@@ -47,6 +46,7 @@ CONVERGENT = [
 VERTICAL = [(0.0, 0.0, 1530.0, 0.0, 0.0, 0.3)]
 STRONG = (-0.06, 0.02, 1e-4, -5e-5, 0.0)  # 4 mm in the frame's corner
 FREE = np.inf
+TILT = ("tau_x", "tau_y")
 NO_DISTORTION = Distortion()
 
 
@@ -105,7 +105,7 @@ def simulated(
     )
 
 
-def free(family: Family, *names: str) -> Distortion:
+def free(family: str, *names: str) -> Distortion:
     return Distortion(family, {name: Prior(0.0, FREE) for name in names})
 
 
@@ -161,6 +161,24 @@ def test_fixed_distortion_stays_fixed() -> None:
     check = checked(simulated(CONVERGENT, distortion=fixed))
     assert check.verdict == "agrees", check.reason
     assert [row.name for row in check.rows] == ["fx", "cx", "cy"]
+    assert max(row.difference_sigmas for row in check.rows) < 0.1
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_tilted_sensor_agrees(known: bool) -> None:
+    tilt = (0.03, -0.02)
+    lens = (*MODERATE, *[0.0] * (12 - len(MODERATE)), *tilt)
+    priors = {
+        name: Prior(value if known else 0.0, 0.0 if known else FREE) for name, value in zip(TILT, tilt, strict=True)
+    }
+    given = free("opencv", "k1", "k2")
+    distortion = replace(given, parameters={**given.parameters, **priors})
+    network = simulated(CONVERGENT, lens=lens, distortion=distortion)
+    # A tilted sensor is all but another principal point.
+    held = replace(network.cameras[0], x0_mm=Prior(X0_MM), y0_mm=Prior(Y0_MM))
+    check = checked(replace(network, cameras=(held,)))
+    assert check.verdict == "agrees", check.reason
+    assert [row.name for row in check.rows] == ["fx", "k1", "k2", *(() if known else TILT)]
     assert max(row.difference_sigmas for row in check.rows) < 0.1
 
 
@@ -222,7 +240,7 @@ def test_wrong_values_in_an_adjustment_differ() -> None:
 
 
 @pytest.mark.parametrize("family", ["torlegard", "brown"])
-def test_a_strong_lens_agrees_by_way_of_the_same_model(family: Family) -> None:
+def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
     names = {"torlegard": ("k3", "k5", "k7", "p1", "p2"), "brown": ("k1", "k2", "k3", "p1", "p2")}[family]
     network = simulated(CONVERGENT * 4, film=False, lens=STRONG, noise_mm=0.002, distortion=free(family, *names))
     check = checked(network)
@@ -293,6 +311,10 @@ def keeping(observations: Observations, targets: dict[str, int]) -> Observations
 def test_what_opencv_has_no_model_for() -> None:
     network = simulated(VERTICAL, distortion=Distortion("juhl", {"t1": Prior(0.0)}, r0_mm=135.0))
     assert "no counterpart of the distortion family juhl" in checked(network).reason
+    gruen = Distortion("gruen", {"a12": Prior(0.0)}, half_mm=(115.0, 115.0))
+    polynomials = replace(network, cameras=(replace(network.cameras[0], distortion=gruen),))
+    assert checked(polynomials).verdict == "not possible"
+    assert "no counterpart of the distortion family gruen" in checked(polynomials).reason
     one_fixed = replace(network.cameras[0], distortion=Distortion(), x0_mm=Prior(0.0))
     assert "both coordinates of the principal point" in checked(replace(network, cameras=(one_fixed,))).reason
 

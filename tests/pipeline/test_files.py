@@ -14,6 +14,7 @@ from measure.shapes import MarkShape, Polygon
 from measure.status import Status
 from pipeline.atomic import atomic_path, write_atomically
 from pipeline.camera_file import read_camera
+from pipeline.camera_text import camera_text
 from pipeline.comparator_file import (
     comparator_from_pixel,
     pixel_from_comparator,
@@ -78,6 +79,20 @@ def test_camera_file_gives_priors_and_marks(tmp_path: Path) -> None:
     assert len(mark.parts) == 4
 
 
+def test_self_calibration_sets_count_in_halves_of_the_frame(tmp_path: Path) -> None:
+    text = CAMERA.replace('"torlegard"', '"legendre(3)"').replace('k3 = "free"', 'all = "free"\na21 = 0.01\na22 = 0')
+    distortion = read_camera(written(tmp_path, "camera.toml", text)).distortion
+    assert distortion.half_mm == (114.0, 114.0)
+    assert len(distortion.parameters) == 26
+    sigmas = {name: prior.sigma for name, prior in distortion.parameters.items()}
+    assert (sigmas["a21"], sigmas["a22"], sigmas["b33"]) == (0.01, 0.0, math.inf)
+    own = text.replace("family =", "half_mm = [100.0, 90.0]\nfamily =")
+    camera = read_camera(written(tmp_path, "camera.toml", own))
+    assert camera.distortion.half_mm == (100.0, 90.0)
+    again = camera_text(camera, lambda _, __: "")
+    assert read_camera(written(tmp_path, "again.toml", again)).distortion == camera.distortion
+
+
 def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
     text = CAMERA.replace('kind = "cross"\narm_mm = 1.0\nline_mm = 0.1\ngap_mm = 0.5', 'kind = "polygon"\n'
                           "vertices_mm = [[0.0, -1.0], [2.0, 0.0], [0.0, 1.0]]")  # fmt: skip
@@ -94,6 +109,8 @@ def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
     [
         ('family = "torlegard"', 'famly = "torlegard"', ["line 9", "famly", "family"]),
         ('family = "torlegard"', 'family = "torlegaard"', ["line 9", "Did you mean 'torlegard'"]),
+        ('family = "torlegard"', 'family = "legendre(1)"', ["line 9", "the order of legendre must be 2 to 9, not 1"]),
+        ('family = "torlegard"', 'family = "ebner"\nhalf_mm = 0', ["line 10", "half_mm", "must be positive"]),
         ("frame_mm = [228.0, 228.0]", "frame_mm = 228.0", ["frame_mm", "[x, y]"]),
         ("frame_mm = [228.0, 228.0]", "frame_mm = [228.0, 228.0", ["not valid TOML", "line"]),
         ("principal_distance_mm = 153.0", 'principal_distance_mm = "153,0"', ["must be a number"]),
@@ -114,6 +131,13 @@ def test_camera_file_with_a_mistake_gets_a_message_that_helps(
     message = refused(read_camera, path)
     for word in [str(path), *words]:
         assert word in message
+
+
+def test_a_self_calibration_set_without_a_frame_is_told_what_it_needs(tmp_path: Path) -> None:
+    text = CAMERA.replace("frame_mm = [228.0, 228.0]\n", "").replace('"torlegard"', '"ebner"')
+    message = refused(read_camera, written(tmp_path, "camera.toml", text))
+    assert "line 8: [distortion] family: ebner counts in halves of the frame" in message
+    assert "Give the camera's frame_mm, or half_mm in this table." in message
 
 
 def test_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:

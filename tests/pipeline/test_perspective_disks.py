@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from adjust.distortion import PARAMETERS
+from adjust.families import parameter_names
 from adjust.network import Distortion
 from adjust.projection import ImageModel
 from adjust.rotation import rotation_from_angles
@@ -49,7 +49,7 @@ def true_model(camera: dict[str, Any], frame: dict[str, Any]) -> ImageModel:
                 camera["principal_point_mm"]["y"]["value"],
             ]
         ),
-        np.array([distortion[name]["value"] for name in PARAMETERS[distortion["family"]]]),
+        np.array([distortion[name]["value"] for name in parameter_names(distortion["family"])]),
         rotation_from_angles(angles),
         np.array([exterior[name]["value"] for name in ("X0", "Y0", "Z0")]),
         np.array([film[name]["value"] for name in ("a1", "a2", "a3", "b1", "b2", "b3")]),

@@ -1,0 +1,86 @@
+"""The table of distortion families: their parameters and what they do to a point or a ray.
+
+A family with an order is spelled with it: "legendre(3)".
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.correction import Correction, Imaged, Settings, no_correction, undistorted
+from adjust.fourier_sets import fourier, fourier_names
+from adjust.juhl import JUHL_NAMES, juhl
+from adjust.opencv_family import OPENCV_NAMES, opencv
+from adjust.physical import BROWN_NAMES, TORLEGARD_NAMES, brown, torlegard
+from adjust.polynomial_sets import EBNER, GRUEN, PolynomialSet, correct, legendre
+
+Array = NDArray[np.float64]
+
+LEGENDRE_ORDERS = range(2, 10)  # from 2, the degree of the tilts that are left out, to one digit an index
+FOURIER_ORDERS = range(1, 10)
+
+
+@dataclass(frozen=True)
+class Family:
+    """A distortion family.
+
+    parameters: their names. image(ray, parameters): what it does to the ray. correct(settings, xy, principal point,
+    parameters): what is subtracted from the observed point. needs: the setting that it cannot do without.
+    """
+
+    parameters: tuple[str, ...] = ()
+    image: Callable[[Array, Array], Imaged] = undistorted
+    correct: Callable[[Settings, Array, Array, Array], Correction] = no_correction
+    needs: str = ""
+
+
+def _polynomials(of: PolynomialSet) -> Family:
+    return Family(of.names, correct=partial(correct, of), needs="half_mm")
+
+
+def _legendre(order: int) -> Family:
+    return _polynomials(legendre(order))
+
+
+def _fourier(order: int) -> Family:
+    return Family(fourier_names(order), correct=partial(fourier, order), needs="half_mm")
+
+
+_FAMILIES = {
+    "none": Family(),
+    "torlegard": Family(TORLEGARD_NAMES, correct=torlegard),
+    "brown": Family(BROWN_NAMES, correct=brown),
+    "opencv": Family(OPENCV_NAMES, image=opencv),
+    "juhl": Family(JUHL_NAMES, correct=juhl, needs="r0_mm"),
+    "ebner": _polynomials(EBNER),
+    "gruen": _polynomials(GRUEN),
+}
+_WITH_ORDER: dict[str, tuple[range, Callable[[int], Family]]] = {
+    "legendre": (LEGENDRE_ORDERS, _legendre),
+    "fourier": (FOURIER_ORDERS, _fourier),
+}
+FAMILY_NAMES = (*_FAMILIES, *(f"{name}(n)" for name in _WITH_ORDER))
+
+
+@lru_cache
+def family(name: str) -> Family:
+    """The family of a name. Raises ValueError for a name or an order that there is not."""
+    if name in _FAMILIES:
+        return _FAMILIES[name]
+    spelled = re.fullmatch(r"(\w+)\((\d+)\)", name)
+    if spelled is None or spelled[1] not in _WITH_ORDER:
+        raise ValueError(f"a distortion family must be one of {', '.join(FAMILY_NAMES)}, not {name}")
+    orders, made = _WITH_ORDER[spelled[1]]
+    order = int(spelled[2])
+    if order not in orders:
+        raise ValueError(f"the order of {spelled[1]} must be {orders[0]} to {orders[-1]}, not {order}")
+    return made(order)
+
+
+def parameter_names(name: str) -> tuple[str, ...]:
+    """The parameters of a family, in their order. Raises ValueError for a name that there is not."""
+    return family(name).parameters
