@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 Datum = Literal["control", "minimal", "free"]
+Method = Literal["combined", "elements"]
 
 REWEIGHTINGS = 30  # rounds of robust estimation or of variance components at most
 
@@ -39,7 +40,9 @@ class Options:
     datum_coordinates: those that "minimal" fixes, at their given values: "12.X" and so on; none: chosen automatically.
     datum_points: the points that carry the inner constraints of "free"; none: all.
     robust: marks with large residuals lose weight (Huber). variance_components: the variances of targets and fiducials
-    are each multiplied by what their residuals say.
+    are each multiplied by what their residuals say. method: "combined", the strict combined model (Gauss-Helmert);
+    "elements", Torlegård's adjustment by elements, which takes the distortion at the observed point: the same as long
+    as distortion changes little over a residual, and what programs do that correct the measured points first.
     """
 
     datum: Datum = "control"
@@ -48,6 +51,7 @@ class Options:
     robust: bool = False
     variance_components: bool = False
     iteration_limit: int = 50
+    method: Method = "combined"
 
     def __post_init__(self) -> None:
         if self.datum not in get_args(Datum):
@@ -55,6 +59,8 @@ class Options:
         for key, datum in (("datum_coordinates", "minimal"), ("datum_points", "free")):
             if getattr(self, key) and self.datum != datum:
                 raise ValueError(f'{key} is for the datum "{datum}", not for "{self.datum}"')
+        if self.method not in get_args(Method):
+            raise ValueError(f"the method must be one of {', '.join(get_args(Method))}, not {self.method}")
         if self.iteration_limit < 1:
             raise ValueError(f"the iteration limit must be at least 1, not {self.iteration_limit}")
 
@@ -71,7 +77,8 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     has no image, or where the chosen datum does not hold the object space.
     """
     validate(network)
-    return adjust_problem(number(network, approximations), options or Options())
+    options = options or Options()
+    return adjust_problem(number(network, approximations, options.method == "elements"), options)
 
 
 def adjust_problem(problem: Problem, options: Options, held: Iterable[int] = ()) -> Adjustment:

@@ -2,7 +2,8 @@
 
 A target obeys T(x, y) = image of its ray, a fiducial T(x, y) = its place in the camera frame. The derivatives are taken
 at computed observations, those that satisfy the functions for the unknowns of the moment: after convergence these are
-the adjusted observations.
+the adjusted observations. By elements the distortion is taken at the observed camera point instead: then
+F = T(x, y) - image of the ray - distortion there, which depends on the observations by T alone.
 """
 
 from dataclasses import dataclass
@@ -31,16 +32,21 @@ class Derivatives:
 def computed_observations(problem: Problem, state: State) -> Array | None:
     """The comparator coordinates (n, 2) in mm that satisfy F1 to F4; None where some point has no image."""
     camera_xy = state.values[problem.places[:, :2]]  # fiducials stay, targets follow
+    affines = problem.affines(state)
+    observed = apply_affine(affines[problem.image_numbers], problem.network.observations.xy_mm)
     for name, rows in problem.targets_by_camera.items():
         interior, parameters = np.split(state.values[problem.unknowns.camera[name]], [3])
         if interior[0] <= 0.0:
             return None
         ray, in_camera = _rays(problem, state, rows)
         distortion = problem.network.camera_by_name[name].distortion
-        camera_xy[rows], found = camera_from_ray(distortion, interior, parameters, ray)
+        if problem.by_elements:
+            at = image_equations(distortion, interior, parameters, observed[rows], ray)
+            camera_xy[rows], found = observed[rows] - at.value, np.isfinite(at.value).all(axis=1)
+        else:
+            camera_xy[rows], found = camera_from_ray(distortion, interior, parameters, ray)
         if not (found & (in_camera[:, 2] < 0.0)).all():
             return None
-    affines = problem.affines(state)
     if not np.linalg.det(affine_gradient(affines)).all():
         return None
     return comparator_from_camera(affines[problem.image_numbers], camera_xy)
@@ -49,7 +55,8 @@ def computed_observations(problem: Problem, state: State) -> Array | None:
 def derivatives(problem: Problem, state: State, xy_mm: Array) -> Derivatives:
     """The derivatives of F1 to F4 (Torlegård) at the observations xy_mm (n, 2)."""
     affines = problem.affines(state)[problem.image_numbers]
-    camera_xy = apply_affine(affines, xy_mm)
+    distorted = problem.network.observations.xy_mm if problem.by_elements else xy_mm  # where distortion is taken
+    camera_xy = apply_affine(affines, distorted)
     by_camera_xy = np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)).copy()
     by_unknowns = np.zeros((len(xy_mm), 2, problem.columns.shape[1]))
     by_unknowns[:, :, PLACE.start : PLACE.start + 2] = -np.eye(2)  # F3, F4; those of targets follow
@@ -67,8 +74,10 @@ def derivatives(problem: Problem, state: State, xy_mm: Array) -> Derivatives:
         by_camera = np.concatenate([at.by_interior, at.by_parameters], axis=2)
         by_unknowns[rows, :, CAMERA.start : CAMERA.start + by_camera.shape[2]] = by_camera
     chain = problem.affines_by_parameters(state)[problem.image_numbers]
-    by_unknowns[:, :, TRANSFORMATION] = by_camera_xy @ affine_design(xy_mm) @ chain
-    return Derivatives(by_camera_xy @ affine_gradient(affines), by_unknowns)
+    by_affine = affine_design(xy_mm) + (by_camera_xy - np.eye(2)) @ affine_design(distorted)
+    by_unknowns[:, :, TRANSFORMATION] = by_affine @ chain
+    gradient = affine_gradient(affines)
+    return Derivatives(gradient if problem.by_elements else by_camera_xy @ gradient, by_unknowns)
 
 
 def _rays(problem: Problem, state: State, rows: Indices) -> tuple[Array, Array]:

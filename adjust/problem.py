@@ -19,15 +19,15 @@ CAMERA = slice(15, None)
 ABSENT = -1  # stands for the unknown of a column that an observation does not have
 
 
-def number(network: Network, approximations: Approximations) -> "Problem":
-    """Number the quantities of a validated network.
+def number(network: Network, approximations: Approximations, by_elements: bool = False) -> "Problem":
+    """Number the quantities of a validated network; by_elements as in `Problem`.
 
     Raises AdjustmentError where a quantity has neither a value nor an approximation.
     """
     cameras = {image.name: image.camera for image in network.images}
     rows = zip(network.observations.image, network.observations.point, network.observations.kind, strict=True)
     observed = frozenset((cameras[image] if kind == "fiducial" else "", point) for image, point, kind in rows)
-    return Problem(network, list_unknowns(network, approximations, observed), approximations.mirrored)
+    return Problem(network, list_unknowns(network, approximations, observed), approximations.mirrored, by_elements)
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,16 @@ class State:
 
 @dataclass(frozen=True)
 class Problem:
-    """A network with its list of unknowns; mirrored: the images whose scan is mirrored."""
+    """A network with its list of unknowns; mirrored: the images whose scan is mirrored.
+
+    by_elements: distortion is that of the observed camera point and not of the adjusted one, so that every observation
+    is an explicit function of the unknowns (adjustment by elements, of indirect observations).
+    """
 
     network: Network
     unknowns: Unknowns
     mirrored: frozenset[str]
+    by_elements: bool = False
 
     def start(self) -> State:
         values = self.unknowns.start

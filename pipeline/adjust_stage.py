@@ -36,6 +36,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
         datum_points=project.adjust.datum_points,
         robust=project.adjust.robust,
         variance_components=project.adjust.variance_components,
+        method=project.adjust.method,
     )
     adjustment = _adjusted(network, options)
     uncorrected = np.zeros_like(network.observations.xy_mm)

@@ -20,6 +20,7 @@ POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 
 Datum = Literal["control", "minimal", "free"]
+Method = Literal["combined", "elements"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class AdjustSettings:
     film_sigma_um: float
     robust: bool
     variance_components: bool
+    method: Method
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,7 @@ def _adjust_settings(table: Table) -> AdjustSettings:
         film_sigma_um=table.number("film_sigma_um", 0.0, least=0.0),
         robust=table.flag("robust", False),
         variance_components=table.flag("variance_components", False),
+        method=cast(Method, table.text("method", "combined", get_args(Method))),
     )
     table.done()
     return settings

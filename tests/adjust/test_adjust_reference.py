@@ -116,6 +116,16 @@ def test_poor_approximations_lead_to_the_same_result(seed: int) -> None:
     assert result.iterations < 20
 
 
+def test_elements_are_the_combined_model_when_axes_are_parallel_and_distortion_small() -> None:
+    """Torlegård's special case, A near I, as good as true of this case's 0.1 mm of distortion and 5 um of noise."""
+    case = load("i_five_images_affine_reduced")
+    start = approximations_of(case, case["input"]["initial_approximations"])
+    result = adjust(network_of(case), start, Options(method="elements"))
+    assert result.converged
+    assert np.abs(differences(case, result)).max() < 0.05
+    assert result.vpv == pytest.approx(case["result"]["vpv"], rel=0.01)
+
+
 def test_history_ends_at_the_result() -> None:
     case = load("i_five_images_affine_reduced")
     result = adjusted(case)

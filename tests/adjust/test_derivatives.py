@@ -105,13 +105,14 @@ def test_rays_accept_complex_steps() -> None:
     np.testing.assert_allclose(ray.imag / STEP, expected, rtol=1e-13)
 
 
+@pytest.mark.parametrize("by_elements", [False, True])
 @pytest.mark.parametrize("kind", ["none", "congruent", "similarity", "affine"])
-def test_functions_by_differences_of_computed_observations(kind: Transformation) -> None:
+def test_functions_by_differences_of_computed_observations(kind: Transformation, by_elements: bool) -> None:
     """F(l(x), x) = 0 defines l(x), so that dl/dx = -A^-1 B: by central differences of l for every unknown."""
     rng = np.random.default_rng(11)
     truth = Truth(mirrored=(False, kind != "none", False, False))
     network, start = simulated(rng, truth, kind, point_sigma=np.inf, free={"k3": np.inf, "k5": np.inf})
-    problem = number(network, start)
+    problem = number(network, start, by_elements)
     state = problem.start()
     computed = computed_observations(problem, state)
     assert computed is not None
