@@ -221,6 +221,7 @@ def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
     observed = run.residuals
     # The test w of a mark that robust estimation has lost is that of the mark as it was given.
     given = replace(observed, w=observed.w / np.sqrt(weighting.weights)[:, None])
+    values = np.where(_meaningless(problem), np.nan, state.values)
     conditions = 2 * len(problem.network.observations) + int(unknowns.has_prior.sum())
     factors = {"target": weighting.target, "fiducial": weighting.fiducial} if options.variance_components else {}
     return Adjustment(
@@ -232,7 +233,7 @@ def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
         redundancy=conditions - len(numbering.free),
         vpv=run.end.vpv,
         names=unknowns.names,
-        values=state.values,
+        values=values,
         cofactor=run.cofactor,
         residuals=given,
         groups=groups(problem, state, run.cofactor.variances, observed, covariance),
@@ -243,6 +244,19 @@ def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
         weights=weighting.weights,
         variance_factors=factors,
     )
+
+
+def _meaningless(problem: Problem) -> NDArray[np.bool_]:
+    """The quantities (n,) that nothing is given of and that nothing tells, for no object point is seen."""
+    network, unknowns = problem.network, problem.unknowns
+    meaningless = np.zeros(len(unknowns), dtype=bool)
+    for name in network.unoriented:
+        meaningless[unknowns.exterior[name]] = True
+    for name in network.idle_cameras & unknowns.camera.keys():
+        camera = network.camera_by_name[name]
+        given = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
+        meaningless[unknowns.camera[name][:3]] = [prior is None for prior in given]
+    return meaningless
 
 
 def _warnings(run: _Run) -> tuple[str, ...]:

@@ -28,22 +28,28 @@ def approximate(network: Network) -> Approximations:
     Film transformations from the fiducial marks; a principal distance nobody knows from resections of the known
     points; exterior orientations as given, or by resection (gross errors tolerated), image after image, with points
     intersected from the images already oriented; where too little is known to begin with, from a model of the images
-    themselves. Independent of the order of images, points and observations.
+    themselves. Independent of the order of images, points and observations. An image that shows fiducials alone gets
+    its film transformation and nothing else.
     Raises AdjustmentError, naming the image, camera or point, where something cannot be found, and what would help.
     """
     validate(network)
     rows = _rows_by_image(network)
     fits = {image.name: _film_transformation(network, image, rows[image.name]) for image in network.images}
     frames = {image.name: _frame(network, image, rows[image.name], fits[image.name]) for image in network.images}
-    interior = {camera.name: _interior(network, camera, frames) for camera in network.cameras}
+    interior = {
+        camera.name: _interior(network, camera, frames)
+        for camera in network.cameras
+        if camera.name not in network.idle_cameras
+    }
     sights = {
         image.name: _sight(network.camera_by_name[image.camera], frames[image.name], interior[image.camera])
         for image in network.images
+        if image.name not in network.without_object
     }
     poses, points = orient(network, sights)
     return Approximations(
         interior=interior,
-        exterior={image.name: _exterior(image, poses[image.name]) for image in network.images},
+        exterior={image.name: _exterior(image, poses[image.name]) for image in network.images if image.name in poses},
         transformation={name: parameters for name, (parameters, _) in fits.items()},
         points=points,
         mirrored=frozenset(name for name, (_, mirrored) in fits.items() if mirrored),

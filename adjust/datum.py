@@ -62,6 +62,8 @@ def _generators(problem: Problem, state: State, center: Array, extent: float) ->
     # A rotation R of the object turns M into M R', which is the rotation vector -M r on top of M.
     turned = np.linalg.solve(problem.attitude_by_unknowns(state), -state.rotations) / extent
     generators[problem.exterior[:, 3:], 3:6] = turned
+    for name in problem.network.unoriented:
+        generators[problem.unknowns.exterior[name]] = 0.0
     return generators
 
 

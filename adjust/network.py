@@ -117,6 +117,11 @@ class Image:
     transformation: Transformation = "affine"
     exterior: Exterior | None = None
 
+    @property
+    def is_observed(self) -> bool:
+        """Whether its whole exterior orientation is given with standard deviations."""
+        return self.exterior is not None and bool(np.isfinite(self.exterior.sigmas).all())
+
 
 @dataclass(frozen=True)
 class ObjectPoint:
@@ -166,6 +171,24 @@ class Network:
     @cached_property
     def point_by_id(self) -> dict[str, ObjectPoint]:
         return {point.id: point for point in self.points}
+
+    @cached_property
+    def without_object(self) -> frozenset[str]:
+        """The images that show no object point, only fiducials or nothing."""
+        rows = zip(self.observations.image, self.observations.kind, strict=True)
+        showing = {image for image, kind in rows if kind != "fiducial"}
+        return frozenset(image.name for image in self.images if image.name not in showing)
+
+    @cached_property
+    def unoriented(self) -> frozenset[str]:
+        """Those of them whose exterior orientation is not observed either: a film transformation is all they have."""
+        return frozenset(name for name in self.without_object if not self.image_by_name[name].is_observed)
+
+    @cached_property
+    def idle_cameras(self) -> frozenset[str]:
+        """The cameras none of whose images shows an object point: their interior orientation has no part."""
+        busy = {image.camera for image in self.images if image.name not in self.without_object}
+        return frozenset(camera.name for camera in self.cameras if camera.name not in busy)
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,10 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
     """
     block = Block(sights, _coordinates(network, firm=True), _coordinates(network, firm=False))
     for image in network.images:
-        if image.exterior is not None:
+        if image.exterior is not None and image.name in sights:
             block.poses[image.name] = _checked(image.exterior, block, image.name)
     extend(block)
-    if not block.poses:
+    if sights and not block.poses:
         block.poses.update(orient_vertical_block(sights, block.firm) or orient_free_model(sights, block.firm))
         extend(block)
     missing = sorted(name for name in sights if name not in block.poses)

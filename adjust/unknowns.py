@@ -71,7 +71,9 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
 
     observed: (camera, id) of every fiducial and ("", id) of every point that is seen in an image. Cameras without an
     image are left out, and so are points that nobody saw; a fiducial that nobody saw and that is free is held where it
-    is given. Raises AdjustmentError where a quantity has neither a value nor an approximation.
+    is given. Held, too, is what only object points tell and no image shows any: the interior orientation of an idle
+    camera, the exterior one of an image that has none. Raises AdjustmentError where a quantity has neither a value nor
+    an approximation.
     """
     listing = _Listing()
     used = {image.camera for image in network.images}
@@ -80,7 +82,9 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
     for each in network.cameras:
         if each.name not in used:
             continue
-        camera[each.name] = listing.add(f"IO.{each.name}", _camera_quantities(each, approximations))
+        idle = each.name in network.idle_cameras
+        quantities = _camera_quantities(each, approximations)
+        camera[each.name] = listing.add(f"IO.{each.name}", _stopped(quantities) if idle else quantities)
         for id_, mark in each.fiducials.items():
             priors = (mark.x_mm, mark.y_mm)
             if (each.name, id_) not in observed:
@@ -95,7 +99,9 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
     transformation = {}
     exterior = {}
     for image in network.images:
-        exterior[image.name] = listing.add(f"EO.{image.name}", _exterior_quantities(image, approximations))
+        quantities = _exterior_quantities(image, approximations)
+        stopped = image.name in network.unoriented
+        exterior[image.name] = listing.add(f"EO.{image.name}", _stopped(quantities) if stopped else quantities)
         transformation[image.name] = listing.add(f"T.{image.name}", _transformation_quantities(image, approximations))
     given, sigma, start = np.array(listing.rows, dtype=np.float64).T
     return Unknowns(tuple(listing.names), given, sigma, start, camera, fiducial, point, transformation, exterior)
@@ -133,6 +139,11 @@ def _row(name: str, prior: Prior | None, approximation: float | None) -> tuple[f
 def _held(prior: Prior) -> Prior:
     """A quantity that nothing observes: fixed if it is free, otherwise its prior alone makes it regular."""
     return prior if np.isfinite(prior.sigma) else Prior(prior.value, 0.0)
+
+
+def _stopped(quantities: list[Quantity]) -> list[Quantity]:
+    """Quantities that have no part: fixed where they are given, at 1 where nothing is, which stands for no value."""
+    return [(name, Prior(1.0 if prior is None else prior.value), None) for name, prior, _ in quantities]
 
 
 def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Quantity]:

@@ -150,9 +150,13 @@ def _check_image(image: Image, targets: int, fiducials: int) -> None:
             f"image {image.name} shows {fiducials} fiducial marks; its {image.transformation} transformation needs "
             f"{needed}. Measure more of them, choose a transformation that needs fewer, or leave the image out."
         )
-    known = image.exterior is not None and bool(np.isfinite(image.exterior.sigmas).all())
-    if targets < TARGETS_NEEDED and not known:
+    if not targets and not fiducials:
+        raise AdjustmentError(
+            f"image {image.name} shows neither fiducial marks nor object points. Leave the image out."
+        )
+    if 0 < targets < TARGETS_NEEDED and not image.is_observed:
         raise AdjustmentError(
             f"image {image.name} shows {targets} object points; its exterior orientation needs {TARGETS_NEEDED}. "
-            f"Measure more targets in it, give its orientation with standard deviations, or leave the image out."
+            f"Measure more targets in it, give its orientation with standard deviations, or leave its targets out: its "
+            f"fiducial marks alone give its film transformation."
         )

@@ -60,7 +60,9 @@ def write_adjustment(adjustment: Adjustment, path: Path) -> None:
 
     Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity
     has `given`, what was known of it beforehand, and every residual its place in the camera. A camera without an image
-    and a point that nobody saw are not in it. Raises InputError where a file cannot be written.
+    and a point that nobody saw are not in it. Where no object point is seen, there is no exterior orientation (null)
+    and no calibration (a camera's values are those given, their sigmas null). Raises InputError where a file cannot be
+    written.
     """
     text = json.dumps(without_nan(adjustment_json(adjustment)), indent=1, ensure_ascii=False, allow_nan=False)
     arrays = io.BytesIO()
@@ -117,7 +119,12 @@ def adjustment_json(adjustment: Adjustment) -> Json:
 
 
 def _camera(adjustment: Adjustment, camera: Camera) -> Json:
-    interior = f"IO.{camera.name}."
+    idle = camera.name in adjustment.network.idle_cameras
+
+    def quantity(name: str, given: Prior | None) -> Json:
+        known = _quantity(adjustment, f"IO.{camera.name}.{name}", given)
+        return known | {"sigma": math.nan} if idle else known
+
     distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
     if camera.distortion.family == "torlegard":
         distortion["decentering"] = camera.distortion.decentering
@@ -125,12 +132,12 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
         distortion["half_mm"] = list(camera.distortion.half_mm)
     for parameter in parameter_names(camera.distortion.family):
         given = camera.distortion.parameters.get(parameter, Prior(0.0))
-        distortion[parameter] = _quantity(adjustment, interior + parameter, given)
+        distortion[parameter] = quantity(parameter, given)
     return {
-        "principal_distance_mm": _quantity(adjustment, interior + "c", camera.principal_distance_mm),
+        "principal_distance_mm": quantity("c", camera.principal_distance_mm),
         "principal_point_mm": {
-            "x": _quantity(adjustment, interior + "x0", camera.x0_mm),
-            "y": _quantity(adjustment, interior + "y0", camera.y0_mm),
+            "x": quantity("x0", camera.x0_mm),
+            "y": quantity("y0", camera.y0_mm),
         },
         "distortion": distortion,
         "fiducials": {
@@ -158,6 +165,8 @@ def _image(adjustment: Adjustment, image: Image) -> Json:
             exterior[f"{element}_deg"] = _quantity(adjustment, name, given, DEG_PER_RAD)
         else:
             exterior[element] = _quantity(adjustment, name, given)
+    if image.name in adjustment.network.unoriented:
+        exterior = {key: quantity | {"sigma": math.nan} for key, quantity in exterior.items()}
     return {"camera": image.camera, "transformation": transformation, "exterior": exterior}
 
 

@@ -53,6 +53,8 @@ def _check_camera(adjustment: Adjustment, name: str) -> CameraCheck:
     if not adjustment.converged:
         return CameraCheck("not possible", f"The adjustment itself has no solution: {_without_stop(adjustment)}.")
     camera = adjustment.network.camera_by_name[name]
+    if name in adjustment.network.idle_cameras:
+        return CameraCheck("not possible", "No image shows object points: the camera is not calibrated.")
     hindrance = _hindrance(camera)
     if hindrance:
         return CameraCheck("not possible", hindrance)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.network import Camera, Image, Network, ObjectPoint, Observations, Prior, Transformation
+from adjust.validation import FIDUCIALS_NEEDED
 from pipeline.camera_file import CameraFile
 from pipeline.comparator_file import ComparatorPoint
 from pipeline.errors import InputError
@@ -45,6 +46,14 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
     return network, (*lonely, *left_out)
 
 
+def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bool:
+    """Whether an adjustment is asked for: of object points, or at least of the film where fiducials suffice for it."""
+    fiducials = Counter(mark.image for mark in marks if mark.kind == "fiducial" and mark.status.is_observation)
+    return _expects_targets(project) or any(
+        _has_film_transformation(_image(project, name), count) for name, count in fiducials.items()
+    )
+
+
 def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
     """Points that are given but that no image shows."""
     if project.given_points is None:
@@ -72,28 +81,57 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
-    """The marks of the images that can be oriented, and a sentence on each of the others."""
+    """The marks that have a part, and a sentence on every image that cannot be oriented.
+
+    Of an image with too few targets the fiducials remain, where they suffice for its film transformation.
+    """
     targets = Counter(mark.image for mark in marks if mark.kind != "fiducial")
-    names = list(dict.fromkeys(mark.image for mark in marks))
-    without = [name for name in names if targets[name] < FEWEST_TARGETS and not _observed(project, name)]
-    if len(without) == len(names):
-        most = max(without, key=lambda name: targets[name])
-        raise InputError(
-            f"{project.comparator}: no image can be oriented: {most!r} shows the most targets, {targets[most]}, and an "
-            f"image needs {FEWEST_TARGETS}. See the status and reason of every mark in that file."
-        )
-    left_out = tuple(
-        f"Image {name!r} has no part in the adjustment: it shows {targets[name]} targets and needs {FEWEST_TARGETS}. "
-        "Look at the reasons of its marks; or observe its orientation in images.csv, with standard deviations."
-        for name in without
+    fiducials = Counter(mark.image for mark in marks if mark.kind == "fiducial")
+    images = [_image(project, name) for name in dict.fromkeys(mark.image for mark in marks)]
+    few = [image for image in images if targets[image.name] < FEWEST_TARGETS and not image.is_observed]
+    lost = [image for image in few if not _has_film_transformation(image, fiducials[image.name])]
+    if len(lost) == len(images):
+        raise InputError(f"{project.comparator}: {_why_nothing(lost, targets, fiducials)}")
+    sentences = [
+        f"Image {image.name!r} has no part in the adjustment: it shows {targets[image.name]} targets and needs "
+        f"{FEWEST_TARGETS}. Look at the reasons of its marks; or observe its orientation in images.csv, with standard "
+        "deviations."
+        for image in lost
+    ]
+    sentences += [
+        f"Image {image.name!r} is not oriented: it shows {targets[image.name]} targets and needs {FEWEST_TARGETS}. Its "
+        "film transformation is adjusted from its fiducials. Look at the reasons of its targets."
+        for image in few
+        if image not in lost and _expects_targets(project)
+    ]
+    dropped = {image.name for image in lost}
+    bare = {image.name for image in few}
+    kept = [mark for mark in marks if mark.image not in (dropped if mark.kind == "fiducial" else bare)]
+    return kept, tuple(sentences)
+
+
+def _expects_targets(project: Project) -> bool:
+    """Whether a project has object points to be seen; without them, film transformations are all it can ask for."""
+    return project.targets is not None or project.given_points is not None
+
+
+def _has_film_transformation(image: Image, fiducials: int) -> bool:
+    return fiducials >= max(FIDUCIALS_NEEDED[image.transformation], 1)
+
+
+def _why_nothing(images: Sequence[Image], targets: Counter[str], fiducials: Counter[str]) -> str:
+    most = max(images, key=lambda image: targets[image.name])
+    shown = max(images, key=lambda image: fiducials[image.name])
+    marks = (
+        f" Nor can a film transformation be found: {shown.name!r} shows the most fiducials, {fiducials[shown.name]}, "
+        f"and its {shown.transformation} transformation needs {FIDUCIALS_NEEDED[shown.transformation]}."
+        if shown.transformation != "none"
+        else ""
     )
-    return [mark for mark in marks if mark.image not in without], left_out
-
-
-def _observed(project: Project, image: str) -> bool:
-    """Whether the project gives the whole exterior orientation with standard deviations."""
-    exterior = project.given_images.exterior.get(image) if project.given_images else None
-    return exterior is not None and bool(np.isfinite(exterior.sigmas).all())
+    return (
+        f"no image can be oriented: {most.name!r} shows the most targets, {targets[most.name]}, and an image needs "
+        f"{FEWEST_TARGETS}.{marks} See the status and reason of every mark in that file."
+    )
 
 
 def _image(project: Project, name: str) -> Image:

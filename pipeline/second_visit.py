@@ -49,7 +49,8 @@ def _with_adjusted_points(field: Field, adjustment: Adjustment) -> Field:
 
 def _visit(field: Field, scan: MeasuredScan, adjustment: Adjustment, polarity: Polarity) -> MeasuredScan:
     """The same object where the visit brought nothing."""
-    if scan.frame.image not in adjustment.network.image_by_name:
+    network = adjustment.network
+    if scan.frame.image not in network.image_by_name or scan.frame.image in network.unoriented:
         return scan
     targets = {mark.point: mark for mark in scan.frame.marks if mark.kind != "fiducial"}
     model = adjusted_image(adjustment, scan.frame.image)

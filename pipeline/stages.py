@@ -15,6 +15,7 @@ from pipeline.comparator_file import read_comparator, write_comparator
 from pipeline.errors import InputError
 from pipeline.measure_stage import measure_scans
 from pipeline.measurement_file import MeasuredScan, read_measurement, write_measurement
+from pipeline.network import anything_to_adjust
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
 from pipeline.report.data import ReportData
@@ -34,7 +35,7 @@ def run_all(project: Project, reporter: Reporter) -> Summary:
     if project.scans:
         scans = measure_scans(project, reporter)
         _write_marks(project, scans)
-        if not _anything_to_adjust(project):
+        if not anything_to_adjust(project, read_comparator(project.comparator)):
             return _reported(project, _measured(project))
     adjustment = adjust_marks(project, read_comparator(project.comparator))
     again = measure_again(project, scans, adjustment, reporter)
@@ -84,11 +85,6 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
     with reporter.stage("reporting") as count:
         count(project.report_path.name, 0, 1)
         return _reported(project, _adjusted(project))
-
-
-def _anything_to_adjust(project: Project) -> bool:
-    """Fiducials alone calibrate nothing: without targets and points the measurement is the result."""
-    return project.targets is not None or project.given_points is not None
 
 
 def _write_marks(project: Project, scans: Sequence[MeasuredScan]) -> None:

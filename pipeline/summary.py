@@ -6,6 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -13,7 +14,7 @@ from rich.text import Text
 from measure.status import Status
 from pipeline.report.data import Problem, ReportData
 from pipeline.report.numbers import value_and_sigma
-from pipeline.report.verdict import judge
+from pipeline.report.verdict import camera_is_calibrated, judge
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
 Json = dict[str, Any]
@@ -64,7 +65,8 @@ def print_summary(summary: Summary, console: Console) -> None:
     if summary.frames:
         console.print(_frame_table(summary.frames))
     if summary.adjustment:
-        console.print(_camera_table(summary.adjustment))
+        calibrated = any(camera_is_calibrated(camera) for camera in summary.adjustment["cameras"].values())
+        console.print((_camera_table if calibrated else _film_table)(summary.adjustment))
     for word, path in summary.files.items():
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 
@@ -81,10 +83,24 @@ def _frame_table(frames: Mapping[str, Mapping[str, int]]) -> Table:
     return table
 
 
+def _film_table(adjustment: Json) -> Table:
+    """What an adjustment of fiducials alone gives of every image."""
+    title = f"Film transformations (sigma0 = {adjustment['sigma0']:.3f}, redundancy {adjustment['redundancy']})"
+    columns = ("image", "transformation", "fiducials", "rms x, um", "rms y, um")
+    table = Table(*columns, title=title, title_justify="left")
+    for name, image in adjustment["images"].items():
+        v_um = np.array([(row["vx_um"], row["vy_um"]) for row in adjustment["residuals"] if row["image"] == name])
+        rms = [f"{value:.2f}" for value in np.sqrt((v_um**2).mean(axis=0))]
+        table.add_row(Text(name), image["transformation"]["kind"], str(len(v_um)), *rms)
+    return table
+
+
 def _camera_table(adjustment: Json) -> Table:
     title = f"Camera (sigma0 = {adjustment['sigma0']:.3f}, redundancy {adjustment['redundancy']})"
     table = Table("camera", "parameter", "value", "sigma", title=title, title_justify="left")
     for name, camera in adjustment["cameras"].items():
+        if not camera_is_calibrated(camera):
+            continue
         point = camera["principal_point_mm"]
         rows = {
             "principal distance, mm": camera["principal_distance_mm"],

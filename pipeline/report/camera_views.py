@@ -12,6 +12,7 @@ from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import ParameterRow, high_correlations, parameter_rows
+from pipeline.report.verdict import camera_is_calibrated
 
 PLOT_PX = 560.0
 LONGEST_VECTOR_PX = 60.0
@@ -79,7 +80,7 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
     images = [image for image in stored["images"] if camera_of(data, image) == name]
     by_image = residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
-    covariance = data.covariance if stored["converged"] else None
+    covariance = data.covariance if stored["converged"] and camera_is_calibrated(camera) else None
     radius_mm, frame_mm = _observed_radius_mm(camera, rows), data.frame_mm.get(name)
     form = fiducials.figure(name, camera, covariance) if covariance else None
     curve = _curves(name, camera, covariance, radius_mm, frame_mm) if covariance else None

@@ -50,6 +50,11 @@ def judge(data: ReportData) -> Verdict:
     return Verdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
 
 
+def camera_is_calibrated(camera: Json) -> bool:
+    """Whether a camera's entry of adjustment.json has an interior orientation, and not just fiducials."""
+    return camera["principal_distance_mm"]["sigma"] is not None
+
+
 def sigma0_bounds(redundancy: int) -> tuple[float, float]:
     """Where sigma0 lies, with a probability of 99 %, when the a-priori standard deviations are right."""
     chi_square = stats.chi2(redundancy)
@@ -165,7 +170,7 @@ def _global_test(adjustment: Json) -> Iterator[Problem]:
         yield Problem(
             f"σ₀ = {sigma0:.2f} is below {low:.2f}: the marks fit better than the sigmas given ({by_group}).",
             "Lower the sigmas of the group that is below 1 (sigma_target_um, sigma_fiducial_um, film_sigma_um, or "
-            "comparator.csv). All sigmas of the result are already multiplied by σ₀.",
+            "comparator.csv; datum: sigma_mm of the fiducials). All sigmas of the result are already multiplied by σ₀.",
         )
 
 
@@ -221,9 +226,12 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
     if level == "failed":
         why = "the network is singular" if data.adjustment["singular"] else "the iteration did not come to rest"
         return f"There is no calibration: {why}."
+    calibrated = {name: each for name, each in data.adjustment["cameras"].items() if camera_is_calibrated(each)}
+    if not calibrated:
+        return f"Film transformations from {found}; no frame is oriented, and no camera calibrated{ending}"
     constants = "; ".join(
         f"{name} has c = {value} ± {sigma} mm" if sigma != "fixed" else f"{name} has c = {value} mm, fixed"
-        for name, camera in data.adjustment["cameras"].items()
+        for name, camera in calibrated.items()
         for value, sigma in [value_and_sigma(*(camera["principal_distance_mm"][key] for key in ("value", "sigma")))]
     )
     return f"Calibrated from {found}: {constants}{ending}"
