@@ -10,6 +10,7 @@ from pipeline.adjustment_file import Covariance
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image
+from pipeline.report.lens_map import LensMap, lens_map
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import ParameterRow, high_correlations, parameter_rows
 from pipeline.report.verdict import camera_is_calibrated
@@ -62,6 +63,8 @@ class CameraView:
     in_given_figure: list[tuple[str, str, str]]
     correlations: list[tuple[str, str, float]]
     curves: Markup | None
+    effect_where: str
+    lens_map: LensMap | None
     curve_rows: list[CurveRow]
     fiducials: list[FiducialRow]
     figure: Markup | None
@@ -93,6 +96,8 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         in_given_figure=_in_given_figure(form) if form else [],
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         curves=lens.curves_plot(curve, radius_mm) if curve else None,
+        effect_where="in the frame" if lens.lens(name, camera).is_of_frame else f"at {fixed(radius_mm, 0)} mm",
+        lens_map=_lens_map(name, camera, covariance, rows, frame_mm) if covariance else None,
         curve_rows=_curve_rows(curve) if curve else [],
         fiducials=[_fiducial_row(id, fiducial, form) for id, fiducial in camera["fiducials"].items()],
         figure=fiducials.figure_plot(form) if form else None,
@@ -121,12 +126,24 @@ def _in_given_figure(form: fiducials.Figure) -> list[tuple[str, str, str]]:
 def _curves(
     name: str, camera: Json, covariance: Covariance, radius_mm: float, frame_mm: tuple[float, float] | None
 ) -> lens.Curves | None:
-    """Out to the frame's corner where its size is known, else to the outermost target."""
+    """Out to the frame's corner where its size is known, else to the outermost target.
+
+    Of a family that is defined over the frame: on circles that lie in it.
+    """
     corner_mm = 0.5 * float(np.hypot(*frame_mm)) if frame_mm else 0.0
     largest = max(radius_mm, corner_mm)
     if not parameter_names(camera["distortion"]["family"]) or largest == 0.0:
         return None
-    return lens.curves(lens.lens(name, camera), covariance, largest)
+    of = lens.lens(name, camera)
+    return lens.curves(of, covariance, min(largest, *of.distortion.half_mm) if of.is_of_frame else largest)
+
+
+def _lens_map(
+    name: str, camera: Json, covariance: Covariance, rows: list[Json], frame_mm: tuple[float, float] | None
+) -> LensMap | None:
+    if not parameter_names(camera["distortion"]["family"]) or not rows:
+        return None
+    return lens_map(lens.lens(name, camera), covariance, vectors.plane(rows, frame_mm, PLOT_PX))
 
 
 def _curve_rows(curve: lens.Curves) -> list[CurveRow]:

@@ -7,7 +7,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from adjust.distortion import image_equations
-from adjust.families import parameter_names
+from adjust.families import family, parameter_names
 from adjust.network import Distortion
 from adjust.projection import ideal_from_observed
 from pipeline.adjustment_file import Covariance
@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 RADII = 80
 DIRECTIONS = 36
+FRAME_GRID = 17
 BAND = 1.959964  # sigmas to a probability of 95 %
 
 
@@ -29,6 +30,11 @@ class Lens:
     distortion: Distortion
     interior: Array
     parameters: Array
+
+    @property
+    def is_of_frame(self) -> bool:
+        """Whether the family is defined over the frame, and not over the radius."""
+        return family(self.distortion.family).needs == "half_mm"
 
     @property
     def unknowns(self) -> tuple[str, ...]:
@@ -119,8 +125,11 @@ def curves(of: Lens, covariance: Covariance, largest_radius_mm: float) -> Curves
 
 
 def largest_effects_um(of: Lens, radius_mm: float) -> dict[str, float]:
-    """By parameter: the largest displacement at a radius that a change of 1 of the parameter makes."""
-    moved = displacement(of, radius_mm * _directions())
+    """By parameter: the largest displacement that a change of 1 of the parameter makes, at a radius.
+
+    Of a family that is defined over the frame: anywhere in it, for beyond it a polynomial means nothing.
+    """
+    moved = displacement(of, _over_the_frame(of.distortion.half_mm) if of.is_of_frame else radius_mm * _directions())
     sizes = np.hypot(moved.by_unknowns_um[:, 0, 1:], moved.by_unknowns_um[:, 1, 1:]).max(axis=0)
     return dict(zip(parameter_names(of.distortion.family), sizes.tolist(), strict=True))
 
@@ -146,6 +155,13 @@ def curves_plot(drawn: Curves, observed_radius_mm: float) -> Markup:
     content.append(_band(x, axes, drawn.radial_um, drawn.radial_sigma_um, "band first"))
     content.append(svg.line(x, axes.y(drawn.radial_um), "curve first"))
     return svg.picture(axes.width, axes.height, "Distortion over the radius with its 95 % band", *content)
+
+
+def _over_the_frame(half_mm: tuple[float, float]) -> Array:
+    """(n, 2) a grid over the frame, its edges included."""
+    along = np.linspace(-1.0, 1.0, FRAME_GRID)
+    x, y = np.meshgrid(half_mm[0] * along, half_mm[1] * along)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def _directions() -> Array:

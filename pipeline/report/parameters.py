@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.families import family as family_of
 from adjust.families import parameter_names
 from pipeline.adjustment_file import Covariance
 from pipeline.report.data import Json
@@ -19,6 +20,7 @@ UNITS = {
     "brown": dict(zip(("k1", "k2", "k3", "p1", "p2", "b1", "b2"), (-2, -4, -6, -1, -1, 0, 0), strict=True)),
 }
 JUHL_UNIT = "µm at 1 dm"
+ANGLES = ("tau_x", "tau_y")
 _POWERS = {0: "–", -1: "mm⁻¹", -2: "mm⁻²", -4: "mm⁻⁴", -6: "mm⁻⁶"}
 
 
@@ -114,4 +116,8 @@ def _effect(quantity: Json, um_per_unit: float) -> str:
 
 
 def _unit(family: str, parameter: str) -> str:
+    if family_of(family).needs == "half_mm":
+        return "mm"
+    if parameter in ANGLES:
+        return "rad"
     return JUHL_UNIT if family == "juhl" else _POWERS[UNITS.get(family, {}).get(parameter, 0)]

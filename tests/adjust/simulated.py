@@ -22,6 +22,7 @@ from adjust.network import (
 Array = NDArray[np.float64]
 
 FIDUCIALS = {"1": (106.0, -106.0), "2": (-106.0, -106.0), "3": (-106.0, 106.0), "4": (106.0, 106.0), "5": (0.0, -113.0)}
+HALF_MM = 114.0
 STATIONS = ((0.0, 0.0, 1500.0), (500.0, 100.0, 1400.0), (-480.0, 80.0, 1600.0), (60.0, 520.0, 1480.0))
 ATTITUDES = ((0.01, -0.02, 0.1), (-0.08, 0.36, 1.6), (-0.05, -0.29, 3.0), (-0.35, 0.03, -1.5))
 
@@ -63,14 +64,25 @@ def torlegard(truth: Truth, x: float, y: float) -> tuple[float, float]:
     return dx, dy
 
 
+def ebner(truth: Truth, x: float, y: float) -> tuple[float, float]:
+    """dx, dy at an observed camera point by Ebner's twelve parameters in mm, the half frame the unit of length."""
+    b = [0.0] + [truth.distortion.get(f"b{i}", 0.0) for i in range(1, 13)]
+    u, v = (x - truth.x0) / HALF_MM, (y - truth.y0) / HALF_MM
+    k, m = u * u - 2 / 3, v * v - 2 / 3
+    dx = b[1] * u + b[2] * v - 2 * b[3] * k + b[4] * u * v + b[5] * m + b[7] * u * m + b[9] * k * v + b[11] * k * m
+    dy = -b[1] * v + b[2] * u + b[3] * u * v - 2 * b[4] * m + b[6] * k + b[8] * k * v + b[10] * u * m + b[12] * k * m
+    return dx, dy
+
+
 def camera_point(truth: Truth, image: int, xyz: Array) -> Array:
     """Where an object point is observed in the camera frame: the ideal point plus the correction there."""
     u, v, w = rotation(*truth.attitudes[image]) @ (xyz - np.array(truth.stations[image]))
+    correction = ebner if truth.family == "ebner" else torlegard
     ideal = np.array([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w])
 
     xy = ideal
     for _ in range(12):  # the corrections contract: each turn leaves about a hundredth of the error
-        xy = ideal + np.array(torlegard(truth, xy[0], xy[1]))
+        xy = ideal + np.array(correction(truth, xy[0], xy[1]))
     return xy
 
 
@@ -121,7 +133,7 @@ def simulated(
         Prior(truth.c + noise * rng.normal(0.0, 1.0), 1.0),
         Prior(truth.x0 + noise * rng.normal(0.0, 1.0), 1.0),
         Prior(truth.y0 + noise * rng.normal(0.0, 1.0), 1.0),
-        Distortion(truth.family, given, truth.decentering),
+        Distortion(truth.family, given, truth.decentering, half_mm=(HALF_MM, HALF_MM)),
         {
             id_: Fiducial(*(Prior(value + spread * rng.normal(), fiducial_sigma) for value in xy))
             for id_, xy in FIDUCIALS.items()

@@ -1,0 +1,66 @@
+"""What the distortion does over the frame, as a grid of vectors: the only picture of a family that is not radial."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from pipeline.adjustment_file import Covariance
+from pipeline.report import svg
+from pipeline.report.lens import Lens, displacement
+from pipeline.report.numbers import value_and_sigma
+from pipeline.report.vectors import FOOT_PX, Plane, scale_bar
+
+Array = NDArray[np.float64]
+
+GRID = 15  # vectors along the longer side
+LONGEST = 1.5  # of the grid's mesh
+
+
+@dataclass(frozen=True)
+class LensMap:
+    """The drawing, and the largest displacement in it with its sigma, ready to print."""
+
+    plot: Markup
+    largest_um: tuple[str, str]
+
+
+def lens_map(of: Lens, covariance: Covariance, on: Plane) -> LensMap:
+    """The displacement at a grid of observed points over a plane, from the ideal to the observed place."""
+    xy = _grid(on)
+    moved = displacement(of, xy - of.interior[1:])
+    size = np.hypot(*moved.value_um.T)
+    at = int(size.argmax())
+    by = (moved.value_um[at] / max(float(size[at]), 1e-12)) @ moved.by_unknowns_um[at]
+    sigma = float(np.sqrt(max(by @ covariance.of(of.unknowns) @ by, 0.0)))
+    return LensMap(_drawn(xy, moved.value_um, on), value_and_sigma(float(size[at]), sigma))
+
+
+def _grid(on: Plane) -> Array:
+    """(n, 2) the middles of a mesh of squares over the plane, mm."""
+    low, high = on.corners_mm
+    mesh = float((high - low).max()) / GRID
+    counts = np.maximum(np.rint((high - low) / mesh), 1.0).astype(int)
+    x, y = (
+        first + (last - first) * (np.arange(count) + 0.5) / count
+        for first, last, count in zip(low, high, counts, strict=True)
+    )
+    return np.stack([each.ravel() for each in np.meshgrid(x, y)], axis=1)
+
+
+def _drawn(xy_mm: Array, value_um: Array, on: Plane) -> Markup:
+    longest_um = float(np.hypot(*value_um.T).max())
+    mesh_px = on.px_per_mm * float((on.corners_mm[1] - on.corners_mm[0]).max()) / GRID
+    px_per_um = svg.round_step(LONGEST * mesh_px / longest_um) if longest_um > 0.0 else 1.0
+    ends = on.page(xy_mm)
+    starts = ends - px_per_um * value_um * (1.0, -1.0)
+    return svg.picture(
+        on.width_px,
+        on.height_px + FOOT_PX,
+        "Distortion vectors over the camera frame",
+        on.drawn(),
+        svg.strokes(starts, ends, "vector target"),
+        svg.strokes(starts, starts, "dot target"),
+        scale_bar(on, px_per_um),
+    )

@@ -1,0 +1,61 @@
+"""A simulated network as the files a user would write."""
+
+from pathlib import Path
+
+import numpy as np
+
+from adjust.network import Network, Prior
+
+
+def write_project(network: Network, folder: Path) -> Path:
+    """camera.toml, points.csv, comparator.csv and project.toml; the path of the last."""
+    camera, points, seen = network.cameras[0], network.points, network.observations
+    c, x0, y0 = camera.principal_distance_mm, camera.x0_mm, camera.y0_mm
+    assert c is not None
+    assert x0 is not None
+    assert y0 is not None
+    given = camera.distortion.parameters
+    lines = [
+        f'name = "{camera.name}"',
+        "frame_mm = [228.0, 228.0]",
+        f"principal_distance_mm = {c.value!r}",
+        f"principal_point_mm = [{x0.value!r}, {y0.value!r}]",
+        "[sigma]",
+        f"principal_distance_mm = {sigma(c)}",
+        f"principal_point_mm = [{sigma(x0)}, {sigma(y0)}]",
+        "[distortion]",
+        f'family = "{camera.distortion.family}"',
+        "[distortion.value]",
+        *(f"{name} = {prior.value!r}" for name, prior in given.items()),
+        "[distortion.sigma]",
+        *(f"{name} = {sigma(prior)}" for name, prior in given.items()),
+    ]
+    for id, mark in camera.fiducials.items():
+        x, y = mark.x_mm, mark.y_mm
+        lines += ["[[fiducial]]", f'id = "{id}"', f"xy_mm = [{x.value!r}, {y.value!r}]"]
+        lines.append(f"sigma_mm = [{sigma(x)}, {sigma(y)}]")
+    (folder / "camera.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    rows = ["point,X,Y,Z,sX,sY,sZ"]
+    for point in points:
+        axes = [axis for axis in (point.X, point.Y, point.Z) if axis is not None]
+        rows.append(",".join([point.id, *(repr(a.value) for a in axes), *(bare(a.sigma) for a in axes)]))
+    (folder / "points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
+    for i, (x_mm, y_mm) in enumerate(seen.xy_mm.tolist()):
+        sx, sy = np.sqrt(np.diag(seen.covariance_mm2[i])).tolist()
+        rows.append(f"{seen.image[i]},{seen.point[i]},{seen.kind[i]},{x_mm!r},{y_mm!r},{sx!r},{sy!r}")
+    (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "project.toml").write_text(
+        'camera = "camera.toml"\n[object]\npoints = "points.csv"\n'
+        f'[adjust]\ntransformation = "{network.images[0].transformation}"\n',
+        encoding="utf-8",
+    )
+    return folder / "project.toml"
+
+
+def sigma(prior: Prior) -> str:
+    return repr(prior.sigma) if np.isfinite(prior.sigma) else '"free"'
+
+
+def bare(value: float) -> str:
+    return repr(value) if np.isfinite(value) else ""
