@@ -16,7 +16,7 @@ from adjust.functions import blind_target
 from adjust.iteration import Linearised, Solution, factorise, iterate, linearise
 from adjust.network import Approximations, Network
 from adjust.problem import Problem, State, number
-from adjust.residuals import groups, residuals
+from adjust.residuals import further_residuals, groups, residuals
 from adjust.result import Adjustment, Cofactor, NullDirection, Residuals
 from adjust.reweighting import Weighting, robust_weights, variance_factor
 from adjust.rows import Numbering
@@ -222,7 +222,9 @@ def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
     # The test w of a mark that robust estimation has lost is that of the mark as it was given.
     given = replace(observed, w=observed.w / np.sqrt(weighting.weights)[:, None])
     values = np.where(_meaningless(problem), np.nan, state.values)
-    conditions = 2 * len(problem.network.observations) + int(unknowns.has_prior.sum())
+    further_rows = sum(len(each.observed) for each in problem.further)
+    conditions = 2 * len(problem.network.observations) + int(unknowns.has_prior.sum()) + further_rows
+    further = tuple(further_residuals(problem, state, run.cofactor))
     factors = {"target": weighting.target, "fiducial": weighting.fiducial} if options.variance_components else {}
     return Adjustment(
         network=problem.network,
@@ -236,13 +238,14 @@ def _result(problem: Problem, run: _Run, options: Options) -> Adjustment:
         values=values,
         cofactor=run.cofactor,
         residuals=given,
-        groups=groups(problem, state, run.cofactor.variances, observed, covariance),
+        groups=groups(problem, state, run.cofactor.variances, observed, covariance, further),
         singular=run.singular,
         warnings=_warnings(run),
         history=run.solution.history,
         mirrored=problem.mirrored,
         weights=weighting.weights,
         variance_factors=factors,
+        further=further,
     )
 
 

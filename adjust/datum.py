@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ Indices = NDArray[np.intp]
 EXACT = 1e-9  # what a generator may move of a given quantity and still be unhindered: rounding
 FLAT = 1e-3  # the same where relief, in parts of the field's extent, is too little to carry a datum
 CENTERINGS = 10  # the transformation is all but linear: two or three do
-LEVERAGE = 0.1  # least part of a coordinate's motion that earlier datum values must leave open
+LEVERAGES = (0.4, 0.1)  # part of a coordinate's motion that other datum values must leave open: at first, at the least
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class ObjectDatum:
 
 
 def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> ObjectDatum:
-    """The similarity transformations that move no fixed and no pseudo-observed coordinate, station or attitude."""
+    """The similarity transformations that change nothing given: coordinates, stations, attitudes and distances."""
     placed = _point_positions(problem) if problem.unknowns.point else problem.exterior[:, :3]
     center = state.values[placed].mean(axis=0)
     extent = float(np.sqrt(((state.values[placed] - center) ** 2).sum(axis=1).mean())) or 1.0
@@ -41,9 +42,21 @@ def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> Ob
     moved = generators.copy()
     moved[problem.exterior[:, 3:]] *= extent  # an angle's motion as that of a point
     hindered = moved[np.isfinite(problem.unknowns.sigma)]
-    rows = np.vstack([hindered / np.sqrt(max(len(hindered), 1)), np.zeros((7, 7))])
+    rows = np.vstack([hindered / np.sqrt(max(len(hindered), 1)), _further_motions(problem, state, moved)])
     _, singular, right = np.linalg.svd(rows, full_matrices=False)
     return ObjectDatum(center, extent, generators, right[singular <= tolerance].T)
+
+
+def _further_motions(problem: Problem, state: State, moved: Array) -> Array:
+    """How further observations change (m, 7), each by one unit at most, however short a distance may be."""
+    rows = [np.zeros((7, 7))]
+    for further in problem.further:
+        by_unknowns = further.by_unknowns(state.values)
+        motions = by_unknowns @ moved[further.positions]
+        lengths = np.linalg.norm(motions, axis=1, keepdims=True)
+        seen = lengths[:, 0] > EXACT * np.linalg.norm(by_unknowns, axis=1)
+        rows.append(motions[seen] / lengths[seen])
+    return np.vstack(rows)
 
 
 def _point_positions(problem: Problem) -> Indices:
@@ -77,12 +90,12 @@ def minimal_datum(problem: Problem) -> Indices:
     datum = object_datum(problem, state, FLAT)
     chosen: list[int] = []
     motions = np.zeros((0, datum.free.shape[1]))
-    for position in _candidates(problem, state):
+    for leverage, position in product(LEVERAGES, _candidates(problem, state)):
         if len(chosen) == datum.free.shape[1]:
             break
         motion = datum.generators[position] @ datum.free
         rest = motion - motions.T @ (motions @ motion)
-        if np.linalg.norm(rest) > LEVERAGE * np.linalg.norm(motion):
+        if np.linalg.norm(rest) > leverage * np.linalg.norm(motion):
             chosen.append(int(position))
             motions = np.vstack([motions, rest / np.linalg.norm(rest)])
     return np.array(chosen, dtype=np.intp)

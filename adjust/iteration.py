@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from adjust.elimination import Factor, eliminate
 from adjust.functions import Derivatives, computed_observations, derivatives
+from adjust.further_observations import square_sum
 from adjust.problem import Problem, State
 from adjust.result import Termination
 from adjust.rows import Numbering, WhitenedRows, of_cameras, prior_differences, prior_root_weights, whitened_rows
@@ -51,16 +52,16 @@ def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Line
         return None
     v = computed - problem.network.observations.xy_mm
     at = derivatives(problem, state, computed)
-    rows = whitened_rows(numbering, at, covariance_mm2, v)
+    rows = whitened_rows(numbering, state.values, at, covariance_mm2, v)
     return Linearised(state, computed, v, at, rows, weighted_square_sum(problem, state, v, covariance_mm2))
 
 
 def weighted_square_sum(problem: Problem, state: State, v_mm: Array, covariance_mm2: Array) -> float:
-    """v'Pv of the observations and of the priors."""
+    """v'Pv of the observations, of the priors and of further observations."""
     weighted = np.linalg.solve(covariance_mm2, v_mm[..., None])[..., 0]
     prior = problem.unknowns.has_prior
     normalised = prior_differences(problem, state)[prior] / problem.unknowns.sigma[prior]
-    return float((v_mm * weighted).sum() + (normalised**2).sum())
+    return float((v_mm * weighted).sum() + (normalised**2).sum()) + square_sum(problem.further, state.values)
 
 
 def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera_priors: bool = True) -> Factor:

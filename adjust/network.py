@@ -152,6 +152,19 @@ class Observations:
 
 
 @dataclass(frozen=True)
+class Distance:
+    """A measured distance between two object points, two stations (by their images' names) or one of each.
+
+    value and its standard deviation in object units.
+    """
+
+    start: str
+    end: str
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Network:
     """Everything that one adjustment knows. Names are unique; the order of things does not matter."""
 
@@ -159,6 +172,7 @@ class Network:
     images: tuple[Image, ...]
     points: tuple[ObjectPoint, ...]
     observations: Observations
+    distances: tuple[Distance, ...] = ()
 
     @cached_property
     def camera_by_name(self) -> dict[str, Camera]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.block import Block, extend, intersected, known_field, resected
 from adjust.errors import AdjustmentError
 from adjust.free_model import orient_free_model
-from adjust.network import Exterior, Network, Prior
+from adjust.network import Distance, Exterior, Network, Prior
 from adjust.resection import Pose, image_distances
 from adjust.rotation import rotation_from_angles
 from adjust.sight import Sight
@@ -33,6 +33,8 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
     if sights and not block.poses:
         block.poses.update(orient_vertical_block(sights, block.firm) or orient_free_model(sights, block.firm))
         extend(block)
+        if all(np.isnan(xyz).all() for xyz in block.rough.values()):
+            _scale_by_distances(block, network.distances)
     missing = sorted(name for name in sights if name not in block.poses)
     if missing:
         raise AdjustmentError(_why_not_oriented(block, missing[0]))
@@ -63,6 +65,20 @@ def _checked(exterior: Exterior, block: Block, image: str) -> Pose:
     left_given = np.median(image_distances(given, xyz, xy_mm, c))
     left_found = np.median(image_distances(found, xyz, xy_mm, c))
     return found if left_given > CLEARLY_WORSE * max(left_found, block.sights[image].sigma_mm) else given
+
+
+def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
+    """Scale a model of an arbitrary base so that measured distances come out, on the average."""
+    places = block.points | {image: pose.center for image, pose in block.poses.items()}
+    ratios = [
+        each.value / np.linalg.norm(places[each.end] - places[each.start])
+        for each in distances
+        if each.start in places and each.end in places
+    ]
+    if ratios:
+        scale = float(np.median(ratios))
+        block.poses = {image: Pose(pose.rotation, scale * pose.center) for image, pose in block.poses.items()}
+        block.points = {point: scale * xyz for point, xyz in block.points.items()}
 
 
 def _all_points(block: Block) -> dict[str, Array]:

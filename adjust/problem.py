@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.further_observations import FurtherObservation, further_observations
 from adjust.network import Approximations, Network
 from adjust.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.transformation import affine_by_parameters, affine_from_parameters
@@ -91,6 +92,11 @@ class Problem:
             derivative = affine_by_parameters(image.transformation, parameters, image.name in self.mirrored)
             chain[i, :, : len(parameters)] = derivative
         return chain
+
+    @cached_property
+    def further(self) -> tuple[FurtherObservation, ...]:
+        """What is observed beside image points and single unknowns."""
+        return further_observations(self.network, self.unknowns)
 
     @cached_property
     def image_numbers(self) -> Indices:

@@ -1,14 +1,15 @@
 """Residuals, redundancy numbers and standardised residuals, and their sums by group."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.elimination import Factor
+from adjust.further_observations import square_sum
 from adjust.iteration import Linearised
 from adjust.problem import Problem, State
-from adjust.result import Group, Residuals
+from adjust.result import Cofactor, FurtherResidual, Group, Residuals
 from adjust.rows import Numbering, prior_differences
 
 Array = NDArray[np.float64]
@@ -25,7 +26,7 @@ def residuals(numbering: Numbering, end: Linearised, factor: Factor, covariance_
     at, root = end.at, end.rows.root
     roots = factor.row_roots(end.rows.blocks)
     adjusted = np.empty((len(end.v_mm), 2, 2))
-    for touched, g in zip(numbering.touched, roots, strict=True):
+    for touched, g in zip(numbering.touched, roots, strict=False):  # behind them stand further observations
         pairs = g.reshape(len(touched.rows), 2, -1)
         adjusted[touched.rows] = pairs @ pairs.transpose(0, 2, 1)
     k = np.linalg.solve(root, at.by_observation @ covariance_mm2).transpose(0, 2, 1)
@@ -37,14 +38,35 @@ def residuals(numbering: Numbering, end: Linearised, factor: Factor, covariance_
     return Residuals(end.v_mm, redundancy, w)
 
 
+def further_residuals(problem: Problem, state: State, cofactor: Cofactor) -> Iterator[FurtherResidual]:
+    """The residuals of further observations: Q_vv = Q - J C_xx J', redundancy numbers the diagonal of Q_vv Q^-1."""
+    for each in problem.further:
+        by_unknowns = each.by_unknowns(state.values)
+        v = each.computed(state.values) - each.observed
+        adjusted = by_unknowns @ cofactor.of(each.positions) @ by_unknowns.T
+        cofactor_v = each.covariance - adjusted
+        redundancy = np.einsum("ij,ji->i", cofactor_v, np.linalg.inv(each.covariance))
+        sigma_v = np.sqrt(np.diag(cofactor_v).clip(0.0))
+        sigma = np.sqrt(np.diag(each.covariance))
+        checked = (redundancy > UNCHECKED) & (sigma_v > 0.0)
+        w = np.where(checked, v / np.where(checked, sigma_v, 1.0), 0.0)
+        for row in zip(each.names, each.observed, v, sigma, redundancy, w, strict=True):
+            yield FurtherResidual(each.group, row[0], *map(float, row[1:]))
+
+
 def groups(
-    problem: Problem, state: State, variances: Array, observed: Residuals, covariance_mm2: Array
+    problem: Problem,
+    state: State,
+    variances: Array,
+    observed: Residuals,
+    covariance_mm2: Array,
+    further: Sequence[FurtherResidual],
 ) -> dict[str, Group]:
     """The groups of observations: target and fiducial in the comparator, and the priors; variances (n,) of all.
 
     control: object coordinates, whose rms is in millionths of the object unit; datum: the fiducials' given places
-    (F5, F6); interior: c, x0', y0' and distortion; exterior. The last two mix units and have no rms. target, fiducial
-    and control are always there.
+    (F5, F6); interior: c, x0', y0' and distortion; exterior; and those of further observations. All behind datum have
+    no rms. target, fiducial and control are always there.
     """
     weighted = np.linalg.solve(covariance_mm2, observed.v_mm[..., None])[..., 0] * observed.v_mm
     result = {}
@@ -52,6 +74,9 @@ def groups(
         rms_um = UM_PER_MM * _rms(observed.v_mm[rows, 0]), UM_PER_MM * _rms(observed.v_mm[rows, 1])
         result[name] = _group(float(weighted[rows].sum()), float(observed.redundancy[rows].sum()), *rms_um)
     result.update(_prior_groups(problem, state, variances))
+    for name in dict.fromkeys(each.group for each in problem.further):
+        vpv = square_sum(tuple(each for each in problem.further if each.group == name), state.values)
+        result[name] = _group(vpv, sum(each.redundancy for each in further if each.group == name), 0.0, 0.0)
     return result
 
 

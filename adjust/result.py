@@ -39,12 +39,30 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+class FurtherResidual:
+    """One observation beside image points and single unknowns, a distance say, in the unit of what is observed.
+
+    group and name as in `FurtherObservation`; v: adjusted less observed; sigma: its a-priori standard deviation;
+    redundancy number; w: v / sigma_v.
+    """
+
+    group: str
+    name: str
+    observed: float
+    v: float
+    sigma: float
+    redundancy: float
+    w: float
+
+
+@dataclass(frozen=True)
 class Group:
     """A kind of observation: its share of v'Pv over its redundancy (sigma0), rms in um per axis, redundancy.
 
     sigma0 is 0 and means nothing where the redundancy is 0: there is no check. `target`, `fiducial`: in the comparator;
     `control`: given object coordinates, rms in millionths of the object unit; `datum`: given places of fiducials (F5,
-    F6); `interior`, `exterior`: given values of mixed units, rms 0. The first three are always there.
+    F6); `interior`, `exterior`: given values of mixed units, rms 0; `distance`: distances, rms 0. The first three are
+    always there.
     """
 
     sigma0: float
@@ -75,6 +93,7 @@ class Adjustment:
     mirrored: the images whose scan is mirrored, as in `Approximations`.
     weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
     variance_factors: the factors found for the variances of the groups "target" and "fiducial", where asked for.
+    further: the residuals of distances and the like.
     """
 
     network: Network
@@ -95,6 +114,7 @@ class Adjustment:
     mirrored: frozenset[str] = frozenset()
     weights: Array = field(default_factory=lambda: np.empty(0))
     variance_factors: Mapping[str, float] = field(default_factory=dict)
+    further: tuple[FurtherResidual, ...] = ()
 
     @property
     def converged(self) -> bool:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.elimination import Block
 from adjust.functions import Derivatives
+from adjust.further_observations import FurtherObservation
 from adjust.problem import ABSENT, Problem, State
 
 Array = NDArray[np.float64]
@@ -34,6 +35,7 @@ class Numbering:
 
     A block is an image, with its orientation and transformation. Where object points have more unknowns than images
     have, a block is a point with its coordinates, and the images' unknowns are shared: whichever leaves less to share.
+    Points and images that further observations tie to others have no unknowns of their own: theirs are shared.
     """
 
     problem: Problem
@@ -47,11 +49,17 @@ class Numbering:
         return np.concatenate([free[~is_own], free[is_own]])
 
     @cached_property
+    def numbers(self) -> Indices:
+        """The number of every quantity among the free unknowns, ABSENT if it is fixed; the last stands for ABSENT."""
+        numbers = np.full(len(self.problem.unknowns) + 1, ABSENT, dtype=np.intp)
+        numbers[self.free] = np.arange(len(self.free))
+        return numbers
+
+    @cached_property
     def touched(self) -> list[Touched]:
         """What every block touches."""
         problem = self.problem
-        numbers = np.full(len(problem.unknowns) + 1, ABSENT, dtype=np.intp)  # the last stands for ABSENT
-        numbers[self.free] = np.arange(len(self.free))
+        numbers = self.numbers
         column_of = np.empty(len(self.free) + 1, dtype=np.intp)
         touched = []
         for rows, positions in self._blocks:
@@ -69,11 +77,19 @@ class Numbering:
     def _blocks(self) -> list[tuple[Indices, Indices]]:
         """Observations and positions of the own unknowns of every block."""
         unknowns = self.problem.unknowns
-        points = [positions for positions in unknowns.point.values() if unknowns.sigma[positions].any()]
+        tied = np.zeros(len(unknowns), dtype=bool)
+        for further in self.problem.further:
+            tied[further.positions] = True
+        points = [
+            positions
+            for positions in unknowns.point.values()
+            if unknowns.sigma[positions].any() and not tied[positions].any()
+        ]
         images = [
             np.concatenate([unknowns.exterior[image.name], unknowns.transformation[image.name]])
             for image in self.problem.network.images
         ]
+        images = [positions[:0] if tied[positions].any() else positions for positions in images]
         if _count(unknowns.sigma, points) > _count(unknowns.sigma, images):
             return self._blocks_by_point(points)
         return list(zip(self.problem.rows_by_image, images, strict=True))
@@ -98,13 +114,18 @@ def _count(sigma: Array, positions: list[Indices]) -> int:
 
 @dataclass(frozen=True)
 class WhitenedRows:
-    """Pairs of rows of unit weight: root (n, 2, 2), the factor L of A C A' = L L', and the blocks."""
+    """Rows of unit weight: root (n, 2, 2), the factor L of A C A' = L L', and the blocks.
+
+    The pairs of rows stand in one block each of `Numbering.touched`; a block for each further observation follows.
+    """
 
     root: Array
     blocks: list[Block]
 
 
-def whitened_rows(numbering: Numbering, at: Derivatives, covariance_mm2: Array, v_mm: Array) -> WhitenedRows:
+def whitened_rows(
+    numbering: Numbering, values: Array, at: Derivatives, covariance_mm2: Array, v_mm: Array
+) -> WhitenedRows:
     """The rows B dx = w of all blocks, every pair multiplied by L^-1, where A C A' = L L'.
 
     At computed observations F is 0, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed less observed.
@@ -114,7 +135,7 @@ def whitened_rows(numbering: Numbering, at: Derivatives, covariance_mm2: Array, 
     matrix = np.asarray(np.linalg.solve(root, at.by_unknowns), dtype=np.float64)
     right = np.asarray(np.linalg.solve(root, a @ v_mm[..., None])[..., 0], dtype=np.float64)
     blocks = [_block(touched, matrix[touched.rows], right[touched.rows]) for touched in numbering.touched]
-    return WhitenedRows(root, blocks)
+    return WhitenedRows(root, blocks + [_further_block(numbering, each, values) for each in numbering.problem.further])
 
 
 def _block(touched: Touched, matrix: Array, right: Array) -> Block:
@@ -122,6 +143,16 @@ def _block(touched: Touched, matrix: Array, right: Array) -> Block:
     dense = np.zeros((len(matrix), 2, count + 1))
     np.put_along_axis(dense, np.repeat(touched.columns[:, None, :], 2, axis=1), matrix, axis=2)
     return Block(touched.own, touched.shared, dense[..., :count].reshape(-1, count), right.reshape(-1))
+
+
+def _further_block(numbering: Numbering, further: FurtherObservation, values: Array) -> Block:
+    """The rows f'(x) dx = l - f(x) of a further observation; what it touches is shared."""
+    numbers = numbering.numbers[further.positions]
+    free = numbers != ABSENT
+    root = np.linalg.cholesky(further.covariance)
+    matrix = np.linalg.solve(root, further.by_unknowns(values)[:, free])
+    right = np.linalg.solve(root, further.observed - further.computed(values))
+    return Block(np.empty(0, dtype=np.intp), numbers[free], matrix, right)
 
 
 def prior_root_weights(numbering: Numbering) -> Array:

@@ -20,6 +20,7 @@ def validate(network: Network) -> None:
     _check_unique("image", (image.name for image in network.images))
     _check_unique("object point", (point.id for point in network.points))
     _check_cameras(network)
+    _check_distances(network)
     _check_shapes(network.observations)
     _check_names(network)
     _check_duplicate_observations(network.observations)
@@ -68,6 +69,32 @@ def _check_cameras(network: Network) -> None:
             raise AdjustmentError(
                 f"camera {camera.name}: the distortion family {camera.distortion.family} counts in halves of the "
                 f"frame. Give half_mm, two positive lengths, such as (115.0, 115.0) for an aerial camera."
+            )
+
+
+def _check_distances(network: Network) -> None:
+    shown = {
+        point
+        for point, kind in zip(network.observations.point, network.observations.kind, strict=True)
+        if kind != "fiducial"
+    }
+    for each in network.distances:
+        what = f"the distance from {each.start} to {each.end}"
+        for end in (each.start, each.end):
+            if end in network.point_by_id and end in network.image_by_name:
+                raise AdjustmentError(f"{what}: {end} is both an object point and an image. Rename one of them.")
+            if end not in network.point_by_id and end not in network.image_by_name:
+                raise AdjustmentError(f"{what}: {end} is neither an object point nor an image. Correct the name.")
+            if end in network.point_by_id and end not in shown:
+                raise AdjustmentError(f"{what}: no image shows the point {end}. Measure it, or leave the distance out.")
+        if each.start == each.end:
+            raise AdjustmentError(f"{what} has the same point at both ends. Correct one of them.")
+        if not 0.0 < each.value < np.inf:
+            raise AdjustmentError(f"{what} must be a positive number, not {each.value:g}.")
+        if not 0.0 < each.sigma < np.inf:
+            raise AdjustmentError(
+                f"{what} needs a positive standard deviation, not {each.sigma:g}. An exact distance is not offered: "
+                f"give a standard deviation far below what matters, {1e-7 * each.value:.1g} say, or leave it out."
             )
 
 

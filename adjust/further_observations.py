@@ -1,0 +1,90 @@
+"""What is observed beside image points and single unknowns: distances, earlier calibrations of a camera.
+
+Each is a group of correlated observations l = f(x) + v of some of the unknowns. One concept serves all: positions of
+the unknowns in f, the observed values with their covariance, computed values and derivatives at a state.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import Network
+from adjust.unknowns import Unknowns
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+class FurtherObservation(Protocol):
+    """Correlated observations (m,) of functions of some unknowns.
+
+    group: what they are called in the result's groups. names (m,): what each is called. positions (k,) of the unknowns
+    that take part. observed (m,) and covariance (m, m) in the units of the unknowns.
+    """
+
+    @property
+    def group(self) -> str: ...
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def positions(self) -> Indices: ...
+    @property
+    def observed(self) -> Array: ...
+    @property
+    def covariance(self) -> Array: ...
+
+    def computed(self, values: Array) -> Array:
+        """What the functions (m,) give for the values (n,) of all unknowns."""
+        ...
+
+    def by_unknowns(self, values: Array) -> Array:
+        """Their derivatives (m, k) by the unknowns at `positions`."""
+        ...
+
+
+def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherObservation, ...]:
+    """All of a validated network."""
+    return (*_distances(network, unknowns),)
+
+
+@dataclass(frozen=True)
+class ObservedDistance:
+    """A distance between two points or stations; positions (6,): the coordinates of one and of the other."""
+
+    names: tuple[str, ...]
+    positions: Indices
+    observed: Array
+    covariance: Array
+    group: str = "distance"
+
+    def computed(self, values: Array) -> Array:
+        return np.array([np.linalg.norm(self._difference(values))])
+
+    def by_unknowns(self, values: Array) -> Array:
+        difference = self._difference(values)
+        direction = difference / np.linalg.norm(difference)
+        return np.concatenate([-direction, direction])[None, :]
+
+    def _difference(self, values: Array) -> Array:
+        start, end = self.positions.reshape(2, 3)
+        return np.asarray(values[end] - values[start])
+
+
+def _distances(network: Network, unknowns: Unknowns) -> Iterator[ObservedDistance]:
+    place = unknowns.point | {image: positions[:3] for image, positions in unknowns.exterior.items()}
+    for each in network.distances:
+        yield ObservedDistance(
+            names=(f"{each.start} to {each.end}",),
+            positions=np.concatenate([place[each.start], place[each.end]]),
+            observed=np.array([each.value]),
+            covariance=np.array([[each.sigma**2]]),
+        )
+
+
+def square_sum(further: tuple[FurtherObservation, ...], values: Array) -> float:
+    """Their share of v'Pv."""
+    differences = ((each.observed - each.computed(values), each.covariance) for each in further)
+    return float(sum(v @ np.linalg.solve(covariance, v) for v, covariance in differences))

@@ -1,0 +1,203 @@
+"""Distances, observed orientations and earlier calibrations beside image points."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from simulated import ATTITUDES, STATIONS, Truth, camera_point, field_points, simulated
+
+from adjust.adjustment import Options, adjust
+from adjust.approximations import approximate
+from adjust.errors import AdjustmentError
+from adjust.network import Distance, Exterior, Network, ObjectPoint, Prior
+from adjust.problem import number
+from adjust.result import Adjustment
+from adjust.rows import Numbering
+
+Array = NDArray[np.float64]
+
+TRUTH = Truth(distortion={"k3": 1.5e-7})
+EO_SIGMAS = np.array([0.3, 0.3, 0.4, 2e-4, 2e-4, 3e-4])
+
+
+def between(a: Array | tuple[float, ...], b: Array | tuple[float, ...]) -> float:
+    return float(np.linalg.norm(np.asarray(a) - np.asarray(b)))
+
+
+def observed_network(rng: np.random.Generator) -> tuple[Network, Array]:
+    """Unknown points and no film; orientations observed, distances of all three kinds; and the points' truth."""
+    points = field_points(rng, 6)
+    network, _ = simulated(rng, TRUTH, "none", points, np.inf, free={"k3": 1e-8})
+    exteriors = np.hstack([STATIONS, ATTITUDES]) + rng.normal(0.0, EO_SIGMAS, (4, 6))
+    images = tuple(
+        replace(image, exterior=Exterior(row, EO_SIGMAS)) for image, row in zip(network.images, exteriors, strict=True)
+    )
+    distances = (
+        Distance("0", "1", between(points[0], points[1]) + 0.02, 0.02),
+        Distance("2", "4", between(points[2], points[4]) - 0.03, 0.05),
+        Distance("f0", "f2", between(STATIONS[0], STATIONS[2]) + 0.1, 0.1),
+        Distance("5", "f3", between(points[5], STATIONS[3]), 0.1),
+    )
+    cameras = (replace(network.cameras[0], fiducials={}),)
+    return replace(network, cameras=cameras, images=images, distances=distances), points
+
+
+class Dense:
+    """The same sum of squares by formulas of the simulation, minimised without any structure."""
+
+    def __init__(self, network: Network, points: Array) -> None:
+        self.network = network
+        exteriors = [image.exterior.values for image in network.images if image.exterior is not None]
+        start = np.concatenate([[TRUTH.c, TRUTH.x0, TRUTH.y0, 1.5], np.concatenate(exteriors), points.ravel()])
+        found = least_squares(self.residuals, start, jac="3-point", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        self.values = found.x
+        self.vpv = 2.0 * found.cost
+        jacobian = np.asarray(found.jac)
+        self.cofactor = np.linalg.inv(jacobian.T @ jacobian)
+
+    def residuals(self, x: Array) -> Array:
+        (c, x0, y0, k3), exterior, points = x[:4], x[4:28].reshape(4, 6), x[28:].reshape(-1, 3)
+        truth = Truth(c, x0, y0, distortion={"k3": 1e-7 * k3}, stations=tuple(map(tuple, exterior[:, :3])),
+                      attitudes=tuple(map(tuple, exterior[:, 3:])))  # fmt: skip
+        network = self.network
+        rows = zip(network.observations.image, network.observations.point, network.observations.xy_mm, strict=True)
+        result = [(camera_point(truth, int(image[1:]), points[int(point)]) - xy) / 0.004 for image, point, xy in rows]
+        camera = network.cameras[0]
+        given = [camera.principal_distance_mm, camera.x0_mm, camera.y0_mm, camera.distortion.parameters["k3"]]
+        result += [[(v - p.value) / p.sigma] for v, p in zip((c, x0, y0, 1e-7 * k3), given, strict=True) if p]
+        result += [
+            (row - image.exterior.values) / EO_SIGMAS
+            for row, image in zip(exterior, network.images, strict=True)
+            if image.exterior is not None
+        ]
+        place = {f"f{i}": row[:3] for i, row in enumerate(exterior)} | {str(i): xyz for i, xyz in enumerate(points)}
+        result += [[(between(place[d.start], place[d.end]) - d.value) / d.sigma] for d in network.distances]
+        return np.concatenate(result)
+
+
+NAMES = (
+    [f"IO.K.{name}" for name in ("c", "x0", "y0", "k3")]
+    + [f"EO.f{i}.{name}" for i in range(4) for name in ("X0", "Y0", "Z0", "omega", "phi", "kappa")]
+    + [f"PT.{i}.{axis}" for i in range(6) for axis in "XYZ"]
+)
+
+
+def test_observed_orientations_and_distances_as_in_a_dense_adjustment() -> None:
+    network, points = observed_network(np.random.default_rng(1))
+    dense = Dense(network, points)
+    result = adjust(network, approximate(network))
+    scale = np.ones(len(NAMES))
+    scale[3] = 1e-7
+    sigmas = np.sqrt(np.diag(dense.cofactor)) * scale
+    difference = np.array([result.value(name) for name in NAMES]) - dense.values * scale
+    assert np.abs(difference / sigmas).max() < 1e-5
+    assert result.vpv == pytest.approx(dense.vpv, rel=1e-9)
+    cofactor = dense.cofactor * np.outer(scale, scale)
+    np.testing.assert_allclose(result.cofactor_of(NAMES) / np.outer(sigmas, sigmas),
+                               cofactor / np.outer(sigmas, sigmas), atol=1e-6)  # fmt: skip
+    conditions = 2 * 24 + 4 + 24 + 4
+    assert (result.conditions, result.redundancy) == (conditions, conditions - len(NAMES))
+    assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
+    distances = dense.residuals(dense.values)[-4:]
+    np.testing.assert_allclose([row.v / row.sigma for row in result.further], distances, atol=1e-6)
+    for row, each in zip(result.further, network.distances, strict=True):
+        assert row.name == f"{each.start} to {each.end}"
+        assert row.w == pytest.approx(row.v / (row.sigma * np.sqrt(row.redundancy)))
+    assert result.groups["distance"].redundancy == pytest.approx(sum(row.redundancy for row in result.further))
+
+
+def scaled_by_bars(count: int) -> tuple[Network, Array]:
+    """A free network of many or few points, with two scale bars."""
+    rng = np.random.default_rng(5)
+    points = field_points(rng, count)
+    network, _ = simulated(rng, points=points, point_sigma=np.inf)
+    bars = tuple(Distance(a, b, between(points[int(a)], points[int(b)]), 0.01) for a, b in (("0", "1"), ("2", "3")))
+    return replace(network, distances=bars), points
+
+
+@pytest.mark.parametrize("count", [9, 24])
+def test_a_scale_bar_removes_the_scale_defect(count: int) -> None:
+    """Whether images or points are eliminated first; the camera is that of the free network, the size that of the bars.
+
+    One bar is no check of the network, two check each other.
+    """
+    network, points = scaled_by_bars(count)
+    _, start = simulated(np.random.default_rng(5), points=points, point_sigma=np.inf)
+    causes = [null.cause for null in adjust(network, start).singular]
+    assert len(causes) == 6
+    assert not any("grow" in cause for cause in causes)
+    free = adjust(replace(network, distances=()), start, Options("free"))
+    one = adjust(replace(network, distances=network.distances[:1]), start, Options("free"))
+    two = adjust(network, start, Options("free"))
+    assert one.vpv == pytest.approx(free.vpv, rel=1e-9)
+    assert one.redundancy == free.redundancy
+    assert one.further[0].redundancy == pytest.approx(0.0, abs=1e-7)
+    assert one.further[0].w == 0.0
+    assert two.redundancy == free.redundancy + 1
+    assert camera(one) == pytest.approx(camera(free), rel=1e-9)
+    size = between(*(np.array([one.value(f"PT.{id}.{axis}") for axis in "XYZ"]) for id in "01"))
+    assert size == pytest.approx(network.distances[0].value, abs=1e-7)
+
+
+def camera(result: Adjustment) -> list[float]:
+    names = [name for name in result.names if name.startswith(("IO.", "FID."))]
+    return [result.value(name) for name in names] + [result.cofactor_of([name])[0, 0] for name in names]
+
+
+def test_a_wrong_distance_shows_in_its_w() -> None:
+    network, points = scaled_by_bars(24)
+    _, start = simulated(np.random.default_rng(5), points=points, point_sigma=np.inf)
+    first, second = network.distances
+    good = adjust(network, start, Options("minimal"))
+    wrong = replace(network, distances=(first, replace(second, value=second.value + 1.0)))
+    bad = adjust(wrong, start, Options("minimal"))
+    assert max(abs(row.w) for row in good.further) < 3.0
+    assert min(abs(row.w) for row in bad.further) > 10.0  # two bars: one of them is wrong, nothing tells which
+
+
+def test_points_tied_by_a_distance_are_shared() -> None:
+    """Many points, so that points are blocks: those of the bars are not among them."""
+    network, points = scaled_by_bars(24)
+    _, start = simulated(np.random.default_rng(5), points=points, point_sigma=np.inf)
+    problem = number(network, start)
+    numbering = Numbering(problem)
+    own = np.concatenate([touched.own for touched in numbering.touched])
+    tied = {f"PT.{id}.{axis}" for id in "0123" for axis in "XYZ"}
+    assert len(own) == 3 * 20
+    assert not tied & {problem.unknowns.names[numbering.free[i]] for i in own}
+
+
+def test_approximations_of_a_model_have_the_size_of_the_distances() -> None:
+    """Nothing known but a distance: the model's arbitrary base is scaled, and the adjustment finds the truth."""
+    network, points = scaled_by_bars(24)
+    unknown = tuple(ObjectPoint(point.id, None, None, None) for point in network.points)
+    network = replace(network, points=unknown)
+    start = approximate(network)
+    assert between(start.points["4"], start.points["5"]) == pytest.approx(between(points[4], points[5]), rel=0.02)
+    result = adjust(network, start, Options("free"))
+    assert result.converged
+    found = between(*(np.array([result.value(f"PT.{id}.{axis}") for axis in "XYZ"]) for id in "45"))
+    assert found == pytest.approx(between(points[4], points[5]), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("distance", "words"),
+    [
+        (Distance("0", "no", 1.0, 0.1), ["from 0 to no", "neither"]),
+        (Distance("0", "0", 1.0, 0.1), ["same point"]),
+        (Distance("0", "1", -1.0, 0.1), ["positive number"]),
+        (Distance("0", "1", 100.0, 0.0), ["exact distance is not offered", "1e-05"]),
+        (Distance("0", "1", 100.0, np.inf), ["positive standard deviation"]),
+        (Distance("0", "lonely", 100.0, 0.1), ["no image shows the point lonely"]),
+    ],
+)
+def test_a_distance_that_cannot_be_is_refused(distance: Distance, words: list[str]) -> None:
+    network, start = simulated(np.random.default_rng(5))
+    lonely = ObjectPoint("lonely", Prior(0.0), Prior(0.0), Prior(0.0))
+    network = replace(network, points=(*network.points, lonely), distances=(distance,))
+    with pytest.raises(AdjustmentError) as error:
+        adjust(network, start)
+    for word in words:
+        assert word in str(error.value)
