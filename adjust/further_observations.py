@@ -74,7 +74,7 @@ class ObservedDistance:
 
 
 def _distances(network: Network, unknowns: Unknowns) -> Iterator[ObservedDistance]:
-    place = unknowns.point | {image: positions[:3] for image, positions in unknowns.exterior.items()}
+    place = {image: positions[:3] for image, positions in unknowns.exterior.items()} | unknowns.point
     for each in network.distances:
         yield ObservedDistance(
             names=(f"{each.start} to {each.end}",),

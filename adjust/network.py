@@ -153,9 +153,10 @@ class Observations:
 
 @dataclass(frozen=True)
 class Distance:
-    """A measured distance between two object points, two stations (by their images' names) or one of each.
+    """A measured distance between two object points, two stations or one of each.
 
-    value and its standard deviation in object units.
+    start, end: a point's name; where no point has it, that of the image whose station it is. value and its standard
+    deviation in object units.
     """
 
     start: str

@@ -69,7 +69,7 @@ def _checked(exterior: Exterior, block: Block, image: str) -> Pose:
 
 def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
     """Scale a model of an arbitrary base so that measured distances come out, on the average."""
-    places = block.points | {image: pose.center for image, pose in block.poses.items()}
+    places = {image: pose.center for image, pose in block.poses.items()} | block.points
     ratios = [
         each.value / np.linalg.norm(places[each.end] - places[each.start])
         for each in distances

@@ -81,8 +81,6 @@ def _check_distances(network: Network) -> None:
     for each in network.distances:
         what = f"the distance from {each.start} to {each.end}"
         for end in (each.start, each.end):
-            if end in network.point_by_id and end in network.image_by_name:
-                raise AdjustmentError(f"{what}: {end} is both an object point and an image. Rename one of them.")
             if end not in network.point_by_id and end not in network.image_by_name:
                 raise AdjustmentError(f"{what}: {end} is neither an object point nor an image. Correct the name.")
             if end in network.point_by_id and end not in shown:

@@ -105,6 +105,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "images": {image.name: _image(adjustment, image) for image in network.images},
         "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
         "residuals": _residuals(adjustment),
+        "distances": _distances(adjustment),
         "groups": {
             name: {
                 "sigma0": group.sigma0,
@@ -231,6 +232,23 @@ def _residuals(adjustment: Adjustment) -> list[Json]:
     ]
 
 
+def _distances(adjustment: Adjustment) -> list[Json]:
+    """In the unit of the object coordinates."""
+    rows = (row for row in adjustment.further if row.group == "distance")
+    return [
+        {
+            "from": given.start,
+            "to": given.end,
+            "distance": row.observed,
+            "sigma": row.sigma,
+            "v": row.v,
+            "redundancy": row.redundancy,
+            "w": row.w,
+        }
+        for given, row in zip(adjustment.network.distances, rows, strict=True)
+    ]
+
+
 def _in_camera(adjustment: Adjustment, xy_mm: Array) -> Array:
     """Every observation's comparator coordinates (n, 2) in its own camera, mm."""
     images = np.array(adjustment.network.observations.image)
@@ -337,6 +355,10 @@ _ADJUSTMENT = {
     "points": _Each(dict, {"X": _QUANTITY, "Y": _QUANTITY, "Z": _QUANTITY}),
     "residuals": _Each(
         list, dict.fromkeys(("image", "point", "kind"), str) | dict.fromkeys(_RESIDUAL_NUMBERS, _NUMBER)
+    ),
+    "distances": _Each(
+        list,
+        dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", "sigma", "v", "redundancy", "w"), _NUMBER),
     ),
     "warnings": _Each(list, str),
     "variance_factors": _Each(dict, _NUMBER),

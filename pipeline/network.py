@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import Camera, Image, Network, ObjectPoint, Observations, Prior, Transformation
+from adjust.network import Camera, Distance, Image, Network, ObjectPoint, Observations, Prior, Transformation
 from adjust.validation import FIDUCIALS_NEEDED
 from pipeline.camera_file import CameraFile
 from pipeline.comparator_file import ComparatorPoint
@@ -37,13 +37,15 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
     used, lonely = _locatable(project, used)
     used, left_out = _orientable(project, used)
     images = tuple(_image(project, name) for name in dict.fromkeys(mark.image for mark in used))
+    distances, without_end = _distances(project, used)
     network = Network(
         cameras=_cameras(project, images, used),
         images=images,
         points=_points(project, used),
         observations=_observations(project.adjust, used),
+        distances=distances,
     )
-    return network, (*lonely, *left_out)
+    return network, (*lonely, *left_out, *without_end)
 
 
 def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bool:
@@ -209,6 +211,30 @@ def given_points(project: Project) -> Mapping[str, ObjectPoint]:
     scale = 1.0 / project.unit_mm
     board = project.targets.board.object_points()
     return {id: ObjectPoint(id, *(Prior(scale * value) for value in xyz)) for id, xyz in board.items()}
+
+
+def _distances(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[tuple[Distance, ...], tuple[str, ...]]:
+    """The distances between points and stations that take part, and a sentence on the others."""
+    taking_part = {mark.point for mark in marks if mark.kind != "fiducial"} | {mark.image for mark in marks}
+    known = taking_part | set(given_points(project)) | set(project.given_images.camera if project.given_images else ())
+    known |= set(project.scans)
+    lost = []
+    for given in project.given_distances:
+        for column, end in (("from", given.distance.start), ("to", given.distance.end)):
+            if end not in known:
+                raise given.row.error(column, f"{end!r} is no object point and no image.{did_you_mean(end, known)}")
+            if end not in taking_part:
+                lost.append(f"{given.distance.start} to {given.distance.end}")
+    kept = tuple(
+        given.distance
+        for given in project.given_distances
+        if given.distance.start in taking_part and given.distance.end in taking_part
+    )
+    sentence = (
+        f"Left out, for an end was measured in no image: the distances {listed(list(dict.fromkeys(lost)))}. See the "
+        "status and reason of its marks."
+    )
+    return kept, (sentence,) if lost else ()
 
 
 def _observations(settings: AdjustSettings, marks: Sequence[ComparatorPoint]) -> Observations:

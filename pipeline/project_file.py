@@ -10,6 +10,7 @@ from typing import Literal, cast, get_args
 
 from adjust.network import Transformation
 from pipeline.camera_file import CameraFile, read_camera
+from pipeline.distances_file import GivenDistance, read_distances
 from pipeline.errors import InputError
 from pipeline.images_file import GivenImages, image_name, read_images
 from pipeline.points_file import GivenPoints, read_points
@@ -60,6 +61,7 @@ class Project:
     targets: TargetSettings | None
     given_points: GivenPoints | None
     given_images: GivenImages | None
+    given_distances: tuple[GivenDistance, ...]
     unit_mm: float
     adjust: AdjustSettings
 
@@ -112,6 +114,7 @@ def read_project(path: Path) -> Project:
         targets=read_targets(table.table("targets")) if "targets" in table else None,
         given_points=read_points(folder / objects.text("points")) if "points" in objects else None,
         given_images=given_images,
+        given_distances=read_distances(folder / objects.text("distances")) if "distances" in objects else (),
         unit_mm=UNITS_MM[objects.text("unit", "m", tuple(UNITS_MM))],
         adjust=_adjust_settings(table.table("adjust")),
     )

@@ -144,6 +144,7 @@ def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
             "Nothing checks the result: there are as many unknowns as observations.",
             "Add points or frames; until then no standard deviation here has been confirmed by the data.",
         )
+    yield from _distance_problems(adjustment)
     bad = suspects(adjustment)
     if bad:
         names = ", ".join(f"{row['image']}/{row['point']} (w = {fixed(row['w'], 1)})" for row in bad[:MANY])
@@ -152,6 +153,19 @@ def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
             f"{_count(len(bad), 'observation')} beyond chance: {names}{more}.",
             "Look at the picture: a wrong point number or a disturbed mark is rejected in comparator.csv "
             "(status rejected), and the adjustment run again.",
+        )
+
+
+def _distance_problems(adjustment: Json) -> Iterator[Problem]:
+    distances = adjustment["distances"]
+    limit = critical_w(len(distances)) * max(1.0, adjustment["sigma0"] or 1.0)
+    bad = [row for row in distances if abs(row["w"] or 0.0) > limit]
+    if bad:
+        names = [f"{row['from']} to {row['to']} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})" for row in bad]
+        yield Problem(
+            f"{_count(len(bad), 'distance')} beyond chance: {_listed(names)}.",
+            "Look for a wrong point or unit in the file of distances; two distances that contradict each other are "
+            "both named.",
         )
 
 

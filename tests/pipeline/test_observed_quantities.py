@@ -4,15 +4,19 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from test_cases import CASES, write_project
 
 from adjust.errors import AdjustmentError
 from adjust.result import Adjustment
 from pipeline.adjust_stage import adjust_marks
+from pipeline.adjustment_file import read_adjustment, write_adjustment
 from pipeline.comparator_file import read_comparator
 from pipeline.errors import InputError
 from pipeline.project_file import read_project
+from pipeline.report import ReportData
+from pipeline.report.verdict import judge
 
 pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="the reference cases are not here")
 
@@ -46,6 +50,57 @@ def test_chosen_datum_coordinates(tmp_path: Path) -> None:
     for name in held:
         point, axis = name.split(".")
         assert result.value(f"PT.{name}") == case["input"]["pts_obs"][int(point) - 1]["XYZ".index(axis)]
+
+
+def test_distances_through_files(tmp_path: Path) -> None:
+    """Two scale bars give a free network its size; the rows come out with residuals, and a wrong one is named."""
+    objects = 'distances = "bars.csv"'
+    case = free_project(tmp_path, 'datum = "free"', objects)
+    xyz = np.array(case["input"]["pts_obs"])
+    bars = [("1", "2", 1.0), ("3", "9", 1.0), ("5", "7", 1.01)]
+    lengths = [scale * float(np.linalg.norm(xyz[int(b) - 1] - xyz[int(a) - 1])) for a, b, scale in bars]
+    rows = [f"{a},{b},{length!r},0.2" for (a, b, _), length in zip(bars, lengths, strict=True)]
+    (tmp_path / "bars.csv").write_text("\n".join(["from,to,distance,sigma", *rows]) + "\n", encoding="utf-8")
+    result = adjusted(tmp_path)
+    write_adjustment(result, tmp_path / "adjustment.json")
+    written = read_adjustment(tmp_path / "adjustment.json")
+    assert [(row["from"], row["to"]) for row in written["distances"]] == [("1", "2"), ("3", "9"), ("5", "7")]
+    assert written["groups"]["distance"]["redundancy"] == pytest.approx(1.8, abs=0.2)
+    assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
+    verdict = judge(ReportData("t", adjustment=written))
+    assert any("beyond chance" in each.what and "5 to 7 (v = " in each.what for each in verdict.problems)
+    assert written["redundancy"] == case["result"]["redundancy"] + 2
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("1,77,3.0,0.1", ["line 2, column to", "'77' is no object point"]),
+        ("1,1,3.0,0.1", ["both ends"]),
+        ("1,2,-3.0,0.1", ["column distance", "positive length"]),
+        ("1,2,3.0,0", ["column sigma", "exact distance is not offered"]),
+        ("1,2,3.0,", ["column sigma", "blank"]),
+        ("1,2,3.0,-1", ["column sigma", "negative"]),
+        ("", ["holds no distance"]),
+    ],
+)
+def test_a_mistake_in_the_distances_gets_a_message(row: str, words: list[str], tmp_path: Path) -> None:
+    free_project(tmp_path, objects='distances = "bars.csv"')
+    (tmp_path / "bars.csv").write_text(f"from,to,distance,sigma\n{row}\n", encoding="utf-8")
+    with pytest.raises(InputError) as error:
+        adjusted(tmp_path)
+    for word in ["bars.csv", *words]:
+        assert word in str(error.value)
+
+
+def test_a_distance_to_a_point_that_no_image_shows_is_left_out(tmp_path: Path) -> None:
+    free_project(tmp_path, 'datum = "free"', 'distances = "bars.csv"')
+    with (tmp_path / "points.csv").open("a", encoding="utf-8") as points:
+        points.write("lost,0.0,0.0,0.0,,,\n")
+    (tmp_path / "bars.csv").write_text("from,to,distance,sigma\n1,lost,3.0,0.1\n", encoding="utf-8")
+    result = adjusted(tmp_path)
+    assert result.further == ()
+    assert any("1 to lost" in warning for warning in result.warnings)
 
 
 @pytest.mark.parametrize(
