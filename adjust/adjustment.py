@@ -15,11 +15,11 @@ from adjust.errors import AdjustmentError
 from adjust.functions import blind_target
 from adjust.iteration import Linearised, Solution, factorise, iterate, linearise
 from adjust.network import Approximations, Network
+from adjust.numbering import Numbering
 from adjust.problem import Problem, State, number
 from adjust.residuals import further_residuals, groups, residuals
 from adjust.result import Adjustment, Cofactor, NullDirection, Residuals
 from adjust.reweighting import Weighting, robust_weights, variance_factor
-from adjust.rows import Numbering
 from adjust.validation import validate
 
 Array = NDArray[np.float64]

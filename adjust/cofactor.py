@@ -9,9 +9,9 @@ from scipy.sparse import csr_array
 
 from adjust.datum import free_motion
 from adjust.elimination import Factor
+from adjust.numbering import Numbering
 from adjust.problem import Problem, State
 from adjust.rotation import vector_by_angles
-from adjust.rows import Numbering
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

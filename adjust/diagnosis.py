@@ -4,12 +4,11 @@ import re
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtrcon
 
 from adjust.datum import free_coordinates, object_datum
 from adjust.directions import camera_leads, datum_sentence
-from adjust.elimination import BlockFactor, Factor
+from adjust.elimination import Factor
 from adjust.problem import Problem, State
 from adjust.result import NullDirection
 
@@ -61,10 +60,9 @@ def null_vectors(factor: Factor) -> Array:
     Where blocks do not determine their own unknowns, these vectors alone: the others cannot be told before.
     """
     within = []
-    for block in factor.blocks:
-        for vector in _own_null_vectors(block):
-            within.append(np.zeros(len(factor.scale)))
-            within[-1][block.own] = vector
+    for own, vector in _own_null_vectors(factor):
+        within.append(np.zeros(len(factor.scale)))
+        within[-1][own] = vector
     return np.array(within).T if within else _null_space(factor, SINGULAR)[0]
 
 
@@ -97,19 +95,22 @@ def collapsed(names: list[str]) -> tuple[str, ...]:
 def _within_blocks(problem: Problem, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
     """Null directions of an image's or a point's own unknowns, which the shared ones have no part in."""
     directions = []
-    for block in factor.blocks:
-        for vector in _own_null_vectors(block):
-            names = [problem.unknowns.names[free[block.own[i]]] for i in _largest(vector)]
-            directions.append(NullDirection(tuple(names), *_own_sentence(names[0])))
+    for own, vector in _own_null_vectors(factor):
+        names = [problem.unknowns.names[free[own[i]]] for i in _largest(vector)]
+        directions.append(NullDirection(tuple(names), *_own_sentence(names[0])))
     return tuple(directions)
 
 
-def _own_null_vectors(block: BlockFactor) -> Array:
-    """The vectors (k, own) of a block's own unknowns that its rows do not see."""
-    if len(block.own) == 0:
-        return np.empty((0, 0))
-    _, singular, right = np.linalg.svd(block.triangle)
-    return np.asarray(right[singular <= SINGULAR * singular[0]])
+def _own_null_vectors(factor: Factor) -> list[tuple[Indices, Array]]:
+    """Numbers (o,) of blocks' own unknowns, and vectors (o,) of these that the block's rows do not see."""
+    found = []
+    for block in factor.blocks:
+        if block.own.shape[1] == 0:
+            continue
+        _, singular, right = np.linalg.svd(block.triangle)
+        null = singular <= SINGULAR * singular[:, :1]
+        found += [(block.own[i], right[i, j]) for i, j in np.argwhere(null)]
+    return sorted(found, key=lambda each: int(each[0][0]))
 
 
 def _own_sentence(name: str) -> tuple[str, str]:
@@ -139,7 +140,7 @@ def _null_space(factor: Factor, below: float) -> tuple[Array, Array]:
     vectors = np.zeros((len(factor.scale), int(hardly.sum())))
     vectors[:count] = right[hardly].T
     for block in factor.blocks:
-        vectors[block.own] = _followed(block, vectors[:count])
+        vectors[block.own] = -np.linalg.solve(block.triangle, block.border @ vectors[block.shared])
     lengths = np.linalg.norm(vectors, axis=0)
     return np.linalg.qr(vectors)[0], singular[hardly] / lengths
 
@@ -148,11 +149,6 @@ def _surely_above(triangle: Array, ratio: float) -> bool:
     """Whether an estimate of the condition already tells that all singular values lie above a ratio of the largest."""
     reciprocal, _ = dtrcon(triangle)
     return bool(reciprocal > ratio * len(triangle))
-
-
-def _followed(block: BlockFactor, shared: Array) -> Array:
-    """How an image's own unknowns follow the shared ones without changing its observations."""
-    return np.asarray(-solve_triangular(block.triangle, block.border @ shared[block.shared]))
 
 
 def _named(

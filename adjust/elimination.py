@@ -4,30 +4,34 @@ The rows of an image, or of a point, touch its own unknowns and some shared ones
 factorisation of these rows alone leaves a triangle for its own unknowns and fewer rows in the shared ones; all these
 are factorised together. The cost is linear in the number of blocks, and the condition is that of the rows, not its
 square as with normal equations (Golub and Van Loan, Matrix Computations, section 5.3; Triggs et al., Bundle
-adjustment: a modern synthesis).
+adjustment: a modern synthesis). Blocks of equal shape are factorised together.
+
+Rows that connect what no single block owns are blocks without own unknowns: what they touch must be shared.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dgeqrf, dormqr
 from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-LAPACK_BLOCK = 64  # working space for dormqr, in columns
 ROWS_PER_COLUMN = 4  # rows in the shared unknowns are condensed when there are more of them than this
+CONDENSED_ROWS = 2000  # and more than this
+WIDE = 500  # shared unknowns up to which roots of cofactors run over all of them
 
 
 @dataclass(frozen=True)
-class Block:
-    """The rows of one block: matrix (m, own + shared) times the unknowns = right (m,), of unit weight.
+class Blocks:
+    """The rows of b blocks of equal shape: matrix (b, m, o + s) times the unknowns = right (b, m), of unit weight.
 
-    own: numbers of its own unknowns among all; shared: numbers of the others that it touches, among the shared ones.
+    own (b, o): numbers of every block's own unknowns among all; shared (b, s): numbers of the others that it touches,
+    among the shared ones.
     """
 
     own: Indices
@@ -37,8 +41,8 @@ class Block:
 
 
 @dataclass(frozen=True)
-class BlockFactor:
-    """A block's triangle: triangle own + border shared = right."""
+class BlockFactors:
+    """Their triangles (b, o, o): triangle own + border (b, o, s) shared = right (b, o)."""
 
     own: Indices
     shared: Indices
@@ -55,7 +59,7 @@ class Factor:
     The shared unknowns are the first s.
     """
 
-    blocks: tuple[BlockFactor, ...]
+    blocks: tuple[BlockFactors, ...]
     triangle: Array
     right: Array
     scale: Array
@@ -70,17 +74,22 @@ class Factor:
         shared = solve_triangular(self.triangle, self.right)
         solution[: self.shared_count] = shared
         for block in self.blocks:
-            solution[block.own] = solve_triangular(block.triangle, block.right - block.border @ shared[block.shared])
+            through = (block.border @ shared[block.shared][..., None])[..., 0]
+            solution[block.own] = np.linalg.solve(block.triangle, (block.right - through)[..., None])[..., 0]
         return solution / self.scale
+
+    def length(self) -> float:
+        """Of the solution, in standard deviations: what that function of the unknowns moves which moves most."""
+        squares = [(block.right**2).sum() for block in self.blocks]
+        return float(np.sqrt((self.right**2).sum() + sum(squares)))
 
     def variances(self) -> Array:
         """The diagonal (n,) of the cofactor matrix."""
-        shared = self._shared_root()
         variances = np.empty(len(self.scale))
-        variances[: self.shared_count] = (shared**2).sum(axis=1)
+        variances[: self.shared_count] = (self.shared_root**2).sum(axis=1)
         for block in self.blocks:
-            own, through = _roots(block, shared)
-            variances[block.own] = (own**2).sum(axis=1) + (through**2).sum(axis=1)
+            own, through = self._roots(block)
+            variances[block.own] = (own**2).sum(axis=2) + (through**2).sum(axis=2)
         return variances / self.scale**2
 
     def cofactor_of(self, functions: csr_array) -> Array:
@@ -90,12 +99,12 @@ class Factor:
         used = np.diff(columns.indptr) > 0
         cofactor = np.zeros((len(shared), len(shared)))
         for block in self.blocks:
-            if used[block.own].any():
-                own = columns[:, block.own].toarray()
+            for i in np.flatnonzero(used[block.own].any(axis=1)):
+                own = columns[:, block.own[i]].toarray()
                 rows = np.flatnonzero(own.any(axis=1))
-                root = np.asarray(solve_triangular(block.triangle, own[rows].T, trans="T"), dtype=np.float64)
+                root = np.asarray(solve_triangular(block.triangle[i], own[rows].T, trans="T"), dtype=np.float64)
                 cofactor[np.ix_(rows, rows)] += root.T @ root
-                shared[np.ix_(rows, block.shared)] -= root.T @ block.border
+                shared[np.ix_(rows, block.shared[i])] -= root.T @ block.border[i]
         through = solve_triangular(self.triangle, shared.T, trans="T")
         return np.asarray(cofactor + through.T @ through)
 
@@ -105,65 +114,83 @@ class Factor:
         shared = scaled[: self.shared_count].copy()
         own = []
         for block in self.blocks:
-            own.append(solve_triangular(block.triangle, scaled[block.own], trans="T"))
-            shared[block.shared] -= block.border.T @ own[-1]
+            own.append(np.linalg.solve(block.triangle.transpose(0, 2, 1), scaled[block.own]))
+            np.subtract.at(shared, block.shared, block.border.transpose(0, 2, 1) @ own[-1])
         result = np.empty_like(scaled)
         shared = solve_triangular(self.triangle, solve_triangular(self.triangle, shared, trans="T"))
         result[: self.shared_count] = shared
         for block, root in zip(self.blocks, own, strict=True):
-            result[block.own] = solve_triangular(block.triangle, root - block.border @ shared[block.shared])
+            result[block.own] = np.linalg.solve(block.triangle, root - block.border @ shared[block.shared])
         return result / self.scale[:, None]
 
-    def row_roots(self, blocks: Sequence[Block]) -> list[Array]:
-        """Per block G (m, k), where G G' is the cofactor matrix of the block's adjusted rows, matrix times unknowns."""
-        shared = self._shared_root()
-        roots = []
-        for block, factor in zip(blocks, self.blocks, strict=True):
-            own_count = len(block.own)
-            own, through = _roots(factor, shared)
-            own_rows = block.matrix[:, :own_count] / self.scale[block.own]
-            shared_rows = block.matrix[:, own_count:] / self.scale[block.shared]
-            roots.append(np.hstack([own_rows @ own, own_rows @ through + shared_rows @ shared[block.shared]]))
-        return roots
+    def row_roots(self, blocks: Iterable[Blocks]) -> Iterator[Array]:
+        """G (b, m, k) of blocks as these were factorised: G G' are the cofactor matrices of each one's adjusted rows.
 
-    def _shared_root(self) -> Array:
-        """The inverse (s, s) of the shared triangle."""
-        return solve_triangular(self.triangle, np.eye(self.shared_count))
+        The adjusted rows are the matrix times the unknowns.
+        """
+        for rows, block in zip(blocks, self.blocks, strict=True):
+            count = block.own.shape[1]
+            matrix = rows.matrix / _columns(self.scale, rows)[:, None, :]
+            own, through = self._roots(block)
+            by_shared = matrix[..., :count] @ through + matrix[..., count:] @ self._root_of(block.shared)
+            yield np.concatenate([matrix[..., :count] @ own, by_shared], axis=2)
 
+    @cached_property
+    def shared_root(self) -> Array:
+        """The inverse (s, s) of the shared triangle, R where R R' is the cofactor matrix of scaled shared unknowns."""
+        return np.asarray(solve_triangular(self.triangle, np.eye(self.shared_count)), dtype=np.float64)
 
-def _roots(block: BlockFactor, shared: Array) -> tuple[Array, Array]:
-    """Roots of the own unknowns' cofactor matrix: for shared unknowns held fixed, and what these add."""
-    own = solve_triangular(block.triangle, np.eye(len(block.own)))
-    return own, -own @ (block.border @ shared[block.shared])
+    @cached_property
+    def _shared_cofactor(self) -> Array:
+        return self.shared_root @ self.shared_root.T
+
+    def _root_of(self, shared: Indices) -> Array:
+        """Roots (b, s, k) of the cofactor matrices of blocks' shared unknowns (b, s), which are scaled."""
+        if self.shared_count <= WIDE:
+            return self.shared_root[shared]
+        root = np.linalg.cholesky(self._shared_cofactor[shared[:, :, None], shared[:, None, :]])
+        return np.asarray(root, dtype=np.float64)
+
+    def _roots(self, block: BlockFactors) -> tuple[Array, Array]:
+        """Roots of the own unknowns' cofactor matrix: for shared unknowns held fixed, and what these add."""
+        own = np.asarray(np.linalg.inv(block.triangle), dtype=np.float64)
+        return own, -own @ (block.border @ self._root_of(block.shared))
 
 
 def eliminate(
-    blocks: Sequence[Block], count: int, prior_root_weight: Array, prior_right: Array, damping: float = 0.0
+    blocks: Iterable[Blocks], count: int, prior_root_weight: Array, prior_right: Array, damping: float = 0.0
 ) -> Factor:
     """Factorise the blocks and one row an unknown for its prior.
 
     The prior's row (count,) is prior_root_weight times unknown = prior_right. The shared unknowns are those that no
     block owns, and stand first. A damping holds every scaled unknown where it is (Levenberg and Marquardt).
     """
-    shared_count = count - sum(len(block.own) for block in blocks)
     scale = _column_norms(blocks, prior_root_weight)
     priors = _prior_rows(prior_root_weight / scale, prior_right, damping)
     factors = []
     rests = []
+    is_own = np.zeros(count, dtype=bool)
     for block in blocks:
-        factor, rest = _eliminate_block(block, scale, priors)
+        factor, rest = _eliminate_blocks(block, scale, priors)
         factors.append(factor)
         rests.append((block.shared, rest))
-    shared_priors = _rows_of(priors, np.arange(shared_count))
-    triangle = _condensed(rests, shared_priors, shared_count)
+        is_own[block.own] = True
+    shared_count = count - int(is_own.sum())
+    triangle = _condensed(rests, _rows_of(priors, np.arange(shared_count)), shared_count)
     return Factor(tuple(factors), triangle[:, :-1], triangle[:, -1], scale)
 
 
-def _column_norms(blocks: Iterable[Block], prior_root_weight: Array) -> Array:
+def _columns(values: Array, blocks: Blocks) -> Array:
+    """The values (b, o + s), one an unknown, of what the blocks' columns stand for."""
+    return np.concatenate([values[blocks.own], values[blocks.shared]], axis=1)
+
+
+def _column_norms(blocks: Iterable[Blocks], prior_root_weight: Array) -> Array:
     squares = prior_root_weight**2
     for block in blocks:
-        columns = np.concatenate([block.own, block.shared])
-        squares[columns] += (block.matrix**2).sum(axis=0)
+        of_block = np.einsum("bmk,bmk->bk", block.matrix, block.matrix)
+        columns = np.concatenate([block.own, block.shared], axis=1)
+        squares += np.bincount(columns.ravel(), of_block.ravel(), len(squares))
     return np.asarray(np.where(squares > 0.0, np.sqrt(squares), 1.0))
 
 
@@ -174,54 +201,52 @@ def _prior_rows(root_weight: Array, right: Array, damping: float) -> tuple[Array
 
 
 def _rows_of(priors: tuple[Array, Array], unknowns: Indices) -> Array:
-    """The prior rows (k, k + 1) of some unknowns, the right side behind."""
+    """The prior rows (..., k, k + 1) of some unknowns (..., k), the right side behind."""
     root_weight, right = priors
-    return np.hstack([np.diag(root_weight[unknowns]), right[unknowns, None]])
+    rows = root_weight[unknowns][..., None] * np.eye(unknowns.shape[-1])
+    return np.concatenate([rows, right[unknowns][..., None]], axis=-1)
 
 
-def _eliminate_block(block: Block, scale: Array, priors: tuple[Array, Array]) -> tuple[BlockFactor, Array]:
-    """The block's triangle, and its remaining rows (k, shared + 1) in the shared unknowns, right side behind."""
-    own_count, shared_count = len(block.own), len(block.shared)
-    rows = np.zeros((len(block.matrix) + own_count, own_count + shared_count + 1))
-    rows[: len(block.matrix), :-1] = block.matrix / scale[np.concatenate([block.own, block.shared])]
-    rows[: len(block.matrix), -1] = block.right
-    prior_rows = _rows_of(priors, block.own)
-    rows[len(block.matrix) :, :own_count] = prior_rows[:, :-1]
-    rows[len(block.matrix) :, -1] = prior_rows[:, -1]
-    reflected, tau, _, _ = dgeqrf(rows[:, :own_count])
-    others = _reflected(reflected, tau, rows[:, own_count:])
-    factor = BlockFactor(
-        block.own, block.shared, np.triu(reflected[:own_count]), others[:own_count, :-1], others[:own_count, -1]
-    )
-    rest = others[own_count:]
-    return factor, _triangle(rest) if len(rest) > shared_count + 1 else rest
+def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array]) -> tuple[BlockFactors, Array]:
+    """The blocks' triangles, and their remaining rows (b, k, s + 1) in the shared unknowns, right side behind."""
+    (count, height, width), own_count = blocks.matrix.shape, blocks.own.shape[1]
+    rows = np.zeros((count, height + own_count, width + 1))
+    np.divide(blocks.matrix, _columns(scale, blocks)[:, None, :], out=rows[:, :height, :-1])
+    rows[:, :height, -1] = blocks.right
+    prior_rows = _rows_of(priors, blocks.own)
+    rows[:, height:, :own_count] = prior_rows[..., :-1]
+    rows[:, height:, -1] = prior_rows[..., -1]
+    triangle = _triangle(rows)
+    own = triangle[:, :own_count]
+    factor = BlockFactors(blocks.own, blocks.shared, own[..., :own_count], own[..., own_count:-1], own[..., -1])
+    return factor, triangle[:, own_count:, own_count:]
 
 
-def _reflected(reflectors: Array, tau: Array, columns: Array) -> Array:
-    """Q' times columns (m, k), Q as the Householder vectors of dgeqrf."""
-    if reflectors.shape[1] == 0:
-        return columns
-    work = max(1, columns.shape[1]) * LAPACK_BLOCK
-    result, _, _ = dormqr("L", "T", reflectors, tau, columns, work)
-    return np.asarray(result, dtype=np.float64)
-
-
-def _condensed(rests: Iterable[tuple[Indices, Array]], shared_priors: Array, shared_count: int) -> Array:
+def _condensed(rests: Sequence[tuple[Indices, Array]], shared_priors: Array, shared_count: int) -> Array:
     """The triangle (s, s + 1) of all rows in the shared unknowns, right side behind."""
-    pending = [shared_priors]
-    height = len(shared_priors)
+    together = max(CONDENSED_ROWS, ROWS_PER_COLUMN * (shared_count + 1))
+    triangle = shared_priors
+    pending: list[Array] = []
+    height = 0
     for shared, rest in rests:
-        rows = np.zeros((len(rest), shared_count + 1))
-        rows[:, shared] = rest[:, :-1]
-        rows[:, -1] = rest[:, -1]
-        pending.append(rows)
-        height += len(rows)
-        if height > ROWS_PER_COLUMN * (shared_count + 1):
-            pending = [_triangle(np.vstack(pending))]
-            height = len(pending[0])
-    return _triangle(np.vstack(pending))[:shared_count]
+        count = max(1, together // max(1, rest.shape[1]))
+        for first in range(0, len(rest), count):
+            pending.append(_spread(shared[first : first + count], rest[first : first + count], shared_count))
+            height += len(pending[-1])
+            if height >= together:
+                triangle = _triangle(np.vstack([triangle, *pending]))
+                pending, height = [], 0
+    return _triangle(np.vstack([triangle, *pending]))[:shared_count]
+
+
+def _spread(shared: Indices, rest: Array, shared_count: int) -> Array:
+    """Rows (b, k, s + 1) in some of the shared unknowns (b, s) as rows (b k, all shared + 1)."""
+    spread = np.zeros((*rest.shape[:2], shared_count + 1))
+    columns = np.concatenate([shared, np.full((len(shared), 1), shared_count)], axis=1)
+    np.put_along_axis(spread, np.broadcast_to(columns[:, None, :], rest.shape), rest, axis=2)
+    return spread.reshape(-1, shared_count + 1)
 
 
 def _triangle(rows: Array) -> Array:
-    """The factor R (k, n) of a Householder factorisation of rows (m, n), k the smaller of m and n."""
+    """The factors R (..., k, n) of Householder factorisations of rows (..., m, n), k the smaller of m and n."""
     return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)

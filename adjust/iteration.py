@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from adjust.elimination import Factor, eliminate
 from adjust.functions import Derivatives, computed_observations, derivatives
 from adjust.further_observations import square_sum
+from adjust.numbering import Numbering
 from adjust.problem import Problem, State
 from adjust.result import Termination
-from adjust.rows import Numbering, WhitenedRows, of_cameras, prior_differences, prior_root_weights, whitened_rows
+from adjust.rows import WhitenedRows, of_cameras, prior_differences, prior_root_weights, whitened_rows
 
 Array = NDArray[np.float64]
 
@@ -70,7 +71,7 @@ def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera
     if not camera_priors:
         weights = np.where(of_cameras(numbering), 0.0, weights)
     differences = prior_differences(numbering.problem, at.state)[numbering.free]
-    return eliminate(at.rows.blocks, len(numbering.free), weights, weights * differences, damping)
+    return eliminate(at.rows, len(numbering.free), weights, weights * differences, damping)
 
 
 def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limit: int) -> Solution:
@@ -100,19 +101,18 @@ def _stands_still(history: list[tuple[float, float]]) -> bool:
 def _step(
     numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float
 ) -> tuple[Linearised, float, float] | None:
-    """The next state, the step's largest component in standard deviations and its damping; None: no step helps."""
+    """The next state, the step's length in standard deviations and its damping; None: no step helps."""
     problem = numbering.problem
     while damping < LARGEST_DAMPING:
         try:
             factor = factorise(numbering, at, damping)
             solution = factor.solution()
-            sigmas = np.sqrt(factor.variances())
         except np.linalg.LinAlgError:
             return None
         step = np.zeros(len(problem.unknowns))
         step[numbering.free] = solution
         moved = linearise(numbering, covariance_mm2, problem.moved(at.state, step)) if np.isfinite(step).all() else None
         if moved is not None and moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
-            return moved, float((np.abs(solution) / sigmas).max(initial=0.0)), damping
+            return moved, factor.length(), damping
         damping = max(10.0 * damping, FIRST_DAMPING)
     return None

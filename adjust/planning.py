@@ -15,9 +15,9 @@ from adjust.errors import AdjustmentError
 from adjust.functions import blind_target, computed_observations
 from adjust.iteration import factorise, linearise
 from adjust.network import Approximations, Network
+from adjust.numbering import Numbering
 from adjust.problem import Problem, number
 from adjust.result import Adjustment, NullDirection
-from adjust.rows import Numbering
 from adjust.validation import validate
 
 Array = NDArray[np.float64]

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from adjust.elimination import Factor
 from adjust.further_observations import square_sum
 from adjust.iteration import Linearised
+from adjust.numbering import Numbering
 from adjust.problem import Problem, State
 from adjust.result import Cofactor, FurtherResidual, Group, Residuals
-from adjust.rows import Numbering, prior_differences
+from adjust.rows import prior_differences
 
 Array = NDArray[np.float64]
 
@@ -24,11 +25,11 @@ def residuals(numbering: Numbering, end: Linearised, factor: Factor, covariance_
     With K = C A' L^-T and the whitened rows L^-1 B: Q_vv = K (I - L^-1 B C_xx B' L^-T) K'.
     """
     at, root = end.at, end.rows.root
-    roots = factor.row_roots(end.rows.blocks)
+    roots = factor.row_roots(end.rows)
     adjusted = np.empty((len(end.v_mm), 2, 2))
     for touched, g in zip(numbering.touched, roots, strict=False):  # behind them stand further observations
-        pairs = g.reshape(len(touched.rows), 2, -1)
-        adjusted[touched.rows] = pairs @ pairs.transpose(0, 2, 1)
+        pairs = g.reshape(*touched.rows.shape, 2, g.shape[2])
+        adjusted[touched.rows] = pairs @ pairs.swapaxes(2, 3)
     k = np.linalg.solve(root, at.by_observation @ covariance_mm2).transpose(0, 2, 1)
     cofactor = k @ (np.eye(2) - adjusted) @ k.transpose(0, 2, 1)
     redundancy = np.einsum("nij,nji->ni", cofactor, np.linalg.inv(covariance_mm2))

@@ -1,5 +1,7 @@
 """The blockwise elimination against a dense solution of the same rows."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -8,10 +10,11 @@ from simulated import Truth, field_points, simulated
 
 from adjust import elimination
 from adjust.adjustment import adjust
-from adjust.elimination import Block, Factor, eliminate
+from adjust.elimination import Blocks, Factor, eliminate
 from adjust.iteration import factorise, linearise
+from adjust.numbering import Numbering
 from adjust.problem import number
-from adjust.rows import Numbering, prior_root_weights
+from adjust.rows import prior_root_weights
 
 Array = NDArray[np.float64]
 
@@ -19,26 +22,34 @@ SHARED, OWN, IMAGES = 7, 4, 5
 COUNT = SHARED + OWN * IMAGES
 
 
-def random_blocks(rng: np.random.Generator) -> list[Block]:
+def random_blocks(rng: np.random.Generator) -> list[Blocks]:
     """Blocks of columns of very different size; one sees little of what is shared, one has fewer rows than columns."""
+    own = SHARED + np.arange(OWN * IMAGES).reshape(IMAGES, OWN)
     blocks = []
-    for i in range(IMAGES):
-        own = SHARED + OWN * i + np.arange(OWN)
-        shared = np.array([1, 4]) if i == 0 else np.sort(rng.permutation(SHARED)[:5])
-        rows = 5 if i == 1 else 20
-        matrix = rng.normal(size=(rows, OWN + len(shared))) * 10.0 ** rng.integers(-4, 5, OWN + len(shared))
-        blocks.append(Block(own, shared, matrix, rng.normal(size=rows)))
+    for members, rows, width in (([0], 20, 2), ([1], 5, 5), ([2, 3, 4], 20, 5)):
+        shared = np.array([np.sort(rng.permutation(SHARED)[:width]) for _ in members])
+        matrix = rng.normal(size=(len(members), rows, OWN + width))
+        matrix *= 10.0 ** rng.integers(-4, 5, (len(members), 1, OWN + width))
+        blocks.append(Blocks(own[members], shared, matrix, rng.normal(size=(len(members), rows))))
     return blocks
 
 
-def dense(blocks: list[Block], weight: Array, right: Array) -> tuple[Array, Array]:
+def single(own: NDArray[np.intp], shared: NDArray[np.intp], matrix: Array, right: Array) -> Blocks:
+    """One block alone."""
+    return Blocks(own[None], shared[None], matrix[None], right[None])
+
+
+def dense(blocks: Iterable[Blocks], weight: Array, right: Array) -> tuple[Array, Array]:
     """All rows, priors included, as one matrix."""
     rows = [np.diag(weight)]
+    rights = [right]
     for block in blocks:
-        wide = np.zeros((len(block.matrix), COUNT))
-        wide[:, np.concatenate([block.own, block.shared])] = block.matrix
-        rows.append(wide)
-    return np.vstack(rows), np.concatenate([right, *(block.right for block in blocks)])
+        for own, shared, matrix, of_block in zip(block.own, block.shared, block.matrix, block.right, strict=True):
+            wide = np.zeros((len(matrix), len(weight)))
+            wide[:, np.concatenate([own, shared])] = matrix
+            rows.append(wide)
+            rights.append(of_block)
+    return np.vstack(rows), np.concatenate(rights)
 
 
 def whole(factor: Factor) -> Array:
@@ -65,11 +76,12 @@ def test_it_is_the_dense_least_squares_solution(damping: float) -> None:
     right_sides = rng.normal(size=(COUNT, 3))
     times = factor.cofactor_times(right_sides * scale[:, None]) * scale[:, None]
     np.testing.assert_allclose(times, cofactor @ right_sides, rtol=1e-7, atol=1e-10)
-    for block, root in zip(blocks, factor.row_roots(blocks), strict=True):
-        columns = np.concatenate([block.own, block.shared])
-        scaled = block.matrix / scale[columns]
-        expected_rows = scaled @ cofactor[np.ix_(columns, columns)] @ scaled.T
-        np.testing.assert_allclose(root @ root.T, expected_rows, atol=1e-9)
+    for block, roots in zip(blocks, factor.row_roots(blocks), strict=True):
+        for own, shared, rows, root in zip(block.own, block.shared, block.matrix, roots, strict=True):
+            columns = np.concatenate([own, shared])
+            scaled = rows / scale[columns]
+            expected_rows = scaled @ cofactor[np.ix_(columns, columns)] @ scaled.T
+            np.testing.assert_allclose(root @ root.T, expected_rows, atol=1e-9)
 
 
 def test_the_condition_is_not_squared() -> None:
@@ -79,7 +91,7 @@ def test_the_condition_is_not_squared() -> None:
     other = rng.normal(size=(40, 1))
     matrix = np.hstack([rng.normal(size=(40, 2)), column, column + 1e-10 * other])
     truth = np.array([1.0, -2.0, 3.0, 4.0])
-    block = Block(np.array([2, 3]), np.array([0, 1]), matrix, matrix @ truth)
+    block = single(np.array([2, 3]), np.array([0, 1]), matrix, matrix @ truth)
     factor = eliminate([block], 4, np.zeros(4), np.zeros(4))
     np.testing.assert_allclose(factor.solution(), truth[[2, 3, 0, 1]], atol=1e-4)
 
@@ -87,7 +99,7 @@ def test_the_condition_is_not_squared() -> None:
 def test_all_shared_unknowns_fixed() -> None:
     rng = np.random.default_rng(3)
     matrix = rng.normal(size=(10, 3))
-    block = Block(np.arange(3), np.empty(0, dtype=np.intp), matrix, matrix @ np.array([1.0, 2.0, 3.0]))
+    block = single(np.arange(3), np.empty(0, dtype=np.intp), matrix, matrix @ np.array([1.0, 2.0, 3.0]))
     factor = eliminate([block], 3, np.zeros(3), np.zeros(3))
     np.testing.assert_allclose(factor.solution(), [1.0, 2.0, 3.0], rtol=1e-12)
     np.testing.assert_allclose(whole(factor), np.linalg.inv(matrix.T @ matrix), rtol=1e-10)
@@ -128,16 +140,13 @@ def test_points_or_images_are_eliminated_first(count: int, own: set[int]) -> Non
     network, start = simulated(rng, points=field_points(rng, count), point_sigma=0.05, free={"k3": np.inf})
     problem = number(network, start)
     numbering = Numbering(problem)
-    assert {len(touched.own) for touched in numbering.touched} == own
+    assert {touched.own.shape[1] for touched in numbering.touched} == own
     at = linearise(numbering, network.observations.covariance_mm2, problem.start())
     assert at is not None
-    total = len(numbering.free)
-    matrix = np.zeros((2 * len(network.observations), total))
-    row = 0
-    for block in at.rows.blocks:
-        matrix[row : row + len(block.matrix), np.concatenate([block.own, block.shared])] = block.matrix
-        row += len(block.matrix)
-    normal = matrix.T @ matrix + np.diag(prior_root_weights(numbering) ** 2)
+    weights = prior_root_weights(numbering)
+    matrix, _ = dense(at.rows, weights, np.zeros(len(weights)))
+    assert matrix.shape == (2 * len(network.observations) + len(weights), len(numbering.free))
+    normal = matrix.T @ matrix
     scale = np.sqrt(np.diag(normal))
     expected = np.linalg.inv(normal / np.outer(scale, scale))
     cofactor = whole(factorise(numbering, at)) * np.outer(scale, scale)

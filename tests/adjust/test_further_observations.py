@@ -12,9 +12,9 @@ from adjust.adjustment import Options, adjust
 from adjust.approximations import approximate
 from adjust.errors import AdjustmentError
 from adjust.network import Distance, Exterior, Network, ObjectPoint, Prior
+from adjust.numbering import Numbering
 from adjust.problem import number
 from adjust.result import Adjustment
-from adjust.rows import Numbering
 
 Array = NDArray[np.float64]
 
@@ -163,7 +163,7 @@ def test_points_tied_by_a_distance_are_shared() -> None:
     _, start = simulated(np.random.default_rng(5), points=points, point_sigma=np.inf)
     problem = number(network, start)
     numbering = Numbering(problem)
-    own = np.concatenate([touched.own for touched in numbering.touched])
+    own = np.concatenate([touched.own.ravel() for touched in numbering.touched])
     tied = {f"PT.{id}.{axis}" for id in "0123" for axis in "XYZ"}
     assert len(own) == 3 * 20
     assert not tied & {problem.unknowns.names[numbering.free[i]] for i in own}
