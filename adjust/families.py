@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.correction import Correction, Imaged, Settings, no_correction, undistorted
-from adjust.fourier_sets import fourier, fourier_names
-from adjust.juhl import JUHL_NAMES, juhl
-from adjust.opencv_family import OPENCV_NAMES, opencv
-from adjust.physical import BROWN_NAMES, TORLEGARD_NAMES, brown, torlegard
-from adjust.polynomial_sets import EBNER, GRUEN, PolynomialSet, correct, legendre
+from adjust.fourier_sets import by_order, fourier, fourier_names
+from adjust.juhl import JUHL_GROUPS, JUHL_NAMES, juhl
+from adjust.opencv_family import OPENCV_GROUPS, OPENCV_NAMES, opencv
+from adjust.physical import BROWN_GROUPS, BROWN_NAMES, TORLEGARD_GROUPS, TORLEGARD_NAMES, brown, torlegard
+from adjust.polynomial_sets import EBNER, GRUEN, PolynomialSet, by_degree, correct, legendre
 
 Array = NDArray[np.float64]
 
@@ -29,17 +29,19 @@ class Family:
     """A distortion family.
 
     parameters: their names. image(ray, parameters): what it does to the ray. correct(settings, xy, principal point,
-    parameters): what is subtracted from the observed point. needs: the setting that it cannot do without.
+    parameters): what is subtracted from the observed point. needs: the setting that it cannot do without. groups: the
+    parameters that are one cause, or of one degree, by its name.
     """
 
     parameters: tuple[str, ...] = ()
     image: Callable[[Array, Array], Imaged] = undistorted
     correct: Callable[[Settings, Array, Array, Array], Correction] = no_correction
     needs: str = ""
+    groups: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
 
 def _polynomials(of: PolynomialSet) -> Family:
-    return Family(of.names, correct=partial(correct, of), needs="half_mm")
+    return Family(of.names, correct=partial(correct, of), needs="half_mm", groups=by_degree(of))
 
 
 def _legendre(order: int) -> Family:
@@ -47,15 +49,15 @@ def _legendre(order: int) -> Family:
 
 
 def _fourier(order: int) -> Family:
-    return Family(fourier_names(order), correct=partial(fourier, order), needs="half_mm")
+    return Family(fourier_names(order), correct=partial(fourier, order), needs="half_mm", groups=by_order(order))
 
 
 _FAMILIES = {
     "none": Family(),
-    "torlegard": Family(TORLEGARD_NAMES, correct=torlegard),
-    "brown": Family(BROWN_NAMES, correct=brown),
-    "opencv": Family(OPENCV_NAMES, image=opencv),
-    "juhl": Family(JUHL_NAMES, correct=juhl, needs="r0_mm"),
+    "torlegard": Family(TORLEGARD_NAMES, correct=torlegard, groups=TORLEGARD_GROUPS),
+    "brown": Family(BROWN_NAMES, correct=brown, groups=BROWN_GROUPS),
+    "opencv": Family(OPENCV_NAMES, image=opencv, groups=OPENCV_GROUPS),
+    "juhl": Family(JUHL_NAMES, correct=juhl, needs="r0_mm", groups=JUHL_GROUPS),
     "ebner": _polynomials(EBNER),
     "gruen": _polynomials(GRUEN),
 }

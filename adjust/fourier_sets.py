@@ -26,6 +26,13 @@ def fourier_names(order: int) -> tuple[str, ...]:
     return tuple(f"{letter}{index}" for letter in "abcd" for index in indices)
 
 
+def by_order(order: int) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """The parameters of every order, the larger of m and n."""
+    orders = np.tile(np.abs(_frequencies(order)).max(axis=1), 4)
+    names = np.array(fourier_names(order))
+    return tuple((f"order {n}", tuple(names[orders == n].tolist())) for n in range(1, order + 1))
+
+
 def fourier(order: int, settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
     """The correction of an order, subtracted from the observed point."""
     waves = np.pi * _frequencies(order) / np.array(settings.half_mm)  # (frequencies, 2), in rad per mm

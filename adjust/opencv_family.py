@@ -8,6 +8,13 @@ from adjust.correction import Imaged, matrices
 Array = NDArray[np.float64]
 
 OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1")
+OPENCV_GROUPS = (
+    ("radial", ("k1", "k2", "k3", "k4", "k5", "k6")),
+    ("radial, denominator", ("k4", "k5", "k6")),
+    ("decentering", ("p1", "p2")),
+    ("thin prism", ("s1", "s2", "s3", "s4")),
+    ("tilt", ("tau_x", "tau_y")),
+)
 
 
 def opencv(ray: Array, parameters: Array) -> Imaged:

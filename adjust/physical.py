@@ -9,6 +9,8 @@ Array = NDArray[np.float64]
 
 TORLEGARD_NAMES = ("k3", "k5", "k7", "p1", "p2", "p3", "p4")
 BROWN_NAMES = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
+TORLEGARD_GROUPS = (("radial", TORLEGARD_NAMES[:3]), ("decentering", TORLEGARD_NAMES[3:5]))
+BROWN_GROUPS = (("radial", BROWN_NAMES[:3]), ("decentering", BROWN_NAMES[3:5]), ("affinity", BROWN_NAMES[5:]))
 
 
 def torlegard(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:

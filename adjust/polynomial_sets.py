@@ -84,6 +84,16 @@ GRUEN = _set(
 )
 
 
+def by_degree(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """The parameters of every degree in x and y together."""
+    combined = {STRETCH: 1, SHEAR: 1, TILT_X: 2, TILT_Y: 2}
+    degrees = [combined[term] if isinstance(term, str) else sum(term[1:]) for term in of.terms]
+    return tuple(
+        (f"degree {degree}", tuple(name for name, own in zip(of.names, degrees, strict=True) if own == degree))
+        for degree in sorted(set(degrees))
+    )
+
+
 def correct(of: PolynomialSet, settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
     """The correction of a set, which is subtracted from the observed point."""
     half = np.array(settings.half_mm)

@@ -18,6 +18,7 @@ from adjust.families import family, parameter_names
 from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
 from adjust.projection import adjusted_image
 from adjust.result import Adjustment
+from adjust.significance import group_tests, parameter_tests
 from adjust.transformation import NAMES
 from pipeline.atomic import atomic_path
 from pipeline.errors import InputError
@@ -121,10 +122,11 @@ def adjustment_json(adjustment: Adjustment) -> Json:
 
 def _camera(adjustment: Adjustment, camera: Camera) -> Json:
     idle = camera.name in adjustment.network.idle_cameras
+    tests = {test.name: {"t": test.statistic, "p": test.p} for test in parameter_tests(adjustment, camera)}
 
     def quantity(name: str, given: Prior | None) -> Json:
         known = _quantity(adjustment, f"IO.{camera.name}.{name}", given)
-        return known | {"sigma": math.nan} if idle else known
+        return known | {"sigma": math.nan} if idle else known | tests.get(name, {})
 
     distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
     if camera.distortion.family == "torlegard":
@@ -141,6 +143,10 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
             "y": quantity("y0", camera.y0_mm),
         },
         "distortion": distortion,
+        "significance": [
+            {"group": test.name, "parameters": list(test.parameters), "F": test.statistic, "p": test.p}
+            for test in group_tests(adjustment, camera)
+        ],
         "fiducials": {
             id: {
                 "x_mm": _quantity(adjustment, f"FID.{camera.name}.{id}.x", fiducial.x_mm),

@@ -12,7 +12,7 @@ from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image
 from pipeline.report.lens_map import LensMap, lens_map
 from pipeline.report.numbers import fixed, value_and_sigma
-from pipeline.report.parameters import ParameterRow, high_correlations, parameter_rows
+from pipeline.report.parameters import ParameterRow, group_sentences, high_correlations, parameter_rows
 from pipeline.report.verdict import camera_is_calibrated
 
 PLOT_PX = 560.0
@@ -60,6 +60,7 @@ class CameraView:
     images: int
     radius_mm: float
     parameters: list[ParameterRow]
+    groups: list[str]
     in_given_figure: list[tuple[str, str, str]]
     correlations: list[tuple[str, str, float]]
     curves: Markup | None
@@ -93,6 +94,7 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         images=len(images),
         radius_mm=radius_mm,
         parameters=parameter_rows(name, camera, stored["sigma0"] or 1.0, radius_mm),
+        groups=group_sentences(camera),
         in_given_figure=_in_given_figure(form) if form else [],
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         curves=lens.curves_plot(curve, radius_mm) if curve else None,

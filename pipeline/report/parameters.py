@@ -6,12 +6,12 @@ import numpy as np
 
 from adjust.families import family as family_of
 from adjust.families import parameter_names
+from adjust.significance import LEVEL
 from pipeline.adjustment_file import Covariance
 from pipeline.report.data import Json
 from pipeline.report.lens import largest_effects_um, lens
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 
-SIGNIFICANT = 2.576  # sigmas: chance alone exceeds it once in a hundred times
 MOSTLY_PRIOR = 0.9  # of the prior's sigma is left: the data have told little
 HIGH_CORRELATION = 0.9
 
@@ -67,6 +67,19 @@ def high_correlations(name: str, camera: Json, covariance: Covariance) -> list[t
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
+def group_sentences(camera: Json) -> list[str]:
+    """Which parameters the data need together, as sentences."""
+    return [
+        f"{_group(test['group'])} ({', '.join(test['parameters'])}) together: "
+        + _verdict(f"F = {significant(test['F'], 3)}", test["p"])
+        for test in camera.get("significance", ())
+    ]
+
+
+def _group(name: str) -> str:
+    return name[0].upper() + name[1:]
+
+
 def _row(symbol: str, unit: str, quantity: Json, effect: str, meaning: str) -> ParameterRow:
     value, sigma = value_and_sigma(quantity["value"], quantity["sigma"])
     return ParameterRow(symbol, unit, value, sigma, _given(quantity), effect, meaning)
@@ -93,6 +106,9 @@ def _origin(quantity: Json, sigma0: float) -> str:
     if given is None or not given["sigma"]:
         return "determined by the observations alone"
     moved = f"moved by {fixed(1e3 * (quantity['value'] - given['value']), 0, sign=True)} µm"
+    p = quantity.get("p")
+    if p is not None and p < LEVEL:
+        moved += f", more than the given σ allows ({_chance(p)})"
     left = sigma / (sigma0 * given["sigma"])
     if left > MOSTLY_PRIOR:
         return f"{moved}; known from the given value, hardly from the observations"
@@ -106,8 +122,17 @@ def _significance(quantity: Json) -> str:
     if quantity["sigma"] == 0.0:
         return "held at the given value"
     size = abs(quantity["value"]) / quantity["sigma"]
-    times = f"{size:.1f}" if size < 100.0 else f"{size:.0f}"
-    return f"significant ({times} σ)" if size > SIGNIFICANT else f"not significant ({times} σ)"
+    return _verdict(f"{size:.1f} σ" if size < 100.0 else f"{size:.0f} σ", quantity.get("p"))
+
+
+def _verdict(found: str, p: float | None) -> str:
+    if p is None:
+        return f"not tested ({found})"
+    return f"{'significant' if p < LEVEL else 'not significant'} ({found}, {_chance(p)})"
+
+
+def _chance(p: float) -> str:
+    return f"p = {p:.3f}" if p >= 0.001 else "p < 0.001"
 
 
 def _effect(quantity: Json, um_per_unit: float) -> str:

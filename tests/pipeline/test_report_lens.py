@@ -101,15 +101,15 @@ def test_the_curve_shows_where_no_target_was() -> None:
 
 def test_parameters_say_what_is_significant_and_what_the_prior_carried() -> None:
     entry = camera("brown", k1=5e-8, p1=1e-7)
-    entry["distortion"]["k1"]["sigma"] = 1e-9
-    entry["distortion"]["p1"]["sigma"] = 1e-7
+    entry["distortion"]["k1"] |= {"sigma": 1e-9, "p": 1e-30}
+    entry["distortion"]["p1"] |= {"sigma": 1e-7, "p": 0.32}
     entry["principal_distance_mm"] |= {"sigma": 0.5, "given": {"value": 152.5, "sigma": 1.0}}
     entry["principal_point_mm"]["x"] |= {"sigma": 0.99, "given": {"value": 0.0, "sigma": 1.0}}
     rows = {row.symbol: row for row in parameter_rows("A", entry, 1.0, 100.0)}
-    assert rows["k1"].meaning == "significant (50.0 σ)"
+    assert rows["k1"].meaning == "significant (50.0 σ, p < 0.001)"
     assert rows["k1"].unit == "mm⁻²"
     assert rows["k1"].effect == "50.0 ± 1.0"
-    assert rows["p1"].meaning == "not significant (1.0 σ)"
+    assert rows["p1"].meaning == "not significant (1.0 σ, p = 0.320)"
     assert rows["c"].meaning == "moved by +500 µm; the given value's share is 25 %"
     assert "hardly from the observations" in rows["x₀′"].meaning
     assert rows["y₀′"].meaning == "held at the given value"
