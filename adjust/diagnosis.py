@@ -1,35 +1,38 @@
 """What the observations do not determine: null directions of the equations, named with cause and remedy."""
 
 import re
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtrcon
 
 from adjust.datum import free_coordinates, object_datum
-from adjust.directions import camera_leads, datum_sentence
+from adjust.directions import camera_leads, datum_sentence, following
 from adjust.elimination import Factor
+from adjust.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
+from adjust.own_directions import own_sentence, unnamed_sentence
 from adjust.problem import Problem, State
 from adjust.result import NullDirection
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below which there is no solution
-WEAK = 1e-4  # below which noise makes the solution
+WEAK = 1e-4  # singular values of the scaled rows, over the largest, below which noise makes the solution
 INVOLVED = 0.01  # part of a null vector's largest component that is worth a name
 PURE = 1e-5  # part that a name must have in an exact null direction, beyond what earlier names took
 MIXED = 0.05  # the same in a direction that is seen just a little, where everything plays a small part
 SETTLED = 3.0  # how much more than observations priors must weigh to make a weak direction theirs
 INSIDE = 1e-6  # what a known direction may stick out of the null space: rounding
+OBJECT_AXES = ("X", "Y", "Z", "X0", "Y0", "Z0")  # quantities that place points and stations
 NAMES_SHOWN = 3  # more names of one kind than this are shown as one, with a star
 UNDETERMINED = 0.99  # posterior over prior standard deviation above which the observations say nothing
 
 
 def singular_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
     """The null directions of the factor of a state, at its computed observations; none where it is regular."""
-    within = _within_blocks(problem, free, factor)
-    return within or _named(problem, state, free, factor, _null_space(factor, SINGULAR)[0], PURE)
+    blind = blind_blocks(factor)
+    null, _ = null_space(factor, blind, SINGULAR)
+    return (*_within_blocks(problem, state, free, blind), *_named(problem, state, free, factor, null, PURE))
 
 
 def weak_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
@@ -39,9 +42,7 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     priors weigh less than SETTLED times what the observations do. Directions that move fiducials with priors are no
     cause for alarm: their priors are meant to place them.
     """
-    if _within_blocks(problem, free, factor):
-        return ()
-    hardly, told = _null_space(factor, WEAK)
+    hardly, told = null_space(factor, blind_blocks(factor), WEAK)
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
     sigma = np.where(
         np.char.startswith(np.array(problem.unknowns.names)[free], "IO."), problem.unknowns.sigma[free], np.inf
@@ -52,18 +53,6 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)
     unsettled = of_unit_weight @ right[weight < SETTLED].T
     return _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
-
-
-def null_vectors(factor: Factor) -> Array:
-    """Orthonormal vectors (n, d) of the scaled unknowns that no row sees.
-
-    Where blocks do not determine their own unknowns, these vectors alone: the others cannot be told before.
-    """
-    within = []
-    for own, vector in _own_null_vectors(factor):
-        within.append(np.zeros(len(factor.scale)))
-        within[-1][own] = vector
-    return np.array(within).T if within else _null_space(factor, SINGULAR)[0]
 
 
 def undetermined(problem: Problem, variances: Array) -> tuple[str, ...]:
@@ -92,63 +81,14 @@ def collapsed(names: list[str]) -> tuple[str, ...]:
     return tuple(shown)
 
 
-def _within_blocks(problem: Problem, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
+def _within_blocks(
+    problem: Problem, state: State, free: Indices, blind: Sequence[BlindBlock]
+) -> Iterable[NullDirection]:
     """Null directions of an image's or a point's own unknowns, which the shared ones have no part in."""
-    directions = []
-    for own, vector in _own_null_vectors(factor):
-        names = [problem.unknowns.names[free[own[i]]] for i in _largest(vector)]
-        directions.append(NullDirection(tuple(names), *_own_sentence(names[0])))
-    return tuple(directions)
-
-
-def _own_null_vectors(factor: Factor) -> list[tuple[Indices, Array]]:
-    """Numbers (o,) of blocks' own unknowns, and vectors (o,) of these that the block's rows do not see."""
-    found = []
-    for block in factor.blocks:
-        if block.own.shape[1] == 0:
-            continue
-        _, singular, right = np.linalg.svd(block.triangle)
-        null = singular <= SINGULAR * singular[:, :1]
-        found += [(block.own[i], right[i, j]) for i, j in np.argwhere(null)]
-    return sorted(found, key=lambda each: int(each[0][0]))
-
-
-def _own_sentence(name: str) -> tuple[str, str]:
-    """Cause and remedy where the observations do not determine the owner of an unknown."""
-    kind, owner = name.rsplit(".", 1)[0].split(".", 1)
-    if kind == "PT":
-        return (
-            f"The rays to point {owner} do not determine where it lies.",
-            "Measure it in more images, from stations further apart, give its coordinates, or leave it out.",
-        )
-    return (
-        f"The marks of image {owner} do not determine its own orientation and transformation.",
-        "Measure more marks in this image, not all on one line, or leave the image out.",
-    )
-
-
-def _null_space(factor: Factor, below: float) -> tuple[Array, Array]:
-    """Orthonormal vectors (n, d) of all scaled unknowns that are hardly seen, and how much they are seen (d,).
-
-    These are the vectors whose singular values are below a part of the largest of all.
-    """
-    count = factor.shared_count
-    if count == 0 or _surely_above(factor.triangle, below):
-        return np.zeros((len(factor.scale), 0)), np.zeros(0)
-    _, singular, right = np.linalg.svd(factor.triangle)
-    hardly = singular <= below * singular[0]
-    vectors = np.zeros((len(factor.scale), int(hardly.sum())))
-    vectors[:count] = right[hardly].T
-    for block in factor.blocks:
-        vectors[block.own] = -np.linalg.solve(block.triangle, block.border @ vectors[block.shared])
-    lengths = np.linalg.norm(vectors, axis=0)
-    return np.linalg.qr(vectors)[0], singular[hardly] / lengths
-
-
-def _surely_above(triangle: Array, ratio: float) -> bool:
-    """Whether an estimate of the condition already tells that all singular values lie above a ratio of the largest."""
-    reciprocal, _ = dtrcon(triangle)
-    return bool(reciprocal > ratio * len(triangle))
+    for block in blind:
+        for vector in block.right.T:
+            names = [problem.unknowns.names[free[block.own[i]]] for i in _largest(vector)]
+            yield NullDirection(tuple(names), *own_sentence(problem, state, names[0]))
 
 
 def _named(
@@ -164,14 +104,19 @@ def _named(
     functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
     lengths = np.linalg.norm(functionals, axis=1, keepdims=True)
     seen = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest
-    chosen = _independent_rows(seen, part, np.array([lead.rank for lead in leads], dtype=np.intp))
-    vectors = still @ np.linalg.pinv(seen[chosen])
+    ranks = np.array([lead.rank for lead in leads], dtype=np.intp)
+    axes = (functionals[ranks == 0] * factor.scale**2).T  # as motions of the scaled unknowns
+    chosen = _independent_rows(seen, part, ranks, _made_of(axes, rest, part))
+    vectors = _with_object_still(names, still @ np.linalg.pinv(seen[chosen]), ranks[chosen])
     left = still @ _unseen_by(seen[chosen], PURE)
-    sentences += [(leads[i].cause, leads[i].remedy) for i in chosen]
-    sentences += [_unknown_direction(names, vector) for vector in left.T]
+    moved = [[names[i] for i in _largest(vector)] for vector in np.hstack([datum, vectors, left]).T]
+    of_leads = moved[datum.shape[1] : len(moved) - left.shape[1]]
+    sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
+    for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
+        most = names[int(np.argmax(np.abs(vector)))]
+        sentences.append(unnamed_sentence(most, following(set(own) - {most})))
     return tuple(
-        NullDirection(collapsed([names[i] for i in _largest(vector)]), cause, remedy)
-        for vector, (cause, remedy) in zip(np.hstack([datum, vectors, left]).T, sentences, strict=True)
+        NullDirection(collapsed(own), cause, remedy) for own, (cause, remedy) in zip(moved, sentences, strict=True)
     )
 
 
@@ -198,10 +143,38 @@ def _with_points_still(problem: Problem, free: Indices, datum: Array, vectors: A
     return np.asarray(vectors - datum @ amounts)
 
 
-def _independent_rows(rows: Array, part: float, ranks: Indices) -> list[int]:
-    """Independent rows (m, d), up to d: those of the lowest rank first, of equals that which sticks out most."""
+def _with_object_still(names: list[str], vectors: Array, ranks: Indices) -> Array:
+    """Vectors (n, d) with as much of the others added to those of rank 0 as leaves stations and points where they are.
+
+    A common shift of fiducials and principal point, which no object takes part in, is then told as just that.
+    """
+    placed = np.array([name.rsplit(".", 1)[1] in OBJECT_AXES for name in names], dtype=bool)
+    first, others = vectors[:, ranks == 0], vectors[:, ranks > 0]
+    result = vectors.copy()
+    result[:, ranks == 0] -= others @ np.linalg.lstsq(others[placed], first[placed])[0]
+    return result
+
+
+def _made_of(motions: Array, vectors: Array, part: float) -> Array:
+    """A projector (d, d) on what of orthonormal vectors (n, d) moves the unknowns of motions (n, m) by these alone.
+
+    An affinity that leaves two fiducial marks in their places shifts their mean, and yet it is no shift.
+    """
+    moved = np.any(motions != 0.0, axis=1)
+    basis = np.linalg.qr(motions[moved])[0]
+    kept = _unseen_by(vectors[moved] - basis @ (basis.T @ vectors[moved]), part)
+    return kept @ kept.T
+
+
+def _independent_rows(rows: Array, part: float, ranks: Indices, axes: Array | None = None) -> list[int]:
+    """Independent rows (m, d), up to d: those of the lowest rank first, of equals that which sticks out most.
+
+    axes: a projector (d, d) that rows of rank 0 have to pass.
+    """
     chosen: list[int] = []
     rest = rows.copy()
+    if axes is not None:
+        rest[ranks == 0] = rest[ranks == 0] @ axes
     for rank in np.unique(ranks):
         while len(chosen) < rows.shape[1]:
             lengths = np.where(ranks == rank, np.linalg.norm(rest, axis=1), 0.0)
@@ -226,11 +199,3 @@ def _largest(vector: Array) -> list[int]:
     """The components that matter, in order."""
     size = np.abs(vector)
     return [int(i) for i in np.flatnonzero(size > INVOLVED * size.max())]
-
-
-def _unknown_direction(names: list[str], vector: Array) -> tuple[str, str]:
-    largest = names[int(np.argmax(np.abs(vector)))]
-    return (
-        f"These unknowns can move together, {largest} most, without changing any observation.",
-        f"Give {largest} or another of them a standard deviation, or add observations that see it.",
-    )

@@ -1,5 +1,6 @@
 """The directions in which a network's unknowns are known to move together, and what to say of them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,19 +10,63 @@ from adjust.families import parameter_names
 from adjust.problem import Problem, State
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+FLAT = 0.01  # least over largest extent of the field, below which there is no relief to speak of
+PARALLEL_RAD = np.radians(1.0)  # axes within this of each other are parallel
+FIELD = 4  # points from which something is known of the field, and not just of its datum
 
 
 @dataclass(frozen=True)
 class Lead:
-    """What a null direction is called after: a functional (n,) of the unknowns that it changes, cause and remedy.
+    """What a null direction is called after: a functional (n,) of the unknowns that it changes, and the words for it.
 
-    rank: of several leads that would do, that of the lowest rank gives the name.
+    rank: of several leads that would do, that of the lowest rank gives the name. motion: what moves; because: why
+    nothing hinders it, where that is more than what follows it. given: what a prior would end it, partner: another
+    unknown (its name, and in words) that would, where it moves too; otherwise: what else to do.
     """
 
     rank: int
     functional: Array
-    cause: str
-    remedy: str
+    motion: str
+    given: str
+    because: str = ""
+    partner: tuple[str, str] | None = None
+    otherwise: str = ""
+
+    def sentence(self, moved: Iterable[str]) -> tuple[str, str]:
+        """Cause and remedy of a direction that moves some unknowns."""
+        moved = set(moved)
+        cause = f"{self.motion}{following(moved, self.motion)}{self.because and f': {self.because}'}."
+        given = [self.given] + ([self.partner[1]] if self.partner and self.partner[0] in moved else [])
+        remedy = f"Give a standard deviation to {', or to '.join(given)}{self.otherwise and f', or {self.otherwise}'}."
+        return cause, remedy
+
+
+FOLLOWERS = (  # what follows a motion: the unknowns' kind, quantities (all where empty), words, a word that told it
+    ("T", (), "the film transformations", ""),
+    ("IO", ("x0", "y0"), "the principal point", "principal point's"),
+    ("IO", ("c",), "the principal distance", "principal distance"),
+    ("EO", ("X0", "Y0", "Z0"), "the stations", ""),
+    ("EO", ("omega", "phi"), "the tilts", ""),
+    ("EO", ("kappa",), "kappa", ""),
+    ("PT", ("X", "Y"), "the object points in plan", ""),
+    ("PT", ("Z",), "the heights", ""),
+)
+
+
+def following(moved: Iterable[str], motion: str = "") -> str:
+    """What moves along, in words."""
+    kinds = {(name.split(".", 1)[0], name.rsplit(".", 1)[1]) for name in moved}
+    words = [
+        word
+        for owner, quantities, word, told in FOLLOWERS
+        if not (told and told in motion) and any(o == owner and (not quantities or q in quantities) for o, q in kinds)
+    ]
+    if not words:
+        return ""
+    listed = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    return f", followed by {listed}"
 
 
 DATUM_LEADS = (
@@ -45,11 +90,17 @@ def datum_sentence(number: int) -> tuple[str, str]:
 
 
 def camera_leads(problem: Problem, state: State) -> list[Lead]:
-    """What a null direction of fiducials (rank 0), interior orientation (1) or distortion (2) is called after."""
+    """What a null direction is called after.
+
+    Ranks: 0 what is a change of the camera's own axes, 1 other changes of its fiducials, 2 interior orientation, 3
+    distortion.
+    """
     leads = []
+    field = _field_of(problem, state)
     for name, positions in problem.unknowns.camera.items():
         leads += _fiducial_leads(problem, state, name)
-        leads += _interior_leads(problem, name, positions[[1, 2, 0, *range(3, len(positions))]])
+        leads += _interior_leads(problem, name, positions, field)
+        leads += _distortion_leads(problem, name, positions[3:])
     return leads
 
 
@@ -61,82 +112,101 @@ def _fiducial_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
     positions = np.array(pairs)
     x, y = (state.values[positions] - state.values[positions].mean(axis=0)).T
     one, zero = np.ones_like(x), np.zeros_like(x)
-    marks = f"all fiducial marks of camera {camera}"
-    follow = "and the transformation of every image follows"
-    texts = (
-        (
-            one,
-            zero,
-            f"Shift x: {marks} can shift together in x', {follow}.",
-            "x' of one fiducial mark (F5), or to x0' (F7) where it is named here",
-        ),
-        (
-            zero,
-            one,
-            f"Shift y: {marks} can shift together in y', {follow}.",
-            "y' of one fiducial mark (F6), or to y0' (F8) where it is named here",
-        ),
-        (
-            -y,
-            x,
-            f"Rotation: {marks} can turn together about the principal point, {follow} with kappa.",
-            "one coordinate of a fiducial mark that has a lever arm (F5, F6)",
-        ),
-        (
-            x,
-            y,
-            f"Scale: {marks} can grow together, {follow} with the principal distance or the stations' distance.",
-            "two fiducial marks (F5, F6), or to the principal distance (F9) where it is named here",
-        ),
-        (
-            x,
-            -y,
-            f"Affinity: {marks} can stretch in x' against y', {follow} with stations and object.",
-            "three fiducial marks (F5, F6), or take images that converge or are turned by 90 degrees about their axes",
-        ),
-        (
-            y,
-            x,
-            f"Shear: {marks} can shear, {follow} with stations and object.",
-            "three fiducial marks (F5, F6), or take images that converge or are turned by 90 degrees about their axes",
-        ),
+    marks = f"all fiducial marks of camera {camera} can"
+    turned = "add images turned by 90 degrees about their axes or tilted in other directions"
+    x0, y0 = (f"IO.{camera}.x0", "x0' (F7)"), (f"IO.{camera}.y0", "y0' (F8)")
+    c = (f"IO.{camera}.c", "the principal distance (F9)")
+    lever = "one coordinate of a fiducial mark that has a lever arm (F5, F6)"
+    two, three = (f"x' and y' of {number} fiducial marks (F5, F6)" for number in ("two", "three"))
+    leads = (  # rank, dx', dy', motion, given, partner, otherwise
+        (0, one, zero, f"Shift x: {marks} shift together in x'", "x' of one fiducial mark (F5)", x0, ""),
+        (0, zero, one, f"Shift y: {marks} shift together in y'", "y' of one fiducial mark (F6)", y0, ""),
+        (0, -y, x, f"Rotation: {marks} turn together about the principal point", lever, None, ""),
+        (0, x, y, f"Scale: {marks} grow together", two, c, ""),
+        (1, x, -y, f"Affinity: {marks} stretch in x' against y'", three, None, turned),
+        (1, y, x, f"Shear: {marks} shear", three, None, turned),
     )
-    leads = []
-    for dx, dy, cause, known in texts:
+    listed = []
+    for rank, dx, dy, motion, given, partner, otherwise in leads:
         functional = np.zeros(len(problem.unknowns))
         functional[positions] = np.stack([dx, dy], axis=1)
-        leads.append(Lead(0, functional, cause, f"Give a standard deviation to {known}."))
-    return leads
+        listed.append(Lead(rank, functional, motion, given, "", partner, otherwise))
+    return listed
 
 
-def _interior_leads(problem: Problem, camera: str, positions: NDArray[np.intp]) -> list[Lead]:
-    """x0', y0', c and the distortion parameters of a camera."""
-    geometry = "take convergent images, images turned by 90 degrees about their axes, or a field with more relief"
-    texts = [
-        (
-            f"The principal point's {axis}' of camera {camera} cannot be told from a shift or tilt of the stations: "
-            f"the field is flat or the axes are parallel.",
-            f"Give {axis}' a standard deviation ({number}), or {geometry}.",
-        )
-        for axis, number in (("x0", "F7"), ("y0", "F8"))
-    ]
-    texts.append(
-        (
-            f"The principal distance of camera {camera} cannot be told from the stations' distance from the field, or "
-            f"from the heights: the field is flat or the axes are parallel.",
-            f"Give the principal distance a standard deviation (F9), or {geometry}.",
-        )
+@dataclass(frozen=True)
+class _Field:
+    """What decides whether images tell the interior orientation from the exterior.
+
+    known: coordinates of object points that are known beforehand, and not just as a datum.
+    """
+
+    flat: bool
+    parallel: bool
+    known: str  # "points", "heights", "nothing"
+
+    @property
+    def because(self) -> str:
+        if self.flat:
+            axes = "the camera axes are parallel" if self.parallel else "too few images are tilted in other directions"
+            return f"the field is flat and {axes}"
+        known = {"points": "", "heights": ", and only heights are known", "nothing": ", and no object point is known"}
+        if self.parallel:
+            return f"the camera axes are parallel{known[self.known]}"
+        return "these stations and points do not tell them apart"
+
+
+def _field_of(problem: Problem, state: State) -> _Field:
+    """The field that the observed points make, and the axes of the images."""
+    positions = np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
+    xyz = state.values[positions]
+    extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False) if len(xyz) > 2 else np.zeros(3)
+    axes = state.rotations[:, 2]
+    mean = axes.mean(axis=0)
+    off = np.linalg.norm(np.cross(axes, mean / (np.linalg.norm(mean) or 1.0)), axis=1)
+    given = problem.network.points
+    heights = sum(point.Z is not None and np.isfinite(point.Z.sigma) for point in given)
+    whole = sum(all(q is not None and np.isfinite(q.sigma) for q in (point.X, point.Y, point.Z)) for point in given)
+    known = "points" if whole >= FIELD else "heights" if heights >= FIELD else "nothing"
+    return _Field(bool(extents[-1] <= FLAT * extents[0]), bool(off.max() < PARALLEL_RAD), known)
+
+
+def _interior_leads(problem: Problem, camera: str, positions: Indices, field: _Field) -> list[Lead]:
+    """x0', y0' and c of a camera."""
+    tilted = "add images tilted in different directions"
+    relief = "points at other heights" if field.known == "points" else "known points (X, Y, Z) at different heights"
+    for_point = f"{tilted}, or {relief}"
+    if field.known != "points" and not field.flat:
+        for_point = "add images turned by 180 degrees about their axes"
+    texts = (
+        (1, f"The principal point's x0' of camera {camera} can shift", "x0' (F7)", for_point),
+        (2, f"The principal point's y0' of camera {camera} can shift", "y0' (F8)", for_point),
+        (0, f"The principal distance of camera {camera} can change", "it (F9)", f"{tilted}, or {relief}"),
     )
-    texts += [
-        (
-            f"The distortion parameter {name} of camera {camera} cannot be told from the other unknowns.",
-            f"Fix {name} or give it a standard deviation, or spread the targets better over the frame.",
-        )
-        for name in parameter_names(problem.network.camera_by_name[camera].distortion.family)
-    ]
-    unit = np.zeros((len(positions), len(problem.unknowns)))
-    unit[np.arange(len(positions)), positions] = 1.0
     return [
-        Lead(1 if number < 3 else 2, functional, cause, remedy)
-        for number, (functional, (cause, remedy)) in enumerate(zip(unit, texts, strict=True))
+        Lead(2, _unit(problem, positions[number]), motion, given, field.because, None, otherwise)
+        for number, motion, given, otherwise in texts
     ]
+
+
+def _distortion_leads(problem: Problem, camera: str, positions: Indices) -> list[Lead]:
+    """The distortion parameters of a camera."""
+    names = parameter_names(problem.network.camera_by_name[camera].distortion.family)
+    return [
+        Lead(
+            3,
+            _unit(problem, position),
+            f"The distortion parameter {name} of camera {camera} can change",
+            name,
+            "the targets do not tell it from the other unknowns",
+            None,
+            "fix it, or spread the targets better over the frame",
+        )
+        for name, position in zip(names, positions, strict=True)
+    ]
+
+
+def _unit(problem: Problem, position: int) -> Array:
+    functional = np.zeros(len(problem.unknowns))
+    functional[position] = 1.0
+    return functional

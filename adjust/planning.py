@@ -9,12 +9,12 @@ from scipy.linalg import qr
 
 from adjust.adjustment import Options, adjust_problem, with_datum
 from adjust.cofactor import free_cofactor
-from adjust.diagnosis import null_vectors
 from adjust.elimination import Factor
 from adjust.errors import AdjustmentError
 from adjust.functions import blind_target, computed_observations
 from adjust.iteration import factorise, linearise
 from adjust.network import Approximations, Network
+from adjust.null_space import null_vectors
 from adjust.numbering import Numbering
 from adjust.problem import Problem, number
 from adjust.result import Adjustment, NullDirection

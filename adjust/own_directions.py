@@ -1,0 +1,100 @@
+"""What to say of an image or a point that its own observations do not determine, and of directions without a name."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.problem import Problem, State
+
+Array = NDArray[np.float64]
+
+IN_LINE = 1e-6  # width over length of marks in an image, and base over distance of stations, that are none
+SHOWN = 3  # names that are told one by one
+
+
+def own_sentence(problem: Problem, state: State, name: str) -> tuple[str, str]:
+    """Cause and remedy where the observations do not determine the image or the point that an unknown is of."""
+    kind, owner = name.rsplit(".", 1)[0].split(".", 1)
+    return _of_point(problem, state, owner) if kind == "PT" else _of_image(problem, owner)
+
+
+def _of_point(problem: Problem, state: State, point: str) -> tuple[str, str]:
+    position = problem.unknowns.point[point][0]
+    numbers = problem.image_numbers[(problem.places[:, 0] == position) & ~problem.is_fiducial]
+    images = _listed([problem.network.images[i].name for i in numbers])
+    stations = state.values[problem.exterior[numbers, :3]]
+    distances = np.linalg.norm(stations - state.values[problem.unknowns.point[point]], axis=1)
+    apart = np.linalg.norm(stations - stations[0], axis=1).max()
+    other = "give its coordinates, or leave it out."
+    if len(numbers) == 1:
+        cause = f"Only image {images} shows point {point}: one ray does not tell where on it the point lies."
+        return cause, f"Measure it in an image from another station, {other}"
+    if apart <= IN_LINE * distances.max():
+        cause = f"The images that show point {point} ({images}) were taken from one station: their rays are one ray."
+        return cause, f"Measure it in an image from another station, {other}"
+    cause = (
+        f"Point {point} lies in line with the stations of the images that show it ({images}): their rays are one ray."
+    )
+    return cause, f"Measure it in an image from a station off that line, {other}"
+
+
+def _of_image(problem: Problem, image: str) -> tuple[str, str]:
+    xy_mm = problem.network.observations.xy_mm
+    own = np.array(problem.network.observations.image) == image
+    why = [
+        f"all its {what} lie on one line"
+        for what, rows in (("targets", own & ~problem.is_fiducial), ("fiducial marks", own & problem.is_fiducial))
+        if rows.any() and _on_a_line(xy_mm[rows])
+    ]
+    cause = f"The marks of image {image} do not determine its own orientation and transformation"
+    where = "off that line" if why else "spread over the frame"
+    return (
+        f"{cause}{': ' if why else ''}{' and '.join(why)}.",
+        f"Measure more marks in this image, {where}, give its orientation in images.csv, or leave the image out.",
+    )
+
+
+def _on_a_line(xy_mm: Array) -> bool:
+    extents = np.linalg.svd(xy_mm - xy_mm.mean(axis=0), compute_uv=False)
+    return len(extents) < 2 or bool(extents[-1] <= IN_LINE * extents[0])
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - SHOWN
+    return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def unnamed_sentence(name: str, followers: str) -> tuple[str, str]:
+    """Cause and remedy of a direction that no lead names, after the unknown that moves most in it."""
+    owner, quantity = name.rsplit(".", 1)
+    kind, owner = owner.split(".", 1)
+    match kind:
+        case "EO":
+            return (
+                f"The exterior orientation of image {owner} can change ({quantity} most){followers}: too few known "
+                "points, or rays from other stations, hold it.",
+                "Measure known points in this image, take images from other stations that share its points, or give "
+                "its orientation with standard deviations in images.csv.",
+            )
+        case "PT":
+            return (
+                f"The object point {owner} can move ({quantity} most){followers}.",
+                "Measure it in more images, give its coordinates with standard deviations, or leave it out.",
+            )
+        case "FID":
+            camera, mark = owner.rsplit(".", 1)
+            return (
+                f"The fiducial mark {mark} of camera {camera} can move ({quantity} most){followers}.",
+                "Give it a standard deviation (F5, F6), or measure it in more images.",
+            )
+        case "T":
+            return (
+                f"The film transformation of image {owner} can change ({quantity} most){followers}.",
+                "Measure more fiducial marks in this image, or choose a transformation with fewer parameters.",
+            )
+        case _:
+            return (
+                f"The quantity {quantity} of camera {owner} can change{followers}.",
+                f"Give {quantity} a standard deviation, or fix it.",
+            )

@@ -1,0 +1,284 @@
+"""Networks that cannot be adjusted, or hardly: one for every row of the catalogue of null directions, and others.
+
+Each is simulated without errors, with its truth as approximations and, unless it says otherwise, with no prior on any
+fiducial, on c, x0', y0' (F5 to F9 dropped).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+from simulated import STATIONS, Truth, field_points, simulated
+
+from adjust.adjustment import Options
+from adjust.network import (
+    Approximations,
+    Camera,
+    Fiducial,
+    Network,
+    ObjectPoint,
+    Prior,
+    Transformation,
+)
+
+Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
+
+FREE = np.inf
+HEIGHT = 1500.0
+LEVEL_STATIONS = ((0.0, 0.0, HEIGHT), (500.0, 100.0, HEIGHT), (-480.0, 80.0, HEIGHT), (60.0, 520.0, HEIGHT))
+CONVERGENT = ((0.01, -0.02, 0.1), (-0.08, 0.36, 1.6), (-0.05, -0.29, 3.0), (-0.35, 0.03, -1.5))
+TILTED = (0.2, 0.1, 0.3)
+KNOWN, UNKNOWN, HEIGHTS = (0.0, 0.0, 0.0), (FREE, FREE, FREE), (FREE, FREE, 0.0)
+AXES = ("Shift x", "Shift y", "Rotation", "Scale")
+DEFORMATIONS = ("Affinity", "Shear")
+POINT = ("principal point's x0'", "principal point's y0'")
+DISTANCE = ("principal distance of camera K can change",)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a network is made of. sigma: of X, Y, Z of every point; prior: of c, x0', y0' and of all fiducials."""
+
+    attitudes: tuple[Triple, ...]
+    stations: tuple[Triple, ...] = STATIONS
+    relief: float = 200.0
+    sigma: Triple = KNOWN
+    prior: float = FREE
+    kind: Transformation = "affine"
+    points: Array | None = None
+    distortion: Mapping[str, float] = field(default_factory=dict)  # standard deviations; all values are 0
+    noise: bool = False
+
+    def network(self) -> tuple[Network, Approximations]:
+        """The network, and the truth as its approximations."""
+        parameters = dict.fromkeys(self.distortion, 0.0)
+        truth = Truth(
+            stations=self.stations,
+            attitudes=self.attitudes,
+            mirrored=(False,) * len(self.stations),
+            distortion=parameters,
+        )
+        points = self.points
+        if points is None:
+            points = field_points(np.random.default_rng(1), 14, relief=1.0) * [1.0, 1.0, self.relief]
+        rng = np.random.default_rng(0)
+        network, start = simulated(rng, truth, self.kind, points, 0.0, dict(self.distortion), self.noise)
+        exact = {
+            f"f{i}": np.array([*station, *attitude])
+            for i, (station, attitude) in enumerate(zip(self.stations, self.attitudes, strict=True))
+        }
+        network = replace(network, points=tuple(with_sigma(point, self.sigma) for point in network.points))
+        return with_prior(network, self.prior), replace(start, exterior=exact)
+
+
+def with_sigma(point: ObjectPoint, sigma: Triple) -> ObjectPoint:
+    x, y, z = (
+        None if prior is None else replace(prior, sigma=s)
+        for prior, s in zip((point.X, point.Y, point.Z), sigma, strict=True)
+    )
+    return replace(point, X=x, Y=y, Z=z)
+
+
+def with_prior(network: Network, sigma: float) -> Network:
+    """All of F5 to F9 with one standard deviation."""
+    return given(network, dict.fromkeys(("x", "y", "c", "x0", "y0"), sigma))
+
+
+def given(network: Network, sigmas: Mapping[str, float], marks: int | None = None) -> Network:
+    """Standard deviations for c, x0, y0 and for x and y of the first (None: all) fiducials, the others as they are."""
+    camera = network.cameras[0]
+    fiducials = {
+        id_: Fiducial(
+            replace(mark.x_mm, sigma=sigmas.get("x", mark.x_mm.sigma)),
+            replace(mark.y_mm, sigma=sigmas.get("y", mark.y_mm.sigma)),
+        )
+        for id_, mark in list(camera.fiducials.items())[:marks]
+    }
+    changed = Camera(
+        camera.name,
+        _given(camera.principal_distance_mm, sigmas.get("c")),
+        _given(camera.x0_mm, sigmas.get("x0")),
+        _given(camera.y0_mm, sigmas.get("y0")),
+        camera.distortion,
+        {**camera.fiducials, **fiducials},
+    )
+    return replace(network, cameras=(changed,))
+
+
+def _given(prior: Prior | None, sigma: float | None) -> Prior | None:
+    return prior if prior is None or sigma is None else replace(prior, sigma=sigma)
+
+
+def vertical(*kappas: float) -> tuple[Triple, ...]:
+    return tuple((0.0, 0.0, kappa) for kappa in kappas)
+
+
+def quarters(omega: float = 0.0, phi: float = 0.0, kappa: float = 0.0) -> tuple[Triple, ...]:
+    """Four images turned by 0, 90, 180 and 270 degrees about their common axis."""
+    return tuple((omega, phi, kappa + turn) for turn in (0.0, pi / 2, pi, -pi / 2))
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A network, what it is in words, the words of its null directions in order, and what mends which of them."""
+
+    title: str
+    setup: Setup
+    words: tuple[str, ...]
+    mended: Mapping[str, tuple[Setup, tuple[str, ...]]]
+    datum: str = "minimal"
+
+    @property
+    def options(self) -> Options:
+        return Options(datum="minimal" if self.datum == "minimal" else "control")
+
+
+def _more(setup: Setup, *attitudes: Triple) -> Setup:
+    """With further images, taken from stations of their own."""
+    further = ((-150.0, -520.0, 1450.0), (350.0, -380.0, 1550.0))[: len(attitudes)]
+    return replace(setup, stations=setup.stations + further, attitudes=setup.attitudes + attitudes)
+
+
+TILTS = ((0.3, 0.0, 0.4), (0.0, 0.33, -0.2))  # images tilted in different directions
+
+_flat = Setup(vertical(0.1, 1.6, 3.0, -1.5), relief=0.0)
+_tilted = Setup((TILTED,) * 4, relief=0.0)
+_two = Setup(((0.1, -0.3, 0.2), (-0.05, 0.35, 0.1)), STATIONS[:2], relief=0.0)
+_parallel = Setup(vertical(0.0, 0.0, 0.0, 0.0), sigma=UNKNOWN)
+_half_turned = Setup(vertical(0.0, pi, 0.0, pi), sigma=UNKNOWN)
+_turned = Setup(quarters(), sigma=UNKNOWN)
+_crosswise = Setup(quarters(), LEVEL_STATIONS, relief=0.0, sigma=HEIGHTS)
+_heights_parallel = Setup(vertical(0.0, 0.0, 0.0, 0.0), LEVEL_STATIONS, relief=0.0, sigma=HEIGHTS)
+_heights_relief = Setup(quarters(), sigma=HEIGHTS)
+_plane = Setup(CONVERGENT, relief=0.0, sigma=UNKNOWN)
+_pair = Setup(CONVERGENT[:2], STATIONS[:2], sigma=UNKNOWN)
+
+CATALOGUE: dict[str, Failure] = {
+    "known-flat-vertical": Failure(
+        "Known points, flat field, vertical images, any kappa",
+        _flat,
+        (*AXES, *POINT, *DISTANCE),
+        {
+            "add images tilted in different directions": (_more(_flat, *TILTS), POINT + DISTANCE),
+            "points at other heights": (replace(_flat, relief=200.0), POINT + DISTANCE),
+        },
+    ),
+    "known-flat-tilted": Failure(
+        "Known points, flat field, one tilted attitude for all images",
+        _tilted,
+        (*AXES, *DEFORMATIONS, *DISTANCE),
+        {
+            "images turned by 90 degrees about their axes": (
+                replace(_tilted, attitudes=quarters(*TILTED)),
+                DEFORMATIONS + DISTANCE,
+            ),
+            "tilted in different directions": (_more(_tilted, *TILTS), DEFORMATIONS + DISTANCE),
+            "points at other heights": (replace(_tilted, relief=200.0), DISTANCE),
+        },
+    ),
+    "known-flat-two": Failure(
+        "Known points, flat field, two convergent images",
+        _two,
+        (*AXES, "Affinity"),
+        {
+            "images turned by 90 degrees about their axes": (_more(_two, (-0.05, 0.35, 0.1 + pi / 2)), DEFORMATIONS),
+            "tilted in other directions": (_more(_two, TILTS[0]), DEFORMATIONS),
+        },
+    ),
+    "known-relief": Failure(
+        "Known points, three-dimensional field, even vertical images of one kappa",
+        Setup(vertical(0, 0, 0, 0)),
+        AXES,
+        {},
+    ),
+    "unknown-convergent": Failure("Unknown points, convergent images", Setup(CONVERGENT, sigma=UNKNOWN), AXES, {}),
+    "unknown-parallel": Failure(
+        "Unknown points, parallel axes, equal kappa",
+        _parallel,
+        (*AXES, *DEFORMATIONS, *POINT, *DISTANCE),
+        {
+            "images turned by 180 degrees about their axes": (
+                replace(_parallel, attitudes=vertical(0, pi, 0, 0)),
+                POINT,
+            ),
+            "images turned by 90 degrees about their axes": (
+                replace(_parallel, attitudes=vertical(0, pi / 2, 0, 0)),
+                DEFORMATIONS,
+            ),
+            "tilted in different directions": (_more(_parallel, *TILTS), DEFORMATIONS + POINT + DISTANCE),
+            "known points (X, Y, Z) at different heights": (
+                replace(_parallel, sigma=KNOWN),
+                DEFORMATIONS + POINT + DISTANCE,
+            ),
+        },
+    ),
+    "unknown-half-turned": Failure(
+        "Unknown points, parallel axes, kappa 0 and 180 degrees",
+        _half_turned,
+        (*AXES, *DEFORMATIONS, *DISTANCE),
+        {
+            "images turned by 90 degrees about their axes": (
+                replace(_half_turned, attitudes=vertical(0, pi, pi / 2, pi)),
+                DEFORMATIONS,
+            ),
+            "tilted in different directions": (_more(_half_turned, *TILTS), DEFORMATIONS + DISTANCE),
+        },
+    ),
+    "unknown-turned": Failure(
+        "Unknown points, vertical images, kappa spread, three-dimensional field",
+        _turned,
+        (*AXES, *DISTANCE),
+        {
+            "tilted in different directions": (_more(_turned, *TILTS), DISTANCE),
+            "known points (X, Y, Z) at different heights": (replace(_turned, sigma=KNOWN), DISTANCE),
+        },
+    ),
+    "heights-flat-crosswise": Failure(
+        "Only heights known, flat field, vertical images crosswise (Juhl)",
+        _crosswise,
+        (*AXES, *POINT, *DISTANCE),
+        {
+            "tilted in different directions": (_more(_crosswise, *TILTS), POINT + DISTANCE),
+            "known points (X, Y, Z) at different heights": (
+                replace(_crosswise, sigma=KNOWN, relief=200.0),
+                POINT + DISTANCE,
+            ),
+        },
+    ),
+    "heights-flat-parallel": Failure(
+        "Only heights known, flat field, parallel axes, equal kappa",
+        _heights_parallel,
+        (*AXES, *DEFORMATIONS, *POINT, *DISTANCE),
+        {
+            "images turned by 90 degrees about their axes": (
+                replace(_heights_parallel, attitudes=vertical(0, pi / 2, 0, 0)),
+                DEFORMATIONS,
+            ),
+            "tilted in different directions": (_more(_heights_parallel, *TILTS), POINT + DISTANCE),
+        },
+    ),
+    "heights-relief-crosswise": Failure(
+        "Only heights known, field with relief, vertical images crosswise",
+        _heights_relief,
+        (*AXES, *DISTANCE),
+        {
+            "tilted in different directions": (_more(_heights_relief, *TILTS), DISTANCE),
+            "known points (X, Y, Z) at different heights": (replace(_heights_relief, sigma=KNOWN), DISTANCE),
+        },
+    ),
+    "unknown-plane": Failure(
+        "Unknown points of a plane, four convergent images",
+        _plane,
+        (*AXES, "Affinity"),
+        {"tilted in other directions": (_more(_plane, (0.33, -0.2, 0.8)), DEFORMATIONS)},
+    ),
+    "unknown-pair": Failure(
+        "Unknown points, one convergent pair",
+        _pair,
+        (*AXES, *DEFORMATIONS, *DISTANCE),
+        {"tilted in different directions": (_more(_pair, TILTS[0]), DEFORMATIONS + DISTANCE)},
+    ),
+}

@@ -1,0 +1,75 @@
+"""The gallery of failures: every network of the catalogue, how many null directions, their words, and the remedies."""
+
+from collections.abc import Callable
+
+import pytest
+from gallery import AXES, CATALOGUE, DEFORMATIONS, given
+
+from adjust.adjustment import adjust
+from adjust.network import Network
+from adjust.result import Adjustment
+
+GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
+    "Shift x": [
+        ("x' of one fiducial mark (F5)", lambda network: given(network, {"x": 1.0}, 1)),
+        ("x0' (F7)", lambda network: given(network, {"x0": 1.0})),
+    ],
+    "Shift y": [
+        ("y' of one fiducial mark (F6)", lambda network: given(network, {"y": 1.0}, 1)),
+        ("y0' (F8)", lambda network: given(network, {"y0": 1.0})),
+    ],
+    "Rotation": [("one coordinate of a fiducial mark", lambda network: given(network, {"y": 1.0}, 1))],
+    "Scale": [("the principal distance (F9)", lambda network: given(network, {"c": 1.0}))],
+    "principal point's x0'": [("x0' (F7)", lambda network: given(network, {"x0": 1.0}))],
+    "principal point's y0'": [("y0' (F8)", lambda network: given(network, {"y0": 1.0}))],
+    "principal distance of camera K can change": [("it (F9)", lambda network: given(network, {"c": 1.0}))],
+}
+
+
+@pytest.mark.parametrize("name", list(CATALOGUE))
+def test_number_words_and_changes_of_the_network_that_mend_it(name: str) -> None:
+    failure = CATALOGUE[name]
+    result = adjust(*failure.setup.network(), failure.options)
+    assert result.termination == "singular"
+    assert len(result.singular) == len(failure.words)
+    for direction, words in zip(result.singular, failure.words, strict=True):
+        assert words in direction.cause
+        assert direction.remedy.startswith("Give a standard deviation to ")
+        assert direction.parameters
+
+    advised = " ".join(direction.remedy for direction in result.singular)
+    for words, (setup, gone) in failure.mended.items():
+        assert words in advised
+        mended = adjust(*setup.network(), failure.options)
+        assert not causes(mended, gone), words
+        assert len(mended.singular) < len(failure.words)
+
+
+@pytest.mark.parametrize("name", list(CATALOGUE))
+def test_each_prior_that_is_asked_for_ends_one_direction(name: str) -> None:
+    """The four of the camera's axes in two networks, all others in theirs."""
+    failure = CATALOGUE[name]
+    network, start = failure.setup.network()
+    alike = () if name in ("known-relief", "known-flat-vertical") else AXES
+    for direction in adjust(network, start, failure.options).singular:
+        if direction.cause.startswith(alike):
+            continue
+        for words, remedy in next((v for k, v in GIVEN.items() if k in direction.cause), []):
+            assert words in direction.remedy
+            mended = adjust(remedy(network), start, failure.options)
+            assert len(mended.singular) == len(failure.words) - 1, f"{words} against {direction.cause}"
+
+
+@pytest.mark.parametrize("name", ["known-relief", "known-flat-tilted", "known-flat-two"])
+def test_fiducials_with_priors_end_what_they_are_to_end(name: str) -> None:
+    """Two marks: shifts, rotation and scale; three: affinity and shear too."""
+    failure = CATALOGUE[name]
+    network, start = failure.setup.network()
+    for marks, gone in ((2, AXES), (3, AXES + DEFORMATIONS)):
+        mended = adjust(given(network, {"x": 1.0, "y": 1.0}, marks), start, failure.options)
+        assert not causes(mended, gone)
+
+
+def causes(result: Adjustment, words: tuple[str, ...]) -> list[str]:
+    """The causes that a result still tells, of those with some words."""
+    return [direction.cause for direction in result.singular if any(word in direction.cause for word in words)]
