@@ -52,6 +52,17 @@ class BlockFactors:
 
 
 @dataclass(frozen=True)
+class ReducedRows:
+    """Rows of b blocks as own (b, m, o) times quantities of unit covariance plus through (b, m, s) times the scaled
+    shared unknowns (b, s); these quantities are not correlated with each other nor with the shared unknowns.
+    """
+
+    own: Array
+    shared: Indices
+    through: Array
+
+
+@dataclass(frozen=True)
 class Factor:
     """The square root of the normal equations: the blocks' triangles, and that of the shared unknowns (s, s).
 
@@ -128,12 +139,16 @@ class Factor:
 
         The adjusted rows are the matrix times the unknowns.
         """
+        for rows in self.reduced_rows(blocks):
+            yield np.concatenate([rows.own, rows.through @ self.root_of(rows.shared)], axis=2)
+
+    def reduced_rows(self, blocks: Iterable[Blocks]) -> Iterator["ReducedRows"]:
+        """The adjusted rows of blocks that own and share what those factorised do, one after the other."""
         for rows, block in zip(blocks, self.blocks, strict=True):
             count = block.own.shape[1]
             matrix = rows.matrix / _columns(self.scale, rows)[:, None, :]
-            own, through = self._roots(block)
-            by_shared = matrix[..., :count] @ through + matrix[..., count:] @ self._root_of(block.shared)
-            yield np.concatenate([matrix[..., :count] @ own, by_shared], axis=2)
+            own = matrix[..., :count] @ np.linalg.inv(block.triangle)
+            yield ReducedRows(own, rows.shared, matrix[..., count:] - own @ block.border)
 
     @cached_property
     def shared_root(self) -> Array:
@@ -144,7 +159,7 @@ class Factor:
     def _shared_cofactor(self) -> Array:
         return self.shared_root @ self.shared_root.T
 
-    def _root_of(self, shared: Indices) -> Array:
+    def root_of(self, shared: Indices) -> Array:
         """Roots (b, s, k) of the cofactor matrices of blocks' shared unknowns (b, s), which are scaled."""
         if self.shared_count <= WIDE:
             return self.shared_root[shared]
@@ -154,7 +169,7 @@ class Factor:
     def _roots(self, block: BlockFactors) -> tuple[Array, Array]:
         """Roots of the own unknowns' cofactor matrix: for shared unknowns held fixed, and what these add."""
         own = np.asarray(np.linalg.inv(block.triangle), dtype=np.float64)
-        return own, -own @ (block.border @ self._root_of(block.shared))
+        return own, -own @ (block.border @ self.root_of(block.shared))
 
 
 def eliminate(

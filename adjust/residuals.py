@@ -1,42 +1,29 @@
-"""Residuals, redundancy numbers and standardised residuals, and their sums by group."""
+"""Residuals of the observations, and their sums by group."""
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.elimination import Factor
 from adjust.further_observations import square_sum
-from adjust.iteration import Linearised
-from adjust.numbering import Numbering
-from adjust.problem import Problem, State
+from adjust.problem import ABSENT, Problem, State
+from adjust.reliability import UNCHECKED, Misfits, redundancies, statistics
 from adjust.result import Cofactor, FurtherResidual, Group, Residuals
+from adjust.reweighting import Weighting
 from adjust.rows import prior_differences
+from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 
-UNCHECKED = 1e-9  # an observation of a smaller redundancy is not checked by any other
 UM_PER_MM = 1000.0
 
 
-def residuals(numbering: Numbering, end: Linearised, factor: Factor, covariance_mm2: Array) -> Residuals:
-    """The residuals with their redundancy numbers, the diagonal of Q_vv P (Förstner; Baarda's w = v / sigma_v).
-
-    With K = C A' L^-T and the whitened rows L^-1 B: Q_vv = K (I - L^-1 B C_xx B' L^-T) K'.
-    """
-    at, root = end.at, end.rows.root
-    roots = factor.row_roots(end.rows)
-    adjusted = np.empty((len(end.v_mm), 2, 2))
-    for touched, g in zip(numbering.touched, roots, strict=False):  # behind them stand further observations
-        pairs = g.reshape(*touched.rows.shape, 2, g.shape[2])
-        adjusted[touched.rows] = pairs @ pairs.swapaxes(2, 3)
-    k = np.linalg.solve(root, at.by_observation @ covariance_mm2).transpose(0, 2, 1)
-    cofactor = k @ (np.eye(2) - adjusted) @ k.transpose(0, 2, 1)
-    redundancy = np.einsum("nij,nji->ni", cofactor, np.linalg.inv(covariance_mm2))
-    variance = np.einsum("nii->ni", cofactor)
-    checked = redundancy > UNCHECKED
-    w = np.where(checked, end.v_mm / np.sqrt(np.where(checked, variance, 1.0)), 0.0)
-    return Residuals(end.v_mm, redundancy, w)
+def residuals(v_mm: Array, found: Misfits | None, weighting: Weighting) -> Residuals:
+    """The residuals of the observations with their redundancy numbers and standardised; found None: no solution."""
+    if found is None:
+        return Residuals(v_mm, np.zeros_like(v_mm), np.zeros_like(v_mm))
+    count = len(v_mm)
+    return Residuals(v_mm, redundancies(found)[:count], statistics(found, weighting.weights).w[:count])
 
 
 def further_residuals(problem: Problem, state: State, cofactor: Cofactor) -> Iterator[FurtherResidual]:
@@ -58,52 +45,57 @@ def further_residuals(problem: Problem, state: State, cofactor: Cofactor) -> Ite
 def groups(
     problem: Problem,
     state: State,
-    variances: Array,
-    observed: Residuals,
-    covariance_mm2: Array,
+    v_mm: Array,
+    found: Misfits | None,
+    weighting: Weighting,
     further: Sequence[FurtherResidual],
 ) -> dict[str, Group]:
-    """The groups of observations: target and fiducial in the comparator, and the priors; variances (n,) of all.
+    """The groups of observations: target, tie and fiducial in the comparator, and the priors.
 
     control: object coordinates, whose rms is in millionths of the object unit; datum: the fiducials' given places
     (F5, F6); interior: c, x0', y0' and distortion; exterior; and those of further observations. All behind datum have
-    no rms. target, fiducial and control are always there.
+    no rms. target, fiducial and control are always there. What the adjustment does without is in none of them.
     """
-    weighted = np.linalg.solve(covariance_mm2, observed.v_mm[..., None])[..., 0] * observed.v_mm
+    units = TestedUnits(problem)
     result = {}
-    for name, rows in (("target", ~problem.is_fiducial), ("fiducial", problem.is_fiducial)):
-        rms_um = UM_PER_MM * _rms(observed.v_mm[rows, 0]), UM_PER_MM * _rms(observed.v_mm[rows, 1])
-        result[name] = _group(float(weighted[rows].sum()), float(observed.redundancy[rows].sum()), *rms_um)
-    result.update(_prior_groups(problem, state, variances))
+    for name in ("target", "tie", "fiducial", "control", "datum", "interior", "exterior"):
+        members = (units.groups == name) & weighting.used
+        if not members.any() and name not in ("target", "fiducial", "control"):
+            continue
+        vpv, redundancy = group_sums(units, found, members) if found else (0.0, 0.0)
+        result[name] = _group(vpv, redundancy, *_rms_um(problem, state, v_mm, name, members))
     for name in dict.fromkeys(each.group for each in problem.further):
         vpv = square_sum(tuple(each for each in problem.further if each.group == name), state.values)
         result[name] = _group(vpv, sum(each.redundancy for each in further if each.group == name), 0.0, 0.0)
     return result
 
 
-def _prior_groups(problem: Problem, state: State, variances: Array) -> Iterator[tuple[str, Group]]:
-    unknowns = problem.unknowns
-    v = -prior_differences(problem, state)
-    given = np.where(unknowns.has_prior, unknowns.sigma, 1.0) ** 2
-    redundancy = 1.0 - variances / given
-    kinds = {"control": "PT.", "datum": "FID.", "interior": "IO.", "exterior": "EO."}
-    names = np.array(unknowns.names)
-    for group, prefix in kinds.items():
-        members = unknowns.has_prior & np.char.startswith(names, prefix)
-        if not members.any() and group != "control":
-            continue
-        rms = [0.0, 0.0]
-        if group in ("control", "datum"):
-            scale = 1e6 if group == "control" else UM_PER_MM
-            axes = ("X", "Y") if group == "control" else ("x", "y")
-            rms = [scale * _rms(v[members & np.char.endswith(names, f".{axis}")]) for axis in axes]
-        vpv = float((v[members] ** 2 / given[members]).sum())
-        yield group, _group(vpv, float(redundancy[members].sum()), *rms)
-
-
 def _group(vpv: float, redundancy: float, rms_x_um: float, rms_y_um: float) -> Group:
     sigma0 = float(np.sqrt(vpv / redundancy)) if redundancy > UNCHECKED else 0.0
     return Group(sigma0, rms_x_um, rms_y_um, redundancy)
+
+
+def group_sums(units: TestedUnits, found: Misfits, members: NDArray[np.bool_]) -> tuple[float, float]:
+    """v'Pv and redundancy of some of what is tested."""
+    vpv = float((found.residual[members] ** 2).sum())
+    # Behind a single coordinate stands a 1 in the hat matrix.
+    return vpv, float(2 * members.sum() - np.trace(found.hat[members], axis1=1, axis2=2).sum())
+
+
+def _rms_um(problem: Problem, state: State, v_mm: Array, group: str, members: NDArray[np.bool_]) -> tuple[float, float]:
+    """The rms of a group by axis, in um or in millionths of the object unit; 0 where units are mixed."""
+    count = len(v_mm)
+    if group in problem.network.observations.kind or group in ("target", "fiducial"):
+        v_um = UM_PER_MM * v_mm[members[:count]]
+        return _rms(v_um[:, 0]), _rms(v_um[:, 1])
+    if group not in ("control", "datum"):
+        return 0.0, 0.0
+    given = TestedUnits(problem).positions[members[count:]].ravel()
+    given = given[given != ABSENT]
+    names = np.array(problem.unknowns.names)[given]
+    v = (1e6 if group == "control" else UM_PER_MM) * prior_differences(problem, state)[given]
+    x, y = (".X", ".Y") if group == "control" else (".x", ".y")
+    return _rms(v[np.char.endswith(names, x)]), _rms(v[np.char.endswith(names, y)])
 
 
 def _rms(v: Array) -> float:

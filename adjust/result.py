@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.network import Network
+from adjust.tested import Tested
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -30,7 +31,7 @@ class Residuals:
     """One row an observation of the network, in its order.
 
     v_mm (n, 2): adjusted less observed comparator coordinates; redundancy (n, 2): redundancy numbers of x and y;
-    w (n, 2): standardised residuals v / sigma_v.
+    w (n, 2): standardised residuals, v / sigma_v where the two coordinates are not correlated (see `Reliability`).
     """
 
     v_mm: Array
@@ -83,6 +84,74 @@ class Cofactor(Protocol):
 
 
 @dataclass(frozen=True)
+class OuterEffect:
+    """What the worst undetected error does to a camera parameter.
+
+    effect: in the parameter's unit, of an error of the smallest detectable size in `cause`; in_sigmas: over the
+    parameter's a-priori standard deviation.
+    """
+
+    parameter: str
+    effect: float
+    in_sigmas: float
+    cause: str
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """How well the observations check each other: one row for everything that is tested.
+
+    All (N, 2) by coordinate; a quantity of one coordinate has zeros in the place of a second, and inf for errors. With
+    C the covariance given, v the residual, Q_v its cofactor matrix, P the inverse of C, h one coordinate:
+    redundancy: diagonal of Q_v P, with the weights that were used. w: h'P v / root(h'P Q_v P h), v / sigma_v where P is
+    diagonal; 0 where nothing checks the coordinate. tau: w / sigma0. smallest: the gross error that the test of the
+    coordinate detects with the probability `power`, delta0 / root(h'P Q_v P h), in mm, object units or rad; inf where
+    nothing checks it. effect: how far an undetected one moves any function of the unknowns at most, in its standard
+    deviations. (Baarda's inner and outer reliability.)
+    statistic (N,): v'P (P Q_v P)^- P v of all coordinates together, chi-square of `sizes` (N,); smallest_together (N,):
+    the gross error of a pair in its least favourable direction.
+    An observation that has lost weight is tested as it was given, against all the others with the weights that these
+    have left.
+    outer: one entry a free camera parameter; unchecked: what no other observation checks, left out there.
+    """
+
+    tested: tuple[Tested, ...]
+    redundancy: Array
+    w: Array
+    tau: Array
+    critical_tau: float
+    smallest: Array
+    effect: Array
+    statistic: Array
+    sizes: NDArray[np.intp]
+    smallest_together: Array
+    outer: tuple[OuterEffect, ...]
+    unchecked: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """An observation or given quantity that contradicts the others beyond chance, given the other suspects left out.
+
+    size: its coordinates that were tested together; statistic: chi-square with so many degrees of freedom; critical:
+    what chance reaches in 1 of 100 adjustments (`Probabilities.family`). w, tau: of its worst coordinate in the
+    adjustment as it stands; critical_tau: of tau. error: the gross error as the others see it, by coordinate, in mm,
+    object units or rad. alike: what could as well be wrong in its place. removed: the adjustment does without it.
+    """
+
+    tested: Tested
+    size: int
+    statistic: float
+    critical: float
+    w: float
+    tau: float
+    critical_tau: float
+    error: tuple[float, ...]
+    alike: tuple[str, ...]
+    removed: bool
+
+
+@dataclass(frozen=True)
 class Adjustment:
     """The result: values, covariance, residuals, and how it came about.
 
@@ -92,8 +161,10 @@ class Adjustment:
     that. Without a solution (termination "singular", "diverged") it is zero and means nothing.
     mirrored: the images whose scan is mirrored, as in `Approximations`.
     weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
-    variance_factors: the factors found for the variances of the groups "target" and "fiducial", where asked for.
     further: the residuals of distances and the like.
+    variance_factors: the factors found for the variances of groups, where asked for; variance_sigmas: their standard
+    deviations.
+    reliability: None where there is no solution. suspects: the worst first.
     """
 
     network: Network
@@ -115,6 +186,9 @@ class Adjustment:
     weights: Array = field(default_factory=lambda: np.empty(0))
     variance_factors: Mapping[str, float] = field(default_factory=dict)
     further: tuple[FurtherResidual, ...] = ()
+    variance_sigmas: Mapping[str, float] = field(default_factory=dict)
+    reliability: Reliability | None = None
+    suspects: tuple[Suspect, ...] = ()
 
     @property
     def converged(self) -> bool:

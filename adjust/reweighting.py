@@ -1,64 +1,93 @@
-"""What changes the weights between adjustments: robust estimation and variance components."""
+"""What changes the weights between adjustments: robust estimation, variance components, observations taken out."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem import Problem
-from adjust.result import Residuals
+from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
-HUBER = 2.0  # standardised length of a residual pair, per axis, from which on a mark loses weight
-MEDIAN_LENGTH = np.sqrt(np.log(2.0))  # the median of that length for normally distributed errors
-STANDSTILL = 1e-3  # relative change of weights or variances that is none
-CHECKED = 1e-6  # redundancy below which nothing checks a mark
-LEAST_REDUNDANCY = 1.0  # a group with less redundancy keeps its variance
+WeightFunction = Literal["huber", "igg3"]
+
+STANDARD = 2.0  # standardised length of a contradiction, per coordinate, from which on an observation loses weight
+LOST = 6.0  # ... and from which on the redescending function leaves it none
+MEDIAN_LENGTH = np.sqrt(np.log(2.0))  # the median of that length for a pair of normally distributed errors
+STANDSTILL = 1e-3  # change of a weight, or relative change of a variance, that is none
+NO_WEIGHT = 1e-12  # stands for none: what has no more than this has no influence and is no observation
 
 
 @dataclass(frozen=True)
 class Weighting:
-    """Factors on the given covariances: weights (n,) of robust estimation, variance factors of the two groups."""
+    """Factors on what is given: weights (N,) of everything that is tested, variance factors by group."""
 
     weights: Array
-    target: float = 1.0
-    fiducial: float = 1.0
+    factors: Mapping[str, float] = field(default_factory=dict)
 
-    def covariance(self, problem: Problem) -> Array:
-        """The covariances (n, 2, 2) in mm² that an adjustment is to use."""
-        group = np.where(problem.is_fiducial, self.fiducial, self.target)
-        return problem.network.observations.covariance_mm2 * (group / self.weights)[:, None, None]
+    def applied(self, problem: Problem) -> tuple[Problem, Array]:
+        """The problem with the standard deviations of its priors, and the covariances (n, 2, 2) in mm², to be used."""
+        units = TestedUnits(problem)
+        count = len(problem.network.observations)
+        variance = self.variances(units)
+        sigma = problem.unknowns.sigma.copy()
+        for pair, factor in zip(units.positions.T, np.sqrt(np.tile(variance[count:], (2, 1))), strict=True):
+            sigma[pair[pair >= 0]] *= factor[pair >= 0]
+        covariance = problem.network.observations.covariance_mm2 * variance[:count, None, None]
+        if (variance[count:] == 1.0).all():
+            return problem, covariance
+        return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma)), covariance
+
+    def variances(self, units: TestedUnits) -> Array:
+        """(N,) the factors on the given variances."""
+        by_group = np.ones(len(units))
+        for group, factor in self.factors.items():
+            by_group[units.groups == group] = factor
+        return by_group / self.weights
 
     def differs(self, other: "Weighting") -> bool:
         """Whether another weighting is another one."""
-        here = np.array([*self.weights, self.target, self.fiducial])
-        there = np.array([*other.weights, other.target, other.fiducial])
+        here, there = (np.array(list(each.factors.values())) for each in (self, other))
+        if (np.abs(self.weights - other.weights) > STANDSTILL).any() or len(here) != len(there):
+            return True
         return bool((np.abs(here - there) > STANDSTILL * there).any())
 
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(N,) what takes part."""
+        return np.asarray(self.weights > NO_WEIGHT)
 
-def robust_weights(covariance_mm2: Array, result: Residuals, weights: Array) -> Array:
-    """Huber's weights (n,) of marks: 1, or HUBER over the standardised length t of the residual where that is larger.
 
-    t² = v'Pv / r, with P before any reduction and r the mark's redundancy (0 to 2), over the square of the scale that
-    the median of all t gives: t² is 1 on the average. A mark without redundancy keeps its weight. Source: P. J. Huber,
-    Robust Statistics, 1981.
+def robust_weights(statistic: Array, sizes: Indices, observed: int, function: WeightFunction) -> Array:
+    """Weights (N,) by what everything contradicts the others by.
+
+    t² = statistic / sizes is the square of a standardised length per coordinate, 1 on the average: the statistic is
+    that of the observation as it was given, redundancy and all, so that one with leverage is not spared. In images,
+    the first `observed` ones, t is over the scale that their median gives. With k = 2 and K = 6:
+
+    huber: 1, and k / t from k on. A gross error keeps the influence of one of k sigma. (P. J. Huber, Robust
+    Statistics, 1981.)
+    igg3: the same times ((K - t) / (K - k))² from k on, and nothing from K on: gross errors have no influence at all,
+    good observations keep their whole weight. (Y. Yang, L. Song, T. Xu, Robust estimator for correlated observations
+    based on bifactor equivalent weights, Journal of Geodesy 76, 2002.)
+
+    What nothing checks keeps its weight.
     """
-    full = covariance_mm2 * weights[:, None, None]
-    vpv = (np.linalg.solve(full, result.v_mm[..., None])[..., 0] * result.v_mm).sum(axis=1)
-    redundancy = result.redundancy.sum(axis=1)
-    checked = redundancy > CHECKED
-    t = np.sqrt(vpv[checked] / redundancy[checked])
+    checked = sizes > 0
+    t = np.sqrt(statistic / np.maximum(sizes, 1))
+    t[:observed] /= robust_scale(statistic[:observed], sizes[:observed])
+    weights = STANDARD / np.maximum(t, STANDARD)
+    if function == "igg3":
+        weights *= np.clip((LOST - t) / (LOST - STANDARD), 0.0, 1.0) ** 2
+    return np.where(checked, np.maximum(weights, NO_WEIGHT), 1.0)
+
+
+def robust_scale(statistic: Array, sizes: Indices) -> float:
+    """The standard deviation of unit weight that the median of pairs' statistics gives; 1 where there is none."""
+    t = np.sqrt(statistic[sizes == 2] / 2.0)
     scale = float(np.median(t)) / MEDIAN_LENGTH if len(t) else 0.0
-    reduced = np.ones(len(weights))
-    if scale > 0.0:
-        reduced[checked] = HUBER / np.maximum(t / scale, HUBER)
-    return reduced
-
-
-def variance_factor(covariance_mm2: Array, result: Residuals, members: NDArray[np.bool_]) -> float:
-    """v'Pv over the redundancy of a group, the factor that its variances lack (Förstner's estimate)."""
-    v = result.v_mm[members]
-    vpv = (np.linalg.solve(covariance_mm2[members], v[..., None])[..., 0] * v).sum()
-    redundancy = result.redundancy[members].sum()
-    return float(vpv / redundancy) if redundancy > LEAST_REDUNDANCY and vpv > 0.0 else 1.0
+    return scale if scale > 0.0 else 1.0

@@ -1,0 +1,79 @@
+"""How to adjust."""
+
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from adjust.probabilities import Probabilities
+from adjust.reweighting import WeightFunction
+from adjust.tested import PRIOR_GROUPS
+
+Datum = Literal["control", "minimal", "free"]
+Method = Literal["combined", "elements"]
+
+MEASURED_KINDS = ("target", "tie", "fiducial")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to adjust.
+
+    datum: "control", what is given of points and stations and nothing else; "minimal", as many coordinates fixed as
+    these leave free; "free", inner constraints over points of which nothing is given.
+    datum_coordinates: those that "minimal" fixes, at their given values: "12.X" and so on; none: chosen automatically.
+    datum_points: the points that carry the inner constraints of "free"; none: all.
+    robust: what contradicts the others loses weight, "huber" (or True) some and "igg3" at last all; see
+    `robust_weights`. snooping: what contradicts the others beyond chance is taken out; see `adjust.snooping`.
+    variance_components: the variances of groups are each multiplied by what their residuals say: True for targets, tie
+    points and fiducials in the images, or names of groups (see `Group`).
+    probabilities: of the tests.
+    method: "combined", the strict combined model (Gauss-Helmert); "elements", Torlegård's adjustment by elements, which
+    takes the distortion at the observed point: the same as long as distortion changes little over a residual, and what
+    programs do that correct the measured points first.
+    """
+
+    datum: Datum = "control"
+    datum_coordinates: tuple[str, ...] = ()
+    datum_points: tuple[str, ...] = ()
+    robust: bool | WeightFunction = False
+    variance_components: bool | tuple[str, ...] = False
+    iteration_limit: int = 50
+    snooping: bool = False
+    method: Method = "combined"
+    probabilities: Probabilities = field(default_factory=Probabilities)
+
+    def __post_init__(self) -> None:
+        if self.datum not in get_args(Datum):
+            raise ValueError(f"the datum must be one of {', '.join(get_args(Datum))}, not {self.datum}")
+        if self.method not in get_args(Method):
+            raise ValueError(f"the method must be one of {', '.join(get_args(Method))}, not {self.method}")
+        for key, datum in (("datum_coordinates", "minimal"), ("datum_points", "free")):
+            if getattr(self, key) and self.datum != datum:
+                raise ValueError(f'{key} is for the datum "{datum}", not for "{self.datum}"')
+        if self.iteration_limit < 1:
+            raise ValueError(f"the iteration limit must be at least 1, not {self.iteration_limit}")
+        if self.robust not in (True, False, *get_args(WeightFunction)):
+            raise ValueError(
+                f"robust must be True, False or one of {', '.join(get_args(WeightFunction))}, not {self.robust}"
+            )
+        if self.robust and self.snooping:
+            raise ValueError("robust estimation and data snooping both take out gross errors: choose one of them")
+        strangers = sorted(set(self.groups) - {*MEASURED_KINDS, *PRIOR_GROUPS})
+        if strangers:
+            raise ValueError(
+                f"there is no group {', '.join(strangers)}: variance components are those of "
+                f"{', '.join((*MEASURED_KINDS, *PRIOR_GROUPS))}"
+            )
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups whose variance components are to be estimated."""
+        if isinstance(self.variance_components, bool):
+            return MEASURED_KINDS if self.variance_components else ()
+        return self.variance_components
+
+    @property
+    def weight_functions(self) -> tuple[WeightFunction, ...]:
+        """Of robust estimation, one after the other: the redescending one begins where the convex one ends."""
+        if not self.robust:
+            return ()
+        return ("huber", "igg3") if self.robust == "igg3" else ("huber",)

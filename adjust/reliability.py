@@ -1,0 +1,260 @@
+"""Redundancy, test statistics, smallest detectable errors and their effect (Baarda's inner and outer reliability).
+
+Everything that is tested is brought to unit weight: with C the covariance that the adjustment used, T'T = C^-1 and
+H = T B C_xx B' T' (the hat matrix), its residuals T v have the cofactor matrix I - H. What it contradicts the others by
+is d = -(I - H)^-1 T v, and the cofactor matrix of d is (I - H)^-1 = I + H (I - H)^-1: its own and that of the others'
+prediction. Where the adjustment used a weight p times that given, its own is p I in the given weight.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.elimination import Blocks, Factor
+from adjust.iteration import Linearised
+from adjust.numbering import Numbering
+from adjust.probabilities import Probabilities
+from adjust.problem import ABSENT, Problem
+from adjust.result import OuterEffect, Reliability
+from adjust.rows import prior_differences
+from adjust.tested import Tested, TestedUnits
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+UNCHECKED = 1e-9  # an observation of a smaller redundancy is not checked by any other
+UNCONTROLLED = 1e-4  # below this an error must be hundreds of standard deviations to be seen: told apart from the rest
+
+
+@dataclass(frozen=True)
+class UnitRows:
+    """The rows T B of what is tested, in b blocks of equal shape, reduced to the shared unknowns (see `ReducedRows`).
+
+    units (b, u): their numbers, ABSENT for rows that are none. own (b, u, 2, o), through (b, u, 2, s): a pair of rows
+    each, zeros behind a single one. shared (b, s).
+    """
+
+    units: Indices
+    own: Array
+    shared: Indices
+    through: Array
+
+
+@dataclass(frozen=True)
+class Misfits:
+    """All that is tested, in unit weight: T, H (N, 2, 2), T v (N, 2); behind a single coordinate H is 1, T and v 0."""
+
+    transform: Array
+    hat: Array
+    residual: Array
+
+
+def misfits(numbering: Numbering, end: Linearised, factor: Factor) -> Misfits:
+    """Residuals and hat matrices of everything that is tested."""
+    units = TestedUnits(numbering.problem)
+    transform = _transforms(numbering.problem, end, units)
+    hat = np.zeros((len(units) + 1, 2, 2))  # the last stands for ABSENT
+    for rows in unit_rows(numbering, end, factor):
+        roots = np.concatenate([rows.own, rows.through @ factor.root_of(rows.shared)[:, None]], axis=3)
+        hat[rows.units] = roots @ roots.swapaxes(2, 3)
+    hat = hat[:-1]
+    hat[units.sizes == 1, 1, 1] = 1.0
+    v = np.zeros((len(units), 2))
+    v[: len(end.v_mm)] = end.v_mm
+    v[len(end.v_mm) :] = -_of_pairs(units, prior_differences(numbering.problem, end.state))
+    return Misfits(transform, hat, (transform @ v[..., None])[..., 0])
+
+
+def unit_rows(numbering: Numbering, end: Linearised, factor: Factor) -> Iterator[UnitRows]:
+    """The rows of everything that is tested: block by block, its own unknowns' priors behind; then the shared ones'."""
+    units = TestedUnits(numbering.problem)
+    unit_of = _prior_units(numbering, units)
+    touched = numbering.touched
+    with_priors = (
+        _with_own_priors(numbering, block) if i < len(touched) else block for i, block in enumerate(end.rows)
+    )
+    for block, rows in zip(touched, factor.reduced_rows(with_priors), strict=False):  # behind: further observations
+        own_units = np.concatenate([block.rows, unit_of[block.own]], axis=1)
+        pairs = (*own_units.shape, 2)
+        own = rows.own.reshape(*pairs, rows.own.shape[2])
+        yield UnitRows(own_units, own, rows.shared, rows.through.reshape(*pairs, rows.through.shape[2]))
+    shared = numbering.numbers[units.positions]
+    given = np.flatnonzero(shared[:, 0] < factor.shared_count)
+    shared = np.where(shared[given] == ABSENT, 0, shared[given])
+    weights = -_of_pairs(units, _prior_root_weights(numbering.problem))[given] / factor.scale[shared]
+    through = weights[:, :, None] * np.eye(2)
+    nothing = np.zeros((len(given), 1, 2, 0))
+    yield UnitRows(len(end.v_mm) + given[:, None], nothing, shared, through[:, None])
+
+
+def _prior_units(numbering: Numbering, units: TestedUnits) -> Indices:
+    """(f,) the unit that tests the prior of a free unknown alone, ABSENT where there is none."""
+    unit_of = np.full(len(numbering.free), ABSENT, dtype=np.intp)
+    alone = np.flatnonzero(units.positions[:, 1] == ABSENT)
+    observed = len(units) - len(units.positions)
+    unit_of[numbering.numbers[units.positions[alone, 0]]] = observed + alone
+    return unit_of
+
+
+def _with_own_priors(numbering: Numbering, blocks: Blocks) -> Blocks:
+    """Blocks with the priors of their own unknowns behind: a pair of rows each, of which the second is zero."""
+    count, width = blocks.own.shape
+    weights = _prior_root_weights(numbering.problem)[numbering.free]
+    rows = np.zeros((count, width, 2, blocks.matrix.shape[2]))
+    rows[:, np.arange(width), 0, np.arange(width)] = -weights[blocks.own]
+    matrix = np.concatenate([blocks.matrix, rows.reshape(count, 2 * width, -1)], axis=1)
+    return replace(blocks, matrix=matrix)
+
+
+def _prior_root_weights(problem: Problem) -> Array:
+    """One over the standard deviation of every prior (n,), 0 where there is none."""
+    unknowns = problem.unknowns
+    return np.where(unknowns.has_prior, 1.0 / np.where(unknowns.has_prior, unknowns.sigma, 1.0), 0.0)
+
+
+def _of_pairs(units: TestedUnits, values: Array) -> Array:
+    """Values (n,) of unknowns as (m, 2) of the priors that are tested, 0 for what is absent."""
+    return np.append(values, 0.0)[units.positions]
+
+
+def _transforms(problem: Problem, end: Linearised, units: TestedUnits) -> Array:
+    transform = np.zeros((len(units), 2, 2))
+    transform[: len(end.v_mm)] = np.linalg.solve(end.rows.root, end.at.by_observation)
+    transform[len(end.v_mm) :, [0, 1], [0, 1]] = _of_pairs(units, _prior_root_weights(problem))
+    return transform
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """The tests of all units as they were given: see `Reliability`.
+
+    discrepancy_weight (N, 2, 2): P Q_v P, the inverse of the cofactor matrix of what a unit contradicts the others by;
+    error (N, 2): that contradiction, the gross error as the others see it.
+    """
+
+    w: Array
+    statistic: Array
+    sizes: Indices
+    discrepancy_weight: Array
+    error: Array
+    checked: NDArray[np.bool_]
+
+
+def statistics(misfits: Misfits, weights: Array) -> Statistics:
+    """The test statistics of all units, weights (N,) the parts of the given weights that the adjustment used."""
+    adjusted, axes = np.linalg.eigh(misfits.hat)
+    free = np.clip(1.0 - adjusted, 0.0, None)
+    of_given = weights[:, None] * free + adjusted
+    along = (axes.transpose(0, 2, 1) @ misfits.residual[..., None])[..., 0]
+    seen = free > UNCHECKED
+    squares = np.where(seen, along**2 / np.where(seen, free * of_given, 1.0), 0.0)
+    inward = misfits.transform.transpose(0, 2, 1) @ axes
+    weight = (inward * (free / of_given)[:, None, :]) @ inward.transpose(0, 2, 1)
+    pull = (inward @ (along / of_given)[..., None])[..., 0]
+    own_weight = np.einsum("nki,nki->ni", misfits.transform, misfits.transform) / weights[:, None]
+    variance = np.einsum("nii->ni", weight)
+    checked = variance > UNCHECKED * own_weight
+    w = np.where(checked, pull / np.sqrt(np.where(checked, variance, 1.0)), 0.0)
+    contradiction = (axes @ np.where(seen, -along / np.where(seen, free, 1.0), 0.0)[..., None])[..., 0]
+    back = np.linalg.pinv(misfits.transform)
+    error = (back @ contradiction[..., None])[..., 0]
+    return Statistics(w, squares.sum(axis=1), seen.sum(axis=1), weight, error, checked)
+
+
+def redundancies(misfits: Misfits) -> Array:
+    """The diagonal (N, 2) of Q_v P; its sum is the redundancy of the adjustment."""
+    back = np.linalg.pinv(misfits.transform)
+    return np.asarray(np.einsum("nij,njk,nki->ni", back, np.eye(2) - misfits.hat, misfits.transform))
+
+
+def reliability(
+    numbering: Numbering,
+    end: Linearised,
+    factor: Factor,
+    found: Misfits,
+    weights: Array,
+    sigma0: float,
+    redundancy: int,
+    probabilities: Probabilities,
+) -> Reliability:
+    """Tests of all observations and given quantities, and what they would not show."""
+    units = TestedUnits(numbering.problem)
+    tested = units.named()
+    tests = statistics(found, weights)
+    variance = np.einsum("nii->ni", tests.discrepancy_weight)
+    smallest = _over(probabilities.noncentrality(1), variance, tests.checked)
+    hidden = np.einsum("nki,nkl,nli->ni", found.transform, found.hat, found.transform)
+    effect = np.where(tests.checked, np.where(tests.checked, smallest, 0.0) * np.sqrt(hidden), np.inf)
+    effect[(units.sizes == 1), 1] = 0.0
+    least = np.asarray(np.linalg.eigvalsh(tests.discrepancy_weight)[:, 0], dtype=np.float64)
+    both = np.asarray(tests.checked.all(axis=1))
+    together = np.where(both, _over(probabilities.noncentrality(2), least, both), smallest.min(axis=1))
+    own_weight = np.einsum("nki,nki->ni", found.transform, found.transform) / weights[:, None]
+    controlled = variance > UNCONTROLLED * own_weight
+    outer = _outer(numbering, end, factor, found, np.where(controlled, smallest, 0.0), tested)
+    uncontrolled = zip(*np.nonzero(~controlled & (np.arange(2) < units.sizes[:, None])), strict=True)
+    return Reliability(
+        tested=tested,
+        redundancy=redundancies(found),
+        w=tests.w,
+        tau=tests.w / sigma0 if sigma0 > 0.0 else np.zeros_like(tests.w),
+        critical_tau=probabilities.critical_tau(redundancy),
+        smallest=smallest,
+        effect=effect,
+        statistic=tests.statistic,
+        sizes=tests.sizes,
+        smallest_together=together,
+        outer=outer,
+        unchecked=tuple(tested[i].coordinate_name(axis) for i, axis in uncontrolled),
+    )
+
+
+def _over(shift: float, variance: Array, checked: NDArray[np.bool_]) -> Array:
+    return np.where(checked, shift / np.sqrt(np.where(checked, variance, 1.0)), np.inf)
+
+
+def _outer(
+    numbering: Numbering,
+    end: Linearised,
+    factor: Factor,
+    found: Misfits,
+    errors: Array,
+    tested: tuple[Tested, ...],
+) -> tuple[OuterEffect, ...]:
+    """The largest effect of any of the errors (N, 2), one at a time, on every free camera parameter.
+
+    dx = C_xx B' T' T h times the error; the columns of T B R that a block has for itself meet none of the cameras'.
+    """
+    unknowns = numbering.problem.unknowns
+    cameras = np.concatenate([*unknowns.camera.values(), *unknowns.fiducial.values()]).astype(np.intp)
+    free = numbering.free[: factor.shared_count]
+    members = np.flatnonzero(np.isin(free, cameras))
+    of_cameras = factor.shared_root[members] / factor.scale[members, None]
+    by_shared = factor.shared_root @ of_cameras.T
+    largest = np.zeros(len(members))
+    causes = np.full((len(members), 2), ABSENT)
+    turned = np.append(found.transform * errors[:, None, :], np.zeros((1, 2, 2)), axis=0)  # the last is of ABSENT
+    for rows in unit_rows(numbering, end, factor):
+        moved = rows.through @ by_shared[rows.shared][:, None]
+        effects = -(turned[rows.units].swapaxes(2, 3) @ moved).reshape(2 * rows.units.size, len(members))
+        if len(effects) == 0:
+            continue
+        worst = np.abs(effects).argmax(axis=0)
+        values = effects[worst, np.arange(len(members))]
+        larger = np.abs(values) > np.abs(largest)
+        largest[larger] = values[larger]
+        causes[larger] = np.column_stack([rows.units.ravel()[worst // 2], worst % 2])[larger]
+    sigma = np.sqrt((of_cameras**2).sum(axis=1))
+    return tuple(
+        OuterEffect(
+            unknowns.names[position],
+            float(value),
+            float(abs(value) / s),
+            tested[cause[0]].coordinate_name(cause[1]) if cause[0] != ABSENT else "",
+        )
+        for position, value, s, cause in sorted(
+            zip(free[members], largest, sigma, causes, strict=True), key=lambda entry: int(entry[0])
+        )
+    )

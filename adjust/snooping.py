@@ -1,0 +1,217 @@
+"""Data snooping: which observations and given quantities contradict the others.
+
+One after the other, the worst first, each tested as if those before it were not there; and every one of these anew as
+if the later ones were not there, so that two errors neither hide each other nor make good observations suspect. This is
+done in the linear model of one adjustment, whose residuals T v and cofactor matrix V = I - T B C_xx B' T', all of unit
+weight, tell what any of them would be without some of the observations (Baarda's data snooping, with the forward and
+backward steps of a regression).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.elimination import Factor
+from adjust.iteration import Linearised
+from adjust.numbering import Numbering
+from adjust.probabilities import Probabilities
+from adjust.reliability import UNCHECKED, Misfits, statistics, unit_rows
+from adjust.result import Reliability, Suspect
+from adjust.reweighting import Weighting, robust_scale
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+TOLD_APART = 7.0  # difference of two statistics from which on one explanation is clearly the better: odds of 30 to 1
+ALIKE_SHOWN = 3
+AT_ONCE = 20  # columns of the residuals' cofactor matrix that are made in one pass
+MOST_SUSPECT = 0.25  # part of all that is tested: where more contradicts the rest, who is to say which
+
+
+@dataclass(frozen=True)
+class Search:
+    """The tests of one adjustment, and what is out of question: see `search`.
+
+    found: residuals and hat matrices. limits (N,): what chance lets the statistics reach, those of a network whose
+    observations are worse than given raised by the scale of their median.
+    """
+
+    numbering: Numbering
+    end: Linearised
+    factor: Factor
+    found: Misfits
+    weighting: Weighting
+    limits: Array
+
+
+def search(
+    numbering: Numbering, end: Linearised, factor: Factor, found: Misfits, weighting: Weighting,
+    probabilities: Probabilities,
+) -> Search:  # fmt: skip
+    """The tests of an adjustment with their limits."""
+    tests = statistics(found, weighting.weights)
+    count = int((tests.sizes > 0).sum())
+    observed = len(end.v_mm)
+    scale = max(1.0, robust_scale(tests.statistic[:observed], tests.sizes[:observed]))
+    limits = np.where(tests.sizes > 0, probabilities.critical(tests.sizes, count) * scale**2, np.inf)
+    return Search(numbering, end, factor, found, weighting, limits)
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A unit that contradicts the others, the other such units left out.
+
+    error (2,): the gross error as the others see it. alike: units that explain the contradiction as well.
+    """
+
+    unit: int
+    statistic: float
+    error: Array
+    alike: tuple[int, ...]
+
+
+def contradictions(search: Search) -> list[Contradiction]:
+    """What contradicts the others beyond its limit, in the order in which it was found."""
+    covariance = _Covariance(search)
+    most = int(MOST_SUSPECT * len(search.limits))
+    chosen: list[int] = []
+    for _ in range(2 * most):
+        statistic = _without(search, covariance, chosen)
+        worst = int(np.argmax(statistic / search.limits))
+        if statistic[worst] <= search.limits[worst] or len(chosen) == most:
+            break
+        chosen.append(worst)
+        cleared = [unit for unit in _cleared(search, covariance, chosen) if unit != worst]
+        chosen = [unit for unit in chosen if unit not in cleared]
+    return [_contradiction(search, covariance, chosen, unit) for unit in chosen]
+
+
+class _Covariance:
+    """Columns of V, made when they are asked for and many at a time, for each costs a pass over all blocks."""
+
+    def __init__(self, search: Search) -> None:
+        self._search = search
+        self._columns: dict[int, Array] = {}
+
+    def columns(self, units: Sequence[int]) -> Array:
+        """(N, 2, 2 k) of some units."""
+        missing = [unit for unit in units if unit not in self._columns]
+        if missing:
+            self._columns |= _columns(self._search, self._likely(missing))
+        size = len(self._search.limits)
+        return np.concatenate([np.zeros((size, 2, 0)), *(self._columns[unit] for unit in units)], axis=2)
+
+    def _likely(self, missing: list[int]) -> list[int]:
+        tests = statistics(self._search.found, self._search.weighting.weights)
+        worst = np.argsort(-tests.statistic / self._search.limits)[:AT_ONCE]
+        return [*missing, *(int(unit) for unit in worst if unit not in self._columns and unit not in missing)]
+
+
+def _columns(search: Search, units: Sequence[int]) -> dict[int, Array]:
+    """The columns (N, 2, 2) of V of some units."""
+    homes: dict[int, tuple[int, int, Array, Array]] = {}  # what holds the unit's block, which it is there, own rows,
+    root = search.factor.shared_root  # and the covariances of its rows with the shared unknowns
+    for part, rows in enumerate(unit_rows(search.numbering, search.end, search.factor)):
+        for block, place in np.argwhere(np.isin(rows.units, units)):
+            by_shared = root @ (root[rows.shared[block]].T @ rows.through[block, place].T)
+            homes[int(rows.units[block, place])] = (part, int(block), rows.own[block, place], by_shared)
+    columns = {unit: np.zeros((len(search.limits) + 1, 2, 2)) for unit in units}  # the last stands for ABSENT
+    for part, rows in enumerate(unit_rows(search.numbering, search.end, search.factor)):
+        for unit, (home, block, own, by_shared) in homes.items():
+            columns[unit][rows.units] = -(rows.through @ by_shared[rows.shared][:, None])
+            if part == home:
+                columns[unit][rows.units[block]] -= rows.own[block] @ own.T
+    columns = {unit: of_unit[:-1] for unit, of_unit in columns.items()}
+    for unit in units:
+        columns[unit][unit] = np.eye(2) - search.found.hat[unit]
+    return columns
+
+
+def _without(search: Search, covariance: _Covariance, left_out: Sequence[int]) -> Array:
+    """The statistics (N,) as they would be without some units; 0 for these."""
+    residual, cofactor = search.found.residual, np.eye(2) - search.found.hat
+    if left_out:
+        columns = covariance.columns(left_out)
+        inverse = _inverse(columns[left_out].reshape(2 * len(left_out), -1))
+        through = columns @ inverse
+        residual = residual - through @ residual[left_out].ravel()
+        cofactor = cofactor - through @ columns.transpose(0, 2, 1)
+    variance, axes = np.linalg.eigh(cofactor)
+    along = (axes.transpose(0, 2, 1) @ residual[..., None])[..., 0]
+    seen = variance > UNCHECKED
+    statistic: Array = np.where(seen, along**2 / np.where(seen, variance, 1.0), 0.0).sum(axis=1)
+    statistic[left_out] = 0.0
+    return statistic
+
+
+def _inverse(cofactor: Array) -> Array:
+    """The inverse, what nothing checks left out."""
+    variance, axes = np.linalg.eigh(cofactor)
+    seen = variance > UNCHECKED
+    return np.asarray((axes[:, seen] / variance[seen]) @ axes[:, seen].T)
+
+
+def _joint(search: Search, covariance: _Covariance, chosen: Sequence[int]) -> tuple[Array, Array]:
+    """The gross errors (k, 2) of all chosen units together, in unit weight, and their statistics (k,)."""
+    inverse = _inverse(covariance.columns(chosen)[chosen].reshape(2 * len(chosen), -1))
+    errors = -(inverse @ search.found.residual[chosen].ravel()).reshape(-1, 2)
+    own = inverse.reshape(len(chosen), 2, len(chosen), 2)
+    variance, axes = np.linalg.eigh(np.einsum("kikj->kij", own))
+    along = (axes.transpose(0, 2, 1) @ errors[..., None])[..., 0]
+    seen = variance > UNCHECKED
+    return errors, np.where(seen, along**2 / np.where(seen, variance, 1.0), 0.0).sum(axis=1)
+
+
+def _cleared(search: Search, covariance: _Covariance, chosen: Sequence[int]) -> list[int]:
+    """Chosen units that no longer contradict the others without the rest of the chosen."""
+    statistic = _joint(search, covariance, chosen)[1]
+    return [unit for unit, value in zip(chosen, statistic, strict=True) if value <= search.limits[unit]]
+
+
+def _contradiction(search: Search, covariance: _Covariance, chosen: Sequence[int], unit: int) -> Contradiction:
+    errors, statistics_ = _joint(search, covariance, chosen)
+    at = chosen.index(unit)
+    others = _without(search, covariance, [each for each in chosen if each != unit])
+    near = np.flatnonzero((others > search.limits) & (others > statistics_[at] - TOLD_APART))
+    alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
+    back = np.linalg.pinv(search.found.transform[unit])
+    return Contradiction(unit, float(statistics_[at]), back @ errors[at], tuple(alike))
+
+
+def suspects(
+    search: Search,
+    contradicting: Sequence[Contradiction],
+    removed: Sequence[Contradiction],
+    result: Reliability,
+    probabilities: Probabilities,
+    redundancy: int,
+) -> tuple[Suspect, ...]:
+    """What contradicts the others and what weighs less for that reason, with names, the worst first."""
+    tests = statistics(search.found, search.weighting.weights)
+    entries = {each.unit: each for each in contradicting}
+    known = {each.unit: each.alike for each in removed}
+    weakened = (search.weighting.weights < 1.0) & (tests.statistic > search.limits)
+    for unit in map(int, np.flatnonzero(weakened)):
+        entries[unit] = Contradiction(unit, float(tests.statistic[unit]), tests.error[unit], known.get(unit, ()))
+    count = int((tests.sizes > 0).sum())
+    named = []
+    for unit, entry in sorted(entries.items(), key=lambda item: -item[1].statistic / search.limits[item[0]]):
+        worst = int(np.abs(result.w[unit]).argmax())
+        tested = result.tested[unit]
+        named.append(
+            Suspect(
+                tested=tested,
+                size=int(tests.sizes[unit]),
+                statistic=entry.statistic,
+                critical=float(search.limits[unit]),
+                w=float(result.w[unit, worst]),
+                tau=float(result.tau[unit, worst]),
+                critical_tau=probabilities.critical_tau(redundancy, count),
+                error=tuple(float(value) for value in entry.error[: len(tested.coordinates)]),
+                alike=tuple(result.tested[other].name for other in entry.alike[:ALIKE_SHOWN]),
+                removed=not bool(search.weighting.used[unit]),
+            )
+        )
+    return tuple(named)

@@ -1,0 +1,106 @@
+"""What is tested as one: an image point, a given fiducial, any other given coordinate."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.problem import ABSENT, Problem
+
+Indices = NDArray[np.intp]
+
+PRIOR_GROUPS = ("datum", "control", "interior", "exterior")
+
+
+@dataclass(frozen=True)
+class Tested:
+    """One image point, or one given quantity: what a gross error would be found in, and taken out with.
+
+    group: target, tie or fiducial in an image; datum (the given place of a fiducial), control (a given object
+    coordinate), interior or exterior (a given element). owner: its image or camera, empty for object points. point:
+    its id, empty for the elements. coordinates: x and y where both are tested as one, else a single one.
+    """
+
+    group: str
+    owner: str
+    point: str
+    coordinates: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """In words: "target 45 in image f1", "given fiducial 7 (camera RC20)", "control point 12 Z"."""
+        alone = f" {self.coordinates[0]}" if len(self.coordinates) == 1 else ""
+        match self.group:
+            case "datum":
+                return f"given fiducial {self.point}{alone} (camera {self.owner})"
+            case "control":
+                return f"control point {self.point}{alone}"
+            case "interior":
+                return f"given{alone} (camera {self.owner})"
+            case "exterior":
+                return f"given{alone} of image {self.owner}"
+            case _:
+                return f"{self.group} {self.point}{alone} in image {self.owner}"
+
+    def coordinate_name(self, axis: int) -> str:
+        """One of its coordinates in words: "target 45 x in image f1"."""
+        return Tested(self.group, self.owner, self.point, (self.coordinates[axis],)).name if self.is_pair else self.name
+
+    @property
+    def is_pair(self) -> bool:
+        return len(self.coordinates) == 2
+
+
+@dataclass(frozen=True)
+class TestedUnits:
+    """Everything that is tested in a problem: its observations in their order, then its priors."""
+
+    problem: Problem
+
+    def __len__(self) -> int:
+        return len(self.problem.network.observations) + len(self.positions)
+
+    @cached_property
+    def positions(self) -> Indices:
+        """(m, 2) positions of the unknowns that the priors are of, ABSENT behind those that stand alone."""
+        unknowns = self.problem.unknowns
+        given = unknowns.has_prior
+        pairs = [pair for pair in unknowns.fiducial.values() if given[pair].all()]
+        paired = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+        alone = np.setdiff1d(np.flatnonzero(given), paired)
+        return np.concatenate([paired, np.column_stack([alone, np.full(len(alone), ABSENT)])])
+
+    @cached_property
+    def sizes(self) -> Indices:
+        """(N,) the number of coordinates of each."""
+        observed = np.full(len(self.problem.network.observations), 2)
+        return np.concatenate([observed, (self.positions != ABSENT).sum(axis=1)])
+
+    @cached_property
+    def groups(self) -> NDArray[np.str_]:
+        """(N,) the group of each."""
+        kinds = {"FID": "datum", "PT": "control", "IO": "interior", "EO": "exterior"}
+        names = self.problem.unknowns.names
+        given = [kinds[names[position].split(".", 1)[0]] for position in self.positions[:, 0]]
+        return np.array([*self.problem.network.observations.kind, *given], dtype=np.str_)
+
+    def named(self) -> tuple[Tested, ...]:
+        """All of them, with their names."""
+        observations = self.problem.network.observations
+        rows = zip(observations.kind, observations.image, observations.point, strict=True)
+        observed = [Tested(kind, image, point, ("x", "y")) for kind, image, point in rows]
+        return (*observed, *self._named_priors())
+
+    def _named_priors(self) -> Sequence[Tested]:
+        unknowns = self.problem.unknowns
+        owner_of = {int(i): ("datum", *key) for key, pair in unknowns.fiducial.items() for i in pair}
+        owner_of |= {int(i): ("control", "", id_) for id_, three in unknowns.point.items() for i in three}
+        owner_of |= {int(i): ("interior", name, "") for name, some in unknowns.camera.items() for i in some}
+        owner_of |= {int(i): ("exterior", name, "") for name, six in unknowns.exterior.items() for i in six}
+        named = []
+        for pair in self.positions:
+            coordinates = tuple(unknowns.names[i].rsplit(".", 1)[1] for i in pair if i != ABSENT)
+            named.append(Tested(*owner_of[int(pair[0])], coordinates))
+        return named

@@ -1,0 +1,217 @@
+"""Redundancy, w, tau, smallest detectable errors and their effect, against errors that are really made."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from simulated import Truth, simulated
+
+from adjust.adjustment import Options, adjust
+from adjust.network import Approximations, Camera, Exterior, Network, ObservationKind, Prior
+from adjust.probabilities import Probabilities
+from adjust.result import Adjustment, Reliability
+
+Array = NDArray[np.float64]
+
+DELTA0 = 4.13  # alpha 0.1 %, power 80 %
+
+
+def exact_network() -> tuple[Network, Approximations]:
+    """No errors; weighted control, tight fiducials, one observed station, one target with correlated coordinates."""
+    truth = Truth()
+    network, start = simulated(
+        np.random.default_rng(3), truth, point_sigma=0.02, noise=False, fiducial_sigma=0.005, free={"k3": np.inf}
+    )
+    covariance = network.observations.covariance_mm2.copy()
+    covariance[unit_of(network, "target", "f1", "4")] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
+    values = np.array([*truth.stations[2], *truth.attitudes[2]])
+    sigmas = np.array([0.1, 0.1, np.inf, np.inf, np.inf, np.inf])
+    images = tuple(
+        replace(image, exterior=Exterior(values, sigmas)) if image.name == "f2" else image for image in network.images
+    )
+    observations = replace(network.observations, covariance_mm2=covariance)
+    return replace(network, images=images, observations=observations), start
+
+
+def unit_of(network: Network, kind: ObservationKind, image: str, point: str) -> int:
+    rows = network.observations
+    return list(zip(rows.kind, rows.image, rows.point, strict=True)).index((kind, image, point))
+
+
+def reliability_of(result: Adjustment) -> Reliability:
+    assert result.reliability is not None
+    return result.reliability
+
+
+def with_observation(network: Network, row: int, error: Array) -> Network:
+    xy = network.observations.xy_mm.copy()
+    xy[row] += error
+    return replace(network, observations=replace(network.observations, xy_mm=xy))
+
+
+def with_control(network: Network, error: float) -> Network:
+    def moved(prior: Prior | None) -> Prior | None:
+        return prior and Prior(prior.value + error, prior.sigma)
+
+    points = tuple(replace(point, Z=moved(point.Z)) if point.id == "5" else point for point in network.points)
+    return replace(network, points=points)
+
+
+def with_camera(network: Network, change: Callable[[Camera], Camera]) -> Network:
+    return replace(network, cameras=(change(network.cameras[0]),))
+
+
+def with_fiducial(network: Network, error: float) -> Network:
+    def changed(camera: Camera) -> Camera:
+        mark = camera.fiducials["3"]
+        wrong = replace(mark, y_mm=Prior(mark.y_mm.value + error, mark.y_mm.sigma))
+        return replace(camera, fiducials=dict(camera.fiducials) | {"3": wrong})
+
+    return with_camera(network, changed)
+
+
+def with_station(network: Network, error: float) -> Network:
+    def moved(exterior: Exterior | None) -> Exterior | None:
+        return exterior and Exterior(exterior.values + error * np.eye(6)[0], exterior.sigmas)
+
+    images = tuple(replace(i, exterior=moved(i.exterior)) if i.name == "f2" else i for i in network.images)
+    return replace(network, images=images)
+
+
+X, Y = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+CASES: dict[str, tuple[str, int, Callable[[Network, float], Network]]] = {
+    "target": ("target 4 in image f1", 1, lambda n, e: with_observation(n, unit_of(n, "target", "f1", "4"), e * Y)),
+    "fiducial": (
+        "fiducial 2 in image f3",
+        0,
+        lambda n, e: with_observation(n, unit_of(n, "fiducial", "f3", "2"), e * X),
+    ),
+    "control": ("control point 5 Z", 0, with_control),
+    "datum": ("given fiducial 3 (camera K)", 1, with_fiducial),
+    "exterior": ("given X0 of image f2", 0, with_station),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_smallest_detectable_error_shifts_the_test_by_delta0_and_the_camera_as_told(case: str) -> None:
+    name, axis, spoilt = CASES[case]
+    network, start = exact_network()
+    clean = adjust(network, start)
+    tests = reliability_of(clean)
+    unit = [tested.name for tested in tests.tested].index(name)
+    error = tests.smallest[unit, axis]
+    dirty = adjust(spoilt(network, error), start)
+    assert abs(reliability_of(dirty).w[unit, axis]) == pytest.approx(DELTA0, rel=2e-3)
+
+    shift = dirty.values - clean.values
+    sigma = np.sqrt(clean.cofactor.variances)
+    free = np.flatnonzero(sigma > 0.0)
+    inverse = np.linalg.inv(clean.cofactor.of(free) / np.outer(sigma[free], sigma[free]))
+    normalised = shift[free] / sigma[free]
+    assert np.sqrt(normalised @ inverse @ normalised) == pytest.approx(tests.effect[unit, axis], rel=5e-3)
+    for outer in tests.outer:
+        position = clean.index(outer.parameter)
+        assert abs(shift[position]) < 1.005 * abs(outer.effect) + 1e-4 * sigma[position]
+        assert outer.in_sigmas == pytest.approx(abs(outer.effect) / sigma[position], rel=1e-9)
+
+
+def test_the_cause_that_is_named_moves_the_parameter_by_what_is_told() -> None:
+    network, start = exact_network()
+    clean = adjust(network, start)
+    tests = reliability_of(clean)
+    named = {
+        t.coordinate_name(axis): (i, axis) for i, t in enumerate(tests.tested) for axis in range(len(t.coordinates))
+    }
+    checked = 0
+    for outer in tests.outer:
+        unit, axis = named[outer.cause]
+        if unit < len(network.observations):
+            error = tests.smallest[unit, axis] * np.eye(2)[axis]
+            dirty = adjust(with_observation(network, unit, error), start)
+            shift = dirty.value(outer.parameter) - clean.value(outer.parameter)
+            assert shift == pytest.approx(outer.effect, rel=5e-3)
+            checked += 1
+    assert checked >= 2
+    assert {outer.parameter for outer in tests.outer} >= {"IO.K.c", "IO.K.x0", "IO.K.k3", "FID.K.1.x"}
+
+
+def test_an_error_in_the_least_favourable_direction_shifts_the_test_of_the_point() -> None:
+    network, start = exact_network()
+    tests = reliability_of(adjust(network, start))
+    unit = unit_of(network, "target", "f1", "4")
+    size = tests.smallest_together[unit]
+    turns = np.linspace(0.0, np.pi, 7)[:-1]
+    errors = size * np.column_stack([np.cos(turns), np.sin(turns)])
+    spoilt = [adjust(with_observation(network, unit, error), start) for error in errors]
+    statistics = [reliability_of(result).statistic[unit] for result in spoilt]
+    # As a function of the direction it is a constant and a sine of twice the angle: its minimum follows from these.
+    mean = np.mean(statistics)
+    wave = np.hypot(np.mean(statistics * np.cos(2 * turns)), np.mean(statistics * np.sin(2 * turns)))
+    assert mean - 2.0 * wave == pytest.approx(Probabilities().noncentrality(2) ** 2, rel=5e-3)
+
+
+def test_the_redundancies_of_everything_add_up() -> None:
+    network, start = exact_network()
+    result = adjust(network, start)
+    tests = reliability_of(result)
+    assert tests.redundancy.sum() == pytest.approx(result.redundancy)
+    assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
+    np.testing.assert_allclose(tests.redundancy[: len(network.observations)], result.residuals.redundancy)
+
+
+def test_w_of_an_observation_does_not_depend_on_the_weight_that_it_was_left() -> None:
+    """Nearly without weight it is predicted by the others; the test is that of the observation as it was given."""
+    network, start = simulated(np.random.default_rng(5), fiducial_sigma=0.01)
+    unit = unit_of(network, "target", "f1", "4")
+    spoilt = with_observation(network, unit, np.array([0.03, 0.08]))
+    plain, robust = adjust(spoilt, start), adjust(spoilt, start, Options(robust="igg3"))
+    assert robust.weights[unit] < 1e-6
+    others = np.delete(robust.weights, unit)
+    assert (others == 1.0).mean() > 0.8
+    assert reliability_of(robust).w[unit] == pytest.approx(reliability_of(plain).w[unit], rel=0.15)
+
+
+def test_what_nothing_checks_is_told() -> None:
+    """Three fiducials for an affine transformation: no reading of theirs is checked, and none has an MDB."""
+    network, start = simulated(np.random.default_rng(10))
+    rows = network.observations
+    keep = [
+        i
+        for i, (image, kind, point) in enumerate(zip(rows.image, rows.kind, rows.point, strict=True))
+        if image != "f0" or (kind == "fiducial" and point in "123")
+    ]
+    few = replace(
+        rows,
+        image=tuple(rows.image[i] for i in keep),
+        point=tuple(rows.point[i] for i in keep),
+        kind=tuple(rows.kind[i] for i in keep),
+        xy_mm=rows.xy_mm[keep],
+        covariance_mm2=rows.covariance_mm2[keep],
+    )
+    exterior = Exterior(np.array([*Truth().stations[0], *Truth().attitudes[0]]), np.zeros(6))
+    images = tuple(replace(i, exterior=exterior) if i.name == "f0" else i for i in network.images)
+    result = adjust(replace(network, observations=few, images=images), start)
+    tests = reliability_of(result)
+    unit = unit_of(replace(network, observations=few), "fiducial", "f0", "1")
+    assert np.isinf(tests.smallest[unit]).all()
+    assert (tests.w[unit] == 0.0).all()
+    assert {"fiducial 1 x in image f0", "fiducial 3 y in image f0"} <= set(tests.unchecked)
+    assert not any("f0" in outer.cause for outer in tests.outer)
+
+
+def test_the_usual_probabilities_give_baardas_delta0() -> None:
+    assert Probabilities().noncentrality(1) == pytest.approx(DELTA0, abs=0.005)
+    assert Probabilities(alpha=0.05).noncentrality(1) == pytest.approx(2.80, abs=0.005)
+    with pytest.raises(ValueError, match="power must lie between 0 and 1"):
+        Probabilities(power=80.0)
+
+
+def test_critical_tau_is_the_quantile_of_a_residual_over_the_sigma0_that_it_is_part_of() -> None:
+    rng = np.random.default_rng(1)
+    for redundancy in (3, 12):
+        z = rng.normal(size=(400_000, redundancy))
+        tau = np.abs(z[:, 0]) / np.sqrt((z**2).mean(axis=1))
+        assert Probabilities(alpha=0.01).critical_tau(redundancy) == pytest.approx(np.quantile(tau, 0.99), rel=0.005)
+    assert np.isinf(Probabilities().critical_tau(1))
