@@ -47,7 +47,8 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     sigma = np.where(
         np.char.startswith(np.array(problem.unknowns.names)[free], "IO."), problem.unknowns.sigma[free], np.inf
     )
-    placed = marks & np.isfinite(problem.unknowns.sigma[free])
+    calibrated = [each.positions for each in problem.further if each.group == "calibration"]
+    placed = marks & (np.isfinite(problem.unknowns.sigma[free]) | np.isin(free, np.concatenate([[], *calibrated])))
     kept = _unseen_by(hardly[placed], MIXED)
     of_unit_weight = hardly @ kept @ np.linalg.inv(np.linalg.qr(np.maximum(told, SINGULAR)[:, None] * kept, mode="r"))
     _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)

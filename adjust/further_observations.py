@@ -47,7 +47,7 @@ class FurtherObservation(Protocol):
 
 def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherObservation, ...]:
     """All of a validated network."""
-    return (*_distances(network, unknowns),)
+    return (*_distances(network, unknowns), *_calibrations(network, unknowns))
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,37 @@ def _distances(network: Network, unknowns: Unknowns) -> Iterator[ObservedDistanc
             observed=np.array([each.value]),
             covariance=np.array([[each.sigma**2]]),
         )
+
+
+@dataclass(frozen=True)
+class ObservedCalibration:
+    """An earlier calibration; positions (m,): the quantities that it gives."""
+
+    names: tuple[str, ...]
+    positions: Indices
+    observed: Array
+    covariance: Array
+    group: str = "calibration"
+
+    def computed(self, values: Array) -> Array:
+        return np.asarray(values[self.positions])
+
+    def by_unknowns(self, values: Array) -> Array:
+        return np.eye(len(self.positions))
+
+
+def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCalibration]:
+    """Those of the quantities that are free: a fiducial that no image shows is held, and has no part here."""
+    number = {name: i for i, name in enumerate(unknowns.names)}
+    for each in network.calibrations:
+        free = [i for i, name in enumerate(each.names) if name in number and unknowns.sigma[number[name]] > 0.0]
+        if free:
+            yield ObservedCalibration(
+                names=tuple(each.names[i] for i in free),
+                positions=np.array([number[each.names[i]] for i in free], dtype=np.intp),
+                observed=each.values[free],
+                covariance=each.covariance[np.ix_(free, free)],
+            )
 
 
 def square_sum(further: tuple[FurtherObservation, ...], values: Array) -> float:

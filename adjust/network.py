@@ -166,6 +166,19 @@ class Distance:
 
 
 @dataclass(frozen=True)
+class Calibration:
+    """What an earlier adjustment found of a camera, "equal to image observations" (Juhl).
+
+    names (m,) as in `Adjustment.names`: `IO.<camera>.c`, `FID.<camera>.<id>.x`; values (m,), covariance (m, m). What
+    was given beforehand in that adjustment is in it already: these quantities must be free of priors here.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
 class Network:
     """Everything that one adjustment knows. Names are unique; the order of things does not matter."""
 
@@ -174,6 +187,7 @@ class Network:
     points: tuple[ObjectPoint, ...]
     observations: Observations
     distances: tuple[Distance, ...] = ()
+    calibrations: tuple[Calibration, ...] = ()
 
     @cached_property
     def camera_by_name(self) -> dict[str, Camera]:

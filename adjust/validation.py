@@ -1,16 +1,17 @@
 """What a network must have before it can be adjusted, told with the name of the culprit."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from adjust.errors import AdjustmentError
 from adjust.families import family
-from adjust.network import Image, Network, Observations
+from adjust.network import Camera, Image, Network, Observations, Prior
 
 FIDUCIALS_NEEDED = {"none": 0, "congruent": 2, "similarity": 2, "affine": 3}
 TARGETS_NEEDED = 3
+DEFINITE = 1e-13  # least eigenvalue of an earlier calibration's correlation matrix
 
 
 def validate(network: Network) -> None:
@@ -21,6 +22,7 @@ def validate(network: Network) -> None:
     _check_unique("object point", (point.id for point in network.points))
     _check_cameras(network)
     _check_distances(network)
+    _check_calibrations(network)
     _check_shapes(network.observations)
     _check_names(network)
     _check_duplicate_observations(network.observations)
@@ -94,6 +96,46 @@ def _check_distances(network: Network) -> None:
                 f"{what} needs a positive standard deviation, not {each.sigma:g}. An exact distance is not offered: "
                 f"give a standard deviation far below what matters, {1e-7 * each.value:.1g} say, or leave it out."
             )
+
+
+def _check_calibrations(network: Network) -> None:
+    sigmas = {name: sigma for camera in network.cameras for name, sigma in _camera_sigmas(camera)}
+    given: set[str] = set()
+    for each in network.calibrations:
+        for name in each.names:
+            if name not in sigmas:
+                raise AdjustmentError(f"an earlier calibration gives {name}, which no camera has. Leave it out.")
+            if name in given or np.isfinite(sigmas[name]):
+                other = (
+                    "another calibration" if name in given else f"a standard deviation of its own ({sigmas[name]:g})"
+                )
+                raise AdjustmentError(
+                    f"{name} has an earlier calibration and {other}: the same knowledge would count twice. Keep one."
+                )
+            given.add(name)
+        count = len(each.names)
+        if each.values.shape != (count,) or each.covariance.shape != (count, count):
+            raise AdjustmentError(
+                f"an earlier calibration of {count} quantities has {each.values.shape} values and a covariance of the "
+                f"shape {each.covariance.shape}."
+            )
+        scale = np.sqrt(np.diag(each.covariance).clip(1e-300))
+        if not np.linalg.eigvalsh(each.covariance / np.outer(scale, scale)).min(initial=1.0) > DEFINITE:
+            raise AdjustmentError(
+                f"the covariance of an earlier calibration of {', '.join(each.names[:3])} and more is not positive "
+                f"definite: some of these quantities were fixed, or no observation told them apart. Fix them here too."
+            )
+
+
+def _camera_sigmas(camera: Camera) -> Iterator[tuple[str, float]]:
+    """The camera's quantities by their names, and the standard deviations that they have of their own."""
+    interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
+    priors: dict[str, Prior | None] = {f"IO.{camera.name}.{name}": prior for name, prior in interior.items()}
+    priors |= {f"IO.{camera.name}.{name}": prior for name, prior in camera.distortion.parameters.items()}
+    for id_, mark in camera.fiducials.items():
+        priors |= {f"FID.{camera.name}.{id_}.x": mark.x_mm, f"FID.{camera.name}.{id_}.y": mark.y_mm}
+    for name, prior in priors.items():
+        yield name, np.inf if prior is None else prior.sigma
 
 
 def _check_shapes(observations: Observations) -> None:

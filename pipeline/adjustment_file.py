@@ -107,6 +107,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
         "residuals": _residuals(adjustment),
         "distances": _distances(adjustment),
+        "calibrations": _calibrations(adjustment),
         "groups": {
             name: {
                 "sigma0": group.sigma0,
@@ -252,6 +253,22 @@ def _distances(adjustment: Adjustment) -> list[Json]:
             "w": row.w,
         }
         for given, row in zip(adjustment.network.distances, rows, strict=True)
+    ]
+
+
+def _calibrations(adjustment: Adjustment) -> list[Json]:
+    """Earlier calibrations, one row a quantity: value and sigma as they were observed; mm."""
+    return [
+        {
+            "name": row.name,
+            "value": row.observed,
+            "sigma": row.sigma,
+            "v": row.v,
+            "redundancy": row.redundancy,
+            "w": row.w,
+        }
+        for row in adjustment.further
+        if row.group == "calibration"
     ]
 
 

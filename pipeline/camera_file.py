@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
 from adjust import network
 from adjust.families import FAMILY_NAMES, family, parameter_names
 from measure import shapes
+from pipeline.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.errors import InputError
 from pipeline.mark_table import read_mark
 from pipeline.spelling import did_you_mean
@@ -31,7 +32,8 @@ class GivenFiducial:
 class CameraFile:
     """A camera file as read: mm, a standard deviation of 0 fixes, inf frees.
 
-    principal_distance_mm and principal_point_mm are None where the file leaves them to the points.
+    principal_distance_mm and principal_point_mm are None where the file leaves them to the points. calibration: an
+    earlier one, which takes the place of the standard deviations of all that it gives.
     """
 
     path: Path
@@ -43,6 +45,7 @@ class CameraFile:
     principal_point_sigma_mm: tuple[float, float]
     distortion: network.Distortion
     fiducials: tuple[GivenFiducial, ...]
+    calibration: EarlierCalibration | None = None
 
     def layout(self) -> shapes.FiducialLayout:
         """The marks to be measured. Raises InputError where one has no drawing or the frame's size is missing."""
@@ -110,6 +113,7 @@ def parse_camera(table: Table) -> CameraFile:
         distortion=_distortion(table.table("distortion"), frame),
         fiducials=fiducials,
     )
+    camera = replace(camera, calibration=read_calibration(sigma, camera.camera()))
     sigma.done()
     return camera
 

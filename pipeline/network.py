@@ -6,7 +6,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import Camera, Distance, Image, Network, ObjectPoint, Observations, Prior, Transformation
+from adjust.network import (
+    Calibration,
+    Camera,
+    Distance,
+    Image,
+    Network,
+    ObjectPoint,
+    Observations,
+    Prior,
+    Transformation,
+)
 from adjust.validation import FIDUCIALS_NEEDED
 from pipeline.camera_file import CameraFile
 from pipeline.comparator_file import ComparatorPoint
@@ -38,12 +48,14 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
     used, left_out = _orientable(project, used)
     images = tuple(_image(project, name) for name in dict.fromkeys(mark.image for mark in used))
     distances, without_end = _distances(project, used)
+    cameras, calibrations = _cameras(project, images, used)
     network = Network(
-        cameras=_cameras(project, images, used),
+        cameras=cameras,
         images=images,
         points=_points(project, used),
         observations=_observations(project.adjust, used),
         distances=distances,
+        calibrations=calibrations,
     )
     return network, (*lonely, *left_out, *without_end)
 
@@ -180,15 +192,22 @@ def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:
             )
 
 
-def _cameras(project: Project, images: Sequence[Image], marks: Sequence[ComparatorPoint]) -> tuple[Camera, ...]:
-    cameras = []
+def _cameras(
+    project: Project, images: Sequence[Image], marks: Sequence[ComparatorPoint]
+) -> tuple[tuple[Camera, ...], tuple[Calibration, ...]]:
+    """The cameras that images are of, and the earlier calibrations that take the place of priors."""
+    cameras, calibrations = [], []
     for file in project.cameras.values():
         names = {image.name for image in images if image.camera == file.name}
         if names:
             xy = np.array([mark.xy_mm for mark in marks if mark.image in names])
             center = (xy.min(axis=0) + xy.max(axis=0)) / 2 if file.principal_point_mm is None else np.zeros(2)
-            cameras.append(file.camera((float(center[0]), float(center[1]))))
-    return tuple(cameras)
+            camera = file.camera((float(center[0]), float(center[1])))
+            if file.calibration is not None:
+                camera, calibration = file.calibration.applied(camera)
+                calibrations.append(calibration)
+            cameras.append(camera)
+    return tuple(cameras), tuple(calibrations)
 
 
 def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectPoint, ...]:

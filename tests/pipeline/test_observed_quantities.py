@@ -1,6 +1,8 @@
 """Datum, distances and other observed quantities through the user's files."""
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +103,68 @@ def test_a_distance_to_a_point_that_no_image_shows_is_left_out(tmp_path: Path) -
     result = adjusted(tmp_path)
     assert result.further == ()
     assert any("1 to lost" in warning for warning in result.warnings)
+
+
+def calibrated_twice(folder: Path, change: Callable[[str], str] = str) -> tuple[Adjustment, Adjustment]:
+    """The reference case adjusted, and once more with the result as the earlier calibration of a changed camera."""
+    case = json.loads((CASES / "iii_selfcal_mixed.json").read_text(encoding="utf-8"))
+    for name in ("earlier", "later"):
+        (folder / name).mkdir()
+        write_project(case, folder / name)
+    first = adjusted(folder / "earlier")
+    write_adjustment(first, folder / "earlier" / "adjustment.json")
+    camera = folder / "later" / "camera.toml"
+    text = camera.read_text(encoding="utf-8").replace(
+        "[sigma]\n", '[sigma]\ncalibration = "../earlier/adjustment.json"\n'
+    )
+    camera.write_text(change(text), encoding="utf-8")
+    return first, adjusted(folder / "later")
+
+
+def test_an_earlier_calibration_through_files(tmp_path: Path) -> None:
+    """The same observations twice: the same values, and smaller sigmas."""
+    first, second = calibrated_twice(tmp_path)
+    assert second.converged
+    for name in ("c", "x0", "y0", "k3"):
+        sigma = first.sigma(f"IO.C.{name}")
+        assert second.value(f"IO.C.{name}") == pytest.approx(first.value(f"IO.C.{name}"), abs=0.01 * sigma)
+        assert second.sigma(f"IO.C.{name}") < 0.95 * sigma
+    write_adjustment(second, tmp_path / "second.json")
+    written = read_adjustment(tmp_path / "second.json")
+    rows = {row["name"]: row for row in written["calibrations"]}
+    assert rows["IO.C.c"]["value"] == first.value("IO.C.c")
+    assert rows["IO.C.c"]["sigma"] == pytest.approx(first.sigma("IO.C.c"), rel=1e-9)  # a posteriori
+    assert {f"FID.C.{i}.{axis}" for i in range(1, 5) for axis in "xy"} <= set(rows)
+    assert "IO.C.k7" not in rows  # fixed in both
+    assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
+
+
+def test_the_fiducials_of_an_earlier_calibration_can_be_left_out(tmp_path: Path) -> None:
+    _, second = calibrated_twice(
+        tmp_path, lambda text: text.replace("[sigma]", "[sigma]\ncalibration_fiducials = false", 1)
+    )
+    assert {row.name.split(".")[0] for row in second.further} == {"IO"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("../earlier/adjustment.json", "../earlier/no.json", ["no.json", "no such file"]),
+        ("[distortion]", '[distortion]\nfamily = "brown"\n[unused]', ["family = 'torlegard'", "'brown'"]),
+        ('decentering = "paper"', 'decentering = "reduced"', ["decentering = 'paper'"]),
+        ("r0_mm = 0.0", "r0_mm = 50.0", ["r0_mm = 0.0"]),
+        ("\nk7 = 0.0\n", "\nk7 = 1e-20\n", ["held k7 fixed at 0", "standard deviation of 0"]),
+    ],
+)
+def test_a_calibration_of_another_lens_is_refused(old: str, new: str, words: list[str], tmp_path: Path) -> None:
+    def changed(text: str) -> str:
+        assert old in text
+        return re.sub(r"\[unused\].*?(?=\[\[fiducial)", "", text.replace(old, new, 1), flags=re.DOTALL)
+
+    with pytest.raises(InputError) as error:
+        calibrated_twice(tmp_path, changed)
+    for word in words:
+        assert word in str(error.value)
 
 
 @pytest.mark.parametrize(
