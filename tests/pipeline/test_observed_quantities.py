@@ -127,7 +127,7 @@ def test_an_earlier_calibration_through_files(tmp_path: Path) -> None:
     assert second.converged
     for name in ("c", "x0", "y0", "k3"):
         sigma = first.sigma(f"IO.C.{name}")
-        assert second.value(f"IO.C.{name}") == pytest.approx(first.value(f"IO.C.{name}"), abs=0.01 * sigma)
+        assert second.value(f"IO.C.{name}") == pytest.approx(first.value(f"IO.C.{name}"), abs=0.05 * sigma)
         assert second.sigma(f"IO.C.{name}") < 0.95 * sigma
     write_adjustment(second, tmp_path / "second.json")
     written = read_adjustment(tmp_path / "second.json")
