@@ -20,6 +20,7 @@ from adjust.result import Adjustment, Cofactor
 from adjust.runs import ROUNDS, Run, again, run
 from adjust.snooping import contradictions, search, suspects
 from adjust.tested import TestedUnits
+from adjust.transformation import marks_needed
 from adjust.validation import validate
 from adjust.variance_components import factor_sigmas
 
@@ -189,7 +190,7 @@ def _warnings(last: Run, cofactor: Cofactor) -> tuple[str, ...]:
             warnings.append(
                 f"The observations say nothing about {', '.join(blind)}: their standard deviations stay as given."
             )
-    return tuple(warnings + _unseen(problem))
+    return tuple(warnings + _unseen(problem) + _films_by_targets(problem))
 
 
 def _worst(last: Run) -> str:
@@ -210,3 +211,18 @@ def _unseen(problem: Problem) -> list[str]:
         return []
     shown = ", ".join(points[:5]) + (f" and {len(points) - 5} more" if len(points) > 5 else "")
     return [f"No image shows the object points {shown}: they take no part."]
+
+
+def _films_by_targets(problem: Problem) -> list[str]:
+    """Images whose film transformation takes more than their fiducial marks."""
+    images = problem.network.images
+    shown = np.bincount(problem.image_numbers[problem.is_fiducial], minlength=len(images))
+    few = [i for i, image in enumerate(images) if shown[i] < marks_needed(image.transformation)]
+    if not few:
+        return []
+    first = images[few[0]]
+    others = f" {len(few) - 1} more images are alike." if len(few) > 1 else ""
+    return [
+        f"Image {first.name} shows {shown[few[0]]} fiducial marks, and its {first.transformation} transformation takes "
+        f"{marks_needed(first.transformation)} of its own: the targets determine the rest of it.{others}"
+    ]

@@ -16,7 +16,7 @@ from adjust.projection import ideal_from_observed
 from adjust.resection import Pose
 from adjust.rotation import angles_from_rotation, angles_near
 from adjust.sight import Sight
-from adjust.transformation import affine_from_parameters, apply_affine
+from adjust.transformation import film_kind
 from adjust.validation import validate
 
 Array = NDArray[np.float64]
@@ -88,11 +88,12 @@ def _film_transformation(network: Network, image: Image, rows: list[int]) -> tup
 
 def _frame(network: Network, image: Image, rows: list[int], fit: tuple[Array, bool]) -> _Frame:
     observations = network.observations
+    parameters, mirrored = fit
     targets = [row for row in rows if observations.kind[row] != "fiducial"]
     variances = np.trace(observations.covariance_mm2[targets], axis1=1, axis2=2) / 2
     return _Frame(
         tuple(observations.point[row] for row in targets),
-        apply_affine(affine_from_parameters(image.transformation, *fit), observations.xy_mm[targets]),
+        film_kind(image.transformation, mirrored).apply(parameters, observations.xy_mm[targets]),
         float(np.sqrt(np.median(variances))) if targets else 0.0,
     )
 

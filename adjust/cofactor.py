@@ -60,8 +60,8 @@ class Datum:
 class FactorCofactor:
     """The cofactor matrix of all quantities (n, n) from the factor of the free unknowns (f).
 
-    by_free (n, f): the quantities as they are reported by the unknowns: omega, phi, kappa by rotation vectors, rows
-    without an entry for what is fixed.
+    by_free (n, f): the quantities as they are reported by the unknowns: omega, phi, kappa by rotation vectors, film
+    parameters by centred ones, rows without an entry for what is fixed.
     """
 
     factor: Factor
@@ -79,7 +79,7 @@ class FactorCofactor:
         plain = self.factor.variances()
         entries = np.diff(self.by_free.indptr)
         variances = self.by_free.multiply(self.by_free) @ plain
-        several = np.flatnonzero(entries > 1)  # the angles of one image stand together, and so do their parts here
+        several = np.flatnonzero(entries > 1)  # those of one image stand together, and so do their parts here
         for part in np.split(several, range(AT_ONCE, len(several), AT_ONCE)):
             variances[part] = np.diag(self.factor.cofactor_of(self.by_free[part]))
         return np.asarray(variances if self.datum is None else np.maximum(variances + self.datum.variances, 0.0))
@@ -108,15 +108,23 @@ def inner_cofactor(
 
 
 def _reported(problem: Problem, state: State) -> csr_array:
-    """The quantities as they are reported by those that are moved (n, n): omega, phi, kappa by rotation vectors.
+    """The quantities as they are reported by those that are moved (n, n).
 
-    Where phi is +-90 degrees, omega and kappa are told by their sum or difference alone (the pseudo-inverse).
+    That is omega, phi, kappa by rotation vectors, and film parameters by centred ones. Where phi is +-90
+    degrees, omega and kappa are told by their sum or difference alone (the pseudo-inverse).
     """
     count = len(problem.unknowns)
     angles = problem.exterior[~problem.keeps_angles, 3:]
     by_vector = np.linalg.pinv(vector_by_angles(state.values[angles]))
-    others = np.setdiff1d(np.arange(count), angles)
-    rows = np.concatenate([others, np.repeat(angles, 3, axis=1).ravel()])
-    columns = np.concatenate([others, np.tile(angles, 3).ravel()])
-    values = np.concatenate([np.ones(len(others)), by_vector.ravel()])
-    return csr_array((values, (rows, columns)), shape=(count, count))
+    groups = [(angles, by_vector), *problem.films_by_centred(state)]
+    others = np.setdiff1d(np.arange(count), np.concatenate([positions.ravel() for positions, _ in groups]))
+    rows, columns, values = [others], [others], [np.ones(len(others), dtype=np.float64)]
+    for positions, derivatives in groups:
+        at = np.broadcast_to(positions[:, :, None], derivatives.shape)
+        rows.append(at.ravel())
+        columns.append(at.swapaxes(1, 2).ravel())
+        values.append(derivatives.ravel().astype(np.float64))
+    entries = (np.concatenate(rows), np.concatenate(columns))
+    matrix = csr_array((np.concatenate(values), entries), shape=(count, count))
+    matrix.eliminate_zeros()
+    return matrix

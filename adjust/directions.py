@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.families import parameter_names
 from adjust.problem import Problem, State
+from adjust.transformation import follows_tilts
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -15,6 +16,7 @@ Indices = NDArray[np.intp]
 FLAT = 0.01  # least over largest extent of the field, below which there is no relief to speak of
 PARALLEL_RAD = np.radians(1.0)  # axes within this of each other are parallel
 FIELD = 4  # points from which something is known of the field, and not just of its datum
+LEAST_BEND = 1e-6  # of squares of the fiducials' places beyond affinities: three marks have none
 
 
 @dataclass(frozen=True)
@@ -92,13 +94,14 @@ def datum_sentence(number: int) -> tuple[str, str]:
 def camera_leads(problem: Problem, state: State) -> list[Lead]:
     """What a null direction is called after.
 
-    Ranks: 0 what is a change of the camera's own axes, 1 other changes of its fiducials, 2 interior orientation, 3
-    distortion.
+    Ranks: -1 a tilt, which moves much else along, 0 what is a change of the camera's own axes, 1 other changes of its
+    fiducials, 2 interior orientation, 3 distortion.
     """
     leads = []
     field = _field_of(problem, state)
     for name, positions in problem.unknowns.camera.items():
         leads += _fiducial_leads(problem, state, name)
+        leads += _tilt_leads(problem, state, name)
         leads += _interior_leads(problem, name, positions, field)
         leads += _distortion_leads(problem, name, positions[3:])
     return leads
@@ -132,6 +135,35 @@ def _fiducial_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
         functional[positions] = np.stack([dx, dy], axis=1)
         listed.append(Lead(rank, functional, motion, given, "", partner, otherwise))
     return listed
+
+
+def _tilt_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
+    """A tilt of all cameras about x' or y', where every film transformation of a camera can undo it.
+
+    It moves the fiducials by t (x'², x'y'), of which the functional takes what no affinity of theirs can be.
+    """
+    kinds = [image.transformation for image in problem.network.images if image.camera == camera]
+    pairs = [positions for (owner, _), positions in problem.unknowns.fiducial.items() if owner == camera]
+    if not pairs or not all(follows_tilts(kind) for kind in kinds):
+        return []
+    positions = np.array(pairs)
+    centred = state.values[positions] - state.values[positions].mean(axis=0)
+    affine = np.column_stack([np.ones(len(centred)), centred])
+    leads = []
+    for axis, other in ((0, 1), (1, 0)):
+        bend = centred[:, [axis]] * centred
+        bend -= affine @ np.linalg.lstsq(affine, bend)[0]
+        if np.abs(bend).max() < LEAST_BEND * np.abs(centred).max() ** 2:
+            continue
+        functional = np.zeros(len(problem.unknowns))
+        functional[positions] = bend
+        motion = (
+            f"Tilt {'xy'[axis]}: all fiducial marks of camera {camera} can move by {'xy'[axis]}' times x' and y', as "
+            f"with one tilt of all cameras about {'xy'[other]}'"
+        )
+        given = "x' and y' of four fiducial marks (F5, F6), or to the attitude of an image"
+        leads.append(Lead(-1, functional, motion, given, "", None, "choose an affine transformation"))
+    return leads
 
 
 @dataclass(frozen=True)

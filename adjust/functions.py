@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.distortion import ImageEquations, image_equations
-from adjust.problem import CAMERA, EXTERIOR, PLACE, TRANSFORMATION, Problem, State
+from adjust.problem import EXTERIOR, PLACE, Problem, State
 from adjust.projection import camera_from_ray, rays
 from adjust.rotation import cross_matrix
-from adjust.transformation import affine_design, affine_gradient, apply_affine, comparator_from_camera
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,17 @@ class Derivatives:
 
 def computed_observations(problem: Problem, state: State) -> Array | None:
     """The comparator coordinates (n, 2) in mm that satisfy F1 to F4; None where some point has no image."""
+    camera_xy = _computed_in_camera(problem, state)
+    if camera_xy is None:
+        return None
+    xy_mm, found = _computed_in_comparator(problem, state, camera_xy)
+    return xy_mm if found.all() else None
+
+
+def _computed_in_camera(problem: Problem, state: State) -> Array | None:
+    """The camera coordinates (n, 2) of all marks; None where some point has no image."""
     camera_xy = state.values[problem.places[:, :2]]  # fiducials stay, targets follow
-    affines = problem.affines(state)
-    observed = apply_affine(affines[problem.image_numbers], problem.network.observations.xy_mm)
+    observed = _observed_in_camera(problem, state) if problem.by_elements else camera_xy
     for name, rows in problem.targets_by_camera.items():
         interior, parameters = np.split(state.values[problem.unknowns.camera[name]], [3])
         if interior[0] <= 0.0:
@@ -47,16 +55,34 @@ def computed_observations(problem: Problem, state: State) -> Array | None:
             camera_xy[rows], found = camera_from_ray(distortion, interior, parameters, ray)
         if not (found & (in_camera[:, 2] < 0.0)).all():
             return None
-    if not np.linalg.det(affine_gradient(affines)).all():
-        return None
-    return comparator_from_camera(affines[problem.image_numbers], camera_xy)
+    return camera_xy
+
+
+def _observed_in_camera(problem: Problem, state: State) -> Array:
+    """The camera coordinates (n, 2) of the observations as they were made."""
+    camera_xy = np.empty_like(problem.network.observations.xy_mm)
+    for films in problem.films:
+        parameters = state.values[films.positions][films.of]
+        camera_xy[films.rows] = films.kind.apply(parameters, problem.network.observations.xy_mm[films.rows])
+    return camera_xy
+
+
+def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) -> tuple[Array, Mask]:
+    """The comparator coordinates (n, 2) of camera coordinates (n, 2), and which the film transformations give."""
+    xy_mm = np.empty_like(camera_xy)
+    found = np.empty(len(camera_xy), dtype=bool)
+    for films in problem.films:
+        parameters, center_mm = state.values[films.positions][films.of], films.center_mm[films.of]
+        xy_mm[films.rows], found[films.rows] = films.kind.inverse(parameters, camera_xy[films.rows], center_mm)
+    return xy_mm, found
 
 
 def derivatives(problem: Problem, state: State, xy_mm: Array) -> Derivatives:
     """The derivatives of F1 to F4 (Torlegård) at the observations xy_mm (n, 2)."""
-    affines = problem.affines(state)[problem.image_numbers]
     distorted = problem.network.observations.xy_mm if problem.by_elements else xy_mm  # where distortion is taken
-    camera_xy = apply_affine(affines, distorted)
+    film = _film_derivatives(problem, state, xy_mm)
+    at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
+    camera_xy = at_distorted.camera_xy
     by_camera_xy = np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)).copy()
     by_unknowns = np.zeros((len(xy_mm), 2, problem.columns.shape[1]))
     by_unknowns[:, :, PLACE.start : PLACE.start + 2] = -np.eye(2)  # F3, F4; those of targets follow
@@ -72,12 +98,33 @@ def derivatives(problem: Problem, state: State, xy_mm: Array) -> Derivatives:
         by_unknowns[rows, :, EXTERIOR] = np.concatenate([-by_point, by_attitude], axis=2)
         by_unknowns[rows, :, PLACE] = by_point
         by_camera = np.concatenate([at.by_interior, at.by_parameters], axis=2)
-        by_unknowns[rows, :, CAMERA.start : CAMERA.start + by_camera.shape[2]] = by_camera
-    chain = problem.affines_by_parameters(state)[problem.image_numbers]
-    by_affine = affine_design(xy_mm) + (by_camera_xy - np.eye(2)) @ affine_design(distorted)
-    by_unknowns[:, :, TRANSFORMATION] = by_affine @ chain
-    gradient = affine_gradient(affines)
-    return Derivatives(gradient if problem.by_elements else by_camera_xy @ gradient, by_unknowns)
+        first = problem.camera_columns.start
+        by_unknowns[rows, :, first : first + by_camera.shape[2]] = by_camera
+    by_film = film.by_parameters + (by_camera_xy - np.eye(2)) @ at_distorted.by_parameters
+    by_unknowns[:, :, problem.film_columns] = by_film
+    return Derivatives(film.by_xy if problem.by_elements else by_camera_xy @ film.by_xy, by_unknowns)
+
+
+@dataclass(frozen=True)
+class _FilmDerivatives:
+    """Camera coordinates (n, 2), their derivatives by the comparator's (n, 2, 2) and centred parameters (n, 2, k)."""
+
+    camera_xy: Array
+    by_xy: Array
+    by_parameters: Array
+
+
+def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
+    width = problem.film_columns.stop - problem.film_columns.start
+    result = _FilmDerivatives(np.empty_like(xy_mm), np.empty((*xy_mm.shape, 2)), np.zeros((*xy_mm.shape, width)))
+    for films in problem.films:
+        rows, xy, count = films.rows, xy_mm[films.rows], films.positions.shape[1]
+        parameters = state.values[films.positions][films.of]
+        design = films.kind.design(parameters, xy, films.center_mm[films.of], films.half_mm[films.of])
+        result.camera_xy[rows] = films.kind.apply(parameters, xy)
+        result.by_xy[rows] = films.kind.gradient(parameters, xy)
+        result.by_parameters[rows, :, :count] = design
+    return result
 
 
 def _rays(problem: Problem, state: State, rows: Indices) -> tuple[Array, Array]:
@@ -102,8 +149,8 @@ def _ray_by_in_camera(in_camera: Array) -> Array:
     return np.stack([first, second], axis=1)
 
 
-def blind_target(problem: Problem, state: State) -> str:
-    """The first target that has no image in a state, and why; empty where all have one."""
+def blind_mark(problem: Problem, state: State) -> str:
+    """The first mark that has no image in a state, and why; empty where all have one."""
     observations = problem.network.observations
     for name, rows in problem.targets_by_camera.items():
         interior, parameters = np.split(state.values[problem.unknowns.camera[name]], [3])
@@ -119,4 +166,13 @@ def blind_target(problem: Problem, state: State) -> str:
             if bad.any():
                 row = rows[int(np.argmax(bad))]
                 return f"point {observations.point[row]} {why} in image {observations.image[row]}"
+    camera_xy = _computed_in_camera(problem, state)
+    if camera_xy is not None:
+        _, found = _computed_in_comparator(problem, state, camera_xy)
+        row = int(np.argmin(found))
+        image = problem.network.images[problem.image_numbers[row]]
+        return (
+            f"{observations.kind[row]} {observations.point[row]} is where the {image.transformation} transformation of "
+            f"image {image.name} folds over"
+        )
     return ""

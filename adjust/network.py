@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.families import parameter_names
+from adjust.transformation import film_kind
 
 Array = NDArray[np.float64]
 
 Decentering = Literal["reduced", "paper"]
-Transformation = Literal["none", "congruent", "similarity", "affine"]
+Transformation = str  # as `adjust.transformation` spells it
 ObservationKind = Literal["target", "fiducial", "tie"]
 
 
@@ -117,6 +118,9 @@ class Image:
     transformation: Transformation = "affine"
     exterior: Exterior | None = None
 
+    def __post_init__(self) -> None:
+        film_kind(self.transformation)
+
     @property
     def is_observed(self) -> bool:
         """Whether its whole exterior orientation is given with standard deviations."""
@@ -179,6 +183,14 @@ class Calibration:
 
 
 @dataclass(frozen=True)
+class Extent:
+    """Where the observations of an image lie in the comparator: the middle (2,) and half the larger side, mm."""
+
+    center_mm: Array
+    half_mm: float
+
+
+@dataclass(frozen=True)
 class Network:
     """Everything that one adjustment knows. Names are unique; the order of things does not matter."""
 
@@ -219,14 +231,30 @@ class Network:
         busy = {image.camera for image in self.images if image.name not in self.without_object}
         return frozenset(camera.name for camera in self.cameras if camera.name not in busy)
 
+    @cached_property
+    def extent_by_image(self) -> dict[str, Extent]:
+        number_of = {image.name: i for i, image in enumerate(self.images)}
+        numbers = [number_of[name] for name in self.observations.image]
+        lowest, highest = np.full((len(self.images), 2), np.inf), np.full((len(self.images), 2), -np.inf)
+        np.minimum.at(lowest, numbers, self.observations.xy_mm)
+        np.maximum.at(highest, numbers, self.observations.xy_mm)
+        return {image.name: _extent(lowest[i], highest[i]) for i, image in enumerate(self.images)}
+
+
+def _extent(lowest: Array, highest: Array) -> Extent:
+    """An image that shows less than two places has the extent of a millimetre."""
+    if not np.isfinite(lowest).all():
+        return Extent(np.zeros(2), 1.0)
+    return Extent((lowest + highest) / 2.0, float((highest - lowest).max()) / 2.0 or 1.0)
+
 
 @dataclass(frozen=True)
 class Approximations:
     """Where the iteration starts: by camera, image and point name, in the units of the network.
 
     interior (c, x0', y0'); exterior (6,); transformation: the parameters of the image's kind in the order of
-    `adjust.transformation.NAMES`; points (3,). mirrored: the images whose scan is mirrored (the determinant of their
-    transformation is negative), which a congruent or similarity transformation has to be told.
+    `adjust.transformation.film_parameter_names`; points (3,). mirrored: the images whose scan is mirrored (the
+    determinant of their transformation is negative), which a congruent, similarity or conformal one has to be told.
     """
 
     interior: Mapping[str, Array]

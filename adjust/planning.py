@@ -11,7 +11,7 @@ from adjust.adjustment import Options, adjust_problem, with_datum
 from adjust.cofactor import free_cofactor
 from adjust.elimination import Factor
 from adjust.errors import AdjustmentError
-from adjust.functions import blind_target, computed_observations
+from adjust.functions import blind_mark, computed_observations
 from adjust.iteration import factorise, linearise
 from adjust.network import Approximations, Network
 from adjust.null_space import null_vectors
@@ -116,6 +116,6 @@ def _factor(numbering: Numbering) -> Factor:
 
 def _blind(problem: Problem) -> str:
     return (
-        f"The network cannot be planned: {blind_target(problem, problem.start())}. Turn the camera towards the field, "
+        f"The network cannot be planned: {blind_mark(problem, problem.start())}. Turn the camera towards the field, "
         f"or leave the point out of that image."
     )

@@ -6,17 +6,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.film_kinds import FilmKind
 from adjust.further_observations import FurtherObservation, further_observations
-from adjust.network import Approximations, Network
+from adjust.network import Approximations, Network, Transformation
 from adjust.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
-from adjust.transformation import affine_by_parameters, affine_from_parameters
+from adjust.transformation import film_kind
 from adjust.unknowns import Unknowns, list_unknowns
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-EXTERIOR, TRANSFORMATION, PLACE = slice(0, 6), slice(6, 12), slice(12, 15)  # columns of an observation's derivatives
-CAMERA = slice(15, None)
+EXTERIOR, PLACE = slice(0, 6), slice(6, 9)  # columns of an observation's derivatives; those of film and camera follow
 ABSENT = -1  # stands for the unknown of a column that an observation does not have
 
 
@@ -44,6 +44,23 @@ class State:
 
 
 @dataclass(frozen=True)
+class Films:
+    """The images with one kind of film transformation, and their observations.
+
+    images (m,): their numbers; positions (m, k) of their parameters; center_mm (m, 2), half_mm (m,) of their extents;
+    rows (n,): their observations; of (n,): the image of each of these, counted among the m.
+    """
+
+    kind: FilmKind
+    images: Indices
+    positions: Indices
+    center_mm: Array
+    half_mm: Array
+    rows: Indices
+    of: Indices
+
+
+@dataclass(frozen=True)
 class Problem:
     """A network with its list of unknowns; mirrored: the images whose scan is mirrored.
 
@@ -61,8 +78,13 @@ class Problem:
         return State(values, rotation_from_angles(values[self.exterior[:, 3:]]))
 
     def moved(self, state: State, step: Array) -> State:
-        """The state after a step (n,) of the unknowns; rotation vectors stand in the places of the angles."""
+        """The state after a step (n,) of the unknowns.
+
+        Rotation vectors stand in the places of the angles, centred film parameters in those of the film parameters.
+        """
         values = state.values + step
+        for positions, by_centred in self.films_by_centred(state):
+            values[positions] = state.values[positions] + (by_centred @ step[positions][..., None])[..., 0]
         rotations = rotation_from_vector(step[self.exterior[:, 3:]]) @ state.rotations
         for i, positions in enumerate(self.exterior[:, 3:]):
             if self.keeps_angles[i]:
@@ -76,22 +98,48 @@ class Problem:
         by_angles = vector_by_angles(state.values[self.exterior[:, 3:]])
         return np.where(self.keeps_angles[:, None, None], by_angles, np.eye(3))
 
-    def affines(self, state: State) -> Array:
-        """(images, 6) the coefficients of the transformations."""
-        affines = np.empty((len(self.network.images), 6))
-        for i, image in enumerate(self.network.images):
-            parameters = state.values[self.unknowns.transformation[image.name]]
-            affines[i] = affine_from_parameters(image.transformation, parameters, image.name in self.mirrored)
-        return affines
+    def films_by_centred(self, state: State) -> list[tuple[Indices, Array]]:
+        """Positions (m, k) of film parameters, and their derivatives (m, k, k) by what moves them, the centred ones."""
+        return [
+            (films.positions, films.kind.by_centred(state.values[films.positions], films.center_mm, films.half_mm))
+            for films in self.films
+        ]
 
-    def affines_by_parameters(self, state: State) -> Array:
-        """(images, 6, 6) their derivatives by the transformations' own parameters, zeros behind these."""
-        chain = np.zeros((len(self.network.images), 6, 6))
+    @cached_property
+    def films(self) -> list[Films]:
+        """The film transformations of all images, those of one kind together."""
+        members: dict[tuple[Transformation, bool], list[int]] = {}
         for i, image in enumerate(self.network.images):
-            parameters = state.values[self.unknowns.transformation[image.name]]
-            derivative = affine_by_parameters(image.transformation, parameters, image.name in self.mirrored)
-            chain[i, :, : len(parameters)] = derivative
-        return chain
+            members.setdefault((image.transformation, image.name in self.mirrored), []).append(i)
+        return [self._films(film_kind(*key), np.array(images)) for key, images in members.items()]
+
+    def _films(self, kind: FilmKind, images: Indices) -> Films:
+        names = [self.network.images[i].name for i in images]
+        extents = [self.network.extent_by_image[name] for name in names]
+        place = np.full(len(self.network.images), ABSENT, dtype=np.intp)
+        place[images] = np.arange(len(images))
+        rows = np.flatnonzero(place[self.image_numbers] != ABSENT)
+        return Films(
+            kind,
+            images,
+            np.array([self.unknowns.transformation[name] for name in names], dtype=np.intp),
+            np.array([extent.center_mm for extent in extents]),
+            np.array([extent.half_mm for extent in extents]),
+            rows,
+            place[self.image_numbers[rows]],
+        )
+
+    @cached_property
+    def film_columns(self) -> slice:
+        """The columns of film parameters among an observation's derivatives."""
+        widest = max(len(positions) for positions in self.unknowns.transformation.values())
+        return slice(PLACE.stop, PLACE.stop + widest)
+
+    @cached_property
+    def camera_columns(self) -> slice:
+        """The columns of interior orientation and distortion among an observation's derivatives."""
+        widest = max(len(positions) for positions in self.unknowns.camera.values())
+        return slice(self.film_columns.stop, self.film_columns.stop + widest)
 
     @cached_property
     def further(self) -> tuple[FurtherObservation, ...]:
@@ -147,17 +195,16 @@ class Problem:
 
     @cached_property
     def columns(self) -> Indices:
-        """(n, k) positions of the unknowns in an observation's derivatives: EXTERIOR, TRANSFORMATION, PLACE, CAMERA."""
-        widest = max(len(positions) for positions in self.unknowns.camera.values())
-        by_image = np.full((len(self.network.images), CAMERA.start + widest), ABSENT, dtype=np.intp)
+        """(n, k) positions of the unknowns in an observation's derivatives: EXTERIOR, PLACE, film, camera."""
+        by_image = np.full((len(self.network.images), self.camera_columns.stop), ABSENT, dtype=np.intp)
         by_image[:, EXTERIOR] = self.exterior
         for i, image in enumerate(self.network.images):
-            transformation = self.unknowns.transformation[image.name]
+            film = self.unknowns.transformation[image.name]
             camera = self.unknowns.camera[image.camera]
-            by_image[i, TRANSFORMATION.start : TRANSFORMATION.start + len(transformation)] = transformation
-            by_image[i, CAMERA.start : CAMERA.start + len(camera)] = camera
+            by_image[i, self.film_columns][: len(film)] = film
+            by_image[i, self.camera_columns][: len(camera)] = camera
         columns = by_image[self.image_numbers]
         columns[self.is_fiducial, EXTERIOR] = ABSENT
-        columns[self.is_fiducial, CAMERA] = ABSENT
+        columns[self.is_fiducial, self.camera_columns] = ABSENT
         columns[:, PLACE] = self.places
         return columns

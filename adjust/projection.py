@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from adjust.distortion import image_equations
 from adjust.families import parameter_names
-from adjust.network import EXTERIOR_NAMES, Approximations, Distortion, Network
+from adjust.network import EXTERIOR_NAMES, Approximations, Distortion, Image, Network
 from adjust.result import Adjustment
 from adjust.rotation import rotation_from_angles
-from adjust.transformation import NAMES, affine_from_parameters, apply_affine, comparator_from_camera
+from adjust.transformation import Film, film_parameter_names
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,7 +24,7 @@ class ImageModel:
     """One image as it is known at a time: interior and exterior orientation, distortion, film transformation.
 
     interior (3,): c, x0', y0' in mm; parameters (k,) of the distortion in the order of `families.parameter_names`;
-    rotation (3, 3) object to camera; station (3,) in object units; affine (6,): a1, a2, a3, b1, b2, b3.
+    rotation (3, 3) object to camera; station (3,) in object units.
     """
 
     distortion: Distortion
@@ -32,7 +32,7 @@ class ImageModel:
     parameters: Array
     rotation: Array
     station: Array
-    affine: Array
+    film: Film
 
     def camera_from_object(self, xyz: Array) -> tuple[Array, Mask]:
         """Observed, that is distorted, camera coordinates (n, 2) in mm of object points (n, 3); which have an image."""
@@ -43,15 +43,16 @@ class ImageModel:
     def comparator_from_object(self, xyz: Array) -> tuple[Array, Mask]:
         """Comparator coordinates (n, 2) in mm of object points (n, 3); which of them have an image."""
         xy_mm, visible = self.camera_from_object(xyz)
-        return self.comparator_from_camera(xy_mm), visible
+        comparator_mm, found = self.comparator_from_camera(xy_mm)
+        return comparator_mm, visible & found
 
     def camera_from_comparator(self, xy_mm: Array) -> Array:
         """Observed camera coordinates (n, 2) of comparator coordinates (n, 2), mm."""
-        return apply_affine(self.affine, xy_mm)
+        return self.film.camera_from_comparator(xy_mm)
 
-    def comparator_from_camera(self, xy_mm: Array) -> Array:
-        """Comparator coordinates (n, 2) of observed camera coordinates (n, 2), mm."""
-        return comparator_from_camera(self.affine, xy_mm)
+    def comparator_from_camera(self, xy_mm: Array) -> tuple[Array, Mask]:
+        """Comparator coordinates (n, 2) of observed camera coordinates (n, 2), mm; which of them the film has."""
+        return self.film.comparator_from_camera(xy_mm)
 
     def ideal_from_observed(self, xy_mm: Array) -> tuple[Array, Mask]:
         """Camera coordinates (n, 2) free of distortion, of observed ones (n, 2), mm; which could be corrected."""
@@ -68,14 +69,14 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
         return np.array([adjustment.value(f"{owner}.{each}") for each in names])
 
     exterior = values(f"EO.{name}", EXTERIOR_NAMES)
-    transformation = values(f"T.{name}", NAMES[image.transformation])
+    parameters = values(f"T.{name}", film_parameter_names(image.transformation))
     return ImageModel(
         distortion=camera.distortion,
         interior=values(f"IO.{camera.name}", ("c", "x0", "y0")),
         parameters=values(f"IO.{camera.name}", parameter_names(camera.distortion.family)),
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
-        affine=affine_from_parameters(image.transformation, transformation, name in adjustment.mirrored),
+        film=_film(network, image, parameters, name in adjustment.mirrored),
     )
 
 
@@ -86,15 +87,19 @@ def approximate_image(network: Network, approximations: Approximations, name: st
     given = camera.distortion.parameters
     names = parameter_names(camera.distortion.family)
     exterior = approximations.exterior[name]
-    transformation = approximations.transformation.get(name, np.empty(0))
+    film_parameters = approximations.transformation.get(name, np.empty(0))
     return ImageModel(
         distortion=camera.distortion,
         interior=approximations.interior[camera.name],
         parameters=np.array([given[each].value if each in given else 0.0 for each in names]),
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
-        affine=affine_from_parameters(image.transformation, transformation, name in approximations.mirrored),
+        film=_film(network, image, film_parameters, name in approximations.mirrored),
     )
+
+
+def _film(network: Network, image: Image, parameters: Array, mirrored: bool) -> Film:
+    return Film(image.transformation, parameters, network.extent_by_image[image.name].center_mm, mirrored)
 
 
 def rays(rotation: Array, station: Array, xyz: Array) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ import numpy as np
 from adjust.diagnosis import singular_directions
 from adjust.elimination import Factor
 from adjust.errors import AdjustmentError
-from adjust.functions import blind_target
+from adjust.functions import blind_mark
 from adjust.iteration import Linearised, Solution, factorise, iterate, linearise
 from adjust.numbering import Numbering
 from adjust.options import Options
@@ -142,7 +142,7 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
     start = linearise(numbering, covariance, state)
     if start is None:
         raise AdjustmentError(
-            f"The adjustment cannot start: with the approximations, {blind_target(problem, state)}. Check the "
+            f"The adjustment cannot start: with the approximations, {blind_mark(problem, state)}. Check the "
             f"approximate orientation of the image, and the sign of W: M rotates from object to camera, which looks "
             f"along its negative z axis."
         )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.errors import AdjustmentError
 from adjust.families import parameter_names
 from adjust.network import EXTERIOR_NAMES, Approximations, Camera, Image, Network, ObjectPoint, Prior
-from adjust.transformation import NAMES
+from adjust.transformation import film_parameter_names
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -179,7 +179,7 @@ def _exterior_quantities(image: Image, approximations: Approximations) -> list[Q
 
 
 def _transformation_quantities(image: Image, approximations: Approximations) -> list[Quantity]:
-    names = NAMES[image.transformation]
+    names = film_parameter_names(image.transformation)
     start = approximations.transformation.get(image.name, np.full(len(names), np.nan))
     if len(start) != len(names):
         raise AdjustmentError(

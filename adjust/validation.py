@@ -8,8 +8,8 @@ import numpy as np
 from adjust.errors import AdjustmentError
 from adjust.families import family
 from adjust.network import Camera, Image, Network, Observations, Prior
+from adjust.transformation import fewest_marks, marks_needed
 
-FIDUCIALS_NEEDED = {"none": 0, "congruent": 2, "similarity": 2, "affine": 3}
 TARGETS_NEEDED = 3
 DEFINITE = 1e-13  # least eigenvalue of an earlier calibration's correlation matrix
 
@@ -211,11 +211,13 @@ def _counts(observations: Observations) -> Counter[tuple[str, bool]]:
 
 
 def _check_image(image: Image, targets: int, fiducials: int) -> None:
-    needed = FIDUCIALS_NEEDED[image.transformation]
-    if fiducials < needed:
+    needed = marks_needed(image.transformation)
+    fewest = fewest_marks(image.transformation) if targets else needed
+    if fiducials < fewest:
+        alone = f", {needed} where its targets tell nothing of it" if needed > fewest else ""
         raise AdjustmentError(
             f"image {image.name} shows {fiducials} fiducial marks; its {image.transformation} transformation needs "
-            f"{needed}. Measure more of them, choose a transformation that needs fewer, or leave the image out."
+            f"{fewest}{alone}. Measure more of them, choose a transformation that needs fewer, or leave the image out."
         )
     if not targets and not fiducials:
         raise AdjustmentError(

@@ -19,7 +19,7 @@ from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
 from adjust.projection import adjusted_image
 from adjust.result import Adjustment
 from adjust.significance import group_tests, parameter_tests
-from adjust.transformation import NAMES
+from adjust.transformation import film_parameter_names
 from pipeline.atomic import atomic_path
 from pipeline.errors import InputError
 
@@ -161,7 +161,7 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
 
 def _image(adjustment: Adjustment, image: Image) -> Json:
     transformation: Json = {"kind": image.transformation, "mirrored": image.name in adjustment.mirrored}
-    for parameter in NAMES[image.transformation]:
+    for parameter in film_parameter_names(image.transformation):
         key, scale = (f"{parameter}_deg", DEG_PER_RAD) if parameter in ANGLES else (parameter, 1.0)
         transformation[key] = _quantity(adjustment, f"T.{image.name}.{parameter}", None, scale)
     exterior: Json = {}

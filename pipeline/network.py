@@ -17,7 +17,7 @@ from adjust.network import (
     Prior,
     Transformation,
 )
-from adjust.validation import FIDUCIALS_NEEDED
+from adjust.transformation import marks_needed
 from pipeline.camera_file import CameraFile
 from pipeline.comparator_file import ComparatorPoint
 from pipeline.errors import InputError
@@ -130,7 +130,7 @@ def _expects_targets(project: Project) -> bool:
 
 
 def _has_film_transformation(image: Image, fiducials: int) -> bool:
-    return fiducials >= max(FIDUCIALS_NEEDED[image.transformation], 1)
+    return fiducials >= max(marks_needed(image.transformation), 1)
 
 
 def _why_nothing(images: Sequence[Image], targets: Counter[str], fiducials: Counter[str]) -> str:
@@ -138,7 +138,7 @@ def _why_nothing(images: Sequence[Image], targets: Counter[str], fiducials: Coun
     shown = max(images, key=lambda image: fiducials[image.name])
     marks = (
         f" Nor can a film transformation be found: {shown.name!r} shows the most fiducials, {fiducials[shown.name]}, "
-        f"and its {shown.transformation} transformation needs {FIDUCIALS_NEEDED[shown.transformation]}."
+        f"and its {shown.transformation} transformation needs {marks_needed(shown.transformation)}."
         if shown.transformation != "none"
         else ""
     )

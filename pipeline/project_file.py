@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, cast, get_args
 
 from adjust.network import Transformation
+from adjust.transformation import film_kind
 from pipeline.camera_file import CameraFile, read_camera
 from pipeline.distances_file import GivenDistance, read_distances
 from pipeline.errors import InputError
@@ -229,4 +230,9 @@ def _datum_choice(table: Table, key: str, datum: Datum, wanted: Datum) -> tuple[
 def _transformation(table: Table) -> Transformation | None:
     if "transformation" not in table:
         return None
-    return cast(Transformation, table.text("transformation", choices=get_args(Transformation)))
+    spelling = table.text("transformation")
+    try:
+        film_kind(spelling)
+    except ValueError as error:
+        raise table.error("transformation", f"{error}.") from None
+    return spelling

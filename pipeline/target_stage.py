@@ -11,6 +11,7 @@ from adjust.network import Exterior
 from adjust.projection import ImageModel
 from adjust.resection import resect
 from adjust.rotation import rotation_from_angles
+from adjust.transformation import Film
 from measure.boards import measure_board
 from measure.disk_search import DiskSearch, disk_candidates
 from measure.results import MarkMeasurement
@@ -109,24 +110,24 @@ def approximate_model(project: Project, measured: MeasuredScan) -> tuple[ImageMo
         return None, "the image has no approximate orientation in images.csv"
     if camera.principal_distance_mm is None:
         return None, f"{camera.path.name} gives no principal_distance_mm to predict the targets with"
-    affine = _camera_from_comparator(camera, measured)
-    if affine is None:
+    film = _camera_from_comparator(camera, measured)
+    if film is None:
         return None, "too few fiducials were measured to know where the camera's frame lies in the scan"
-    return _model(camera, exterior, affine, measured), ""
+    return _model(camera, exterior, film, measured), ""
 
 
-def _camera_from_comparator(camera: CameraFile, measured: MeasuredScan) -> Array | None:
-    """a1, a2, a3, b1, b2, b3 (6,), from the fiducials; the identity for a camera that has none."""
+def _camera_from_comparator(camera: CameraFile, measured: MeasuredScan) -> Film | None:
+    """The film as the measurement of the fiducials took it to be; none for a camera that has none."""
     if not camera.fiducials:
-        return np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+        return Film("none", np.zeros(0), np.zeros(2))
     if measured.frame.pixel_from_camera is None:
         return None
     places = np.linalg.inv(np.vstack([measured.frame.pixel_from_camera, [0.0, 0.0, 1.0]]))[:2]
     linear = places[:, :2] @ np.diag(pixel_from_comparator(np.ones(2), measured.pitch_um))
-    return np.array([places[0, 2], *linear[0], places[1, 2], *linear[1]])
+    return Film("affine", np.array([places[0, 2], *linear[0], places[1, 2], *linear[1]]), np.zeros(2))
 
 
-def _model(camera: CameraFile, exterior: Exterior, affine: Array, measured: MeasuredScan) -> ImageModel:
+def _model(camera: CameraFile, exterior: Exterior, film: Film, measured: MeasuredScan) -> ImageModel:
     middle = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0, measured.pitch_um)
     x0, y0 = middle if camera.principal_point_mm is None else camera.principal_point_mm
     distortion = camera.distortion
@@ -137,7 +138,7 @@ def _model(camera: CameraFile, exterior: Exterior, affine: Array, measured: Meas
         np.array([0.0 if prior is None else prior.value for prior in given]),
         rotation_from_angles(exterior.values[3:]),
         exterior.values[:3],
-        affine,
+        film,
     )
 
 

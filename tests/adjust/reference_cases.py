@@ -20,7 +20,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.transformation import NAMES
+from adjust.transformation import film_parameter_names
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
 CAMERA = "K"
@@ -93,7 +93,7 @@ def approximations_of(case: Case, values: dict[str, float]) -> Approximations:
             image.name: np.array([start[f"EO{image.name}.{e}"] for e in EXTERIOR_NAMES]) for image in network.images
         },
         transformation={
-            image.name: np.array([start[f"T{image.name}.{p}"] for p in NAMES[case["transform"]]])
+            image.name: np.array([start[f"T{image.name}.{p}"] for p in film_parameter_names(case["transform"])])
             for image in network.images
         },
         points={point.id: np.array([start[f"PT{point.id}.{axis}"] for axis in "XYZ"]) for point in network.points},

@@ -1,6 +1,7 @@
 """Networks simulated with formulas of their own, point by point: nothing of them comes from the code under test."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,10 @@ from adjust.network import (
 
 Array = NDArray[np.float64]
 
+KINDS = (
+    "none", "congruent", "similarity", "affine", "projective", "bilinear",
+    "conformal(1)", "conformal(2)", "conformal(3)", "polynomial(1)", "polynomial(2)", "polynomial(3)",
+)  # fmt: skip
 FIDUCIALS = {"1": (106.0, -106.0), "2": (-106.0, -106.0), "3": (-106.0, 106.0), "4": (106.0, 106.0), "5": (0.0, -113.0)}
 HALF_MM = 114.0
 STATIONS = ((0.0, 0.0, 1500.0), (500.0, 100.0, 1400.0), (-480.0, 80.0, 1600.0), (60.0, 520.0, 1480.0))
@@ -29,7 +34,7 @@ ATTITUDES = ((0.01, -0.02, 0.1), (-0.08, 0.36, 1.6), (-0.05, -0.29, 3.0), (-0.35
 
 @dataclass(frozen=True)
 class Truth:
-    """What a network is simulated from. affine: comparator to camera, a1 a2 a3 b1 b2 b3, one an image."""
+    """What a network is simulated from. middle_mm: of the images, in the comparator."""
 
     c: float = 153.0
     x0: float = 0.4
@@ -40,6 +45,7 @@ class Truth:
     stations: tuple[tuple[float, float, float], ...] = STATIONS
     attitudes: tuple[tuple[float, float, float], ...] = ATTITUDES
     mirrored: tuple[bool, ...] = (False, False, False, False)
+    middle_mm: tuple[float, float] = (0.0, 0.0)
 
 
 def rotation(omega: float, phi: float, kappa: float) -> Array:
@@ -92,8 +98,10 @@ def affine(truth: Truth, image: int, kind: Transformation) -> Array:
     c, s = np.cos(turn), np.sin(turn)
     m = -1.0 if truth.mirrored[image] else 1.0
     scale = 1.0 if kind == "congruent" else 1.001
-    stretch = 1.0003 if kind == "affine" else 1.0
-    return np.array([3.0 - image, scale * stretch * c, -m * scale * s, 1.0 + image, scale * s, m * scale * c])
+    stretch = 1.0 if kind in ("congruent", "similarity") or kind.startswith("conformal") else 1.0003
+    linear = scale * np.array([[stretch * c, -m * s], [s, m * c]])
+    a1, b1 = np.array([3.0 - image, 1.0 + image]) - linear @ truth.middle_mm
+    return np.array([a1, *linear[0], b1, *linear[1]])
 
 
 def field_points(rng: np.random.Generator, count: int, relief: float = 200.0) -> Array:
@@ -119,12 +127,11 @@ def simulated(
     points = field_points(rng, 12) if points is None else points
     rows: list[tuple[str, str, str, Array, float]] = []
     for i in range(len(truth.stations)):
-        film = affine(truth, i, kind)
-        inverse = np.linalg.inv([[film[1], film[2]], [film[4], film[5]]])
+        film = film_parameters(truth, i, kind)
         marks = [(id_, "fiducial", np.array(xy), 0.003) for id_, xy in FIDUCIALS.items()] if kind != "none" else []
         marks += [(str(j), "target", camera_point(truth, i, xyz), 0.004) for j, xyz in enumerate(points)]
         for id_, what, xy, sigma in marks:
-            observed = xy if kind == "none" else inverse @ (xy - film[[0, 3]])
+            observed = comparator_point(kind, film, truth.mirrored[i], xy)
             rows.append((f"f{i}", id_, what, observed + noise * rng.normal(0.0, sigma, 2), sigma))
     given = {name: Prior(value, (free or {}).get(name, 0.0)) for name, value in truth.distortion.items()}
     spread = fiducial_sigma * noise
@@ -157,21 +164,23 @@ def simulated(
 
 def start_of(truth: Truth, kind: Transformation, points: Array) -> Approximations:
     """The truth, coarsely rounded."""
-    films = [affine(truth, i, kind) for i in range(len(truth.stations))]
+    films = [film_parameters(truth, i, kind) for i in range(len(truth.stations))]
     return Approximations(
         interior={"K": np.array([truth.c, truth.x0, truth.y0])},
         exterior={
             f"f{i}": np.concatenate([np.round(station, -1), np.round(attitude, 2)])
             for i, (station, attitude) in enumerate(zip(truth.stations, truth.attitudes, strict=True))
         },
-        transformation={f"f{i}": np.round(film_parameters(film, kind), 3) for i, film in enumerate(films)},
+        transformation={f"f{i}": np.round(film, 3) for i, film in enumerate(films)},
         points={str(j): xyz for j, xyz in enumerate(points)},
         mirrored=frozenset(f"f{i}" for i, mirrored in enumerate(truth.mirrored) if mirrored),
     )
 
 
-def film_parameters(film: Array, kind: Transformation) -> Array:
-    """The parameters of a transformation's kind, of its six coefficients."""
+def film_parameters(truth: Truth, image: int, kind: Transformation) -> Array:
+    """The parameters of an image's film: `affine`, and a bend of some hundredths of a millimetre."""
+    film = affine(truth, image, kind)
+    bend = np.random.default_rng(100 + image).uniform(-1.0, 1.0, 42)
     match kind:
         case "none":
             return np.empty(0)
@@ -181,3 +190,59 @@ def film_parameters(film: Array, kind: Transformation) -> Array:
             return np.asarray(film[[0, 3, 1, 4]])
         case "affine":
             return film
+        case "projective":
+            return np.append(film, 1e-4 * bend[:2])
+        case "bilinear":
+            return np.array([*film[:3], 5e-6 * bend[0], *film[3:], 5e-6 * bend[1]])
+    order = int(kind[-2])
+    if kind.startswith("conformal"):
+        powers = np.repeat(np.arange(2, order + 1), 2)
+        return np.array([film[0], film[3], film[1], film[4], *(0.05 / 100.0**powers * bend[: len(powers)])])
+    degrees = np.array([degree for degree in range(2, order + 1) for _ in range(degree + 1)])
+    terms = 0.05 / 100.0**degrees * bend[: 2 * len(degrees)].reshape(2, -1)
+    return np.array([*film[:3], *terms[0], *film[3:], *terms[1]])
+
+
+def camera_of_film(kind: Transformation, p: Array, mirrored: bool, x: Any, y: Any) -> tuple[Any, Any]:
+    """The formulas of the film transformations, term by term."""
+    m = -1.0 if mirrored else 1.0
+    match kind:
+        case "none":
+            return x, y
+        case "congruent":
+            return p[0] + np.cos(p[2]) * x - m * np.sin(p[2]) * y, p[1] + np.sin(p[2]) * x + m * np.cos(p[2]) * y
+        case "similarity":
+            return p[0] + p[2] * x - m * p[3] * y, p[1] + p[3] * x + m * p[2] * y
+        case "affine":
+            return p[0] + p[1] * x + p[2] * y, p[3] + p[4] * x + p[5] * y
+        case "projective":
+            d = 1.0 + p[6] * x + p[7] * y
+            return (p[0] + p[1] * x + p[2] * y) / d, (p[3] + p[4] * x + p[5] * y) / d
+        case "bilinear":
+            return p[0] + p[1] * x + p[2] * y + p[3] * x * y, p[4] + p[5] * x + p[6] * y + p[7] * x * y
+    if kind.startswith("conformal"):
+        y = m * y
+        real = (1.0, x, x**2 - y**2, x**3 - 3 * x * y**2)
+        imaginary = (0.0, y, 2 * x * y, 3 * x**2 * y - y**3)
+        a, b = p[0::2], p[1::2]
+        return (
+            sum(a[k] * real[k] - b[k] * imaginary[k] for k in range(len(a))),
+            sum(a[k] * imaginary[k] + b[k] * real[k] for k in range(len(a))),
+        )
+    half = len(p) // 2
+    terms = (1.0, x, y, x**2, x * y, y**2, x**3, x**2 * y, x * y**2, y**3)[:half]
+    return sum(p[k] * term for k, term in enumerate(terms)), sum(p[half + k] * term for k, term in enumerate(terms))
+
+
+def comparator_point(kind: Transformation, p: Array, mirrored: bool, camera_xy: Array) -> Array:
+    """Where a camera point lies in the comparator: the chord of the film over its first 100 mm, again and again."""
+
+    def image(x: float, y: float) -> Array:
+        return np.array(camera_of_film(kind, p, mirrored, x, y))
+
+    chord = np.linalg.inv(np.stack([image(100.0, 0.0) - image(0.0, 0.0), image(0.0, 100.0) - image(0.0, 0.0)], axis=1))
+    xy, step = np.zeros(2), np.ones(2)
+    while np.abs(step).max() > 1e-12:
+        step = 100.0 * chord @ (camera_xy - image(xy[0], xy[1]))
+        xy = xy + step
+    return xy

@@ -82,6 +82,10 @@ def unknown_image(network: Network) -> Network:
     return replace(network, images=network.images[1:])
 
 
+def bent(network: Network) -> Network:
+    return replace(network, images=tuple(replace(image, transformation="projective") for image in network.images))
+
+
 def lopsided(network: Network) -> Network:
     return replace(network, observations=replace(network.observations, point=network.observations.point[:-1]))
 
@@ -101,6 +105,10 @@ GALLERY: dict[str, tuple[Change, list[str]]] = {
     "nan": (nan_coordinate, ["target 4", "image f0", "not a finite number"]),
     "two targets": (lambda n: without(n, "f1", "target", 2), ["image f1", "2 object points", "needs 3"]),
     "two fiducials": (lambda n: without(n, "f3", "fiducial", 2), ["image f3", "2 fiducial", "affine", "needs 3"]),
+    "two of four": (
+        lambda n: without(bent(n), "f3", "fiducial", 2),
+        ["image f3", "2 fiducial", "projective transformation needs 3", "4 where its targets tell nothing of it"],
+    ),
     "no fiducials": (lambda n: without(n, "f3", "fiducial", 0), ["image f3", "0 fiducial", "needs 3"]),
     "parameter": (strange_parameter, ["camera K", "torlegard", "k9", "k3, k5"]),
     "rows do not go together": (lopsided, ["do not go together"]),

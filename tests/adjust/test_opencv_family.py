@@ -12,6 +12,7 @@ from adjust.families import parameter_names
 from adjust.network import Approximations, Camera, Distortion, Image, Network, ObjectPoint, Observations, Prior
 from adjust.projection import ImageModel, adjusted_image, approximate_image, camera_from_ray, ideal_from_observed
 from adjust.rotation import angles_from_rotation, rotation_from_angles
+from adjust.transformation import Film
 
 Array = NDArray[np.float64]
 
@@ -135,7 +136,7 @@ def test_torlegard_is_inverted() -> None:
         np.array([truth.distortion.get(name, 0.0) for name in parameter_names("torlegard")]),
         rotation_from_angles(angles),
         station,
-        np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+        Film("none", np.empty(0), np.zeros(2)),
     )
     observed, visible = model.camera_from_object(xyz)
     assert visible.all()
@@ -161,7 +162,12 @@ def test_what_has_no_image_is_told() -> None:
     )
     assert list(found) == [True, False]
     model = ImageModel(
-        Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0), np.eye(3), np.zeros(3), np.array([0.0, 1, 0, 0, 0, 1])
+        Distortion(),
+        np.array([100.0, 0.0, 0.0]),
+        np.empty(0),
+        np.eye(3),
+        np.zeros(3),
+        Film("none", np.empty(0), np.zeros(2)),
     )
     _, visible = model.comparator_from_object(np.array([[0.0, 0.0, -5.0], [0.0, 0.0, 5.0], [1.0, 0.0, 0.0]]))
     assert list(visible) == [True, False, False]

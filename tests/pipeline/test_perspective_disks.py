@@ -10,6 +10,7 @@ from adjust.families import parameter_names
 from adjust.network import Distortion
 from adjust.projection import ImageModel
 from adjust.rotation import rotation_from_angles
+from adjust.transformation import Film
 from pipeline.comparator_file import pixel_from_comparator
 from pipeline.disks import across, disk_images, disk_normals, eccentricity_mm, plane_normal
 
@@ -52,7 +53,7 @@ def true_model(camera: dict[str, Any], frame: dict[str, Any]) -> ImageModel:
         np.array([distortion[name]["value"] for name in parameter_names(distortion["family"])]),
         rotation_from_angles(angles),
         np.array([exterior[name]["value"] for name in ("X0", "Y0", "Z0")]),
-        np.array([film[name]["value"] for name in ("a1", "a2", "a3", "b1", "b2", "b3")]),
+        Film("affine", np.array([film[name]["value"] for name in ("a1", "a2", "a3", "b1", "b2", "b3")]), np.zeros(2)),
     )
 
 
