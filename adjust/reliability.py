@@ -104,7 +104,7 @@ def _with_own_priors(numbering: Numbering, blocks: Blocks) -> Blocks:
     weights = _prior_root_weights(numbering.problem)[numbering.free]
     rows = np.zeros((count, width, 2, blocks.matrix.shape[2]))
     rows[:, np.arange(width), 0, np.arange(width)] = -weights[blocks.own]
-    matrix = np.concatenate([blocks.matrix, rows.reshape(count, 2 * width, -1)], axis=1)
+    matrix = np.concatenate([blocks.matrix, rows.reshape(count, 2 * width, blocks.matrix.shape[2])], axis=1)
     return replace(blocks, matrix=matrix)
 
 
