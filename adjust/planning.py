@@ -42,7 +42,8 @@ class Plan:
 
     def sigma(self, name: str) -> float:
         """The expected standard deviation of an unknown: 0 where it is fixed, inf where it is not determined."""
-        return float(self.sigmas([name], np.eye(1))[0])
+        i = self.adjustment.index(name)
+        return np.inf if self.null[i].any() else self.sigma0 * float(np.sqrt(self.adjustment.cofactor.variances[i]))
 
     def sigmas(self, names: Sequence[str], functions: Array) -> Array:
         """The expected standard deviations (m,) of linear functions (m, k) of k unknowns; inf where not determined."""
@@ -103,7 +104,9 @@ def _held(problem: Problem) -> tuple[list[int], Array]:
         held += [int(position) for position in numbering.free[pivots]]
         still = np.abs(scaled) <= STILL * np.abs(scaled).max(axis=0)
         by_free = free_cofactor(numbering, problem.start(), factor).by_free
-        null = np.hstack([null, by_free @ (np.where(still, 0.0, scaled) / factor.scale[:, None])])
+        vectors = np.where(still, 0.0, scaled) / factor.scale[:, None]
+        moved, could_move = by_free @ vectors, abs(by_free) @ np.abs(vectors)
+        null = np.hstack([null, np.where(np.abs(moved) <= STILL * could_move, 0.0, moved)])
 
 
 def _factor(numbering: Numbering) -> Factor:

@@ -15,6 +15,7 @@ from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from pipeline import stages
 from pipeline.demo import run_demo
+from pipeline.design.run import run_design
 from pipeline.errors import InputError
 from pipeline.progress import Reporter
 from pipeline.project_file import Project, read_project
@@ -123,6 +124,23 @@ def render(
         render_project(scene, out_dir, count)
     typer.echo(f"{out_dir / 'project.toml'}")
     return DONE
+
+
+@app.command()
+def design(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="The scene file.", show_default=False)],
+    out_dir: Annotated[
+        Path | None, typer.Argument(metavar="[OUT_DIR]", help="Where design.json goes; SCENE-design by default.")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """The precision to be expected of a scene's photographs, without any picture, and what would improve it."""
+    planned = run_design(scene, out_dir, Reporter())
+    if as_json:
+        typer.echo(json.dumps(planned.content, indent=1, ensure_ascii=False))
+    else:
+        planned.print(Console())
+    return LOOK if planned.needs_a_look else DONE
 
 
 @app.command()

@@ -1,5 +1,7 @@
 """The table [field] of a scene file: disks on grids anywhere in space, disks one by one, or a planar board."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,9 +33,10 @@ def read_field(table: Table, unit: str, seed: int) -> DiskField | BoardField:
         )
     generator = np.random.default_rng([seed, 10])
     targets = [target for grid in table.tables("grid") for target in _grid_targets(grid, generator)]
+    targets += [target for scatter in table.tables("scatter") for target in _scattered_targets(scatter, generator)]
     targets += [_target(entry) for entry in table.tables("target")]
     if not targets:
-        raise table.error("grid", "the field has no target. Add [[field.grid]] or [[field.target]].")
+        raise table.error("grid", "the field has no target. Add [[field.grid]], [[field.scatter]] or [[field.target]].")
     return DiskField(tuple(targets), diameter, table.number("surround", 2.0, least=0.0))
 
 
@@ -41,21 +44,54 @@ def _grid_targets(table: Table, generator: np.random.Generator) -> list[DiskTarg
     """Targets about a centre, row by row from the bottom, each moved at random within its cell and out of the plane."""
     first = table.whole("first")
     columns, rows = table.whole("columns", least=1), table.whole("rows", least=1)
-    center = np.array(table.triple("center", (0.0, 0.0, 0.0)))
-    right, up = np.array(table.triple("right")), np.array(table.triple("up"))
-    jitter, relief = table.number("jitter", 0.0, least=0.0), table.number("relief", 0.0, least=0.0)
-    normal = np.cross(right, up)
-    if not np.linalg.norm(normal) > 0.0:
-        raise table.error("up", "must not be parallel to right: the two steps span the grid's plane.")
-    normal /= np.linalg.norm(normal)
+    plane = _Plane.read(table)
+    jitter = table.number("jitter", 0.0, least=0.0)
     table.done()
     row, column = np.divmod(np.arange(rows * columns), columns)
     across = column - (columns - 1) / 2 + generator.uniform(-jitter, jitter, len(row))
     along = row - (rows - 1) / 2 + generator.uniform(-jitter, jitter, len(row))
-    height = generator.uniform(-relief, relief, len(row))
-    places: Array = center + across[:, None] * right + along[:, None] * up + height[:, None] * normal
-    # Whole micro-units: a field that is surveyed has coordinates that can be written down.
-    return [DiskTarget(str(first + i), _triple(np.round(place, 6)), _triple(normal)) for i, place in enumerate(places)]
+    return plane.targets(first, across, along, generator.uniform(-1.0, 1.0, len(row)))
+
+
+def _scattered_targets(table: Table, generator: np.random.Generator) -> list[DiskTarget]:
+    """Targets at random all over a parallelogram, and out of its plane; fewer of them are the first of more."""
+    first, count = table.whole("first"), table.whole("points", least=1)
+    plane = _Plane.read(table)
+    table.done()
+    across, along, height = generator.uniform(-0.5, 0.5, (count, 3)).T
+    return plane.targets(first, across, along, 2.0 * height)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    """Where targets lie: about a centre, in steps right and up, out of the plane by up to the relief either way."""
+
+    center: Array
+    right: Array
+    up: Array
+    relief: float
+
+    @staticmethod
+    def read(table: Table) -> "_Plane":
+        plane = _Plane(
+            np.array(table.triple("center", (0.0, 0.0, 0.0))),
+            np.array(table.triple("right")),
+            np.array(table.triple("up")),
+            table.number("relief", 0.0, least=0.0),
+        )
+        if not np.linalg.norm(np.cross(plane.right, plane.up)) > 0.0:
+            raise table.error("up", "must not be parallel to right: the two steps span the plane of the targets.")
+        return plane
+
+    def targets(self, first: int, across: Array, along: Array, height: Array) -> list[DiskTarget]:
+        """across, along (n,) in steps, height (n,) in reliefs."""
+        normal = np.cross(self.right, self.up)
+        normal /= np.linalg.norm(normal)
+        out = self.relief * height[:, None] * normal
+        places: Array = self.center + across[:, None] * self.right + along[:, None] * self.up + out
+        # Whole micro-units: a field that is surveyed has coordinates that can be written down.
+        places = np.round(places, 6)
+        return [DiskTarget(str(first + i), _triple(place), _triple(normal)) for i, place in enumerate(places)]
 
 
 def _target(table: Table) -> DiskTarget:

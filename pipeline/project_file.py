@@ -197,7 +197,7 @@ def _pitch(table: Table) -> tuple[float, float] | None:
 def _adjust_settings(table: Table) -> AdjustSettings:
     datum = cast(Datum, table.text("datum", "control", get_args(Datum)))
     settings = AdjustSettings(
-        transformation=_transformation(table),
+        transformation=read_transformation(table),
         datum=datum,
         datum_coordinates=_datum_choice(table, "datum_coordinates", datum, "minimal"),
         datum_points=_datum_choice(table, "datum_points", datum, "free"),
@@ -227,7 +227,8 @@ def _datum_choice(table: Table, key: str, datum: Datum, wanted: Datum) -> tuple[
     return names
 
 
-def _transformation(table: Table) -> Transformation | None:
+def read_transformation(table: Table) -> Transformation | None:
+    """The key `transformation`; None where it is absent. Raises InputError."""
     if "transformation" not in table:
         return None
     spelling = table.text("transformation")

@@ -10,6 +10,7 @@ import numpy as np
 
 from measure import shapes
 from pipeline.camera_file import CameraFile, parse_camera, read_camera
+from pipeline.design.settings import read_design
 from pipeline.errors import InputError
 from pipeline.field_table import read_field
 from pipeline.scene_project import Given, SceneFile, write_project
@@ -37,7 +38,12 @@ def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = 
 
 def read_scene(path: Path) -> SceneFile:
     """Read SCENE.toml. Raises InputError naming file, line and key."""
-    table = read_toml(path)
+    return parse_scene(read_toml(path))
+
+
+def parse_scene(table: Table) -> SceneFile:
+    """The scene that stands in the root table of a file."""
+    path = table.file
     seed = table.whole("seed", 1)
     camera = _camera(table)
     field_table = table.table("field")
@@ -67,9 +73,10 @@ def read_scene(path: Path) -> SceneFile:
         ),
     )
     given = _given(table.table("given"))
+    design = read_design(table.table("design"), given.point[0] if given.planimetry else math.inf, given.point[1])
     for part in (film_table, scanner_table, picture, table):
         part.done()
-    return SceneFile(path, made, camera, unit, given)
+    return SceneFile(path, made, camera, unit, given, design)
 
 
 def _made(path: Path, make: Callable[[], Made]) -> Made:

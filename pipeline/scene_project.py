@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tifffile
@@ -16,8 +17,9 @@ from measure import shapes
 from pipeline.atomic import atomic_path, write_atomically
 from pipeline.camera_file import CameraFile, GivenFiducial
 from pipeline.camera_text import camera_text
+from pipeline.design.settings import DesignSettings
 from pipeline.field_table import UNITS_MM
-from synthetic_images.scene import BoardField, Scene, SceneImage
+from synthetic_images.scene import BoardField, FilmKind, Scene, SceneImage
 from synthetic_images.targets import Target, field_targets
 
 Array = NDArray[np.float64]
@@ -48,7 +50,7 @@ class Given:
 class SceneFile:
     """A scene file as read. camera: the true camera, with the priors that the given one is to have.
 
-    unit: of the object's coordinates.
+    unit: of the object's coordinates. design: how the same photographs are planned.
     """
 
     path: Path
@@ -56,6 +58,7 @@ class SceneFile:
     camera: CameraFile
     unit: str
     given: Given
+    design: DesignSettings
 
 
 def write_project(scene_file: SceneFile, out_dir: Path) -> None:
@@ -181,7 +184,7 @@ images = "images.csv"
 unit = "{scene_file.unit}"
 
 [adjust]
-transformation = "{_transformation(scene_file)}"
+transformation = "{film_transformation(scene_file)}"
 """
 
 
@@ -196,5 +199,6 @@ def _targets_text(scene_file: SceneFile) -> str:
     return f"{text}{dots}asymmetric = {str(field.asymmetric).lower()}\n"
 
 
-def _transformation(scene_file: SceneFile) -> str:
+def film_transformation(scene_file: SceneFile) -> FilmKind | Literal["none"]:
+    """The transformation that the scene's film needs; none for a camera without fiducials."""
     return scene_file.scene.film.kind if scene_file.camera.fiducials else "none"

@@ -131,6 +131,13 @@ class Table:
             raise self.error(key, f'must be a list of texts, ["...", "..."], not {value!r}.')
         return tuple(value)
 
+    def numbers(self, key: str) -> tuple[float, ...]:
+        """A list of numbers, whole ones as they are."""
+        value = self._get(key, None)
+        if not isinstance(value, list) or not value:
+            raise self.error(key, f"must be a list of numbers, [1.0, 2.0, ...], not {value!r}.")
+        return tuple(item if type(item) is int else self._number(key, item) for item in value)
+
     def table(self, key: str) -> "Table":
         """A table inside of this one; an empty one where it is absent."""
         value = self._get(key, {})

@@ -1,0 +1,1 @@
+"""What a planned network of photographs would give: `reseau design`."""

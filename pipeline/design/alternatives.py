@@ -1,0 +1,161 @@
+"""What would help: the same plan with one more photograph, another kappa, more points, better control or measuring."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.rotation import angles_from_rotation, rotation_from_angles
+from pipeline.design.expected import Expected, expect
+from pipeline.design.setup import FEWEST_TARGETS, PlannedPoint, Setup
+from synthetic_images.scene import SceneImage
+
+Array = NDArray[np.float64]
+
+QUARTER = math.pi / 2
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One change of the setup, and what it would make of the camera's standard deviations.
+
+    gain_percent: by how much each shrinks; nan where neither plan determines it, 100 where only the changed one does.
+    """
+
+    change: str
+    expected: Expected
+    gain_percent: Mapping[str, float]
+
+    @property
+    def usefulness(self) -> float:
+        """The mean gain over all quantities."""
+        gains = [gain for gain in self.gain_percent.values() if not math.isnan(gain)]
+        return sum(gains) / len(gains) if gains else 0.0
+
+
+Progress = Callable[[str, int, int], None]
+
+
+def alternatives(basis: Expected, progress: Progress | None = None) -> tuple[Alternative, ...]:
+    """Every kind of change once; of photographs that could be taken anew or turned, the most useful of each kind."""
+    setup = basis.setup
+    kinds = [list(kind) for kind in (*_photos(setup), _turned(setup), *([one] for one in _better(setup)))]
+    total = sum(len(kind) for kind in kinds)
+    done = 0
+    chosen = []
+    for kind in kinds:
+        tried = []
+        for change, changed in kind:
+            tried.append(_compared(basis, change, changed))
+            done += 1
+            if progress is not None:
+                progress(change, done, total)
+        if tried:
+            chosen.append(max(tried, key=lambda alternative: alternative.usefulness))
+    return tuple(chosen)
+
+
+def gains(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
+    """By how many percent standard deviations shrink."""
+    return {name: _gain(sigma, after.get(name, 0.0)) for name, sigma in before.items()}
+
+
+def _gain(before: float, after: float) -> float:
+    if math.isinf(before):
+        return math.nan if math.isinf(after) else 100.0
+    return -math.inf if math.isinf(after) else 100.0 * (1.0 - after / before)
+
+
+def _compared(basis: Expected, change: str, changed: Setup) -> Alternative:
+    expected = expect(changed)
+    return Alternative(change, expected, gains(basis.camera_sigmas, expected.camera_sigmas))
+
+
+Change = tuple[str, Setup]
+Exterior = tuple[float, float, float, float, float, float]
+
+
+def _photos(setup: Setup) -> Iterator[Iterable[Change]]:
+    """One more photograph: each that the settings name; one as there is, but turned or carried round the field."""
+    for photo in setup.settings.photos:
+        omega, phi, kappa = (math.radians(angle) for angle in photo.angles_deg)
+        image = SceneImage(photo.name, (*photo.position, omega, phi, kappa))
+        yield [(f"one more photo: {photo.name}", _with(setup, image))]
+    center, axis = _field_axis(setup.points)
+    yield _more(setup, "turned by 90 degrees", _rolled)
+    for turn, words in ((QUARTER, "a quarter"), (2 * QUARTER, "half")):
+        rotation = _about(axis, turn)
+        yield _more(setup, f"carried {words} round the field", partial(_carried, center=center, rotation=rotation))
+
+
+def _more(setup: Setup, words: str, moved: Callable[[Exterior], Exterior]) -> Iterator[Change]:
+    for image in setup.images:
+        new = SceneImage(f"{image.name} again", moved(image.exterior))
+        if len(setup.seen_by(new)) >= FEWEST_TARGETS:
+            yield f"one more photo: as {image.name}, {words}", _with(setup, new)
+
+
+def _turned(setup: Setup) -> Iterator[Change]:
+    """Another kappa of one photograph."""
+    for i, image in enumerate(setup.images):
+        new = replace(image, exterior=_rolled(image.exterior))
+        if len(setup.seen_by(new)) >= FEWEST_TARGETS:
+            images = (*setup.images[:i], new, *setup.images[i + 1 :])
+            yield f"another kappa: {image.name} turned by 90 degrees", replace(setup, images=images)
+
+
+def _better(setup: Setup) -> Iterator[Change]:
+    """More or better measurements; only those that there are."""
+    yield "twice as many points, spread alike", replace(setup, points=(*setup.points, *map(_double, setup.points)))
+    if any(0.0 < point.sigma_height < math.inf for point in setup.points):
+        points = (replace(point, sigma_height=point.sigma_height / 2) for point in setup.points)
+        yield "given heights twice as good", replace(setup, points=tuple(points))
+    if any(0.0 < point.sigma_planimetry < math.inf for point in setup.points):
+        points = (replace(point, sigma_planimetry=point.sigma_planimetry / 2) for point in setup.points)
+        yield "given X and Y twice as good", replace(setup, points=tuple(points))
+    settings = setup.settings
+    if setup.transformation != "none":
+        finer = replace(settings, sigma_fiducial_um=settings.sigma_fiducial_um / 2)
+        yield "fiducials measured twice as well", replace(setup, settings=finer)
+    finer = replace(settings, sigma_target_um=settings.sigma_target_um / 2)
+    yield "targets measured twice as well", replace(setup, settings=finer)
+
+
+def _double(point: PlannedPoint) -> PlannedPoint:
+    """A second point in the same place stands for one more of the same distribution."""
+    return replace(point, id=f"{point.id} again")
+
+
+def _with(setup: Setup, image: SceneImage) -> Setup:
+    return replace(setup, images=(*setup.images, image))
+
+
+def _rolled(exterior: Exterior) -> Exterior:
+    return (*exterior[:5], exterior[5] + QUARTER)
+
+
+def _field_axis(points: Iterable[PlannedPoint]) -> tuple[Array, Array]:
+    """The middle of the field and the mean direction in which its targets face."""
+    listed = list(points)
+    center = np.mean([point.xyz for point in listed], axis=0)
+    axis = np.mean([point.normal for point in listed], axis=0)
+    length = float(np.linalg.norm(axis))
+    return center, axis / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+
+
+def _about(axis: Array, turn_rad: float) -> Array:
+    """The rotation matrix (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + math.sin(turn_rad) * cross + (1 - math.cos(turn_rad)) * cross @ cross)
+
+
+def _carried(exterior: Exterior, center: Array, rotation: Array) -> Exterior:
+    """Station and camera together."""
+    station = center + rotation @ (np.array(exterior[:3]) - center)
+    angles = angles_from_rotation(rotation_from_angles(np.array(exterior[3:])) @ rotation.T)
+    x, y, z, omega, phi, kappa = (float(value) for value in (*station, *angles))
+    return (x, y, z, omega, phi, kappa)

@@ -1,0 +1,159 @@
+"""The expected precision of a setup: of the camera, along the radius, of the points."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.adjustment import Options
+from adjust.distortion import image_equations
+from adjust.families import parameter_names
+from adjust.network import Network
+from adjust.planning import Plan, plan
+from adjust.projection import ideal_from_observed
+from pipeline.design.setup import Setup, planned_network
+from pipeline.report.lens import Lens, displacement
+
+Array = NDArray[np.float64]
+
+UM_PER_MM = 1000.0
+DIRECTIONS = 36
+QUARTERS = 4
+ROUNDING_UM = 1e-9
+INTERIOR = ("c", "x0", "y0")
+
+
+@dataclass(frozen=True)
+class AtRadius:
+    """Expected standard deviations in um at a radius: rms over all directions, one axis each.
+
+    radial, tangential: of the distortion; ray: of where a ray of known direction is imaged in the camera frame, by the
+    whole interior orientation.
+    """
+
+    radius_mm: float
+    radial_um: float
+    tangential_um: float
+    ray_um: float
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """A setup, its network and what is expected of it."""
+
+    setup: Setup
+    network: Network
+    plan: Plan
+
+    @property
+    def camera(self) -> str:
+        return self.network.cameras[0].name
+
+    @property
+    def family_parameters(self) -> tuple[str, ...]:
+        """The distortion parameters that are not fixed."""
+        given = self.network.cameras[0].distortion.parameters
+        return tuple(name for name in self._parameters if name in given and given[name].sigma > 0.0)
+
+    @property
+    def fiducials(self) -> tuple[str, ...]:
+        return tuple(self.network.cameras[0].fiducials)
+
+    @cached_property
+    def camera_sigmas(self) -> Mapping[str, float]:
+        """The standard deviations of what is to be found of the camera, by name; nothing that is fixed.
+
+        c, x0, y0 and fiducials (rms of all coordinates) in um, distortion parameters in their own units, `ray`: where a
+        ray is imaged at the largest radius, um.
+        """
+        names = list(self._unknowns)
+        told = dict(zip(names, self.plan.sigmas(self._full_names, np.eye(len(names))), strict=True))
+        sigmas = {name: UM_PER_MM * float(told[name]) for name in INTERIOR}
+        sigmas |= {name: float(told[name]) for name in self.family_parameters}
+        marks = [float(told[name]) for name in names[len(INTERIOR) + len(self._parameters) :]]
+        sigmas |= {"fiducials": UM_PER_MM * rms(marks), "ray": self.curve[-1].ray_um}
+        return {name: sigma for name, sigma in sigmas.items() if sigma > 0.0}
+
+    @cached_property
+    def curve(self) -> tuple[AtRadius, ...]:
+        """The distortion's precision at the radii that the settings ask for."""
+        radii = self.setup.settings.radii_mm
+        if not radii:
+            corner = float(np.hypot(*self.setup.lens.frame_mm)) / 2
+            radii = tuple(corner * quarter / QUARTERS for quarter in range(1, QUARTERS + 1))
+        functions = [self._functions(radius) for radius in radii]
+        sigmas = self.plan.sigmas(self._full_names, np.concatenate(functions))
+        sigmas = np.where(sigmas > ROUNDING_UM, sigmas, 0.0)
+        parts = np.split(sigmas, len(radii))
+        return tuple(
+            AtRadius(
+                radius, rms(part[:DIRECTIONS]), rms(part[DIRECTIONS : 2 * DIRECTIONS]), rms(part[2 * DIRECTIONS :])
+            )
+            for radius, part in zip(radii, parts, strict=True)
+        )
+
+    @cached_property
+    def point_sigmas(self) -> Array:
+        """(n, 3) of the network's points, object units."""
+        names = [f"PT.{point.id}.{axis}" for point in self.network.points for axis in "XYZ"]
+        return np.array([self.plan.sigma(name) for name in names]).reshape(-1, 3)
+
+    @property
+    def _parameters(self) -> tuple[str, ...]:
+        return parameter_names(self.network.cameras[0].distortion.family)
+
+    @property
+    def _unknowns(self) -> tuple[str, ...]:
+        """All quantities of the camera, the interior orientation first, then the distortion, then the fiducials."""
+        marks = (f"{id}.{axis}" for id in self.fiducials for axis in "xy")
+        return (*INTERIOR, *self._parameters, *marks)
+
+    @property
+    def _full_names(self) -> list[str]:
+        within = len(INTERIOR) + len(self._parameters)
+        owners = ["IO"] * within + ["FID"] * (2 * len(self.fiducials))
+        return [f"{owner}.{self.camera}.{name}" for owner, name in zip(owners, self._unknowns, strict=True)]
+
+    def _functions(self, radius_mm: float) -> Array:
+        """Rows (4 DIRECTIONS, k) in um: the radial and the tangential distortion at a radius, the image of a ray."""
+        angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+        outward = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        across = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
+        adjustment = self.plan.adjustment
+        interior = np.array([adjustment.value(f"IO.{self.camera}.{name}") for name in INTERIOR])
+        values = np.array([adjustment.value(f"IO.{self.camera}.{name}") for name in self._parameters])
+        lens = Lens(self.camera, self.network.cameras[0].distortion, interior, values)
+        by_c_and_parameters = displacement(lens, radius_mm * outward).by_unknowns_um
+        radial = np.einsum("di,dik->dk", outward, by_c_and_parameters)
+        tangential = np.einsum("di,dik->dk", across, by_c_and_parameters)
+        ray = _ray_by_unknowns(lens, radius_mm * outward)
+        functions = np.zeros((4 * DIRECTIONS, len(self._unknowns)))
+        count = len(INTERIOR) + len(values)
+        columns = [0, *range(len(INTERIOR), count)]
+        functions[:DIRECTIONS, columns] = radial
+        functions[DIRECTIONS : 2 * DIRECTIONS, columns] = tangential
+        functions[2 * DIRECTIONS :, :count] = UM_PER_MM * ray.reshape(-1, count)
+        return functions
+
+
+def _ray_by_unknowns(lens: Lens, from_principal_point_mm: Array) -> Array:
+    """How the image of a ray moves with c, x0', y0' and the parameters (n, 2, 3 + k): F = 0 with the ray held."""
+    xy_mm = lens.interior[1:] + from_principal_point_mm
+    ideal, _ = ideal_from_observed(lens.distortion, lens.interior, lens.parameters, xy_mm)
+    ray = (ideal - lens.interior[1:]) / lens.interior[0]
+    at = image_equations(lens.distortion, lens.interior, lens.parameters, xy_mm, ray)
+    by_unknowns = np.concatenate([at.by_interior, at.by_parameters], axis=2)
+    return -np.asarray(np.linalg.solve(at.by_xy, by_unknowns))
+
+
+def expect(setup: Setup) -> Expected:
+    """Plan a setup. Raises InputError or AdjustmentError where an image shows too little."""
+    network, values = planned_network(setup)
+    return Expected(setup, network, plan(network, values, Options(setup.settings.datum), setup.settings.sigma0))
+
+
+def rms(values: list[float] | Array) -> float:
+    """Root of the mean square; 0 of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0

@@ -1,0 +1,163 @@
+"""A planned set of photographs, and the network that measuring them would give."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust import network
+from adjust.fiducial_fit import fit_transformation
+from adjust.network import Approximations, Network, Prior, Transformation
+from pipeline.camera_file import CameraFile
+from pipeline.design.settings import DesignSettings
+from pipeline.errors import InputError
+from pipeline.scene_project import SceneFile, film_transformation
+from synthetic_images.projection import camera_from_object
+from synthetic_images.scene import SceneCamera, SceneImage
+from synthetic_images.targets import field_targets
+
+Array = NDArray[np.float64]
+
+FEWEST_TARGETS = 3  # that an image must show to be oriented
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPoint:
+    """A target: where it is and faces (3,), and the standard deviations of its given X and Y, and of its given Z.
+
+    0: known exactly, inf: unknown; in object units.
+    """
+
+    id: str
+    xyz: Array
+    normal: Array
+    sigma_planimetry: float
+    sigma_height: float
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Everything that decides a plan. lens: the camera as it projects; camera: the same with its priors."""
+
+    lens: SceneCamera
+    camera: CameraFile
+    transformation: Transformation
+    points: tuple[PlannedPoint, ...]
+    images: tuple[SceneImage, ...]
+    settings: DesignSettings
+
+    def seen_by(self, image: SceneImage) -> list[int]:
+        """The points that lie within an image's frame and face its camera; that one hides another is not looked for."""
+        xyz = np.array([point.xyz for point in self.points])
+        normals = np.array([point.normal for point in self.points])
+        xy_mm = camera_from_object(self.lens, image.exterior, xyz)
+        faces = (normals * (np.asarray(image.exterior[:3]) - xyz)).sum(axis=1) > 0.0
+        with np.errstate(invalid="ignore"):
+            inside = (np.abs(xy_mm) <= np.asarray(self.lens.frame_mm) / 2).all(axis=1)
+        return [int(i) for i in np.flatnonzero(inside & faces)]
+
+
+def setup_of(scene_file: SceneFile) -> Setup:
+    """The plan of a scene. Raises InputError where it names control points that the field does not have."""
+    settings = scene_file.design
+    targets = field_targets(scene_file.scene.field)
+    strangers = set(settings.control_points) - {target.id for target in targets}
+    if strangers:
+        raise InputError(
+            f"{scene_file.path}: [design] control_points: the field has no target {min(strangers)!r}. Its targets are "
+            f"{targets[0].id!r} to {targets[-1].id!r}."
+        )
+    points = []
+    for target in targets:
+        planimetry, height = settings.sigma_planimetry, settings.sigma_height
+        if settings.control_points and target.id not in settings.control_points:
+            planimetry = height = math.inf
+        if target.id in scene_file.given.fixed_points and not scene_file.given.planimetry:
+            planimetry = 0.0
+        points.append(PlannedPoint(target.id, target.center, target.normal, planimetry, height))
+    transformation = settings.transformation or film_transformation(scene_file)
+    if transformation != "none" and not scene_file.camera.fiducials:
+        raise InputError(
+            f"{scene_file.path}: [design] transformation is {transformation!r}, but the camera has no fiducials. "
+            'Write transformation = "none", or add the fiducials.'
+        )
+    return Setup(
+        scene_file.scene.camera, scene_file.camera, transformation, tuple(points), scene_file.scene.images, settings
+    )
+
+
+def planned_network(setup: Setup) -> tuple[Network, Approximations]:
+    """The network that measuring a setup gives, with the setup itself as the values of its unknowns.
+
+    The film lies straight in the comparator, and every visible mark is measured. A point of which nothing is known and
+    that fewer than two images show has no part in it. Raises InputError where an image shows too few targets.
+    """
+    seen = {image.name: setup.seen_by(image) for image in setup.images}
+    for name, rows in seen.items():
+        if len(rows) < FEWEST_TARGETS:
+            raise InputError(
+                f"Image {name!r} would show {len(rows)} targets and needs {FEWEST_TARGETS}. Move or turn it towards "
+                "the field, or leave it out."
+            )
+    rays = Counter(i for rows in seen.values() for i in rows)
+    used = [i for i in sorted(rays) if rays[i] >= 2 or math.isfinite(min(_sigmas(setup.points[i])))]
+    camera = _camera(setup)
+    observations = _observations(setup, seen, set(used))
+    points = [setup.points[i] for i in used]
+    planned = Network(
+        cameras=(camera,),
+        images=tuple(network.Image(image.name, camera.name, setup.transformation) for image in setup.images),
+        points=tuple(_object_point(point) for point in points),
+        observations=observations,
+    )
+    return planned, _values(setup, planned, points)
+
+
+def _sigmas(point: PlannedPoint) -> tuple[float, float]:
+    return point.sigma_planimetry, point.sigma_height
+
+
+def _camera(setup: Setup) -> network.Camera:
+    """The camera with its priors; fiducials only where images are transformed by them."""
+    point = setup.camera.principal_point_mm or (0.0, 0.0)
+    fiducials = setup.camera.fiducials if setup.transformation != "none" else ()
+    return replace(setup.camera, principal_point_mm=point, fiducials=fiducials).camera()
+
+
+def _object_point(point: PlannedPoint) -> network.ObjectPoint:
+    plane, height = _sigmas(point)
+    x, y, z = (float(value) for value in point.xyz)
+    return network.ObjectPoint(point.id, Prior(x, plane), Prior(y, plane), Prior(z, height))
+
+
+def _observations(setup: Setup, seen: dict[str, list[int]], used: set[int]) -> network.Observations:
+    """One row a visible mark; the coordinates are computed when the network is planned."""
+    film_um = setup.settings.film_sigma_um
+    rows: list[tuple[str, str, network.ObservationKind, float]] = []
+    for image in setup.images:
+        if setup.transformation != "none":
+            sigma = math.hypot(setup.settings.sigma_fiducial_um, film_um)
+            shown = [one.id for one in setup.camera.fiducials if one.id not in image.covered]
+            rows += [(image.name, id, "fiducial", sigma) for id in shown]
+        sigma = math.hypot(setup.settings.sigma_target_um, film_um)
+        rows += [(image.name, setup.points[i].id, "target", sigma) for i in seen[image.name] if i in used]
+    images, points, kinds, sigmas_um = zip(*rows, strict=True)
+    variances_mm2 = (np.array(sigmas_um) / 1000.0) ** 2
+    return network.Observations(
+        images, points, kinds, np.zeros((len(rows), 2)), variances_mm2[:, None, None] * np.eye(2)
+    )
+
+
+def _values(setup: Setup, planned: Network, points: list[PlannedPoint]) -> Approximations:
+    camera = planned.cameras[0]
+    marks = np.array([one.xy_mm for one in setup.camera.fiducials]).reshape(-1, 2)
+    straight, _ = fit_transformation(setup.transformation, marks, marks)
+    point = setup.lens.principal_point_mm
+    return Approximations(
+        interior={camera.name: np.array([setup.lens.principal_distance_mm, *point])},
+        exterior={image.name: np.array(image.exterior) for image in setup.images},
+        transformation={image.name: straight for image in setup.images},
+        points={point.id: point.xyz for point in points},
+    )

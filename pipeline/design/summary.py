@@ -1,0 +1,142 @@
+"""What `reseau design` prints: the expected precision, what would help, the sweeps, where the files are."""
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from pipeline.design.alternatives import Alternative
+from pipeline.design.expected import Expected, rms
+from pipeline.design.sweeps import Layouts, Swept
+from pipeline.report.numbers import fixed, significant, value_and_sigma
+
+UNDETERMINED = "not determined"
+UM_PER_MM = 1000.0
+LABELS = {"c": "c", "x0": "x0'", "y0": "y0'", "fiducials": "fiducials", "ray": "ray"}
+UNITS = {"c": "µm", "x0": "µm", "y0": "µm", "fiducials": "µm", "ray": "µm"}
+
+
+def print_design(
+    expected: Expected,
+    layouts: Layouts,
+    helpful: tuple[Alternative, ...],
+    swept: Iterable[Swept],
+    files: Mapping[str, Path],
+    console: Console,
+) -> None:
+    """For a person; file paths are never folded."""
+    adjustment = expected.plan.adjustment
+    console.print(
+        f"{len(expected.network.images)} photographs, {len(expected.network.points)} points, redundancy "
+        f"{adjustment.redundancy}, sigma0 {expected.plan.sigma0:g} (given)",
+        highlight=False,
+    )
+    for null in expected.plan.singular:
+        console.print(Text(f"- {', '.join(null.parameters)}: {null.cause}", style="bold yellow"))
+        console.print(Text(f"  {null.remedy}", style="dim"))
+    for warning in adjustment.warnings:
+        console.print(Text(f"- {warning}"))
+    console.print(_camera_table(expected, layouts))
+    console.print(_curve_table(expected))
+    if expected.fiducials:
+        console.print(_fiducial_table(expected))
+    console.print(_point_table(expected))
+    if helpful:
+        console.print(_help_table(expected, helpful))
+    for one in swept:
+        console.print(_sweep_table(one))
+    for word, path in files.items():
+        console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _camera_table(expected: Expected, layouts: Layouts) -> Table:
+    several = layouts.count > 1
+    title = f"Expected precision of camera {expected.camera}"
+    table = Table("quantity", "value", "sigma", title=title, title_justify="left")
+    if several:
+        table.add_column(f"mean of {layouts.count} layouts")
+        table.add_column("spread")
+    plan, interior = expected.plan, f"IO.{expected.camera}."
+    rows = {"c": "principal distance, mm", "x0": "principal point x', mm", "y0": "principal point y', mm"}
+    rows |= {name: name for name in expected.family_parameters}
+    for name, label in rows.items():
+        sigma = plan.sigma(interior + name)
+        cells = [label, *_told(plan.adjustment.value(interior + name), sigma)]
+        if several and name in layouts.mean:
+            scale = UM_PER_MM if name in UNITS else 1.0
+            cells += [_sigma(layouts.mean[name] / scale), _sigma(layouts.spread[name] / scale)]
+        table.add_row(*cells)
+    return table
+
+
+def _curve_table(expected: Expected) -> Table:
+    table = Table(
+        "radius, mm", "radial", "tangential", "image of a ray", title="Distortion, sigma in µm", title_justify="left"
+    )
+    for at in expected.curve:
+        table.add_row(f"{at.radius_mm:.1f}", _sigma(at.radial_um), _sigma(at.tangential_um), _sigma(at.ray_um))
+    return table
+
+
+def _fiducial_table(expected: Expected) -> Table:
+    table = Table("fiducial", "x', µm", "y', µm", title="Fiducial marks, sigma", title_justify="left")
+    for id in expected.fiducials:
+        sigmas = (UM_PER_MM * expected.plan.sigma(f"FID.{expected.camera}.{id}.{axis}") for axis in "xy")
+        table.add_row(Text(id), *(_sigma(sigma) for sigma in sigmas))
+    return table
+
+
+def _point_table(expected: Expected) -> Table:
+    table = Table("coordinate", "rms", "largest", title="Object points, sigma", title_justify="left")
+    for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
+        told = [float(sigma) for sigma in sigmas if sigma > 0.0]
+        table.add_row(axis, _sigma(rms(told)) if told else "fixed", _sigma(max(told)) if told else "fixed")
+    return table
+
+
+def _help_table(expected: Expected, helpful: tuple[Alternative, ...]) -> Table:
+    names = list(expected.camera_sigmas)
+    title = "What would help: by how many percent the sigmas shrink"
+    table = Table("change", *(LABELS.get(name, name) for name in names), title=title, title_justify="left")
+    for one in helpful:
+        table.add_row(Text(one.change), *(_gain(one.gain_percent[name]) for name in names))
+    return table
+
+
+def _sweep_table(swept: Swept) -> Table:
+    names = swept.names
+    heads = (f"{LABELS.get(name, name)}, {UNITS[name]}" if name in UNITS else name for name in names)
+    layouts = swept.steps[0].sigmas.count
+    title = f"Sigmas over {swept.quantity}" + (f", mean of {layouts} layouts" if layouts > 1 else "")
+    table = Table(swept.quantity, "points", *heads, title=title, title_justify="left")
+    for step in swept.steps:
+        value = step.value if isinstance(step.value, str) else f"{step.value:g}"
+        sigmas = (_sigma(step.sigmas.mean[name]) if name in step.sigmas.mean else "fixed" for name in names)
+        table.add_row(Text(value), str(step.points), *sigmas)
+    slopes = [swept.slope(name) for name in names]
+    if not all(math.isnan(slope) for slope in slopes):
+        table.add_section()
+        table.add_row("slope", "", *("" if math.isnan(slope) else f"{slope:+.2f}" for slope in slopes))
+    return table
+
+
+def _told(value: float, sigma: float) -> tuple[str, str]:
+    if math.isinf(sigma):
+        return significant(value, 6), UNDETERMINED
+    return value_and_sigma(value, sigma)
+
+
+def _sigma(sigma: float) -> str:
+    """To two digits."""
+    if sigma == 0.0:
+        return "0"
+    return UNDETERMINED if math.isinf(sigma) else value_and_sigma(sigma, sigma)[1]
+
+
+def _gain(percent: float) -> str:
+    if math.isnan(percent):
+        return "–"
+    return "lost" if math.isinf(percent) else fixed(percent, 0)
