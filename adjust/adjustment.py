@@ -11,7 +11,7 @@ from adjust.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datu
 from adjust.datum_choice import chosen_coordinates, chosen_points
 from adjust.diagnosis import undetermined, weak_directions
 from adjust.iteration import factorise
-from adjust.network import Approximations, Network
+from adjust.network import STRAIGHT, Approximations, Network
 from adjust.options import Datum, Method, Options
 from adjust.problem import Problem, number
 from adjust.reliability import Misfits, reliability
@@ -48,11 +48,19 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
 def adjust_problem(problem: Problem, options: Options, held: Iterable[int] = ()) -> Adjustment:
     """The same with a network whose quantities are numbered; those at the positions `held` stay where they start."""
     members = chosen_points(problem, options.datum_points)
-    solved = with_datum(problem, options)
+    solved = _without_bending_for_a_datum(with_datum(problem, options))
     solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options)
     if options.datum == "free":
         solution = _freed(problem, solution, members, options)
     return _result(solution, _cofactor(problem, solution, members if options.datum == "free" else None), options)
+
+
+def _without_bending_for_a_datum(problem: Problem) -> Problem:
+    """Straight lines of sight where the datum is lacking: bent ones would hold it, but by next to nothing."""
+    bent = not problem.network.line_of_sight.is_straight
+    if bent and object_datum(problem, problem.start()).free.shape[1] > 0:
+        return replace(problem, network=replace(problem.network, line_of_sight=STRAIGHT))
+    return problem
 
 
 def with_datum(problem: Problem, options: Options) -> Problem:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.distortion import ImageEquations, image_equations
+from adjust.line_of_sight import SightVectors, sight_vectors
 from adjust.problem import EXTERIOR, PLACE, Problem, State
 from adjust.projection import camera_from_ray, rays
 from adjust.rotation import cross_matrix
@@ -92,11 +93,12 @@ def derivatives(problem: Problem, state: State, xy_mm: Array) -> Derivatives:
         at = _image_equations(problem, state, name, camera_xy[rows], ray)
         images = problem.image_numbers[rows]
         by_in_camera = at.by_ray @ _ray_by_in_camera(in_camera)
-        by_point = by_in_camera @ state.rotations[images]
+        by_vector = by_in_camera @ state.rotations[images]
         by_attitude = -by_in_camera @ cross_matrix(in_camera) @ attitude[images]
         by_camera_xy[rows] = at.by_xy
-        by_unknowns[rows, :, EXTERIOR] = np.concatenate([-by_point, by_attitude], axis=2)
-        by_unknowns[rows, :, PLACE] = by_point
+        seen = _sight(problem, state, rows)
+        by_unknowns[rows, :, EXTERIOR] = np.concatenate([by_vector @ seen.by_station, by_attitude], axis=2)
+        by_unknowns[rows, :, PLACE] = by_vector @ seen.by_point
         by_camera = np.concatenate([at.by_interior, at.by_parameters], axis=2)
         first = problem.camera_columns.start
         by_unknowns[rows, :, first : first + by_camera.shape[2]] = by_camera
@@ -129,9 +131,13 @@ def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDeri
 
 def _rays(problem: Problem, state: State, rows: Indices) -> tuple[Array, Array]:
     """The rays (n, 2) of some targets, and their points in the camera's axes (n, 3)."""
-    images = problem.image_numbers[rows]
-    stations = state.values[problem.exterior[images, :3]]
-    return rays(state.rotations[images], stations, state.values[problem.places[rows]])
+    return rays(state.rotations[problem.image_numbers[rows]], _sight(problem, state, rows).vector)
+
+
+def _sight(problem: Problem, state: State, rows: Indices) -> SightVectors:
+    """Some targets as they appear from their stations."""
+    stations = state.values[problem.exterior[problem.image_numbers[rows], :3]]
+    return sight_vectors(problem.network.line_of_sight, stations, state.values[problem.places[rows]])
 
 
 def _image_equations(problem: Problem, state: State, camera: str, camera_xy: Array, ray: Array) -> ImageEquations:

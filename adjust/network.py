@@ -156,6 +156,26 @@ class Observations:
 
 
 @dataclass(frozen=True)
+class LineOfSight:
+    """What bends the lines of sight of aerial frames; a straight line by default.
+
+    curvature: X, Y are map coordinates, true to scale at the height Z = 0, and Z heights above the curved earth.
+    refraction: in the standard atmosphere; Z are heights above sea. unit_m: metres of the object unit.
+    """
+
+    curvature: bool = False
+    refraction: bool = False
+    unit_m: float = 1.0
+
+    @property
+    def is_straight(self) -> bool:
+        return not (self.curvature or self.refraction)
+
+
+STRAIGHT = LineOfSight()
+
+
+@dataclass(frozen=True)
 class Distance:
     """A measured distance between two object points, two stations or one of each.
 
@@ -200,6 +220,7 @@ class Network:
     observations: Observations
     distances: tuple[Distance, ...] = ()
     calibrations: tuple[Calibration, ...] = ()
+    line_of_sight: LineOfSight = STRAIGHT
 
     @cached_property
     def camera_by_name(self) -> dict[str, Camera]:

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from adjust.distortion import image_equations
 from adjust.families import parameter_names
-from adjust.network import EXTERIOR_NAMES, Approximations, Distortion, Image, Network
+from adjust.line_of_sight import sight_vectors
+from adjust.network import EXTERIOR_NAMES, STRAIGHT, Approximations, Distortion, Image, LineOfSight, Network
 from adjust.result import Adjustment
 from adjust.rotation import rotation_from_angles
 from adjust.transformation import Film, film_parameter_names
@@ -33,10 +34,11 @@ class ImageModel:
     rotation: Array
     station: Array
     film: Film
+    line_of_sight: LineOfSight = STRAIGHT
 
     def camera_from_object(self, xyz: Array) -> tuple[Array, Mask]:
         """Observed, that is distorted, camera coordinates (n, 2) in mm of object points (n, 3); which have an image."""
-        ray, in_camera = rays(self.rotation, self.station, xyz)
+        ray, in_camera = rays(self.rotation, sight_vectors(self.line_of_sight, self.station, xyz).vector)
         xy_mm, found = camera_from_ray(self.distortion, self.interior, self.parameters, ray)
         return xy_mm, found & (in_camera[:, 2] < 0.0)
 
@@ -77,6 +79,7 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
         film=_film(network, image, parameters, name in adjustment.mirrored),
+        line_of_sight=network.line_of_sight,
     )
 
 
@@ -95,6 +98,7 @@ def approximate_image(network: Network, approximations: Approximations, name: st
         rotation=rotation_from_angles(exterior[3:]),
         station=exterior[:3],
         film=_film(network, image, film_parameters, name in approximations.mirrored),
+        line_of_sight=network.line_of_sight,
     )
 
 
@@ -102,12 +106,12 @@ def _film(network: Network, image: Image, parameters: Array, mirrored: bool) -> 
     return Film(image.transformation, parameters, network.extent_by_image[image.name].center_mm, mirrored)
 
 
-def rays(rotation: Array, station: Array, xyz: Array) -> tuple[Array, Array]:
-    """The rays (n, 2), -U/W and -V/W, of object points (n, 3), and the points in the camera's axes (n, 3).
+def rays(rotation: Array, vector: Array) -> tuple[Array, Array]:
+    """The rays (n, 2), -U/W and -V/W, along vectors (n, 3) from station to point, and these in the camera's axes.
 
-    rotation (3, 3) or (n, 3, 3), station (3,) or (n, 3). A point in front of the camera has W < 0.
+    rotation (3, 3) or (n, 3, 3). A point in front of the camera has W < 0.
     """
-    in_camera = np.einsum("...ij,...j->...i", rotation, xyz - station)
+    in_camera = np.einsum("...ij,...j->...i", rotation, vector)
     depth = in_camera[..., 2:]
     # A point in the plane of the lens has no image: its ray is kept finite and W = 0 tells.
     return -in_camera[..., :2] / np.where(depth == 0.0, 1.0, depth), in_camera

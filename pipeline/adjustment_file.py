@@ -106,6 +106,8 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "images": {image.name: _image(adjustment, image) for image in network.images},
         "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
         "residuals": _residuals(adjustment),
+        "refraction": network.line_of_sight.refraction,
+        "earth_curvature": network.line_of_sight.curvature,
         "distances": _distances(adjustment),
         "calibrations": _calibrations(adjustment),
         "groups": {

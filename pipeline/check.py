@@ -55,6 +55,8 @@ def _check_camera(adjustment: Adjustment, name: str) -> CameraCheck:
     camera = adjustment.network.camera_by_name[name]
     if name in adjustment.network.idle_cameras:
         return CameraCheck("not possible", "No image shows object points: the camera is not calibrated.")
+    if not adjustment.network.line_of_sight.is_straight:
+        return CameraCheck("not possible", "OpenCV knows neither refraction nor the curvature of the earth.")
     hindrance = _hindrance(camera)
     if hindrance:
         return CameraCheck("not possible", hindrance)

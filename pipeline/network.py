@@ -11,6 +11,7 @@ from adjust.network import (
     Camera,
     Distance,
     Image,
+    LineOfSight,
     Network,
     ObjectPoint,
     Observations,
@@ -21,7 +22,7 @@ from adjust.transformation import marks_needed
 from pipeline.camera_file import CameraFile
 from pipeline.comparator_file import ComparatorPoint
 from pipeline.errors import InputError
-from pipeline.project_file import AdjustSettings, Project
+from pipeline.project_file import UNITS_MM, AdjustSettings, Project
 from pipeline.spelling import did_you_mean
 
 Array = NDArray[np.float64]
@@ -56,6 +57,9 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         observations=_observations(project.adjust, used),
         distances=distances,
         calibrations=calibrations,
+        line_of_sight=LineOfSight(
+            project.adjust.earth_curvature, project.adjust.refraction, project.unit_mm / UNITS_MM["m"]
+        ),
     )
     return network, (*lonely, *left_out, *without_end)
 

@@ -39,6 +39,8 @@ class AdjustSettings:
     sigma_target_um: float
     sigma_fiducial_um: float
     film_sigma_um: float
+    refraction: bool
+    earth_curvature: bool
     robust: bool
     variance_components: bool
     method: Method
@@ -204,6 +206,8 @@ def _adjust_settings(table: Table) -> AdjustSettings:
         sigma_target_um=table.number("sigma_target_um", 5.0, above=0.0),
         sigma_fiducial_um=table.number("sigma_fiducial_um", 5.0, above=0.0),
         film_sigma_um=table.number("film_sigma_um", 0.0, least=0.0),
+        refraction=table.flag("refraction", False),
+        earth_curvature=table.flag("earth_curvature", False),
         robust=table.flag("robust", False),
         variance_components=table.flag("variance_components", False),
         method=cast(Method, table.text("method", "combined", get_args(Method))),

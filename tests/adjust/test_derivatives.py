@@ -75,7 +75,7 @@ def test_rays_accept_complex_steps() -> None:
     rotation = rotation_from_angles(np.array([0.1, 0.2, 0.3]))
     xyz = rng.uniform(-1, 1, (4, 3)).astype(complex)
     xyz[:, 2] += -10 + 1j * STEP
-    ray, in_camera = rays(rotation, np.zeros(3), xyz)
+    ray, in_camera = rays(rotation, xyz)
     u, v, w = in_camera.real.T
     m = rotation[:, 2]
     expected = np.stack([-m[0] / w + u * m[2] / w**2, -m[1] / w + v * m[2] / w**2], axis=1)

@@ -14,6 +14,7 @@ from adjust.errors import AdjustmentError
 from adjust.result import Adjustment
 from pipeline.adjust_stage import adjust_marks
 from pipeline.adjustment_file import read_adjustment, write_adjustment
+from pipeline.check import check_against_opencv
 from pipeline.comparator_file import read_comparator
 from pipeline.errors import InputError
 from pipeline.project_file import read_project
@@ -25,9 +26,10 @@ pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="the reference cases 
 CASE = "iii_selfcal_all_unknown_datum_A"
 
 
-def free_project(folder: Path, adjust: str = "", objects: str = "") -> dict[str, Any]:
+def free_project(folder: Path, adjust: str = "", objects: str = "", scale: float = 1.0) -> dict[str, Any]:
     """The reference network with approximate points and nothing known of them; more lines for its tables."""
     case: dict[str, Any] = json.loads((CASES / f"{CASE}.json").read_text(encoding="utf-8"))
+    case["input"]["pts_obs"] = [[scale * x for x in row] for row in case["input"]["pts_obs"]]
     case["input"]["pts_sigma"] = [[None] * 3 for _ in case["input"]["pts_sigma"]]
     write_project(case, folder)
     file = folder / "project.toml"
@@ -103,6 +105,27 @@ def test_a_distance_to_a_point_that_no_image_shows_is_left_out(tmp_path: Path) -
     result = adjusted(tmp_path)
     assert result.further == ()
     assert any("1 to lost" in warning for warning in result.warnings)
+
+
+def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
+    """The field ten times as large: in decimetres it bends its lines of sight as in metres."""
+    results = []
+    for unit, scale in (("m", 10.0), ("dm", 100.0)):
+        folder = tmp_path / unit
+        folder.mkdir()
+        case = free_project(
+            folder, 'datum = "minimal"\nrefraction = true\nearth_curvature = true', f'unit = "{unit}"', scale
+        )
+        results.append(adjusted(folder))
+    straight = case["result"]["parameters"]["IO.c"]
+    first, second = results
+    assert second.value("IO.C.c") == pytest.approx(first.value("IO.C.c"), abs=1e-6 * straight["std_apriori"])
+    assert second.vpv == pytest.approx(first.vpv, rel=1e-7)
+    assert abs(first.value("IO.C.c") - straight["value"]) > 1e-4
+    write_adjustment(first, tmp_path / "adjustment.json")
+    written = read_adjustment(tmp_path / "adjustment.json")
+    assert (written["refraction"], written["earth_curvature"]) == (True, True)
+    assert check_against_opencv(first).cameras["C"].verdict == "not possible"
 
 
 def calibrated_twice(folder: Path, change: Callable[[str], str] = str) -> tuple[Adjustment, Adjustment]:
