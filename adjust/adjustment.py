@@ -19,6 +19,7 @@ from adjust.residuals import further_residuals, groups, residuals
 from adjust.result import Adjustment, Cofactor
 from adjust.runs import ROUNDS, Run, again, run
 from adjust.snooping import contradictions, search, suspects
+from adjust.suspicions import suspicions
 from adjust.tested import TestedUnits
 from adjust.transformation import marks_needed
 from adjust.validation import validate
@@ -115,6 +116,8 @@ def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
     conditions = int(TestedUnits(problem).sizes[weighting.used].sum()) + further_rows
     further = tuple(further_residuals(problem, state, cofactor))
     found = last.found if last.has_solution else None
+    of_marks = residuals(last.end.v_mm, found, weighting)
+    doubts = suspicions(problem.network.observations, of_marks) if last.converged else []
     result = Adjustment(
         network=problem.network,
         termination=last.solution.termination,
@@ -126,11 +129,11 @@ def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
         names=problem.unknowns.names,
         values=np.where(_meaningless(problem), np.nan, state.values),
         cofactor=cofactor,
-        residuals=residuals(last.end.v_mm, found, weighting),
+        residuals=of_marks,
         groups=groups(problem, state, last.end.v_mm, found, weighting, further),
         further=further,
         singular=last.singular,
-        warnings=_warnings(last, cofactor),
+        warnings=(*_warnings(last, cofactor), *doubts),
         history=last.solution.history,
         mirrored=problem.mirrored,
         weights=weighting.weights[:observed],
@@ -185,7 +188,7 @@ def _warnings(last: Run, cofactor: Cofactor) -> tuple[str, ...]:
             f"The weights did not settle within {ROUNDS} rounds of robust estimation, variance components or data "
             f"snooping."
         )
-    if last.converged:
+    if last.has_solution or last.solution.termination == "diverged":
         weak = weak_directions(
             problem, last.end.state, last.numbering.free, factorise(last.numbering, last.end, camera_priors=False)
         )
@@ -193,11 +196,8 @@ def _warnings(last: Run, cofactor: Cofactor) -> tuple[str, ...]:
             f"Practically singular without priors: {', '.join(each.parameters)}. {each.cause} {each.remedy}"
             for each in weak
         ]
-        blind = undetermined(problem, cofactor.variances)
-        if blind:
-            warnings.append(
-                f"The observations say nothing about {', '.join(blind)}: their standard deviations stay as given."
-            )
+    if last.converged:
+        warnings += filter(None, [undetermined(problem, last.end.state, cofactor.variances)])
     return tuple(warnings + _unseen(problem) + _films_by_targets(problem))
 
 

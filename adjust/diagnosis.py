@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.datum import free_coordinates, object_datum
-from adjust.directions import camera_leads, datum_sentence, following
+from adjust.directions import camera_leads, datum_sentence, field_of, following
 from adjust.elimination import Factor
 from adjust.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
 from adjust.own_directions import own_sentence, unnamed_sentence
@@ -56,18 +56,26 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     return _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
 
 
-def undetermined(problem: Problem, variances: Array) -> tuple[str, ...]:
-    """Cameras' and images' quantities that the observations say nothing about: their priors alone place them.
+def undetermined(problem: Problem, state: State, variances: Array) -> str:
+    """What the observations say nothing about among cameras and images, and why; empty where there is nothing.
 
-    A fiducial that no image shows is not among them: nobody expects otherwise.
+    The priors alone place these quantities: their variances (n,) are still the given ones. A fiducial that no image
+    shows is not among them: nobody expects otherwise.
     """
     unknowns = problem.unknowns
     told = np.zeros(len(unknowns), dtype=bool)
     told[np.unique(problem.columns[problem.columns >= 0])] = True
     told[[i for point in unknowns.point.values() for i in point]] = False
     prior = np.where(unknowns.has_prior & told, unknowns.sigma, np.inf)
-    blind = np.sqrt(variances) > UNDETERMINED * prior
-    return collapsed([unknowns.names[i] for i in np.flatnonzero(blind)])
+    names = [unknowns.names[i] for i in np.flatnonzero(np.sqrt(variances) > UNDETERMINED * prior)]
+    if not names:
+        return ""
+    said = f"The observations say nothing about {', '.join(collapsed(names))}: their standard deviations stay as given"
+    interior = {f"IO.{camera}.{quantity}" for camera in unknowns.camera for quantity in ("c", "x0", "y0")}
+    if interior.isdisjoint(names):
+        return f"{said}. What is given is all that places them: give it well, or fix what you do not need."
+    field = field_of(problem, state)
+    return f"{said}, for {field.because}. To determine them, {field.remedy}."
 
 
 def collapsed(names: list[str]) -> tuple[str, ...]:
@@ -114,11 +122,18 @@ def _named(
     of_leads = moved[datum.shape[1] : len(moved) - left.shape[1]]
     sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
     for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
-        most = names[int(np.argmax(np.abs(vector)))]
-        sentences.append(unnamed_sentence(most, following(set(own) - {most})))
+        sentences.append(_left_sentence(problem, state, names[int(np.argmax(np.abs(vector)))], own))
     return tuple(
         NullDirection(collapsed(own), cause, remedy) for own, (cause, remedy) in zip(moved, sentences, strict=True)
     )
+
+
+def _left_sentence(problem: Problem, state: State, most: str, moved: Sequence[str]) -> tuple[str, str]:
+    """Cause and remedy of a direction without a lead, of what moves most in it: of one point or image, or of many."""
+    owners = {name.rsplit(".", 1)[0].split(".", 1)[1] for name in moved}
+    if len(owners) == 1 and most.startswith(("PT.", "EO.", "T.")):
+        return own_sentence(problem, state, most)
+    return unnamed_sentence(most, following(set(moved) - {most}))
 
 
 def _datum_part(

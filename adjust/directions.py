@@ -98,7 +98,7 @@ def camera_leads(problem: Problem, state: State) -> list[Lead]:
     fiducials, 2 interior orientation, 3 distortion.
     """
     leads = []
-    field = _field_of(problem, state)
+    field = field_of(problem, state)
     for name, positions in problem.unknowns.camera.items():
         leads += _fiducial_leads(problem, state, name)
         leads += _tilt_leads(problem, state, name)
@@ -167,7 +167,7 @@ def _tilt_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
 
 
 @dataclass(frozen=True)
-class _Field:
+class Field:
     """What decides whether images tell the interior orientation from the exterior.
 
     known: coordinates of object points that are known beforehand, and not just as a datum.
@@ -187,8 +187,14 @@ class _Field:
             return f"the camera axes are parallel{known[self.known]}"
         return "these stations and points do not tell them apart"
 
+    @property
+    def remedy(self) -> str:
+        """What tells a principal distance from the stations' distance in any field."""
+        relief = "points at other heights" if self.known == "points" else "known points (X, Y, Z) at different heights"
+        return f"add images tilted in different directions, or {relief}"
 
-def _field_of(problem: Problem, state: State) -> _Field:
+
+def field_of(problem: Problem, state: State) -> Field:
     """The field that the observed points make, and the axes of the images."""
     positions = np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
     xyz = state.values[positions]
@@ -200,20 +206,18 @@ def _field_of(problem: Problem, state: State) -> _Field:
     heights = sum(point.Z is not None and np.isfinite(point.Z.sigma) for point in given)
     whole = sum(all(q is not None and np.isfinite(q.sigma) for q in (point.X, point.Y, point.Z)) for point in given)
     known = "points" if whole >= FIELD else "heights" if heights >= FIELD else "nothing"
-    return _Field(bool(extents[-1] <= FLAT * extents[0]), bool(off.max() < PARALLEL_RAD), known)
+    return Field(bool(extents[-1] <= FLAT * extents[0]), bool(off.max() < PARALLEL_RAD), known)
 
 
-def _interior_leads(problem: Problem, camera: str, positions: Indices, field: _Field) -> list[Lead]:
+def _interior_leads(problem: Problem, camera: str, positions: Indices, field: Field) -> list[Lead]:
     """x0', y0' and c of a camera."""
-    tilted = "add images tilted in different directions"
-    relief = "points at other heights" if field.known == "points" else "known points (X, Y, Z) at different heights"
-    for_point = f"{tilted}, or {relief}"
+    for_point = field.remedy
     if field.known != "points" and not field.flat:
         for_point = "add images turned by 180 degrees about their axes"
     texts = (
         (1, f"The principal point's x0' of camera {camera} can shift", "x0' (F7)", for_point),
         (2, f"The principal point's y0' of camera {camera} can shift", "y0' (F8)", for_point),
-        (0, f"The principal distance of camera {camera} can change", "it (F9)", f"{tilted}, or {relief}"),
+        (0, f"The principal distance of camera {camera} can change", "it (F9)", field.remedy),
     )
     return [
         Lead(2, _unit(problem, positions[number]), motion, given, field.because, None, otherwise)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.correlation import correlations
 from adjust.families import family, parameter_names
 from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
 from adjust.projection import adjusted_image
@@ -99,6 +100,10 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "singular": [
             {"parameters": list(null.parameters), "cause": null.cause, "remedy": null.remedy}
             for null in adjustment.singular
+        ],
+        "correlations": [
+            {"parameters": list(each.parameters), "rho": each.rho, "cause": each.cause, "remedy": each.remedy}
+            for each in correlations(adjustment)
         ],
         "warnings": list(adjustment.warnings),
         "variance_factors": dict(adjustment.variance_factors),
@@ -385,6 +390,7 @@ _ADJUSTMENT = {
         list,
         dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", "sigma", "v", "redundancy", "w"), _NUMBER),
     ),
+    "correlations": _Each(list, {"parameters": list, "rho": _NUMBER, "cause": str, "remedy": str}),
     "warnings": _Each(list, str),
     "variance_factors": _Each(dict, _NUMBER),
     "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),

@@ -63,6 +63,7 @@ class CameraView:
     groups: list[str]
     in_given_figure: list[tuple[str, str, str]]
     correlations: list[tuple[str, str, float]]
+    trade_offs: list[str]
     curves: Markup | None
     effect_where: str
     lens_map: LensMap | None
@@ -97,6 +98,7 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         groups=group_sentences(camera),
         in_given_figure=_in_given_figure(form) if form else [],
         correlations=high_correlations(name, camera, covariance) if covariance else [],
+        trade_offs=_trade_offs(name, stored),
         curves=lens.curves_plot(curve, radius_mm) if curve else None,
         effect_where="in the frame" if lens.lens(name, camera).is_of_frame else f"at {fixed(radius_mm, 0)} mm",
         lens_map=_lens_map(name, camera, covariance, rows, frame_mm) if covariance else None,
@@ -117,6 +119,15 @@ def _observed_radius_mm(camera: Json, rows: list[Json]) -> float:
     point = camera["principal_point_mm"]
     offsets = vectors.places_mm(targets) - (point["x"]["value"], point["y"]["value"])
     return float(np.hypot(*offsets.T).max())
+
+
+def _trade_offs(name: str, stored: Json) -> list[str]:
+    """What of a camera trades off, in words."""
+    return [
+        f"{each['cause']} {each['remedy']}"
+        for each in stored["correlations"]
+        if each["parameters"][0].startswith(f"IO.{name}.")
+    ]
 
 
 def _in_given_figure(form: fiducials.Figure) -> list[tuple[str, str, str]]:

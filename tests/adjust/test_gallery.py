@@ -3,10 +3,10 @@
 from collections.abc import Callable
 
 import pytest
-from gallery import AXES, CATALOGUE, DEFORMATIONS, given
+from gallery import AXES, CATALOGUE, CONVERGENT, DEFORMATIONS, MISHAPS, Setup, given, sentences
 
 from adjust.adjustment import adjust
-from adjust.network import Network
+from adjust.network import Network, Transformation
 from adjust.result import Adjustment
 
 GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
@@ -68,6 +68,28 @@ def test_fiducials_with_priors_end_what_they_are_to_end(name: str) -> None:
     for marks, gone in ((2, AXES), (3, AXES + DEFORMATIONS)):
         mended = adjust(given(network, {"x": 1.0, "y": 1.0}, marks), start, failure.options)
         assert not causes(mended, gone)
+
+
+@pytest.mark.parametrize("name", list(MISHAPS))
+def test_other_mishaps_are_told_in_words(name: str) -> None:
+    mishap = MISHAPS[name]
+    said = sentences(adjust(*mishap.network(), mishap.options))
+    assert len(said) == len(mishap.words)
+    for sentence, words in zip(said, mishap.words, strict=True):
+        assert words in sentence
+
+
+@pytest.mark.parametrize(
+    ("kind", "defects"), [("affine", (4, 3, 1, 2, 0)), ("similarity", (4, 3, 1, 2, 0)), ("congruent", (3, 3, 1, 1, 0))]
+)
+def test_a_good_network_has_the_defect_of_the_priors_that_are_dropped(
+    kind: Transformation, defects: tuple[int, ...]
+) -> None:
+    """F5..F9 dropped, F5..F8, F5 and F6, F5, F6 and F9, F7..F9."""
+    network, start = Setup(CONVERGENT, kind=kind).network()
+    point = {"x0": 1.0, "y0": 1.0}
+    for kept, defect in zip(({}, {"c": 1.0}, {"c": 1.0, **point}, point, {"x": 1.0, "y": 1.0}), defects, strict=True):
+        assert len(adjust(given(network, kept), start).singular) == defect
 
 
 def causes(result: Adjustment, words: tuple[str, ...]) -> list[str]:
