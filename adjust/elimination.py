@@ -16,13 +16,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrcon
 from scipy.sparse import csr_array
+
+from adjust.normal_equations import Groups, border_square
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 ROWS_PER_COLUMN = 4  # rows in the shared unknowns are condensed when there are more of them than this
 CONDENSED_ROWS = 2000  # and more than this
+REFLECTED = 1e10  # rows times columns squared in the shared unknowns up to which these rows are factorised themselves
+SAFE = 1e-6  # reciprocal condition of the shared triangle down to which their normal equations will do
 WIDE = 500  # shared unknowns up to which roots of cofactors run over all of them
 
 
@@ -163,8 +168,8 @@ class Factor:
         """Roots (b, s, k) of the cofactor matrices of blocks' shared unknowns (b, s), which are scaled."""
         if self.shared_count <= WIDE:
             return self.shared_root[shared]
-        root = np.linalg.cholesky(self._shared_cofactor[shared[:, :, None], shared[:, None, :]])
-        return np.asarray(root, dtype=np.float64)
+        places = shared[:, :, None] * self.shared_count + shared[:, None, :]
+        return np.asarray(np.linalg.cholesky(self._shared_cofactor.take(places)), dtype=np.float64)
 
     def _roots(self, block: BlockFactors) -> tuple[Array, Array]:
         """Roots of the own unknowns' cofactor matrix: for shared unknowns held fixed, and what these add."""
@@ -172,25 +177,55 @@ class Factor:
         return own, -own @ (block.border @ self.root_of(block.shared))
 
 
+@dataclass(frozen=True)
+class Sums:
+    """How the blocks' rows are summed up in the shared unknowns.
+
+    rows: the same rows as blocks without own unknowns, arranged so that all rows of a block touch the same shared ones,
+    the columns left out that blocks own. groups: shared unknowns that blocks meet together.
+    """
+
+    rows: Iterable[Blocks]
+    groups: Groups
+
+
 def eliminate(
-    blocks: Iterable[Blocks], count: int, prior_root_weight: Array, prior_right: Array, damping: float = 0.0
+    blocks: Iterable[Blocks],
+    count: int,
+    prior_root_weight: Array,
+    prior_right: Array,
+    damping: float = 0.0,
+    sums: Sums | None = None,
+    sharp: bool = True,
 ) -> Factor:
     """Factorise the blocks and one row an unknown for its prior.
 
     The prior's row (count,) is prior_root_weight times unknown = prior_right. The shared unknowns are those that no
     block owns, and stand first. A damping holds every scaled unknown where it is (Levenberg and Marquardt).
+
+    The rows that are left in the shared unknowns are factorised by reflections. Where that would take too long, and
+    `sums` tell how, their normal equations are summed up and factorised (Cholesky). That squares the condition: of
+    variances the relative error is at most some 1e-16 times the squared condition, 1e-4 where the condition is 1e6;
+    where it is worse, reflections take their time. Not sharp: singular values below 1e-6 need not be told from that.
     """
-    scale = _column_norms(blocks, prior_root_weight)
+    squares, shared_count, height = prior_root_weight**2, count, 0
+    for block in blocks:
+        squares += _column_squares(block, count)
+        shared_count -= block.own.size
+        height += len(block.right) * min(block.right.shape[1], block.shared.shape[1] + 1)
+    scale = np.where(squares > 0.0, np.sqrt(squares), 1.0)
     priors = _prior_rows(prior_root_weight / scale, prior_right, damping)
+    if sums is not None and height * shared_count**2 > REFLECTED:
+        lift = 0.0 if sharp else SAFE**2
+        factor = _by_normal_equations(blocks, sums, scale, priors, shared_count, lift)
+        if factor is not None and (not sharp or _well_conditioned(factor)):
+            return factor
     factors = []
     rests = []
-    is_own = np.zeros(count, dtype=bool)
     for block in blocks:
-        factor, rest = _eliminate_blocks(block, scale, priors)
-        factors.append(factor)
+        eliminated, rest = _eliminate_blocks(block, scale, priors)
+        factors.append(eliminated)
         rests.append((block.shared, rest))
-        is_own[block.own] = True
-    shared_count = count - int(is_own.sum())
     triangle = _condensed(rests, _rows_of(priors, np.arange(shared_count)), shared_count)
     return Factor(tuple(factors), triangle[:, :-1], triangle[:, -1], scale)
 
@@ -200,13 +235,11 @@ def _columns(values: Array, blocks: Blocks) -> Array:
     return np.concatenate([values[blocks.own], values[blocks.shared]], axis=1)
 
 
-def _column_norms(blocks: Iterable[Blocks], prior_root_weight: Array) -> Array:
-    squares = prior_root_weight**2
-    for block in blocks:
-        of_block = np.einsum("bmk,bmk->bk", block.matrix, block.matrix)
-        columns = np.concatenate([block.own, block.shared], axis=1)
-        squares += np.bincount(columns.ravel(), of_block.ravel(), len(squares))
-    return np.asarray(np.where(squares > 0.0, np.sqrt(squares), 1.0))
+def _column_squares(blocks: Blocks, count: int) -> Array:
+    """The sums (count,) of the squares in every column."""
+    of_blocks = np.einsum("bmk,bmk->bk", blocks.matrix, blocks.matrix)
+    columns = np.concatenate([blocks.own, blocks.shared], axis=1)
+    return np.asarray(np.bincount(columns.ravel(), of_blocks.ravel(), count), dtype=np.float64)
 
 
 def _prior_rows(root_weight: Array, right: Array, damping: float) -> tuple[Array, Array]:
@@ -235,6 +268,54 @@ def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array])
     own = triangle[:, :own_count]
     factor = BlockFactors(blocks.own, blocks.shared, own[..., :own_count], own[..., own_count:-1], own[..., -1])
     return factor, triangle[:, own_count:, own_count:]
+
+
+def _by_normal_equations(
+    blocks: Iterable[Blocks],
+    sums: Sums,
+    scale: Array,
+    priors: tuple[Array, Array],
+    shared_count: int,
+    lift: float,
+) -> Factor | None:
+    """None where the normal equations of the shared unknowns are not positive definite."""
+    root_weight, prior_right = priors[0][:shared_count], priors[1][:shared_count]
+    normal = np.diag(root_weight**2 + lift)
+    right = root_weight * prior_right
+    for rows in sums.rows:
+        matrices = rows.matrix / scale[rows.shared][:, None, :]
+        for shared, matrix, of_rows in zip(rows.shared, matrices, rows.right, strict=True):
+            normal[np.ix_(shared, shared)] += matrix.T @ matrix
+            right[shared] += matrix.T @ of_rows
+    factors = [_own_triangles(block, scale, priors) for block in blocks]
+    normal -= border_square(sums.groups, ((factor.shared, factor.border) for factor in factors if factor.own.size))
+    for factor in factors:
+        np.subtract.at(right, factor.shared, (factor.border.swapaxes(1, 2) @ factor.right[..., None])[..., 0])
+    try:
+        root = np.asarray(np.linalg.cholesky(normal), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    return Factor(tuple(factors), root.T, solve_triangular(root, right, lower=True), scale)
+
+
+def _own_triangles(blocks: Blocks, scale: Array, priors: tuple[Array, Array]) -> BlockFactors:
+    """The blocks' triangles, without what remains in the shared unknowns."""
+    own_count = blocks.own.shape[1]
+    matrix = blocks.matrix / _columns(scale, blocks)[:, None, :]
+    prior_rows = _rows_of(priors, blocks.own)
+    own = np.concatenate([matrix[..., :own_count], prior_rows[..., :-1]], axis=1)
+    orthonormal, triangle = np.linalg.qr(own)
+    turned = orthonormal.swapaxes(1, 2)
+    height = matrix.shape[1]
+    right = turned[..., :height] @ blocks.right[..., None] + turned[..., height:] @ prior_rows[..., -1:]
+    border = turned[..., :height] @ matrix[..., own_count:]
+    return BlockFactors(blocks.own, blocks.shared, triangle, border, right[..., 0])
+
+
+def _well_conditioned(factor: Factor) -> bool:
+    """Whether the condition of the shared triangle is such that its square does no harm."""
+    reciprocal, _ = dtrcon(factor.triangle)
+    return bool(reciprocal > SAFE)
 
 
 def _condensed(rests: Sequence[tuple[Indices, Array]], shared_priors: Array, shared_count: int) -> Array:

@@ -1,12 +1,13 @@
 """The free unknowns of a problem, numbered, and what the blocks of its observations touch of them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.normal_equations import Groups
 from adjust.problem import ABSENT, Problem
 
 Indices = NDArray[np.intp]
@@ -65,27 +66,71 @@ class Numbering:
         return numbers
 
     @cached_property
+    def summed(self) -> list[Touched]:
+        """What the observations touch of the shared unknowns, by image where points are blocks, by point otherwise."""
+        numbers = self.numbers[self.problem.columns[:, self.used]]
+        blocks = replace(self._others, owned=np.empty((len(self._others.owned), 0), dtype=np.intp))
+        return list(_arranged(np.where(numbers < self._shared_count, numbers, ABSENT), blocks, self.numbers))
+
+    @cached_property
+    def groups(self) -> Groups:
+        """The shared unknowns of every image, or of every point."""
+        group = np.full(self._shared_count + 1, -1, dtype=np.intp)  # the last stands for what is not shared
+        place = np.zeros_like(group)
+        numbers = self.numbers[self._others.owned]
+        numbers[(numbers == ABSENT) | (numbers >= self._shared_count)] = self._shared_count
+        group[numbers] = np.arange(len(numbers))[:, None]
+        place[numbers] = np.arange(numbers.shape[1])
+        group[-1] = -1
+        return Groups(group[:-1], place[:-1])
+
+    @property
+    def _shared_count(self) -> int:
+        owned = self.numbers[self._blocks.owned]
+        return len(self.free) - int((owned != ABSENT).sum())
+
+    @property
     def _blocks(self) -> "_Blocks":
-        problem, unknowns = self.problem, self.problem.unknowns
-        points = np.array(list(unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
-        tied = np.zeros(len(unknowns) + 1, dtype=bool)  # the last stands for ABSENT
-        for further in problem.further:
+        return self._by_point if self._points_own else self._by_image
+
+    @property
+    def _others(self) -> "_Blocks":
+        return self._by_image if self._points_own else self._by_point
+
+    @cached_property
+    def _points_own(self) -> bool:
+        free = np.append(self.problem.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
+        return bool(free[self._by_point.owned].sum() > free[self._by_image.owned].sum())
+
+    @cached_property
+    def _tied(self) -> NDArray[np.bool_]:
+        """By position: what further observations tie to other unknowns; the last stands for ABSENT."""
+        tied = np.zeros(len(self.problem.unknowns) + 1, dtype=bool)
+        for further in self.problem.further:
             tied[further.positions] = True
-        points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~tied[points].any(axis=1)]
-        images = _side_by_side(
+        return tied
+
+    @cached_property
+    def _by_image(self) -> "_Blocks":
+        unknowns = self.problem.unknowns
+        owned = _side_by_side(
             [
                 np.concatenate([unknowns.exterior[image.name], unknowns.transformation[image.name]])
-                for image in problem.network.images
+                for image in self.problem.network.images
             ]
         )
-        images[tied[images].any(axis=1)] = ABSENT
-        free = np.append(unknowns.sigma > 0.0, False)
-        if free[points].sum() <= free[images].sum():
-            return _Blocks(images, problem.image_numbers)
-        of_point = np.full(len(free), len(points), dtype=np.intp)
+        owned[self._tied[owned].any(axis=1)] = ABSENT
+        return _Blocks(owned, self.problem.image_numbers)
+
+    @cached_property
+    def _by_point(self) -> "_Blocks":
+        problem, unknowns = self.problem, self.problem.unknowns
+        points = np.array(list(unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
+        points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~self._tied[points].any(axis=1)]
+        of_point = np.full(len(unknowns) + 1, len(points), dtype=np.intp)  # the last stands for ABSENT
         of_point[points[:, 0]] = np.arange(len(points))
         block = of_point[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
-        nothing = np.full((len(images), 3), ABSENT, dtype=np.intp)
+        nothing = np.full((len(problem.network.images), 3), ABSENT, dtype=np.intp)
         others = block == len(points)
         return _Blocks(np.concatenate([points, nothing]), block + np.where(others, problem.image_numbers, 0))
 
@@ -108,20 +153,20 @@ def _side_by_side(rows: list[Indices]) -> Indices:
     return array
 
 
-def _arranged(numbers: Indices, blocks: _Blocks, number: Indices) -> Iterator[Touched]:
-    """Blocks of equal shape together; numbers (n, k): those of the unknowns of every derivative."""
-    touches, owned = numbers != ABSENT, number[blocks.owned]
-    count, owns = int(number.max(initial=ABSENT)) + 1, owned != ABSENT
+def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterator[Touched]:
+    """Blocks of equal shape together; derivatives (n, k): the numbers of their unknowns; numbers: by position."""
+    touches, owned = derivatives != ABSENT, numbers[blocks.owned]
+    count, owns = int(numbers.max(initial=ABSENT)) + 1, owned != ABSENT
     first_own = count - int(owns.sum())
     # Every pair of a block and an unknown that it touches or owns: block by block, its own unknowns first.
     of_pair = np.concatenate([np.repeat(blocks.of, touches.sum(axis=1)), np.nonzero(owns)[0]])
-    unknown = np.concatenate([numbers[touches], owned[owns]])
+    unknown = np.concatenate([derivatives[touches], owned[owns]])
     pairs, place = np.unique(of_pair * count + (unknown - first_own) % count, return_inverse=True)
     unknown = (pairs % count + first_own) % count
     first = np.searchsorted(pairs, np.arange(len(owned)) * count)
     widths = np.diff(first, append=len(pairs))
     own_counts = owns.sum(axis=1)
-    columns = np.full(numbers.shape, ABSENT, dtype=np.intp)
+    columns = np.full(derivatives.shape, ABSENT, dtype=np.intp)
     columns[touches] = place[: int(touches.sum())] - np.repeat(first[blocks.of], touches.sum(axis=1))
 
     order = np.argsort(blocks.of, kind="stable")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.elimination import Blocks
+from adjust.elimination import Blocks, Sums
 from adjust.functions import Derivatives
 from adjust.further_observations import FurtherObservation
 from adjust.numbering import Numbering, Touched
@@ -33,6 +33,23 @@ class WhitenedRows:
         for touched in self.numbering.touched:
             yield _blocks(touched, self.matrix[touched.rows], self.right[touched.rows])
         yield from self.further
+
+    @property
+    def sums(self) -> Sums:
+        """How these rows are summed up where there are too many to be factorised."""
+        return Sums(_Summed(self), self.numbering.groups)
+
+
+@dataclass(frozen=True)
+class _Summed:
+    """The rows arranged as in `Numbering.summed`, and the further observations."""
+
+    rows: WhitenedRows
+
+    def __iter__(self) -> Iterator[Blocks]:
+        for touched in self.rows.numbering.summed:
+            yield _blocks(touched, self.rows.matrix[touched.rows], self.rows.right[touched.rows])
+        yield from self.rows.further
 
 
 def whitened_rows(

@@ -1,6 +1,6 @@
 """The blockwise elimination against a dense solution of the same rows."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
@@ -11,7 +11,8 @@ from simulated import Truth, field_points, simulated
 from adjust import elimination
 from adjust.adjustment import adjust
 from adjust.elimination import Blocks, Factor, eliminate
-from adjust.iteration import factorise, linearise
+from adjust.iteration import Linearised, factorise, linearise
+from adjust.network import Approximations, Network
 from adjust.numbering import Numbering
 from adjust.problem import number
 from adjust.rows import prior_root_weights
@@ -105,32 +106,49 @@ def test_all_shared_unknowns_fixed() -> None:
     np.testing.assert_allclose(whole(factor), np.linalg.inv(matrix.T @ matrix), rtol=1e-10)
 
 
-def test_the_cost_is_linear_in_the_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Counted, not timed: rows times columns squared of every factorisation, with known points."""
+@pytest.fixture
+def cost(monkeypatch: pytest.MonkeyPatch) -> Callable[[Network, Approximations], float]:
+    """Of an adjustment, a step: rows times columns squared of every factorisation, counted and not timed."""
     costs: list[float] = []
     original = elimination._triangle
 
     def counted(rows: Array) -> Array:
-        costs.append(rows.shape[0] * rows.shape[1] ** 2)
+        costs.append(rows.size * rows.shape[-1])
         return original(rows)
 
     monkeypatch.setattr(elimination, "_triangle", counted)
 
-    def cost(images: int) -> float:
-        rng = np.random.default_rng(4)
-        angles = np.linspace(0.0, 6.0, images)
-        truth = Truth(
-            stations=tuple((400 * np.cos(a), 400 * np.sin(a), 1500.0) for a in angles),
-            attitudes=tuple((-0.25 * np.sin(a), 0.25 * np.cos(a), a) for a in angles),
-            mirrored=(False,) * images,
-        )
-        network, start = simulated(rng, truth, points=field_points(rng, 8), noise=False)
+    def of(network: Network, start: Approximations) -> float:
         costs.clear()
         result = adjust(network, start)
         assert result.converged
         return sum(costs) / result.iterations
 
-    assert cost(24) < 2.2 * cost(12)
+    return of
+
+
+def test_the_cost_is_linear_in_the_images(cost: Callable[[Network, Approximations], float]) -> None:
+    """With known points."""
+
+    def images(count: int) -> tuple[Network, Approximations]:
+        rng = np.random.default_rng(4)
+        angles = np.linspace(0.0, 6.0, count)
+        truth = Truth(
+            stations=tuple((400 * np.cos(a), 400 * np.sin(a), 1500.0) for a in angles),
+            attitudes=tuple((-0.25 * np.sin(a), 0.25 * np.cos(a), a) for a in angles),
+            mirrored=(False,) * count,
+        )
+        return simulated(rng, truth, points=field_points(rng, 8), noise=False)
+
+    assert cost(*images(24)) < 2.2 * cost(*images(12))
+
+
+def test_the_cost_is_linear_in_unknown_points(cost: Callable[[Network, Approximations], float]) -> None:
+    def points(count: int) -> tuple[Network, Approximations]:
+        rng = np.random.default_rng(4)
+        return simulated(rng, points=field_points(rng, count), point_sigma=0.05, noise=False)
+
+    assert cost(*points(160)) < 2.2 * cost(*points(80))
 
 
 @pytest.mark.parametrize(("count", "own"), [(18, {0, 3}), (9, {12})])
@@ -151,3 +169,50 @@ def test_points_or_images_are_eliminated_first(count: int, own: set[int]) -> Non
     expected = np.linalg.inv(normal / np.outer(scale, scale))
     cofactor = whole(factorise(numbering, at)) * np.outer(scale, scale)
     np.testing.assert_allclose(cofactor, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def linearised(count: int, point_sigma: float = 0.05) -> tuple[Numbering, Linearised]:
+    """A network with unknown points, where it starts."""
+    rng = np.random.default_rng(12)
+    network, start = simulated(rng, points=field_points(rng, count), point_sigma=point_sigma, free={"k3": np.inf})
+    problem = number(network, start)
+    at = linearise(numbering := Numbering(problem), network.observations.covariance_mm2, problem.start())
+    assert at is not None
+    return numbering, at
+
+
+@pytest.mark.parametrize("count", [18, 9])
+def test_normal_equations_give_what_reflections_give(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the network is well conditioned; points or images eliminated first."""
+    numbering, at = linearised(count)
+    by_reflections = factorise(numbering, at)
+    monkeypatch.setattr(elimination, "REFLECTED", 0.0)
+    reflected = []
+    monkeypatch.setattr(elimination, "_eliminate_blocks", lambda *_: reflected.append(True))
+    factor = factorise(numbering, at)
+    assert not reflected
+    sigmas = np.sqrt(by_reflections.variances())
+    np.testing.assert_allclose(factor.solution() / sigmas, by_reflections.solution() / sigmas, atol=1e-8)
+    expected = whole(by_reflections) / np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(whole(factor) / np.outer(sigmas, sigmas), expected, atol=1e-8)
+    assert factor.length() == pytest.approx(by_reflections.length(), rel=1e-10)
+
+
+def test_roots_of_cofactors_are_local_where_many_unknowns_are_shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    numbering, at = linearised(18)
+    factor = factorise(numbering, at)
+    wide, variances = list(factor.row_roots(at.rows)), factor.variances()
+    monkeypatch.setattr(elimination, "WIDE", 0)
+    np.testing.assert_allclose(factor.variances(), variances, rtol=1e-9)
+    for here, there in zip(factor.row_roots(at.rows), wide, strict=True):
+        np.testing.assert_allclose(here @ here.swapaxes(1, 2), there @ there.swapaxes(1, 2), atol=1e-9)
+
+
+def test_what_is_badly_conditioned_is_reflected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a datum the normal equations of the images are singular: the factor is that of the rows themselves."""
+    numbering, at = linearised(18, np.inf)
+    expected = factorise(numbering, at)
+    monkeypatch.setattr(elimination, "REFLECTED", 0.0)
+    np.testing.assert_array_equal(factorise(numbering, at).triangle, expected.triangle)
+    rough = factorise(numbering, at, camera_priors=False)
+    assert np.linalg.svd(rough.triangle)[1][-7:] == pytest.approx(np.full(7, 1e-6), rel=0.01)
