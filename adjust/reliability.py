@@ -189,9 +189,10 @@ def reliability(
     effect = np.where(tests.checked, np.where(tests.checked, smallest, 0.0) * np.sqrt(hidden), np.inf)
     effect[(units.sizes == 1), 1] = 0.0
     least = np.asarray(np.linalg.eigvalsh(tests.discrepancy_weight)[:, 0], dtype=np.float64)
-    both = np.asarray(tests.checked.all(axis=1))
-    together = np.where(both, _over(probabilities.noncentrality(2), least, both), smallest.min(axis=1))
     own_weight = np.einsum("nki,nki->ni", found.transform, found.transform) / weights[:, None]
+    both = np.asarray(tests.checked.all(axis=1))
+    everywhere = both & (least > UNCHECKED * own_weight.min(axis=1))
+    together = np.where(both, _over(probabilities.noncentrality(2), least, everywhere), smallest.min(axis=1))
     controlled = variance > UNCONTROLLED * own_weight
     outer = _outer(numbering, end, factor, found, np.where(controlled, smallest, 0.0), tested)
     uncontrolled = zip(*np.nonzero(~controlled & (np.arange(2) < units.sizes[:, None])), strict=True)
