@@ -1,6 +1,7 @@
 """design.json: what is expected, what would help, and how it follows the quantities that were varied."""
 
 import math
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -12,6 +13,7 @@ from adjust.transformation import film_parameter_names
 from pipeline.adjustment_file import ANGLES, DEG_PER_RAD, without_nan
 from pipeline.design.alternatives import Alternative
 from pipeline.design.expected import Expected, rms
+from pipeline.design.reliability import error_unit
 from pipeline.design.sweeps import Layouts, Swept
 from pipeline.design.variations import Variations
 
@@ -21,12 +23,14 @@ Json = dict[str, Any]
 def design_json(
     scene: Variations,
     expected: Expected,
+    alone: Mapping[str, float],
     layouts: Layouts,
     helpful: tuple[Alternative, ...],
     swept: tuple[tuple[Swept, str], ...],
 ) -> Json:
     """The contents of design.json; a standard deviation of null: the observations do not determine the quantity.
 
+    alone: the standard deviations without given fiducials and interior orientation, by their names in the adjustment.
     swept: every sweep with the name of its picture.
     """
     adjustment = expected.plan.adjustment
@@ -47,9 +51,11 @@ def design_json(
         ],
         "warnings": list(adjustment.warnings),
         "cameras": {expected.camera: _camera(expected)},
+        "photographs_alone": dict(alone),
         "images": {image.name: _image(expected, image) for image in expected.network.images},
         "points": _points(expected),
         "point_summary": _point_summary(expected),
+        "reliability": _reliability(expected),
         "layouts": _layouts(layouts),
         "what_would_help": [
             {"change": one.change, "gain_percent": dict(one.gain_percent), "sigmas": dict(one.expected.camera_sigmas)}
@@ -131,6 +137,25 @@ def _point_summary(expected: Expected) -> Json:
             "undetermined": int(np.isinf(sigmas).sum()),
         }
     return summary
+
+
+def _reliability(expected: Expected) -> Json:
+    """null for a smallest error: nothing checks any of the group."""
+    return {
+        "groups": {
+            one.group: {
+                "coordinates": one.coordinates,
+                "redundancy": one.redundancy,
+                "smallest_error": {"median": one.median, "largest": one.largest, "unit": error_unit(one.group)},
+                "unchecked": one.unchecked,
+            }
+            for one in expected.reliability.groups
+        },
+        "camera": [
+            {"parameter": one.parameter, "effect_in_sigmas": one.in_sigmas, "error_in": one.cause}
+            for one in expected.reliability.camera
+        ],
+    }
 
 
 def _quantity(expected: Expected, name: str, scale: float = 1.0) -> Json:

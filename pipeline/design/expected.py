@@ -13,6 +13,7 @@ from adjust.families import parameter_names
 from adjust.network import Network
 from adjust.planning import Plan, plan
 from adjust.projection import ideal_from_observed
+from pipeline.design.reliability import PlannedReliability, planned_reliability
 from pipeline.design.setup import Setup, planned_network
 from pipeline.report.lens import Lens, displacement
 
@@ -93,6 +94,10 @@ class Expected:
             )
             for radius, part in zip(radii, parts, strict=True)
         )
+
+    @cached_property
+    def reliability(self) -> PlannedReliability:
+        return planned_reliability(self.plan)
 
     @cached_property
     def point_sigmas(self) -> Array:

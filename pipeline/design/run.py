@@ -1,12 +1,14 @@
 """`reseau design`: from a scene file to what its photographs would give, without any picture."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
 from pipeline.atomic import check_writable, write_atomically
+from pipeline.design.alone import alone
 from pipeline.design.alternatives import Alternative, alternatives
 from pipeline.design.design_file import Json, design_json
 from pipeline.design.expected import Expected, expect
@@ -22,6 +24,7 @@ class Design:
     """A plan that was carried out. files: what was written, by a word for it; content: that of design.json."""
 
     expected: Expected
+    alone: Mapping[str, float]
     layouts: Layouts
     helpful: tuple[Alternative, ...]
     swept: tuple[Swept, ...]
@@ -35,7 +38,7 @@ class Design:
 
     def print(self, console: Console) -> None:
         """For a person."""
-        print_design(self.expected, self.layouts, self.helpful, self.swept, self.files, console)
+        print_design(self.expected, self.alone, self.layouts, self.helpful, self.swept, self.files, console)
 
 
 def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> Design:
@@ -50,6 +53,7 @@ def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> De
     with reporter.stage("planning") as count:
         count(scene_path.name, 0, 1)
         expected = expect(setup)
+        without_given = alone(expected)
         layouts = over_layouts(scene, expected)
     helpful: tuple[Alternative, ...] = ()
     if setup.settings.alternatives:
@@ -64,6 +68,6 @@ def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> De
         plot_sweep(swept[-1], picture)
         files[f"sweep of {asked.quantity}"] = picture
     pictures = [path.name for path in files.values()][1:]
-    content = design_json(scene, expected, layouts, helpful, tuple(zip(swept, pictures, strict=True)))
+    content = design_json(scene, expected, without_given, layouts, helpful, tuple(zip(swept, pictures, strict=True)))
     write_atomically(files["design"], json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    return Design(expected, layouts, helpful, tuple(swept), content, files)
+    return Design(expected, without_given, layouts, helpful, tuple(swept), content, files)

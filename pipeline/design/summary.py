@@ -10,17 +10,26 @@ from rich.text import Text
 
 from pipeline.design.alternatives import Alternative
 from pipeline.design.expected import Expected, rms
+from pipeline.design.reliability import error_unit
 from pipeline.design.sweeps import Layouts, Swept
-from pipeline.report.numbers import fixed, significant, value_and_sigma
+from pipeline.report.numbers import NONE, fixed, significant, value_and_sigma
 
 UNDETERMINED = "not determined"
 UM_PER_MM = 1000.0
+KINDS = {
+    "datum": "given fiducial",
+    "control": "given point",
+    "interior": "given interior",
+    "exterior": "given exterior",
+}
+UNIT_WORDS = {"um": " µm", "object unit": ""}
 LABELS = {"c": "c", "x0": "x0'", "y0": "y0'", "fiducials": "fiducials", "ray": "ray"}
 UNITS = {"c": "µm", "x0": "µm", "y0": "µm", "fiducials": "µm", "ray": "µm"}
 
 
 def print_design(
     expected: Expected,
+    alone: Mapping[str, float],
     layouts: Layouts,
     helpful: tuple[Alternative, ...],
     swept: Iterable[Swept],
@@ -39,11 +48,14 @@ def print_design(
         console.print(Text(f"  {null.remedy}", style="dim"))
     for warning in adjustment.warnings:
         console.print(Text(f"- {warning}"))
-    console.print(_camera_table(expected, layouts))
+    console.print(_camera_table(expected, alone, layouts))
     console.print(_curve_table(expected))
     if expected.fiducials:
-        console.print(_fiducial_table(expected))
+        console.print(_fiducial_table(expected, alone))
     console.print(_point_table(expected))
+    if expected.reliability.groups:
+        console.print(_reliability_table(expected))
+        console.print(_outer_table(expected))
     if helpful:
         console.print(_help_table(expected, helpful))
     for one in swept:
@@ -52,10 +64,13 @@ def print_design(
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _camera_table(expected: Expected, layouts: Layouts) -> Table:
+def _camera_table(expected: Expected, alone: Mapping[str, float], layouts: Layouts) -> Table:
+    """With fiducials beside it: what the photographs alone tell, in the frame that the fiducials make."""
     several = layouts.count > 1
     title = f"Expected precision of camera {expected.camera}"
     table = Table("quantity", "value", "sigma", title=title, title_justify="left")
+    if expected.fiducials:
+        table.add_column("photographs alone")
     if several:
         table.add_column(f"mean of {layouts.count} layouts")
         table.add_column("spread")
@@ -65,6 +80,8 @@ def _camera_table(expected: Expected, layouts: Layouts) -> Table:
     for name, label in rows.items():
         sigma = plan.sigma(interior + name)
         cells = [label, *_told(plan.adjustment.value(interior + name), sigma)]
+        if expected.fiducials:
+            cells.append(_sigma(alone[interior + name]) if sigma > 0.0 else "")
         if several and name in layouts.mean:
             scale = UM_PER_MM if name in UNITS else 1.0
             cells += [_sigma(layouts.mean[name] / scale), _sigma(layouts.spread[name] / scale)]
@@ -81,11 +98,13 @@ def _curve_table(expected: Expected) -> Table:
     return table
 
 
-def _fiducial_table(expected: Expected) -> Table:
-    table = Table("fiducial", "x', µm", "y', µm", title="Fiducial marks, sigma", title_justify="left")
+def _fiducial_table(expected: Expected, alone: Mapping[str, float]) -> Table:
+    heads = ("x', µm", "y', µm", "photographs alone: x', µm", "y', µm")
+    table = Table("fiducial", *heads, title="Fiducial marks, sigma", title_justify="left")
     for id in expected.fiducials:
-        sigmas = (UM_PER_MM * expected.plan.sigma(f"FID.{expected.camera}.{id}.{axis}") for axis in "xy")
-        table.add_row(Text(id), *(_sigma(sigma) for sigma in sigmas))
+        names = [f"FID.{expected.camera}.{id}.{axis}" for axis in "xy"]
+        sigmas = (*(expected.plan.sigma(name) for name in names), *(alone[name] for name in names))
+        table.add_row(Text(id), *(_sigma(UM_PER_MM * sigma) for sigma in sigmas))
     return table
 
 
@@ -94,6 +113,33 @@ def _point_table(expected: Expected) -> Table:
     for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
         told = [float(sigma) for sigma in sigmas if sigma > 0.0]
         table.add_row(axis, _sigma(rms(told)) if told else "fixed", _sigma(max(told)) if told else "fixed")
+    return table
+
+
+def _reliability_table(expected: Expected) -> Table:
+    title = "Smallest gross errors that are found"
+    table = Table(
+        "kind", "coordinates", "redundancy", "median", "largest", "unchecked", title=title, title_justify="left"
+    )
+    for one in expected.reliability.groups:
+        unit = error_unit(one.group)
+        sizes = () if unit == "mixed" else (one.median, one.largest)
+        errors = [_sigma(size) + UNIT_WORDS[unit] if math.isfinite(size) else NONE for size in sizes] or [NONE, NONE]
+        table.add_row(
+            KINDS.get(one.group, one.group), str(one.coordinates), f"{one.redundancy:.2f}", *errors, str(one.unchecked)
+        )
+    return table
+
+
+def _outer_table(expected: Expected) -> Table:
+    """Of the fiducials the worst alone."""
+    title = "What errors that are not found may do to the camera"
+    table = Table("parameter", "in its sigmas", "error in", title=title, title_justify="left")
+    effects = expected.reliability.camera
+    marks = [one for one in effects if one.parameter.startswith("FID.")]
+    shown = [one for one in effects if one not in marks] + sorted(marks, key=lambda one: -one.in_sigmas)[:1]
+    for one in shown:
+        table.add_row(Text(one.parameter), f"{one.in_sigmas:.1f}", Text(one.cause))
     return table
 
 

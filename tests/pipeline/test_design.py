@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
+from pipeline.design.alone import alone
 from pipeline.design.alternatives import alternatives
-from pipeline.design.expected import expect
+from pipeline.design.expected import expect, rms
 from pipeline.design.settings import Sweep
 from pipeline.design.setup import planned_network
 from pipeline.design.sweeps import Swept, sweep
@@ -145,12 +146,25 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert content["points"]["6"]["images"] == 2
     assert content["point_summary"]["X"]["estimated"] == 0
     assert 0.0 < content["point_summary"]["Z"]["rms"] < 0.001
+    targets = content["reliability"]["groups"]["target"]
+    assert targets["coordinates"] == 64
+    assert 0.0 < targets["redundancy"] < 1.0
+    assert targets["smallest_error"]["unit"] == "um"
+    assert targets["smallest_error"]["median"] > 4.13 * 5.0  # delta0 times sigma, over the root of a part of 1
+    assert {one["parameter"] for one in content["reliability"]["camera"]} >= {"IO.K.c", "IO.K.k3", "FID.K.a.x"}
     (swept,) = content["sweeps"]
     assert [step["value"] for step in swept["steps"]] == ["similarity", "affine"]
     assert (folder / swept["picture"]).read_bytes().startswith(b"\x89PNG")
     assert run(["design", str(scene), str(tmp_path / "there")]) == DONE
     table = capsys.readouterr().out
-    for words in ("principal distance, mm", "Fiducial marks", "What would help", "Sigmas over design.transformation"):
+    for words in (
+        "principal distance, mm",
+        "Smallest gross errors",
+        "IO.K.c",
+        "Fiducial marks",
+        "What would help",
+        "Sigmas over design.transformation",
+    ):
         assert words in table
 
 
@@ -265,3 +279,21 @@ def test_a_wrong_table_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert run(["design", str(small(tmp_path, ("[[image]]", f"{line}\n[[image]]")))]) == WRONG_INPUT
     assert words in capsys.readouterr().err
     assert not (tmp_path / "small-design").exists()
+
+
+def test_fiducials_of_photographs_alone_are_the_mean_of_as_many(tmp_path: Path) -> None:
+    """Closed form, where targets tell everything of film and orientation: sigma over the root of the number of frames.
+
+    Of the 2 m coordinates shift, turn and scale take four: the mean variance shrinks in that proportion. What is given
+    of the fiducials and of the interior orientation has no say.
+    """
+    for given in ("1.0", "0.002"):
+        scene = small(
+            tmp_path,
+            ("[design]", "[design]\nsigma_target_um = 1e-4\nsigma_fiducial_um = 3.0"),
+            ("sigma_height = 0.001", "sigma_height = 0"),
+            ('id = "a"\n', f'id = "a"\nsigma_mm = {given}\n'),
+        )
+        sigmas = alone(expect(Variations.read(scene).setup()))
+        marks = [sigma for name, sigma in sigmas.items() if name.startswith("FID.")]
+        assert rms(marks) == pytest.approx(0.003 / math.sqrt(2) * math.sqrt(1 - 4 / 8), rel=1e-4)
