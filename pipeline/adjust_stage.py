@@ -30,7 +30,17 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     Raises InputError or AdjustmentError where an adjustment cannot even begin.
     """
     network, left_out = build_network(project, marks)
-    options = Options(
+    options = adjustment_options(project)
+    adjustment = _adjusted(network, options)
+    uncorrected = np.zeros_like(network.observations.xy_mm)
+    if project.disk_radius > 0.0:
+        adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
+    warnings = (*left_out, *_unmeasured(project, network), *_not_corrected(network, uncorrected))
+    return replace(adjustment, warnings=(*adjustment.warnings, *warnings))
+
+
+def adjustment_options(project: Project) -> Options:
+    return Options(
         datum=project.adjust.datum,
         datum_coordinates=project.adjust.datum_coordinates,
         datum_points=project.adjust.datum_points,
@@ -38,12 +48,6 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
         variance_components=project.adjust.variance_components,
         method=project.adjust.method,
     )
-    adjustment = _adjusted(network, options)
-    uncorrected = np.zeros_like(network.observations.xy_mm)
-    if project.disk_radius > 0.0:
-        adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
-    warnings = (*left_out, *_unmeasured(project, network), *_not_corrected(network, uncorrected))
-    return replace(adjustment, warnings=(*adjustment.warnings, *warnings))
 
 
 def _adjusted(network: Network, options: Options) -> Adjustment:

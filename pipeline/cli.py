@@ -14,6 +14,8 @@ from rich.console import Console
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from pipeline import stages
+from pipeline.adjustment_file import without_nan
+from pipeline.choose_stage import choice_json, print_choice, run_choose
 from pipeline.demo import run_demo
 from pipeline.design.run import run_design
 from pipeline.errors import InputError
@@ -106,6 +108,18 @@ def adjust(project: ProjectFile, as_json: AsJson = False) -> int:
 def check(project: ProjectFile, as_json: AsJson = False) -> int:
     """The adjustment against OpenCV's calibration, in check.json."""
     return _with_project(project, stages.run_check, as_json)
+
+
+@app.command()
+def choose(project: ProjectFile, as_json: AsJson = False) -> int:
+    """Which transformation and distortion the observations ask for, in choose.json."""
+    settings = read_project(project)
+    choice = run_choose(settings, Reporter())
+    if as_json:
+        typer.echo(json.dumps(without_nan(choice_json(choice)), indent=1, ensure_ascii=False))
+    else:
+        print_choice(choice, Console(), settings.choice_path)
+    return DONE if choice.chosen and choice.chosen.model == choice.given else LOOK
 
 
 @app.command()

@@ -77,6 +77,10 @@ class Project:
         return self.output / "check.json"
 
     @property
+    def choice_path(self) -> Path:
+        return self.output / "choose.json"
+
+    @property
     def measurement_path(self) -> Path:
         return self.output / "measurement.json"
 

@@ -1,0 +1,198 @@
+"""The model chooser against simulated data of known models."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from simulated import HALF_MM, Truth, field_points, simulated
+
+from adjust.adjustment import Options, adjust
+from adjust.approximations import approximate
+from adjust.cross_validation import CrossValidation, cross_validate, folds
+from adjust.model_choice import Candidate, Choice, choose, f_test, nested_tests, simplest_sufficient
+from adjust.models import Model
+from adjust.network import Distortion, Network, ObjectPoint, Prior, Transformation
+
+Array = NDArray[np.float64]
+
+LENSES: dict[str, tuple[str, dict[str, float]]] = {
+    "none": ("torlegard", {}),
+    "k3": ("torlegard", {"k3": 1.5e-7}),
+    "k3 k5": ("torlegard", {"k3": 2e-7, "k5": -2e-11}),
+    "k3 p1 p2": ("torlegard", {"k3": 1.5e-7, "p1": 8e-7, "p2": -6e-7}),
+    "k3 k5 p1 p2": ("torlegard", {"k3": 2e-7, "k5": -2e-11, "p1": 1.2e-6, "p2": -1e-6}),
+    "ebner": ("ebner", {"b3": 0.02, "b4": -0.02, "b7": 0.05, "b8": -0.03, "b10": 0.03, "b11": 0.03}),
+}
+
+
+def network_of(seed: int, lens: str, film: Transformation, points: int = 40) -> Network:
+    """Four convergent frames of a field with relief, whose lens and film are known; adjusted without any distortion."""
+    rng = np.random.default_rng(seed)
+    family, parameters = LENSES[lens]
+    truth = Truth(family=family, distortion=parameters)
+    kind: Transformation = "none" if film == "none" else "congruent"
+    network, _ = simulated(rng, truth, kind, points=field_points(rng, points, relief=300.0))
+    camera = replace(network.cameras[0], distortion=Distortion())
+    images = tuple(replace(image, transformation=film) for image in network.images)
+    return deformed(replace(network, cameras=(camera,), images=images), film)
+
+
+def deformed(network: Network, film: Transformation) -> Network:
+    """Every scan deformed in its own way, by 30 um at 100 mm: a scale of its own, or also an affinity and a shear."""
+    xy = network.observations.xy_mm.copy()
+    for number, image in enumerate(network.images):
+        rows = [row for row, name in enumerate(network.observations.image) if name == image.name]
+        sign = 1.0 if number % 2 else -1.0
+        matrix = np.eye(2)
+        if film in ("similarity", "affine"):
+            matrix = matrix * (1.0 + 3e-4 * sign * (1 + number) / 2)
+        if film == "affine":
+            matrix = matrix @ np.array([[1.0 + 3e-4 * sign, 2e-4], [0.0, 1.0]])
+        xy[rows] = xy[rows] @ matrix.T
+    return replace(network, observations=replace(network.observations, xy_mm=xy))
+
+
+def chosen(network: Network) -> Choice:
+    own = adjust(network, approximate(network))
+    return choose(own, half_mm={"K": (HALF_MM, HALF_MM)})
+
+
+def test_the_true_lens_is_chosen_and_the_simpler_ones_are_told_to_be_too_simple() -> None:
+    choice = chosen(network_of(2, "k3 k5", "none", points=25))
+    assert choice.chosen is not None
+    assert choice.chosen.model == Model("none", "torlegard", ("k3", "k5"))
+    assert choice.verdict.startswith("The data ask for torlegard k3 k5.")
+    too_simple = {reason.split(" is too simple: ")[0] for reason in choice.reasons if "too simple" in reason}
+    assert too_simple == {"no distortion", "torlegard k3"}
+    assert {each.model.name for each in choice.candidates} >= {"ebner", "legendre(3)"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("film", ["none", "congruent", "similarity", "affine"])
+@pytest.mark.parametrize("lens", list(LENSES))
+def test_the_true_model_is_chosen_nearly_always_and_no_strong_effect_is_ever_missed(
+    lens: str, film: Transformation
+) -> None:
+    """All effects here are strong: thirty micrometres and more."""
+    runs = 12
+    true = Model(film, *(("none", ()) if lens == "none" else lens_model(lens, film)))
+    right = 0
+    for seed in range(runs):
+        choice = chosen(network_of(seed, lens, film))
+        assert choice.chosen is not None
+        found = choice.chosen.model
+        assert found == true or found.contains(true) or found.family == "legendre(3)", found.name
+        right += found == true
+    assert right >= runs - 2
+
+
+def lens_model(lens: str, film: Transformation) -> tuple[str, tuple[str, ...]]:
+    if lens != "ebner":
+        return "torlegard", tuple(lens.split())
+    return "ebner", tuple(f"b{i}" for i in range(3 if film == "affine" else 1, 13))
+
+
+def candidate(parameters: str, vpv: float, sigmas: float | None, family: str = "torlegard") -> Candidate:
+    names = tuple(parameters.split())
+    predicted = None if sigmas is None else CrossValidation(4.0 * sigmas, sigmas, 100)
+    unknowns = 60 + len(names)
+    model = Model("affine", family if names else "none", names)
+    return Candidate(model, "", 360, unknowns, 360 - unknowns, vpv, 1.0, predicted)
+
+
+def test_a_richer_model_must_fit_significantly_better() -> None:
+    """F(1, 298) has its 1 % point at 6.72."""
+    simple = candidate("k3", 300.0, 1.0)
+    for gain, better in ((6.5, False), (7.0, True)):
+        richer = candidate("k3 k5", 300.0 - gain, 0.99)
+        test = f_test(simple, richer)
+        assert test.f == pytest.approx(gain / ((300.0 - gain) / 298))
+        assert (test.p < 0.01) is better
+        assert simplest_sufficient([richer, simple]) is (richer if better else simple)
+
+
+def test_a_richer_model_must_predict_better_too() -> None:
+    simple = candidate("k3", 300.0, 1.0)
+    assert simplest_sufficient([simple, candidate("k3 k5", 280.0, 1.01)]) is simple
+    assert simplest_sufficient([simple, candidate("k3 k5", 280.0, None)]) is simple
+
+
+def test_of_models_that_do_not_contain_each_other_akaike_decides() -> None:
+    simple = candidate("k3", 300.0, 1.0)
+    for vpv, better in ((280.0, False), (250.0, True)):
+        other = candidate(" ".join(f"b{i}" for i in range(3, 13)), vpv, 0.9, "ebner")
+        assert (simple.aicc - other.aicc > 10.0) is better
+        assert simplest_sufficient([simple, other]) is (other if better else simple)
+
+
+def test_what_has_no_solution_is_not_chosen() -> None:
+    broken = Candidate(Model("affine"), "singular. No cause.")
+    good = candidate("k3", 300.0, 1.0)
+    assert simplest_sufficient([broken, good]) is good
+    assert simplest_sufficient([broken]) is None
+
+
+def test_neighbours_alone_are_tested() -> None:
+    ladder = [candidate(names, vpv, 1.0) for names, vpv in (("", 900.0), ("k3", 400.0), ("k3 k5", 300.0))]
+    tests = nested_tests(ladder)
+    assert [(test.simpler.name, test.richer.name) for test in tests] == [
+        ("affine, no distortion", "affine, torlegard k3"),
+        ("affine, torlegard k3", "affine, torlegard k3 k5"),
+    ]
+
+
+def test_akaikes_criteria_in_closed_form() -> None:
+    """Of 100 observations, 4 unknowns and v'Pv 90: AIC 98, AICc 100 ln 0.9 + 10 + 60 / 94."""
+    each = Candidate(Model("none"), "", 100, 4, 96, 90.0)
+    assert each.aic == 98.0
+    assert each.aicc == pytest.approx(100 * np.log(0.9) + 10 + 2 * 5 * 6 / 94)
+
+
+def test_what_is_singular_is_named_and_does_not_stop_the_choice() -> None:
+    """A flat field seen vertically by one attitude, nothing known of the interior: c cannot be told."""
+    truth = Truth(distortion={}, attitudes=((0.0, 0.0, 0.1),) * 4)
+    rng = np.random.default_rng(5)
+    points = field_points(rng, 20, relief=0.0)
+    network, start = simulated(rng, truth, "none", points=points)
+    camera = network.cameras[0]
+    c, x0, y0 = (Prior(value, np.inf) for value in (153.0, 0.0, 0.0))
+    free = replace(camera, principal_distance_mm=c, x0_mm=x0, y0_mm=y0, distortion=Distortion())
+    choice = choose(adjust(replace(network, cameras=(free,)), start))
+    assert choice.chosen is None
+    assert choice.verdict == "No model has a solution."
+    assert all("singular" in each.problem for each in choice.candidates)
+    assert "The principal distance of camera K cannot be told" in choice.reasons[0]
+
+
+def test_exact_images_are_predicted_exactly() -> None:
+    """Of twelve known points, and of twelve unknown ones, which every second of their rays must locate."""
+    points = field_points(np.random.default_rng(3), 24)
+    network, start = simulated(np.random.default_rng(1), None, "none", points, noise=False)
+    unknown = tuple(ObjectPoint(point.id, None, None, None) for point in network.points[12:])
+    given = replace(network, points=(*network.points[:12], *unknown))
+    left_out = folds(given, Options())
+    assert sorted(point for fold in left_out for point in fold) == sorted(point.id for point in given.points)
+    found = cross_validate(adjust(given, start), left_out, Options())
+    assert found is not None
+    assert found.rms_um < 1e-3
+    assert found.rays == 24 * 4
+
+
+def test_few_known_points_stay_in_every_fold() -> None:
+    network, _ = simulated(np.random.default_rng(1), points=field_points(np.random.default_rng(3), 20))
+    unknown = tuple(ObjectPoint(point.id, None, None, None) for point in network.points[5:])
+    left_out = folds(replace(network, points=(*network.points[:5], *unknown)), Options())
+    assert not {"0", "1", "2", "3", "4"} & {point for fold in left_out for point in fold}
+
+
+def test_predictions_of_known_points_err_by_noise_and_by_what_predicts() -> None:
+    """Of 40 points in 5 folds the camera and stations add little to the noise of 4 um that the images have."""
+    network = network_of(4, "k3", "none")
+    model = Model("none", "torlegard", ("k3",))
+    fitted = model.of(network, {}, {})
+    result = adjust(fitted, approximate(fitted))
+    found = cross_validate(result, folds(fitted, Options()), Options())
+    assert found is not None
+    assert found.rms_um == pytest.approx(4.0 * found.sigmas)
+    assert 0.95 < found.sigmas < 1.2
