@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.families import parameter_names
-from adjust.network import Network, Prior, Transformation
+from adjust.network import Calibration, Network, Prior, Transformation
 from adjust.validation import FIDUCIALS_NEEDED
 
 # A transformation and the simpler ones that it contains, simplest first.
@@ -64,7 +64,17 @@ class Model:
             image if image.transformation == "none" else replace(image, transformation=self.transformation)
             for image in network.images
         )
-        return replace(network, cameras=tuple(cameras), images=images)
+        calibrations = tuple(_without_distortion(each, network) for each in network.calibrations)
+        return replace(network, cameras=tuple(cameras), images=images, calibrations=calibrations)
+
+
+def _without_distortion(calibration: Calibration, network: Network) -> Calibration:
+    """What an earlier calibration says of everything but distortion, which is another in every candidate."""
+    distortion = {f"IO.{camera.name}.{name}" for camera in network.cameras for name in camera.distortion.parameters}
+    kept = [i for i, name in enumerate(calibration.names) if name not in distortion]
+    return Calibration(
+        tuple(calibration.names[i] for i in kept), calibration.values[kept], calibration.covariance[np.ix_(kept, kept)]
+    )
 
 
 def given_model(network: Network) -> Model:
