@@ -7,15 +7,18 @@ import numpy as np
 
 from adjust.families import parameter_names
 from adjust.network import Calibration, Network, Prior, Transformation
-from adjust.validation import FIDUCIALS_NEEDED
+from adjust.transformation import marks_needed
 
 # A transformation and the simpler ones that it contains, simplest first.
 TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
     "congruent": (),
     "similarity": ("congruent",),
     "affine": ("congruent", "similarity"),
+    "conformal(2)": ("congruent", "similarity"),
+    "projective": ("congruent", "similarity", "affine"),
+    "bilinear": ("congruent", "similarity", "affine"),
+    "polynomial(2)": ("congruent", "similarity", "affine", "conformal(2)", "bilinear"),
 }
-TAKES_AFFINITY = ("affine",)  # and so leaves none to distortion
 
 PHYSICAL = {
     "torlegard": ("k3", "k3 k5", "k3 p1 p2", "k3 k5 p1 p2", "k3 k5 k7 p1 p2"),
@@ -95,7 +98,7 @@ def transformations(network: Network) -> tuple[Transformation, ...]:
     rows = zip(observations.image, observations.kind, strict=True)
     shown = [image for image, kind in rows if kind == "fiducial" and image in filmed]
     fewest = min(shown.count(image) for image in filmed)
-    return tuple(kind for kind in TRANSFORMATIONS if FIDUCIALS_NEEDED[kind] <= fewest)
+    return tuple(kind for kind in TRANSFORMATIONS if marks_needed(kind) <= fewest)
 
 
 def lenses(network: Network, transformation: Transformation, with_sets: bool) -> tuple[Model, ...]:
@@ -106,6 +109,7 @@ def lenses(network: Network, transformation: Transformation, with_sets: bool) ->
     models += [Model(transformation, ladder, tuple(names.split())) for names in PHYSICAL[ladder]]
     if with_sets:
         for name, affinity in SETS.items():
-            taken = affinity if transformation in TAKES_AFFINITY else ()
+            films = (transformation, *TRANSFORMATIONS.get(transformation, ()))
+            taken = affinity if "affine" in films else ()  # by the film
             models.append(Model(transformation, name, tuple(p for p in parameter_names(name) if p not in taken)))
     return tuple(models)
