@@ -5,7 +5,7 @@ the unknowns in f, the observed values with their covariance, computed values an
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -113,6 +113,19 @@ def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCali
                 observed=each.values[free],
                 covariance=each.covariance[np.ix_(free, free)],
             )
+
+
+def at_computed(network: Network, unknowns: Unknowns, values: Array) -> Network:
+    """The network with distances and calibrations as if they had been observed without error."""
+    distances = tuple(
+        replace(each, value=float(observed.computed(values)[0]))
+        for each, observed in zip(network.distances, _distances(network, unknowns), strict=True)
+    )
+    number = {name: i for i, name in enumerate(unknowns.names)}
+    calibrations = tuple(
+        replace(each, values=np.array([values[number[name]] for name in each.names])) for each in network.calibrations
+    )
+    return replace(network, distances=distances, calibrations=calibrations)
 
 
 def square_sum(further: tuple[FurtherObservation, ...], values: Array) -> float:

@@ -12,6 +12,7 @@ from adjust.cofactor import free_cofactor
 from adjust.elimination import Factor
 from adjust.errors import AdjustmentError
 from adjust.functions import blind_mark, computed_observations
+from adjust.further_observations import at_computed
 from adjust.iteration import factorise, linearise
 from adjust.network import Approximations, Network
 from adjust.null_space import null_vectors
@@ -81,8 +82,9 @@ def _at_computed_observations(problem: Problem) -> Problem:
     xy_mm = computed_observations(problem, problem.start())
     if xy_mm is None:
         raise AdjustmentError(_blind(problem))
-    network = replace(problem.network, observations=replace(problem.network.observations, xy_mm=xy_mm))
     unknowns = problem.unknowns
+    network = at_computed(problem.network, unknowns, unknowns.start)
+    network = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
     given = np.where(np.isnan(unknowns.given), np.nan, unknowns.start)
     return replace(problem, network=network, unknowns=replace(unknowns, given=given))
 

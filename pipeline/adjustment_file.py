@@ -391,6 +391,7 @@ _ADJUSTMENT = {
         dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", "sigma", "v", "redundancy", "w"), _NUMBER),
     ),
     "correlations": _Each(list, {"parameters": list, "rho": _NUMBER, "cause": str, "remedy": str}),
+    "calibrations": _Each(list, {"name": str, **dict.fromkeys(("value", "sigma", "v", "redundancy", "w"), _NUMBER)}),
     "warnings": _Each(list, str),
     "variance_factors": _Each(dict, _NUMBER),
     "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),

@@ -144,7 +144,7 @@ def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
             "Nothing checks the result: there are as many unknowns as observations.",
             "Add points or frames; until then no standard deviation here has been confirmed by the data.",
         )
-    yield from _distance_problems(adjustment)
+    yield from _further_problems(adjustment)
     bad = suspects(adjustment)
     if bad:
         names = ", ".join(f"{row['image']}/{row['point']} (w = {fixed(row['w'], 1)})" for row in bad[:MANY])
@@ -156,10 +156,9 @@ def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
         )
 
 
-def _distance_problems(adjustment: Json) -> Iterator[Problem]:
-    distances = adjustment["distances"]
-    limit = critical_w(len(distances)) * max(1.0, adjustment["sigma0"] or 1.0)
-    bad = [row for row in distances if abs(row["w"] or 0.0) > limit]
+def _further_problems(adjustment: Json) -> Iterator[Problem]:
+    """Distances and earlier calibrations that the images contradict."""
+    bad = _beyond_chance(adjustment, adjustment["distances"])
     if bad:
         names = [f"{row['from']} to {row['to']} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})" for row in bad]
         yield Problem(
@@ -167,6 +166,19 @@ def _distance_problems(adjustment: Json) -> Iterator[Problem]:
             "Look for a wrong point or unit in the file of distances; two distances that contradict each other are "
             "both named.",
         )
+    bad = _beyond_chance(adjustment, adjustment["calibrations"])
+    if bad:
+        names = [f"{row['name']} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})" for row in bad]
+        yield Problem(
+            f"The images contradict the earlier calibration: {_listed(names)}.",
+            "The camera has changed since, or the earlier adjustment lacked something; calibrate without it and "
+            "compare.",
+        )
+
+
+def _beyond_chance(adjustment: Json, rows: list[Json]) -> list[Json]:
+    limit = critical_w(len(rows)) * max(1.0, adjustment["sigma0"] or 1.0)
+    return [row for row in rows if abs(row["w"] or 0.0) > limit]
 
 
 def _global_test(adjustment: Json) -> Iterator[Problem]:

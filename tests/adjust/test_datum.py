@@ -142,6 +142,21 @@ def test_a_datum_that_cannot_be_is_refused(options: Options, words: tuple[str, .
         assert word in str(error.value)
 
 
+def test_a_flat_field_of_heights_needs_a_fourth_chosen_coordinate() -> None:
+    """With noisy heights three would do formally, and noise would make the scale."""
+    case = load("v_singular_H2D_vertcross_affine")
+    rng = np.random.default_rng(1)
+    for row, sigma in zip(case["input"]["pts_obs"], case["input"]["pts_sigma"], strict=True):
+        row[2] += rng.normal(0.0, 0.02)
+        sigma[2] = 0.02
+    network, start = network_of(case), approximations_of(case, case["state"])
+    first, last = network.points[0].id, network.points[-1].id
+    with pytest.raises(AdjustmentError, match="do not hold the object space"):
+        adjust(network, start, Options("minimal", (f"{first}.X", f"{first}.Y", f"{last}.X")))
+    four = Options("minimal", (f"{first}.X", f"{first}.Y", f"{last}.X", f"{last}.Y"))
+    assert adjust(network, start, four).unknowns == adjust(network, start, Options("minimal")).unknowns
+
+
 def test_a_coordinate_that_is_given_needs_no_holding() -> None:
     network, start = simulated(np.random.default_rng(5), point_sigma=0.05)
     with pytest.raises(AdjustmentError, match="X is given with the standard deviation"):

@@ -25,6 +25,7 @@ from adjust.network import (
     Transformation,
 )
 from adjust.numbering import Numbering
+from adjust.planning import plan
 from adjust.problem import number
 from adjust.result import Adjustment
 
@@ -127,6 +128,20 @@ def scaled_by_bars(count: int) -> tuple[Network, Array]:
     network, _ = simulated(rng, points=points, point_sigma=np.inf)
     bars = tuple(Distance(a, b, between(points[int(a)], points[int(b)]), 0.01) for a, b in (("0", "1"), ("2", "3")))
     return replace(network, distances=bars), points
+
+
+def test_planned_distances_are_taken_to_be_true() -> None:
+    """A plan has the cofactors of the adjustment at its values, and nothing to iterate, whatever the distances say."""
+    network, points = observed_network(np.random.default_rng(1))
+    start = approximate(network)
+    exteriors = {f"f{i}": np.array([*STATIONS[i], *ATTITUDES[i]]) for i in range(4)}
+    values = replace(start, points={str(i): xyz for i, xyz in enumerate(points)}, exterior=exteriors)
+    planned = plan(network, values).adjustment
+    wrong = replace(network, distances=tuple(replace(each, value=each.value + 5.0) for each in network.distances))
+    assert plan(wrong, values).adjustment.value("PT.0.X") == pytest.approx(points[0][0], abs=1e-9)
+    assert all(abs(row.v) < 1e-9 for row in planned.further)
+    sigma = np.sqrt(adjust(network, start).cofactor_of(["PT.0.X"])[0, 0])
+    assert np.sqrt(planned.cofactor_of(["PT.0.X"])[0, 0]) == pytest.approx(sigma, rel=0.01)
 
 
 @pytest.mark.parametrize("count", [9, 24])
