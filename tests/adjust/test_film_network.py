@@ -21,7 +21,8 @@ from simulated import (
 
 from adjust.adjustment import adjust
 from adjust.approximations import approximate
-from adjust.network import Network, Prior, Transformation
+from adjust.errors import AdjustmentError
+from adjust.network import Network, Observations, Prior, Transformation
 from adjust.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -62,6 +63,78 @@ def test_perfect_data_leave_nothing_and_give_the_truth_back(kind: Transformation
         off = [abs(result.value(name) - value) for name, value in zip(names, expected, strict=True)]
         assert np.all(off <= np.array([1e-5 * result.sigma(name) / result.sigma0 for name in names]))
     assert result.mirrored == {"f1"}
+
+
+@pytest.mark.parametrize("kind", ["polynomial(3)", "polynomial(5)"])
+def test_the_origin_of_the_comparator_does_not_matter(kind: Transformation) -> None:
+    """A metre and a half off, as on a film strip; with exact observations, which are moved without a rounding."""
+    network, _ = simulated(
+        np.random.default_rng(4), Truth(), "polynomial(3)", field_points(np.random.default_rng(5), 40), noise=False
+    )
+    network = replace(network, images=tuple(replace(image, transformation=kind) for image in network.images))
+    results = [adjust(each, approximate(each)) for each in (network, moved_origin(network, 1500.0))]
+    for result in results:
+        assert result.converged
+        assert np.abs(result.residuals.v_mm).max() < 1e-10
+    for name in ("IO.K.c", "IO.K.x0", "FID.K.3.y", "EO.f2.omega"):
+        near, far = (result.sigma(name) / result.sigma0 for result in results)
+        assert far == pytest.approx(near, rel=1e-9)
+
+
+def moved_origin(network: Network, off_mm: float) -> Network:
+    observations = network.observations
+    return replace(network, observations=replace(observations, xy_mm=observations.xy_mm + off_mm))
+
+
+@pytest.mark.parametrize(("kind", "marks"), [("projective", 3), ("bilinear", 3), ("conformal(3)", 2)])
+def test_targets_determine_what_too_few_marks_leave_open(kind: Transformation, marks: int) -> None:
+    network, _ = simulated(
+        np.random.default_rng(4), Truth(), kind, field_points(np.random.default_rng(5), 25), noise=False
+    )
+    network = with_marks(network, marks)
+    result = adjust(network, approximate(network))
+    assert result.converged
+    assert result.vpv < 1e-12
+    assert result.warnings == (
+        f"Image f0 shows {marks} fiducial marks, and its {kind} transformation takes 4 of its own: the targets "
+        f"determine the rest of it. 3 more images are alike.",
+    )
+
+
+def with_marks(network: Network, count: int, images_of_marks_alone: tuple[str, ...] = ()) -> Network:
+    """The network with the first marks only, and some images without targets."""
+    rows = network.observations
+    keep = [
+        i
+        for i, (image, point, what) in enumerate(zip(rows.image, rows.point, rows.kind, strict=True))
+        if (int(point) <= count if what == "fiducial" else image not in images_of_marks_alone)
+    ]
+    observations = Observations(
+        tuple(rows.image[i] for i in keep),
+        tuple(rows.point[i] for i in keep),
+        tuple(rows.kind[i] for i in keep),
+        rows.xy_mm[keep],
+        rows.covariance_mm2[keep],
+    )
+    return replace(network, observations=observations)
+
+
+def test_an_image_without_targets_needs_all_marks_of_its_own() -> None:
+    network, _ = simulated(np.random.default_rng(4), Truth(), "projective", noise=False)
+    with pytest.raises(AdjustmentError, match=r"image f2 shows 3 fiducial marks; its projective .* needs 4\. Measure"):
+        approximate(with_marks(network, 3, ("f2",)))
+    result = adjust(enough := with_marks(network, 4, ("f2",)), approximate(enough))
+    assert result.converged
+
+
+def test_a_film_that_folds_over_is_told() -> None:
+    network, start = simulated(np.random.default_rng(4), Truth(), "polynomial(2)", noise=False)
+    folded = start.transformation["f1"].copy()
+    folded[3] = 0.02  # x' turns back at some 15 mm from the middle
+    with pytest.raises(
+        AdjustmentError, match=r"cannot start: .* polynomial\(2\) transformation of image f1 folds over"
+    ):
+        adjust(network, replace(start, transformation=dict(start.transformation) | {"f1": folded}))
 
 
 @pytest.mark.parametrize(
