@@ -1,6 +1,6 @@
 """Relinearise and solve until unknowns and adjusted observations stand still."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from adjust.functions import Derivatives, computed_observations, derivatives
 from adjust.further_observations import square_sum
 from adjust.numbering import Numbering
 from adjust.problem import Problem, State
-from adjust.result import Termination
+from adjust.result import Iteration, Termination
 from adjust.rows import WhitenedRows, of_cameras, prior_differences, prior_root_weights, whitened_rows
 
 Array = NDArray[np.float64]
@@ -19,8 +19,12 @@ STANDSTILL_SIGMAS = 1e-8  # a step below this, in standard deviations, is none
 ROUNDING_SIGMAS = 1e-5  # steps below this that no longer shrink are rounding
 VPV_ROUNDING = 1e-9  # relative increase of v'Pv that is not an increase
 FIRST_DAMPING = 1e-4
-LEAST_DAMPING = 1e-6
+LEAST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e8
+POOR_GAIN = 0.25  # of the promised decrease of v'Pv, below which the next step is damped
+LARGEST_EASING = 0.1  # of the damping after a good step
+PROBE = 0.1  # part of a step over which its curvature is taken
+LARGEST_TURN = 0.75  # of a step's length that its second-order part may have
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Solution:
     end: Linearised
     factor: Factor | None
     termination: Termination
-    history: tuple[tuple[float, float], ...]
+    history: tuple[Iteration, ...]
 
 
 def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Linearised | None:
@@ -76,35 +80,65 @@ def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera
 
 
 def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limit: int) -> Solution:
-    """Gauss-Newton steps; one that would increase v'Pv is damped (Levenberg and Marquardt) until it decreases it."""
+    """Gauss-Newton steps, damped where they fail (Levenberg and Marquardt), until nothing moves any more.
+
+    A step is taken when it makes v'Pv smaller; if not, or where a point would have no image after it, the damping
+    grows. How much of the promised decrease came about, the gain, decides on the next damping (Nielsen 1999, Damping
+    parameter in Marquardt's method). Damped steps are bent along the curve on which the linear residuals stay
+    (`_bent`): that follows the valleys in which the principal distance changes with heights and scale.
+    """
     at = start
-    damping = 0.0
-    history: list[tuple[float, float]] = []
+    damping, lately = 0.0, FIRST_DAMPING
+    history: list[Iteration] = []
     while len(history) < limit:
-        moved = _step(numbering, covariance_mm2, at, damping)
+        moved = _step(numbering, covariance_mm2, at, damping, lately)
         if moved is None:
             return Solution(at, None, "diverged", tuple(history))
-        at, step, damping = moved
-        history.append((at.vpv, step))
-        if damping == 0.0 and _stands_still(history):
+        at = moved.end
+        history.append(Iteration(at.vpv, moved.sigmas, moved.damping, moved.attempts))
+        if moved.damping == 0.0 and _stands_still(history):
             return Solution(at, factorise(numbering, at), "converged", tuple(history))
-        damping = damping / 10.0 if damping > LEAST_DAMPING else 0.0
+        damping, lately = _eased(moved.damping, moved.gain), moved.damping or lately
     return Solution(at, factorise(numbering, at), "iteration limit", tuple(history))
 
 
-def _stands_still(history: list[tuple[float, float]]) -> bool:
-    steps = [step for _, step in history[-2:]]
+def _stands_still(history: list[Iteration]) -> bool:
+    steps = [each.largest_step_sigmas for each in history[-2:]]
     if steps[-1] < STANDSTILL_SIGMAS:
         return True
     return len(steps) == 2 and max(steps) < ROUNDING_SIGMAS and steps[1] > 0.5 * steps[0]
 
 
+def _eased(damping: float, gain: float) -> float:
+    """The damping of the next step: less where the linear equations told the truth, more where they did not."""
+    if damping == 0.0:
+        return 0.0 if gain > POOR_GAIN else FIRST_DAMPING
+    eased = damping * max(LARGEST_EASING, 1.0 - (2.0 * gain - 1.0) ** 3)
+    return eased if eased > LEAST_DAMPING else 0.0
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """A step that was taken: where it leads, its length in standard deviations, and how it came about."""
+
+    end: Linearised
+    sigmas: float
+    damping: float
+    gain: float
+    attempts: int
+
+
 def _step(
-    numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float
-) -> tuple[Linearised, float, float] | None:
-    """The next state, the step's length in standard deviations and its damping; None: no step helps."""
+    numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, lately: float
+) -> _Moved | None:
+    """The first step from a state that makes v'Pv smaller, with more and more damping; None: there is none.
+
+    lately: the damping that helped lately, to be tried where it takes some.
+    """
     problem = numbering.problem
+    attempts = 0
     while damping < LARGEST_DAMPING:
+        attempts += 1
         try:
             factor = factorise(numbering, at, damping)
             solution = factor.solution()
@@ -112,8 +146,54 @@ def _step(
             return None
         step = np.zeros(len(problem.unknowns))
         step[numbering.free] = solution
-        moved = linearise(numbering, covariance_mm2, problem.moved(at.state, step)) if np.isfinite(step).all() else None
-        if moved is not None and moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
-            return moved, factor.length(), damping
-        damping = max(10.0 * damping, FIRST_DAMPING)
+        if np.isfinite(step).all():
+            linear_mm = _linear_change(problem, at, step)
+            promised = at.vpv - _linear_square_sum(problem, at, covariance_mm2, step, linear_mm)
+            bent = step if damping == 0.0 else _bent(numbering, covariance_mm2, at, damping, step, linear_mm)
+            moved = None if bent is None else linearise(numbering, covariance_mm2, problem.moved(at.state, bent))
+            if moved is not None and moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
+                gain = (at.vpv - moved.vpv) / promised if promised > VPV_ROUNDING * (1.0 + at.vpv) else 1.0
+                return _Moved(moved, factor.length(), damping, gain, attempts)
+        damping = 10.0 * damping or lately
     return None
+
+
+def _linear_change(problem: Problem, at: Linearised, step: Array) -> Array:
+    """How the computed observations (n, 2) in mm change with a step of the unknowns, to the first order: -A^-1 B dx."""
+    by_column = np.append(step, 0.0)[problem.columns]  # the last stands for ABSENT
+    along = np.einsum("nij,nj->ni", at.at.by_unknowns, by_column)
+    return np.asarray(-np.linalg.solve(at.at.by_observation, along[..., None])[..., 0])
+
+
+def _linear_square_sum(problem: Problem, at: Linearised, covariance_mm2: Array, step: Array, change_mm: Array) -> float:
+    """v'Pv after a step, to the first order."""
+    v = at.v_mm + change_mm
+    weighted = np.linalg.solve(covariance_mm2, v[..., None])[..., 0]
+    prior = problem.unknowns.has_prior
+    normalised = (prior_differences(problem, at.state) - step)[prior] / problem.unknowns.sigma[prior]
+    further = 0.0
+    for each in problem.further:
+        left = each.observed - each.computed(at.state.values) - each.by_unknowns(at.state.values) @ step[each.positions]
+        further += float(left @ np.linalg.solve(each.covariance, left))
+    return float((v * weighted).sum() + (normalised**2).sum()) + further
+
+
+def _bent(
+    numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, step: Array, change_mm: Array
+) -> Array | None:
+    """A damped step with its second-order part; None where that is too large to be trusted, or cannot be found.
+
+    The second derivative of the observations along the step, by a difference, takes the place of an observation:
+    geodesic acceleration (Transtrum and Sethna 2012, Improvements to the Levenberg-Marquardt algorithm).
+    """
+    problem = numbering.problem
+    ahead = computed_observations(problem, problem.moved(at.state, PROBE * step))
+    if ahead is None:
+        return None
+    half_curvature_mm = ((ahead - at.computed_mm) / PROBE - change_mm) / PROBE
+    rows = whitened_rows(numbering, at.state.values, at.at, covariance_mm2, at.v_mm + half_curvature_mm)
+    factor = factorise(numbering, replace(at, rows=rows), damping)
+    bent = np.zeros_like(step)
+    bent[numbering.free] = factor.solution()
+    length, turn = (float(np.linalg.norm(each[numbering.free] * factor.scale)) for each in (step, bent - step))
+    return bent if turn <= LARGEST_TURN * length and np.isfinite(bent).all() else None

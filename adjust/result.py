@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,19 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 Termination = Literal["converged", "singular", "iteration limit", "diverged"]
+
+
+class Iteration(NamedTuple):
+    """A step of the iteration: v'Pv after it, how far it moves what moves most, its damping, the attempts.
+
+    A step that would have increased v'Pv, or after which some point would have had no image, was tried again with more
+    damping (0: an undamped Gauss-Newton step).
+    """
+
+    vpv: float
+    largest_step_sigmas: float
+    damping: float
+    attempts: int
 
 
 @dataclass(frozen=True)
@@ -181,7 +194,7 @@ class Adjustment:
     groups: Mapping[str, Group]
     singular: tuple[NullDirection, ...]
     warnings: tuple[str, ...]
-    history: tuple[tuple[float, float], ...]  # (v'Pv, largest step in sigmas) per iteration
+    history: tuple[Iteration, ...]
     mirrored: frozenset[str] = frozenset()
     weights: Array = field(default_factory=lambda: np.empty(0))
     variance_factors: Mapping[str, float] = field(default_factory=dict)

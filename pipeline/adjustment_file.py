@@ -124,7 +124,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
             }
             for name, group in adjustment.groups.items()
         },
-        "history": [{"vpv": vpv, "largest_step_sigmas": step} for vpv, step in adjustment.history],
+        "history": [step._asdict() for step in adjustment.history],
     }
 
 
