@@ -128,9 +128,7 @@ class _Moved:
     attempts: int
 
 
-def _step(
-    numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, lately: float
-) -> _Moved | None:
+def _step(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, lately: float) -> _Moved | None:
     """The first step from a state that makes v'Pv smaller, with more and more damping; None: there is none.
 
     lately: the damping that helped lately, to be tried where it takes some.

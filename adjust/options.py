@@ -36,7 +36,7 @@ class Options:
     datum_points: tuple[str, ...] = ()
     robust: bool | WeightFunction = False
     variance_components: bool | tuple[str, ...] = False
-    iteration_limit: int = 50
+    iteration_limit: int = 100
     snooping: bool = False
     method: Method = "combined"
     probabilities: Probabilities = field(default_factory=Probabilities)

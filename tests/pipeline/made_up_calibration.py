@@ -21,7 +21,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.result import Adjustment, Group, NullDirection, Residuals
+from adjust.result import Adjustment, Group, Iteration, NullDirection, Residuals
 from measure.status import Status
 from pipeline.adjustment_file import read_adjustment, read_covariance, write_adjustment
 from pipeline.comparator_file import ComparatorPoint
@@ -109,7 +109,11 @@ def adjustment() -> Adjustment:
         },
         singular=(),
         warnings=(),
-        history=((4.1e6, 5e4), (2113.0, 310.0), (262.2, 0.8), (262.1, 1e-4), (262.1, 2e-8), (262.1, 1e-9)),
+        history=(
+            Iteration(4.1e6, 5e4, 1e-3, 2),
+            *(Iteration(*pair, 0.0, 1) for pair in ((2113.0, 310.0), (262.2, 0.8), (262.1, 1e-4), (262.1, 2e-8))),
+            Iteration(262.1, 1e-9, 0.0, 1),
+        ),
     )
 
 

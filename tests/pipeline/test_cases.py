@@ -9,18 +9,27 @@ import pytest
 
 from pipeline.adjust_stage import adjust_marks
 from pipeline.adjustment_file import adjustment_json
+from pipeline.cli import run
 from pipeline.comparator_file import read_comparator
 from pipeline.project_file import read_project
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
-TRANSFORMATION = {"affine": "affine", "similarity": "similarity", "none": "none"}
-NAMES = (
-    "i_five_images_affine_reduced",
-    "i_five_images_affine_paper_noisefree",
-    "i_five_images_similarity_reduced",
-    "iii_selfcal_mixed",
-    "iii_selfcal_all_unknown_datum_A",
-)
+SINGULAR = {  # pseudo-observations that are dropped, by their words in the file
+    "F5-F9": {5, 6, 7, 8, 9},
+    "F7-F9": {7, 8, 9},
+}
+CAUSES = {
+    "F:tx": "shift together in x'",
+    "F:ty": "shift together in y'",
+    "F:rot": "turn together",
+    "F:scale": "grow together",
+    "F:aff": "stretch in x'",
+    "F:shear": "shear",
+    "IO.x0": "x0' of camera",
+    "IO.y0": "y0' of camera",
+    "IO.c": "principal distance of camera",
+}
+NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="the reference cases are not here")
@@ -48,6 +57,44 @@ def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
             assert sigma == pytest.approx(expected["std_aposteriori"], rel=1e-6), parameter
         checked += 1
     assert checked == reference["unknowns"]
+
+
+@pytest.mark.parametrize("priors", list(SINGULAR))
+@pytest.mark.parametrize("name", sorted(path.stem for path in CASES.glob("v_*.json")))
+def test_singular_case_through_files(name: str, priors: str, tmp_path: Path) -> None:
+    """The number and the kinds of the null directions, from the case's own orientations as approximations."""
+    case = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))
+    expected = case["expected_defects_by_dropped_pseudo_observations"][priors]
+    sigmas = {number: None if number in SINGULAR[priors] else 1.0 for number in range(5, 10)}
+    case["input"]["fid_sigma"] = [[sigmas[5], sigmas[6]]] * len(case["input"]["fid_obs"])
+    case["input"]["io_sigma"][:3] = [sigmas[7], sigmas[8], sigmas[9]]
+    write_project(case, tmp_path)
+    write_images(case, tmp_path)
+    code = run(["adjust", str(tmp_path / "project.toml")])
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    assert len(result["singular"]) == expected["total_defect"]
+    assert result["converged"] == (expected["total_defect"] == 0)
+    assert code == 1
+    datum, camera = np.split(np.array(result["singular"], dtype=object), [expected["object_datum_defect"]])
+    assert all("object space" in direction["cause"] and direction["remedy"] for direction in datum)
+    assert len(camera) == len(expected["directions"])
+    for direction, row in zip(camera, expected["directions"], strict=True):
+        assert CAUSES[row["lead"]] in direction["cause"]
+        assert direction["parameters"]
+        assert direction["remedy"]
+
+
+def write_images(case: dict[str, Any], folder: Path) -> None:
+    """images.csv with the orientations of the case's state, angles in degrees."""
+    state = case["state"]
+    rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg"]
+    for image in sorted({row[0] for row in case["input"]["obs"]}):
+        angles = [np.rad2deg(state[f"EO{image}.{angle}"]) for angle in ("omega", "phi", "kappa")]
+        rows.append(",".join(map(str, [image, *(state[f"EO{image}.{axis}"] for axis in ("X0", "Y0", "Z0")), *angles])))
+    (folder / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    project = folder / "project.toml"
+    text = project.read_text(encoding="utf-8")
+    project.write_text(text.replace("[object]", '[object]\nimages = "images.csv"'), encoding="utf-8")
 
 
 def quantity(result: dict[str, Any], parameter: str) -> tuple[float, float]:
@@ -87,8 +134,8 @@ def write_project(case: dict[str, Any], folder: Path) -> None:
         f"principal_point_mm = [{sigma(interior['x0'][1])}, {sigma(interior['y0'][1])}]",
         "[distortion]",
         f'family = "{case["distortion"]}"',
-        f'decentering = "{case["decentering_mode"]}"',
-        f"r0_mm = {case['r0']!r}",
+        f"r0_dm = {case['r0']!r}" if case["distortion"] == "juhl" else f"r0_mm = {case['r0']!r}",
+        'decentering = "paper"' if case["decentering_mode"] == "paper" else "",
         "[distortion.value]",
         *(f"{name} = {value!r}" for name, (value, _) in distortion.items()),
         "[distortion.sigma]",
@@ -106,8 +153,7 @@ def write_project(case: dict[str, Any], folder: Path) -> None:
         rows += [",".join([str(i), str(p), kind, *map(repr, rest)]) for i, p, *rest in given[key]]
     (folder / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     (folder / "project.toml").write_text(
-        'camera = "camera.toml"\n[object]\npoints = "points.csv"\n'
-        f'[adjust]\ntransformation = "{TRANSFORMATION[case["transform"]]}"\n',
+        f'camera = "camera.toml"\n[object]\npoints = "points.csv"\n[adjust]\ntransformation = "{case["transform"]}"\n',
         encoding="utf-8",
     )
 
