@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.approximations import approximate
 from adjust.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.datum_choice import chosen_coordinates, chosen_points
 from adjust.diagnosis import undetermined, weak_directions
+from adjust.errors import AdjustmentError
 from adjust.iteration import factorise
 from adjust.network import STRAIGHT, Approximations, Network
 from adjust.options import Datum, Method, Options
@@ -36,14 +38,37 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     The combined model A v + B dx = w is relinearised at the adjusted observations and unknowns until both stand still
     (Torlegård, equations F1 to F9). The cofactor matrix is that of all unknowns, nothing held fixed but what a standard
     deviation of 0 fixes. A singular network is a result with its null directions, not an error: its values are the
-    approximations, its cofactor matrix is zero and means nothing.
+    approximations, its cofactor matrix is zero and means nothing. Where the iteration does not come to rest it is begun
+    anew from approximations found from the network itself, and a warning says so.
 
     Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
     has no image, or where the chosen datum does not hold the object space.
     """
     validate(network)
     options = options or Options()
-    return adjust_problem(number(network, approximations, options.method == "elements"), options)
+    result = adjust_problem(number(network, approximations, options.method == "elements"), options)
+    if result.termination in ("converged", "singular"):
+        return result
+    return _begun_anew(network, approximations, options, result)
+
+
+def _begun_anew(network: Network, approximations: Approximations, options: Options, stopped: Adjustment) -> Adjustment:
+    """The adjustment from the network's own approximations; what is there already where these are no better."""
+    try:
+        own = approximate(network)
+    except AdjustmentError:
+        return stopped
+    if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
+        return stopped
+    result = adjust_problem(number(network, own, options.method == "elements"), options)
+    if not result.converged:
+        return stopped
+    warning = (
+        f"From the given approximations the iteration did not come to rest ({stopped.termination} after "
+        f"{stopped.iterations} steps); it was begun anew from approximations found from the network itself. Check "
+        "those given."
+    )
+    return replace(result, warnings=(warning, *result.warnings))
 
 
 def adjust_problem(problem: Problem, options: Options, held: Iterable[int] = ()) -> Adjustment:
@@ -132,7 +157,7 @@ def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
         residuals=of_marks,
         groups=groups(problem, state, last.end.v_mm, found, weighting, further),
         further=further,
-        singular=last.singular,
+        singular=last.singular if last.solution.termination == "singular" else (),
         warnings=(*_warnings(last, cofactor), *doubts),
         history=last.solution.history,
         mirrored=problem.mirrored,
@@ -180,9 +205,10 @@ def _warnings(last: Run, cofactor: Cofactor) -> tuple[str, ...]:
         )
     if last.solution.termination == "diverged":
         warnings.append(
-            f"The iteration diverged: no step from the last values makes the residuals smaller. Look for wrong point "
-            f"numbers and wrong approximations; the largest residuals are those of {_worst(last)}."
+            f"The iteration diverged: it came to no minimum. Look for wrong point numbers and wrong approximations; the "
+            f"largest residuals are those of {_worst(last)}."
         )
+        warnings += [f"Where it ended, the equations are singular: {each.cause}" for each in last.singular]
     if not last.settled:
         warnings.append(
             f"The weights did not settle within {ROUNDS} rounds of robust estimation, variance components or data "

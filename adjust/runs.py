@@ -13,7 +13,7 @@ from adjust.numbering import Numbering
 from adjust.options import Options
 from adjust.problem import Problem, State
 from adjust.reliability import Misfits, misfits, statistics
-from adjust.result import NullDirection
+from adjust.result import NullDirection, Termination
 from adjust.reweighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
 from adjust.snooping import Contradiction, contradictions, search
 from adjust.tested import TestedUnits
@@ -35,8 +35,8 @@ def run(problem: Problem, options: Options) -> "Run":
 class Run:
     """One adjustment with given weights: where it ended, and what everything that is tested contradicts the others by.
 
-    problem: as it was given, `numbering` holds it with the priors' weights. found: None where the equations at the end
-    are singular. settled: whether the residuals ask for no other weights. removed: what data snooping has taken out.
+    problem: as it was given, `numbering` holds it with the priors' weights. singular: what is not determined at the end,
+    be that a solution or not; found: None where there is such a thing. settled: whether the residuals ask for no other weights. removed: what data snooping has taken out.
     """
 
     problem: Problem
@@ -155,7 +155,8 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
     factor = solution.factor or factorise(numbering, solution.end)
     singular = singular_directions(weighted, solution.end.state, numbering.free, factor)
     if singular:
-        solution = replace(solution, factor=None, termination="singular")
+        ended: Termination = "singular" if solution.termination == "converged" else "diverged"
+        solution = replace(solution, factor=None, termination=ended)
         return Run(problem, numbering, weighting, solution, singular, factor, None)
     found = misfits(numbering, solution.end, factor)
     return Run(problem, numbering, weighting, solution, (), factor, found)

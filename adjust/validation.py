@@ -22,6 +22,7 @@ def validate(network: Network) -> None:
     _check_unique("object point", (point.id for point in network.points))
     _check_cameras(network)
     _check_shapes(network.observations)
+    _check_distances(network)
     _check_names(network)
     _check_distances(network)
     _check_calibrations(network)
