@@ -205,8 +205,8 @@ def _warnings(last: Run, cofactor: Cofactor) -> tuple[str, ...]:
         )
     if last.solution.termination == "diverged":
         warnings.append(
-            f"The iteration diverged: it came to no minimum. Look for wrong point numbers and wrong approximations; the "
-            f"largest residuals are those of {_worst(last)}."
+            f"The iteration diverged: it came to no minimum. Look for wrong point numbers and wrong approximations; "
+            f"the largest residuals are those of {_worst(last)}."
         )
         warnings += [f"Where it ended, the equations are singular: {each.cause}" for each in last.singular]
     if not last.settled:

@@ -35,8 +35,9 @@ def run(problem: Problem, options: Options) -> "Run":
 class Run:
     """One adjustment with given weights: where it ended, and what everything that is tested contradicts the others by.
 
-    problem: as it was given, `numbering` holds it with the priors' weights. singular: what is not determined at the end,
-    be that a solution or not; found: None where there is such a thing. settled: whether the residuals ask for no other weights. removed: what data snooping has taken out.
+    problem: as it was given, `numbering` holds it with the priors' weights. singular: what is not determined at the
+    end, be that a solution or not; found: None where there is such a thing. settled: whether the residuals ask for no
+    other weights. removed: what data snooping has taken out.
     """
 
     problem: Problem
