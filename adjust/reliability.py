@@ -213,7 +213,8 @@ def reliability(
 
 
 def _over(shift: float, variance: Array, checked: NDArray[np.bool_]) -> Array:
-    return np.where(checked, shift / np.sqrt(np.where(checked, variance, 1.0)), np.inf)
+    told = checked & (variance > 0.0)  # rounding may leave the smaller of two eigenvalues below zero
+    return np.where(told, shift / np.sqrt(np.where(told, variance, 1.0)), np.inf)
 
 
 def _outer(

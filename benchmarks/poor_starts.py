@@ -28,11 +28,11 @@ from adjust.network import (
     ObservationKind,
     Observations,
     Prior,
-    Transformation,
 )
 from adjust.projection import ImageModel
 from adjust.result import Adjustment
 from adjust.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
+from adjust.transformation import Film
 
 Array = NDArray[np.float64]
 
@@ -183,7 +183,7 @@ def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, kno
     )
     lens = np.array([1.5e-7, -4e-12, 0.0, 8e-7, -6e-7, 0.0, 0.0]) if free else np.zeros(7)
     films = [
-        np.array([3.0, np.cos(turn), -np.sin(turn), -2.0, np.sin(turn), np.cos(turn)])
+        Film("affine", np.array([3.0, np.cos(turn), -np.sin(turn), -2.0, np.sin(turn), np.cos(turn)]), np.zeros(2))
         for turn in 0.3 + np.arange(len(exteriors))
     ]
     return simulated(rng, camera, lens, 115.0, 0.005, exteriors, films, points_of(xyz, known), xyz)
@@ -194,7 +194,17 @@ def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, 
     nothing = Prior(0.0, np.inf)
     camera = Camera("K", Prior(8.0, np.inf), nothing, nothing, Distortion("brown", {"k1": nothing, "k2": nothing}))
     lens = np.array([1e-3, -2e-5, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return simulated(rng, camera, lens, 5.0, 0.0003, exteriors, [], points_of(xyz, known), xyz)
+    return simulated(
+        rng,
+        camera,
+        lens,
+        5.0,
+        0.0003,
+        exteriors,
+        [Film("none", np.empty(0), np.zeros(2))] * len(exteriors),
+        points_of(xyz, known),
+        xyz,
+    )
 
 
 def points_of(xyz: Array, known: str) -> list[ObjectPoint]:
@@ -214,25 +224,25 @@ def simulated(
     half_mm: float,
     sigma_mm: float,
     exteriors: list[Array],
-    films: list[Array],
+    films: list[Film],
     points: list[ObjectPoint],
     xyz: Array,
 ) -> Scene:
-    """The points in a frame of 2 half_mm that two images show at least, with errors of sigma_mm; no films: digital."""
+    """The points in a frame of 2 half_mm that two images show at least, with errors of sigma_mm."""
     interior = np.array(
         [0.0 if camera.principal_distance_mm is None else camera.principal_distance_mm.value, 0.1, -0.1]
     )
     rows: list[tuple[str, str, ObservationKind, Array]] = []
     for i, exterior in enumerate(exteriors):
-        film = films[i] if films else np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
         rotation = rotation_from_angles(exterior[3:])
-        model = ImageModel(camera.distortion, interior, lens, rotation, exterior[:3], film)
+        model = ImageModel(camera.distortion, interior, lens, rotation, exterior[:3], films[i])
         xy, seen = model.camera_from_object(xyz)
+        comparator = model.comparator_from_camera(xy)[0]
         inside = np.flatnonzero(seen & (np.abs(xy) < half_mm).all(axis=1))
-        rows += [(f"i{i}", f"p{j}", "target", model.comparator_from_camera(xy[j])) for j in inside]
+        rows += [(f"i{i}", f"p{j}", "target", xy_mm) for j, xy_mm in zip(inside, comparator[inside], strict=True)]
         for id_, mark in camera.fiducials.items():
             place = np.array([mark.x_mm.value, mark.y_mm.value])
-            rows.append((f"i{i}", id_, "fiducial", model.comparator_from_camera(place)))
+            rows.append((f"i{i}", id_, "fiducial", model.comparator_from_camera(place[None])[0][0]))
     shown = Counter(point for _, point, kind, _ in rows if kind == "target")
     rows = [row for row in rows if row[2] == "fiducial" or shown[row[1]] > 1]
     observations = Observations(
@@ -242,12 +252,11 @@ def simulated(
         np.array([row[3] + rng.normal(0.0, sigma_mm, 2) for row in rows]),
         np.tile(sigma_mm**2 * np.eye(2), (len(rows), 1, 1)),
     )
-    kind: Transformation = "affine" if films else "none"
-    images = tuple(Image(f"i{i}", "K", kind) for i in range(len(exteriors)))
+    images = tuple(Image(f"i{i}", "K", films[i].transformation) for i in range(len(exteriors)))
     truth = Approximations(
         interior={"K": interior},
         exterior={f"i{i}": exterior for i, exterior in enumerate(exteriors)},
-        transformation={f"i{i}": films[i] if films else np.empty(0) for i in range(len(exteriors))},
+        transformation={f"i{i}": films[i].parameters for i in range(len(exteriors))},
         points={point.id: place for point, place in zip(points, xyz, strict=True) if shown[point.id] > 1},
     )
     kept = tuple(point for point in points if shown[point.id] > 1)
