@@ -60,7 +60,7 @@ class Model:
                 given,
                 family=self.family,
                 parameters={name: Prior(value, np.inf) for name, value in start.items()},
-                half_mm=half_mm.get(camera.name, given.half_mm),
+                half_mm=given.half_mm if all(given.half_mm) else half_mm.get(camera.name, given.half_mm),
             )
             cameras.append(replace(camera, distortion=distortion))
         images = tuple(
@@ -102,7 +102,10 @@ def transformations(network: Network) -> tuple[Transformation, ...]:
 
 
 def lenses(network: Network, transformation: Transformation, with_sets: bool) -> tuple[Model, ...]:
-    """No distortion, a ladder of the camera's own family (Torlegård's where that is none of PHYSICAL), the sets."""
+    """No distortion, a ladder of the camera's own family (Torlegård's where that is none of PHYSICAL), the sets.
+
+    And the network's own, where it is none of these.
+    """
     family = network.cameras[0].distortion.family
     ladder = family if family in PHYSICAL else "torlegard"
     models = [Model(transformation)]
@@ -112,4 +115,5 @@ def lenses(network: Network, transformation: Transformation, with_sets: bool) ->
             films = (transformation, *TRANSFORMATIONS.get(transformation, ()))
             taken = affinity if "affine" in films else ()  # by the film
             models.append(Model(transformation, name, tuple(p for p in parameter_names(name) if p not in taken)))
-    return tuple(models)
+    own = replace(given_model(network), transformation=transformation)
+    return tuple(models if own in models else [*models, own])

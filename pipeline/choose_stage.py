@@ -61,7 +61,7 @@ def choice_json(choice: Choice) -> Json:
 
 def print_choice(choice: Choice, console: Console, path: Path) -> None:
     """The candidates as a table, then the verdict and a reason a line."""
-    columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, um")
+    columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, um", "correlated")
     table = Table(*columns, title="Candidates", title_justify="left")
     for each in choice.candidates:
         style = "bold green" if each is choice.chosen else ""
@@ -85,6 +85,7 @@ def _numbers(candidate: Candidate) -> tuple[str, ...]:
         f"{candidate.aic:.1f}",
         f"{candidate.aicc:.1f}",
         "none" if predicted is None else f"{predicted.rms_um:.2f}",
+        str(len(candidate.correlated)),
     )
 
 

@@ -61,6 +61,6 @@ def _drawn(xy_mm: Array, value_um: Array, on: Plane) -> Markup:
         "Distortion vectors over the camera frame",
         on.drawn(),
         svg.strokes(starts, ends, "vector target"),
-        svg.strokes(starts, starts, "dot target"),
+        svg.strokes(ends, ends, "dot target"),
         scale_bar(on, px_per_um),
     )

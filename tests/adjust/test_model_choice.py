@@ -11,7 +11,7 @@ from adjust.adjustment import Options, adjust
 from adjust.approximations import approximate
 from adjust.cross_validation import CrossValidation, cross_validate, folds
 from adjust.model_choice import Candidate, Choice, choose, f_test, nested_tests, simplest_sufficient
-from adjust.models import Model
+from adjust.models import Model, lenses
 from adjust.network import Distortion, Network, ObjectPoint, Prior, Transformation
 
 Array = NDArray[np.float64]
@@ -39,17 +39,19 @@ def network_of(seed: int, lens: str, film: Transformation, points: int = 40) -> 
 
 
 def deformed(network: Network, film: Transformation) -> Network:
-    """Every scan deformed in its own way, by 30 um at 100 mm: a scale of its own, or also an affinity and a shear."""
+    """Every scan deformed in its own way, by 30 um at 100 mm: in scale, by an affinity and a shear, or by a tilt."""
     xy = network.observations.xy_mm.copy()
     for number, image in enumerate(network.images):
         rows = [row for row, name in enumerate(network.observations.image) if name == image.name]
         sign = 1.0 if number % 2 else -1.0
         matrix = np.eye(2)
-        if film in ("similarity", "affine"):
+        if film in ("similarity", "affine", "projective"):
             matrix = matrix * (1.0 + 3e-4 * sign * (1 + number) / 2)
-        if film == "affine":
+        if film in ("affine", "projective"):
             matrix = matrix @ np.array([[1.0 + 3e-4 * sign, 2e-4], [0.0, 1.0]])
         xy[rows] = xy[rows] @ matrix.T
+        if film == "projective":
+            xy[rows] /= 1.0 + xy[rows] @ np.array([[3e-6 * sign], [-2e-6 * number]])
     return replace(network, observations=replace(network.observations, xy_mm=xy))
 
 
@@ -69,7 +71,7 @@ def test_the_true_lens_is_chosen_and_the_simpler_ones_are_told_to_be_too_simple(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("film", ["none", "congruent", "similarity", "affine"])
+@pytest.mark.parametrize("film", ["none", "congruent", "similarity", "affine", "projective"])
 @pytest.mark.parametrize("lens", list(LENSES))
 def test_the_true_model_is_chosen_nearly_always_and_no_strong_effect_is_ever_missed(
     lens: str, film: Transformation
@@ -90,7 +92,7 @@ def test_the_true_model_is_chosen_nearly_always_and_no_strong_effect_is_ever_mis
 def lens_model(lens: str, film: Transformation) -> tuple[str, tuple[str, ...]]:
     if lens != "ebner":
         return "torlegard", tuple(lens.split())
-    return "ebner", tuple(f"b{i}" for i in range(3 if film == "affine" else 1, 13))
+    return "ebner", tuple(f"b{i}" for i in range(3 if film in ("affine", "projective") else 1, 13))
 
 
 def candidate(parameters: str, vpv: float, sigmas: float | None, family: str = "torlegard") -> Candidate:
@@ -147,6 +149,17 @@ def test_akaikes_criteria_in_closed_form() -> None:
     each = Candidate(Model("none"), "", 100, 4, 96, 90.0)
     assert each.aic == 98.0
     assert each.aicc == pytest.approx(100 * np.log(0.9) + 10 + 2 * 5 * 6 / 94)
+
+
+def test_the_ladder_is_of_the_cameras_own_family_and_the_networks_own_model_is_on_it() -> None:
+    network = network_of(1, "none", "affine", points=10)
+    brown = Distortion("brown", {name: Prior(0.0, np.inf) for name in ("k1", "b1")})
+    own = replace(network, cameras=(replace(network.cameras[0], distortion=brown),))
+    names = [model.name for model in lenses(own, "congruent", with_sets=True)]
+    assert names[:3] == ["congruent, no distortion", "congruent, brown k1", "congruent, brown k1 k2"]
+    assert names[-3:] == ["congruent, ebner", "congruent, legendre(3)", "congruent, brown k1 b1"]
+    with_affinity, without = (lenses(own, film, with_sets=True)[-3] for film in ("congruent", "bilinear"))
+    assert set(with_affinity.parameters) - set(without.parameters) == {"b1", "b2"}
 
 
 def test_what_is_singular_is_named_and_does_not_stop_the_choice() -> None:

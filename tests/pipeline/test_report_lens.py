@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from pipeline.adjustment_file import Covariance
 from pipeline.report.fiducials import Figure, figure, figure_plot
 from pipeline.report.lens import curves, curves_plot, displacement, largest_effects_um, lens
+from pipeline.report.lens_map import lens_map
+from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import high_correlations, parameter_rows
+from pipeline.report.vectors import Plane
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -91,6 +94,22 @@ def test_the_effect_of_a_parameter_is_the_displacement_it_makes() -> None:
     effects = largest_effects_um(lens("A", camera("torlegard")), RADIUS_MM)
     assert effects["k3"] == pytest.approx(1e3 * RADIUS_MM**3)
     assert effects["p2"] == pytest.approx(3e3 * RADIUS_MM**2)
+
+
+def test_the_map_shows_the_longest_vector_with_its_sigma() -> None:
+    """k3 r³ with r to the outermost of 15 x 15 squares over a frame of 150 mm: 70 mm in x and y, less x0', y0'."""
+    of, matrix = lens("A", camera("torlegard", k3=1e-7)), np.array([[1e-18]])
+    drawn = lens_map(of, covariance("A", ("k3",), matrix), Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0))
+    r = np.hypot(70.3, 70.2)
+    assert drawn.largest_um == value_and_sigma(1e3 * 1e-7 * r**3, 1e3 * 1e-9 * r**3)
+    assert drawn.plot.count("M") == 2 * 15**2 + drawn.plot.count('class="bar"')
+
+
+def test_of_a_set_over_the_frame_the_effect_is_the_largest_within_it() -> None:
+    """2 (ξ² - 2/3) is largest in the middle, 4/3 mm, where ξη is 0."""
+    entry = camera("ebner", b3=0.01)
+    entry["distortion"]["half_mm"] = [114.0, 90.0]
+    assert largest_effects_um(lens("A", entry), RADIUS_MM)["b3"] > 1e3 * 4 / 3 * np.sqrt(90 / 114)
 
 
 def test_the_curve_shows_where_no_target_was() -> None:
