@@ -16,7 +16,7 @@ Indices = NDArray[np.intp]
 WeightFunction = Literal["huber", "igg3"]
 
 STANDARD = 2.0  # standardised length of a contradiction, per coordinate, from which on an observation loses weight
-LOST = 6.0  # ... and from which on the redescending function leaves it none
+LOST = 4.5  # ... and from which on the redescending function leaves it none
 MEDIAN_LENGTH = np.sqrt(np.log(2.0))  # the median of that length for a pair of normally distributed errors
 STANDSTILL = 1e-3  # change of a weight, or relative change of a variance, that is none
 NO_WEIGHT = 1e-12  # stands for none: what has no more than this has no influence and is no observation
@@ -67,7 +67,7 @@ def robust_weights(statistic: Array, sizes: Indices, observed: int, function: We
 
     t² = statistic / sizes is the square of a standardised length per coordinate, 1 on the average: the statistic is
     that of the observation as it was given, redundancy and all, so that one with leverage is not spared. In images,
-    the first `observed` ones, t is over the scale that their median gives. With k = 2 and K = 6:
+    the first `observed` ones, t is over the scale that their median gives. With k = 2 and K = 4.5:
 
     huber: 1, and k / t from k on. A gross error keeps the influence of one of k sigma. (P. J. Huber, Robust
     Statistics, 1981.)

@@ -122,7 +122,8 @@ def _snooped(last: Run, options: Options) -> Run:
             return last
         tests = search(last.numbering, last.end, last.factor, last.found, last.weighting, options.probabilities)
         statistic = statistics(last.found, last.weighting.weights).statistic
-        confirmed = [each for each in last.removed if statistic[each.unit] > tests.limits[each.unit]]
+        limits = tests.limits(statistic, [each.unit for each in last.removed])
+        confirmed = [each for each in last.removed if statistic[each.unit] > limits[each.unit]]
         removed = (*confirmed, *contradictions(tests))
         out = frozenset(each.unit for each in removed)
         if out == {each.unit for each in last.removed}:

@@ -26,48 +26,57 @@ Indices = NDArray[np.intp]
 
 TOLD_APART = 7.0  # difference of two statistics from which on one explanation is clearly the better: odds of 30 to 1
 ALIKE_SHOWN = 3
+SCALE_DOUBT = 2.2  # three standard deviations of the scale that the median of n pairs gives, times the root of n
 AT_ONCE = 20  # columns of the residuals' cofactor matrix that are made in one pass
 MOST_SUSPECT = 0.25  # part of all that is tested: where more contradicts the rest, who is to say which
 
 
 @dataclass(frozen=True)
 class Search:
-    """The tests of one adjustment, and what is out of question: see `search`.
-
-    found: residuals and hat matrices. limits (N,): what chance lets the statistics reach, those of a network whose
-    observations are worse than given raised by the scale of their median.
-    """
+    """The tests of one adjustment: residuals and hat matrices, and what chance lets the statistics (N,) reach."""
 
     numbering: Numbering
     end: Linearised
     factor: Factor
     found: Misfits
     weighting: Weighting
-    limits: Array
+    critical: Array
+
+    def limits(self, statistic: Array, left_out: Sequence[int] = ()) -> Array:
+        """What the statistics (N,) may reach: all the more where the observations are worse than given.
+
+        That is where the median of the image points' statistics says so beyond its own uncertainty.
+        """
+        points = np.setdiff1d(np.arange(len(self.end.v_mm)), left_out)
+        sizes = np.where(self.critical[points] < np.inf, 2, 0)
+        scale = robust_scale(statistic[points], sizes)
+        return self.critical * (scale**2 if scale > 1.0 + SCALE_DOUBT / np.sqrt(max(len(points), 1)) else 1.0)
 
 
 def search(
-    numbering: Numbering, end: Linearised, factor: Factor, found: Misfits, weighting: Weighting,
+    numbering: Numbering,
+    end: Linearised,
+    factor: Factor,
+    found: Misfits,
+    weighting: Weighting,
     probabilities: Probabilities,
-) -> Search:  # fmt: skip
-    """The tests of an adjustment with their limits."""
-    tests = statistics(found, weighting.weights)
-    count = int((tests.sizes > 0).sum())
-    observed = len(end.v_mm)
-    scale = max(1.0, robust_scale(tests.statistic[:observed], tests.sizes[:observed]))
-    limits = np.where(tests.sizes > 0, probabilities.critical(tests.sizes, count) * scale**2, np.inf)
-    return Search(numbering, end, factor, found, weighting, limits)
+) -> Search:
+    """The tests of an adjustment with their critical values."""
+    sizes = statistics(found, weighting.weights).sizes
+    critical = probabilities.critical(sizes, int((sizes > 0).sum()))
+    return Search(numbering, end, factor, found, weighting, np.where(sizes > 0, critical, np.inf))
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A unit that contradicts the others, the other such units left out.
+    """A unit that contradicts the others, the other such units left out: its statistic, and what chance lets it reach.
 
     error (2,): the gross error as the others see it. alike: units that explain the contradiction as well.
     """
 
     unit: int
     statistic: float
+    limit: float
     error: Array
     alike: tuple[int, ...]
 
@@ -75,17 +84,19 @@ class Contradiction:
 def contradictions(search: Search) -> list[Contradiction]:
     """What contradicts the others beyond its limit, in the order in which it was found."""
     covariance = _Covariance(search)
-    most = int(MOST_SUSPECT * len(search.limits))
+    most = int(MOST_SUSPECT * len(search.critical))
     chosen: list[int] = []
     for _ in range(2 * most):
         statistic = _without(search, covariance, chosen)
-        worst = int(np.argmax(statistic / search.limits))
-        if statistic[worst] <= search.limits[worst] or len(chosen) == most:
+        limits = search.limits(statistic, chosen)
+        worst = int(np.argmax(statistic / limits))
+        if statistic[worst] <= limits[worst] or len(chosen) == most:
             break
         chosen.append(worst)
-        cleared = [unit for unit in _cleared(search, covariance, chosen) if unit != worst]
-        chosen = [unit for unit in chosen if unit not in cleared]
-    return [_contradiction(search, covariance, chosen, unit) for unit in chosen]
+        confirmed = _joint(search, covariance, chosen)[1] > limits[chosen]
+        chosen = [unit for unit, still in zip(chosen, confirmed, strict=True) if still or unit == worst]
+    limits = search.limits(_without(search, covariance, chosen), chosen)
+    return [_contradiction(search, covariance, chosen, unit, limits) for unit in chosen]
 
 
 class _Covariance:
@@ -100,12 +111,12 @@ class _Covariance:
         missing = [unit for unit in units if unit not in self._columns]
         if missing:
             self._columns |= _columns(self._search, self._likely(missing))
-        size = len(self._search.limits)
+        size = len(self._search.critical)
         return np.concatenate([np.zeros((size, 2, 0)), *(self._columns[unit] for unit in units)], axis=2)
 
     def _likely(self, missing: list[int]) -> list[int]:
         tests = statistics(self._search.found, self._search.weighting.weights)
-        worst = np.argsort(-tests.statistic / self._search.limits)[:AT_ONCE]
+        worst = np.argsort(-tests.statistic / self._search.critical)[:AT_ONCE]
         return [*missing, *(int(unit) for unit in worst if unit not in self._columns and unit not in missing)]
 
 
@@ -117,7 +128,7 @@ def _columns(search: Search, units: Sequence[int]) -> dict[int, Array]:
         for block, place in np.argwhere(np.isin(rows.units, units)):
             by_shared = root @ (root[rows.shared[block]].T @ rows.through[block, place].T)
             homes[int(rows.units[block, place])] = (part, int(block), rows.own[block, place], by_shared)
-    columns = {unit: np.zeros((len(search.limits) + 1, 2, 2)) for unit in units}  # the last stands for ABSENT
+    columns = {unit: np.zeros((len(search.critical) + 1, 2, 2)) for unit in units}  # the last stands for ABSENT
     for part, rows in enumerate(unit_rows(search.numbering, search.end, search.factor)):
         for unit, (home, block, own, by_shared) in homes.items():
             columns[unit][rows.units] = -(rows.through @ by_shared[rows.shared][:, None])
@@ -164,20 +175,16 @@ def _joint(search: Search, covariance: _Covariance, chosen: Sequence[int]) -> tu
     return errors, np.where(seen, along**2 / np.where(seen, variance, 1.0), 0.0).sum(axis=1)
 
 
-def _cleared(search: Search, covariance: _Covariance, chosen: Sequence[int]) -> list[int]:
-    """Chosen units that no longer contradict the others without the rest of the chosen."""
-    statistic = _joint(search, covariance, chosen)[1]
-    return [unit for unit, value in zip(chosen, statistic, strict=True) if value <= search.limits[unit]]
-
-
-def _contradiction(search: Search, covariance: _Covariance, chosen: Sequence[int], unit: int) -> Contradiction:
-    errors, statistics_ = _joint(search, covariance, chosen)
+def _contradiction(
+    search: Search, covariance: _Covariance, chosen: Sequence[int], unit: int, limits: Array
+) -> Contradiction:
+    errors, joint = _joint(search, covariance, chosen)
     at = chosen.index(unit)
     others = _without(search, covariance, [each for each in chosen if each != unit])
-    near = np.flatnonzero((others > search.limits) & (others > statistics_[at] - TOLD_APART))
+    near = np.flatnonzero((others > limits) & (others > joint[at] - TOLD_APART))
     alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
     back = np.linalg.pinv(search.found.transform[unit])
-    return Contradiction(unit, float(statistics_[at]), back @ errors[at], tuple(alike))
+    return Contradiction(unit, float(joint[at]), float(limits[unit]), back @ errors[at], tuple(alike))
 
 
 def suspects(
@@ -192,12 +199,15 @@ def suspects(
     tests = statistics(search.found, search.weighting.weights)
     entries = {each.unit: each for each in contradicting}
     known = {each.unit: each.alike for each in removed}
-    weakened = (search.weighting.weights < 1.0) & (tests.statistic > search.limits)
+    limits = search.limits(tests.statistic, [*entries, *known])
+    weakened = (search.weighting.weights < 1.0) & (tests.statistic > limits)
     for unit in map(int, np.flatnonzero(weakened)):
-        entries[unit] = Contradiction(unit, float(tests.statistic[unit]), tests.error[unit], known.get(unit, ()))
+        measured = float(tests.statistic[unit]), float(limits[unit]), tests.error[unit]
+        entries[unit] = Contradiction(unit, *measured, known.get(unit, ()))
     count = int((tests.sizes > 0).sum())
     named = []
-    for unit, entry in sorted(entries.items(), key=lambda item: -item[1].statistic / search.limits[item[0]]):
+    for entry in sorted(entries.values(), key=lambda each: -each.statistic / each.limit):
+        unit = entry.unit
         worst = int(np.abs(result.w[unit]).argmax())
         tested = result.tested[unit]
         named.append(
@@ -205,7 +215,7 @@ def suspects(
                 tested=tested,
                 size=int(tests.sizes[unit]),
                 statistic=entry.statistic,
-                critical=float(search.limits[unit]),
+                critical=entry.limit,
                 w=float(result.w[unit, worst]),
                 tau=float(result.tau[unit, worst]),
                 critical_tau=probabilities.critical_tau(redundancy, count),
