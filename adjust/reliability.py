@@ -196,8 +196,12 @@ def reliability(
     controlled = variance > UNCONTROLLED * own_weight
     outer = _outer(numbering, end, factor, found, np.where(controlled, smallest, 0.0), tested)
     uncontrolled = zip(*np.nonzero(~controlled & (np.arange(2) < units.sizes[:, None])), strict=True)
+    back = np.linalg.pinv(found.transform)
     return Reliability(
+        probabilities=probabilities,
         tested=tested,
+        v=(back @ found.residual[..., None])[..., 0],
+        sigma=np.linalg.norm(back, axis=2) * np.sqrt(weights)[:, None],
         redundancy=redundancies(found),
         w=tests.w,
         tau=tests.w / sigma0 if sigma0 > 0.0 else np.zeros_like(tests.w),

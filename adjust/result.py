@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.network import Network
+from adjust.probabilities import Probabilities
 from adjust.tested import Tested
 
 Array = NDArray[np.float64]
@@ -115,12 +116,12 @@ class Reliability:
     """How well the observations check each other: one row for everything that is tested.
 
     All (N, 2) by coordinate; a quantity of one coordinate has zeros in the place of a second, and inf for errors. With
-    C the covariance given, v the residual, Q_v its cofactor matrix, P the inverse of C, h one coordinate:
-    redundancy: diagonal of Q_v P, with the weights that were used. w: h'P v / root(h'P Q_v P h), v / sigma_v where P is
-    diagonal; 0 where nothing checks the coordinate. tau: w / sigma0. smallest: the gross error that the test of the
-    coordinate detects with the probability `power`, delta0 / root(h'P Q_v P h), in mm, object units or rad; inf where
-    nothing checks it. effect: how far an undetected one moves any function of the unknowns at most, in its standard
-    deviations. (Baarda's inner and outer reliability.)
+    C the covariance given, Q_v the cofactor matrix of v, P the inverse of C, h one coordinate:
+    v: adjusted less given, sigma: the a-priori standard deviation, in mm, object units or rad. redundancy: diagonal of
+    Q_v P, with the weights that were used. w: h'P v / root(h'P Q_v P h), v / sigma_v where P is diagonal; 0 where
+    nothing checks the coordinate. tau: w / sigma0. smallest: the gross error that the test of the coordinate detects
+    with the probability `power`, delta0 / root(h'P Q_v P h); inf where nothing checks it. effect: how far an undetected
+    one moves any function of the unknowns at most, in its standard deviations. (Baarda's inner and outer reliability.)
     statistic (N,): v'P (P Q_v P)^- P v of all coordinates together, chi-square of `sizes` (N,); smallest_together (N,):
     the gross error of a pair in its least favourable direction.
     An observation that has lost weight is tested as it was given, against all the others with the weights that these
@@ -128,7 +129,10 @@ class Reliability:
     outer: one entry a free camera parameter; unchecked: what no other observation checks, left out there.
     """
 
+    probabilities: Probabilities
     tested: tuple[Tested, ...]
+    v: Array
+    sigma: Array
     redundancy: Array
     w: Array
     tau: Array

@@ -66,8 +66,9 @@ def robust_weights(statistic: Array, sizes: Indices, observed: int, function: We
     """Weights (N,) by what everything contradicts the others by.
 
     t² = statistic / sizes is the square of a standardised length per coordinate, 1 on the average: the statistic is
-    that of the observation as it was given, redundancy and all, so that one with leverage is not spared. In images,
-    the first `observed` ones, t is over the scale that their median gives. With k = 2 and K = 4.5:
+    that of the observation as it was given, redundancy and all, so that one with leverage is not spared. t is over the
+    scale that the median of the image points, the first `observed` ones, gives; that of priors over no less than 1.
+    With k = 2 and K = 4.5:
 
     huber: 1, and k / t from k on. A gross error keeps the influence of one of k sigma. (P. J. Huber, Robust
     Statistics, 1981.)
@@ -79,7 +80,9 @@ def robust_weights(statistic: Array, sizes: Indices, observed: int, function: We
     """
     checked = sizes > 0
     t = np.sqrt(statistic / np.maximum(sizes, 1))
-    t[:observed] /= robust_scale(statistic[:observed], sizes[:observed])
+    scale = robust_scale(statistic[:observed], sizes[:observed])
+    t[:observed] /= scale
+    t[observed:] /= max(1.0, scale)
     weights = STANDARD / np.maximum(t, STANDARD)
     if function == "igg3":
         weights *= np.clip((LOST - t) / (LOST - STANDARD), 0.0, 1.0) ** 2

@@ -15,7 +15,7 @@ from adjust.problem import Problem, State
 from adjust.reliability import Misfits, misfits, statistics
 from adjust.result import NullDirection, Termination
 from adjust.reweighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
-from adjust.snooping import Contradiction, contradictions, search
+from adjust.snooping import Contradiction, contradictions, limits, search
 from adjust.tested import TestedUnits
 from adjust.variance_components import refined_factors
 
@@ -122,8 +122,8 @@ def _snooped(last: Run, options: Options) -> Run:
             return last
         tests = search(last.numbering, last.end, last.factor, last.found, last.weighting, options.probabilities)
         statistic = statistics(last.found, last.weighting.weights).statistic
-        limits = tests.limits(statistic, [each.unit for each in last.removed])
-        confirmed = [each for each in last.removed if statistic[each.unit] > limits[each.unit]]
+        reach = limits(tests)
+        confirmed = [each for each in last.removed if statistic[each.unit] > reach[each.unit]]
         removed = (*confirmed, *contradictions(tests))
         out = frozenset(each.unit for each in removed)
         if out == {each.unit for each in last.removed}:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from adjust.elimination import Factor
 from adjust.iteration import Linearised
@@ -26,9 +27,12 @@ Indices = NDArray[np.intp]
 
 TOLD_APART = 7.0  # difference of two statistics from which on one explanation is clearly the better: odds of 30 to 1
 ALIKE_SHOWN = 3
-SCALE_DOUBT = 2.2  # three standard deviations of the scale that the median of n pairs gives, times the root of n
+PAIRED = 300  # units among which pairs are looked for that hide each other
 AT_ONCE = 20  # columns of the residuals' cofactor matrix that are made in one pass
 MOST_SUSPECT = 0.25  # part of all that is tested: where more contradicts the rest, who is to say which
+MOST_AT_ONCE = 60  # in one adjustment; the next one goes on
+MANY = 500  # image points: the median of so many is not moved by some gross errors
+RAISED = 1.02  # a scale that is larger by less is no other
 
 
 @dataclass(frozen=True)
@@ -40,17 +44,8 @@ class Search:
     factor: Factor
     found: Misfits
     weighting: Weighting
+    probabilities: Probabilities
     critical: Array
-
-    def limits(self, statistic: Array, left_out: Sequence[int] = ()) -> Array:
-        """What the statistics (N,) may reach: all the more where the observations are worse than given.
-
-        That is where the median of the image points' statistics says so beyond its own uncertainty.
-        """
-        points = np.setdiff1d(np.arange(len(self.end.v_mm)), left_out)
-        sizes = np.where(self.critical[points] < np.inf, 2, 0)
-        scale = robust_scale(statistic[points], sizes)
-        return self.critical * (scale**2 if scale > 1.0 + SCALE_DOUBT / np.sqrt(max(len(points), 1)) else 1.0)
 
 
 def search(
@@ -64,7 +59,7 @@ def search(
     """The tests of an adjustment with their critical values."""
     sizes = statistics(found, weighting.weights).sizes
     critical = probabilities.critical(sizes, int((sizes > 0).sum()))
-    return Search(numbering, end, factor, found, weighting, np.where(sizes > 0, critical, np.inf))
+    return Search(numbering, end, factor, found, weighting, probabilities, np.where(sizes > 0, critical, np.inf))
 
 
 @dataclass(frozen=True)
@@ -82,21 +77,92 @@ class Contradiction:
 
 
 def contradictions(search: Search) -> list[Contradiction]:
-    """What contradicts the others beyond its limit, in the order in which it was found."""
+    """What contradicts the others beyond its limit, in the order in which it was found.
+
+    Where the observations are worse than given, so that everything contradicts everything, limits are raised by their
+    scale. That is learnt without what contradicts the others, for in a small network one gross error spoils all.
+    """
     covariance = _Covariance(search)
-    most = int(MOST_SUSPECT * len(search.critical))
+    scale = _start_scale(search)
+    while True:
+        limits = scale**2 * search.critical
+        chosen = _chosen(search, covariance, limits)
+        learnt = significant_scale(*_rest(search, covariance, chosen), search.probabilities)
+        if learnt <= RAISED * scale:
+            return [_contradiction(search, covariance, chosen, unit, limits) for unit in chosen]
+        scale = learnt
+
+
+def significant_scale(vpv: float, redundancy: float, probabilities: Probabilities) -> float:
+    """Root of v'Pv over the redundancy, where that is larger than chance makes it, else 1."""
+    chance = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > probabilities.family
+    return 1.0 if chance else float(np.sqrt(vpv / redundancy))
+
+
+def limits(search: Search) -> Array:
+    """What the statistics (N,) may reach in an adjustment that does without what contradicts the others."""
+    scale = significant_scale(*_rest(search, _Covariance(search), []), search.probabilities)
+    return np.asarray(scale**2 * search.critical)
+
+
+def _start_scale(search: Search) -> float:
+    """1, and what the median tells where image points are so many that some gross errors do not move it."""
+    observed = len(search.end.v_mm)
+    if observed < MANY:
+        return 1.0
+    tests = statistics(search.found, search.weighting.weights)
+    return max(1.0, robust_scale(tests.statistic[:observed], tests.sizes[:observed]))
+
+
+def _chosen(search: Search, covariance: "_Covariance", limits: Array) -> list[int]:
+    most = min(int(MOST_SUSPECT * len(limits)), MOST_AT_ONCE)
     chosen: list[int] = []
     for _ in range(2 * most):
         statistic = _without(search, covariance, chosen)
-        limits = search.limits(statistic, chosen)
         worst = int(np.argmax(statistic / limits))
-        if statistic[worst] <= limits[worst] or len(chosen) == most:
+        found = [worst] if statistic[worst] > limits[worst] else _hidden_pair(search, covariance, chosen, limits)
+        if not found or len(chosen) + len(found) > most:
             break
-        chosen.append(worst)
+        chosen += found
         confirmed = _joint(search, covariance, chosen)[1] > limits[chosen]
-        chosen = [unit for unit, still in zip(chosen, confirmed, strict=True) if still or unit == worst]
-    limits = search.limits(_without(search, covariance, chosen), chosen)
-    return [_contradiction(search, covariance, chosen, unit, limits) for unit in chosen]
+        chosen = [unit for unit, still in zip(chosen, confirmed, strict=True) if still or unit in found]
+    return chosen
+
+
+def _hidden_pair(search: Search, covariance: "_Covariance", chosen: Sequence[int], limits: Array) -> list[int]:
+    """Two units that hide each other: each contradicts the others without the other one, and both do together.
+
+    Looked for where all that is left contradicts itself (the test of v'Pv), and among the PAIRED worst units alone.
+    """
+    finite = np.isfinite(limits)
+    raised = float((limits[finite] / search.critical[finite]).max(initial=1.0))
+    rest, redundancy = _rest(search, covariance, chosen)
+    if special.chdtrc(redundancy, rest / raised) > search.probabilities.family:
+        return []
+    alone = _without(search, covariance, chosen)
+    candidates = np.argsort(-alone / search.critical, kind="stable")[:PAIRED]
+    covariance.prepare([int(unit) for unit in candidates])
+    critical = raised * search.probabilities.critical(np.array([4]), len(candidates) * (len(candidates) - 1) // 2)[0]
+    given = np.array([_without(search, covariance, [*chosen, int(unit)])[candidates] for unit in candidates])
+    of_pair = alone[candidates][:, None] + given
+    hidden = (of_pair > critical) & (given > limits[candidates]) & (limits[candidates][:, None] < given.T)
+    if not hidden.any():
+        return []
+    first, second = np.unravel_index(np.argmax(np.where(hidden, of_pair, 0.0)), hidden.shape)
+    return [int(candidates[first]), int(candidates[second])]
+
+
+def _rest(search: Search, covariance: "_Covariance", chosen: Sequence[int]) -> tuple[float, float]:
+    """v'Pv and redundancy that are left without some units."""
+    residual, hat = search.found.residual, search.found.hat[search.weighting.used]
+    vpv = float((residual**2).sum())
+    redundancy = 2.0 * len(hat) - float(np.trace(hat, axis1=1, axis2=2).sum())
+    if not chosen:
+        return vpv, redundancy
+    joint = covariance.columns(chosen)[chosen].reshape(2 * len(chosen), -1)
+    explained = residual[chosen].ravel() @ _inverse(joint) @ residual[chosen].ravel()
+    rank = int(np.linalg.matrix_rank(joint, tol=UNCHECKED, hermitian=True))
+    return max(vpv - float(explained), 0.0), redundancy - rank
 
 
 class _Covariance:
@@ -110,9 +176,15 @@ class _Covariance:
         """(N, 2, 2 k) of some units."""
         missing = [unit for unit in units if unit not in self._columns]
         if missing:
-            self._columns |= _columns(self._search, self._likely(missing))
+            self.prepare(self._likely(missing))
         size = len(self._search.critical)
         return np.concatenate([np.zeros((size, 2, 0)), *(self._columns[unit] for unit in units)], axis=2)
+
+    def prepare(self, units: list[int]) -> None:
+        """Make the columns of some units in one pass."""
+        missing = [unit for unit in units if unit not in self._columns]
+        if missing:
+            self._columns |= _columns(self._search, missing)
 
     def _likely(self, missing: list[int]) -> list[int]:
         tests = statistics(self._search.found, self._search.weighting.weights)
@@ -199,10 +271,10 @@ def suspects(
     tests = statistics(search.found, search.weighting.weights)
     entries = {each.unit: each for each in contradicting}
     known = {each.unit: each.alike for each in removed}
-    limits = search.limits(tests.statistic, [*entries, *known])
-    weakened = (search.weighting.weights < 1.0) & (tests.statistic > limits)
+    reach = limits(search)
+    weakened = (search.weighting.weights < 1.0) & (tests.statistic > reach)
     for unit in map(int, np.flatnonzero(weakened)):
-        measured = float(tests.statistic[unit]), float(limits[unit]), tests.error[unit]
+        measured = float(tests.statistic[unit]), float(reach[unit]), tests.error[unit]
         entries[unit] = Contradiction(unit, *measured, known.get(unit, ()))
     count = int((tests.sizes > 0).sum())
     named = []

@@ -46,6 +46,7 @@ def adjustment_options(project: Project) -> Options:
         datum_points=project.adjust.datum_points,
         robust=project.adjust.robust,
         variance_components=project.adjust.variance_components,
+        snooping=project.adjust.snooping,
         method=project.adjust.method,
     )
 

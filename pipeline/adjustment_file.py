@@ -23,6 +23,7 @@ from adjust.significance import group_tests, parameter_tests
 from adjust.transformation import film_parameter_names
 from pipeline.atomic import atomic_path
 from pipeline.errors import InputError
+from pipeline.reliability_json import point_tests, reliability_json, suspect_json
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -107,6 +108,9 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         ],
         "warnings": list(adjustment.warnings),
         "variance_factors": dict(adjustment.variance_factors),
+        "variance_sigmas": dict(adjustment.variance_sigmas),
+        "suspects": [suspect_json(suspect) for suspect in adjustment.suspects],
+        "reliability": reliability_json(adjustment),
         "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras if camera.name in used},
         "images": {image.name: _image(adjustment, image) for image in network.images},
         "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
@@ -218,6 +222,7 @@ def _residuals(adjustment: Adjustment) -> list[Json]:
     sigma_um = 1e3 * np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2))
     v_um = 1e3 * residuals.v_mm
     weights = adjustment.weights if adjustment.weights.size else np.ones(len(observations))
+    tests = point_tests(adjustment)
     camera_mm = _in_camera(adjustment, observations.xy_mm)
     v_camera_um = 1e3 * (_in_camera(adjustment, observations.xy_mm + residuals.v_mm) - camera_mm)
     return [
@@ -241,6 +246,7 @@ def _residuals(adjustment: Adjustment) -> list[Json]:
             "camera_y_mm": float(camera_mm[i, 1]),
             "camera_vx_um": float(v_camera_um[i, 0]),
             "camera_vy_um": float(v_camera_um[i, 1]),
+            **tests[i],
         }
         for i in range(len(observations))
     ]
@@ -394,6 +400,13 @@ _ADJUSTMENT = {
     "calibrations": _Each(list, {"name": str, **dict.fromkeys(("value", "sigma", "v", "redundancy", "w"), _NUMBER)}),
     "warnings": _Each(list, str),
     "variance_factors": _Each(dict, _NUMBER),
+    "variance_sigmas": _Each(dict, _NUMBER),
+    "suspects": _Each(
+        list,
+        {"name": str, "group": str, "owner": str, "point": str, "alike": list, "error": list, "removed": bool}
+        | dict.fromkeys(("statistic", "critical", "w", "tau", "critical_tau"), _NUMBER),
+    ),
+    "reliability": (dict, type(None)),
     "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),
 }
 

@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Literal, cast, get_args
 
 from adjust.network import Transformation
+from adjust.options import MEASURED_KINDS
+from adjust.reweighting import WeightFunction
+from adjust.tested import PRIOR_GROUPS
 from adjust.transformation import film_kind
 from pipeline.camera_file import CameraFile, read_camera
 from pipeline.distances_file import GivenDistance, read_distances
@@ -41,8 +44,9 @@ class AdjustSettings:
     film_sigma_um: float
     refraction: bool
     earth_curvature: bool
-    robust: bool
-    variance_components: bool
+    robust: bool | WeightFunction
+    variance_components: bool | tuple[str, ...]
+    snooping: bool
     method: Method
 
 
@@ -212,12 +216,33 @@ def _adjust_settings(table: Table) -> AdjustSettings:
         film_sigma_um=table.number("film_sigma_um", 0.0, least=0.0),
         refraction=table.flag("refraction", False),
         earth_curvature=table.flag("earth_curvature", False),
-        robust=table.flag("robust", False),
-        variance_components=table.flag("variance_components", False),
+        robust=_robust(table),
+        variance_components=_variance_components(table),
+        snooping=table.flag("snooping", False),
         method=cast(Method, table.text("method", "combined", get_args(Method))),
     )
     table.done()
+    if settings.robust and settings.snooping:
+        raise table.error("snooping", "and robust both take out gross errors. Set one of the two to false.")
     return settings
+
+
+def _robust(table: Table) -> bool | WeightFunction:
+    """Huber's weights are those of `true`."""
+    if "robust" not in table or table.is_flag("robust"):
+        return table.flag("robust", False)
+    return cast(WeightFunction, table.text("robust", choices=get_args(WeightFunction)))
+
+
+def _variance_components(table: Table) -> bool | tuple[str, ...]:
+    if "variance_components" not in table or table.is_flag("variance_components"):
+        return table.flag("variance_components", False)
+    names = table.texts("variance_components")
+    known = (*MEASURED_KINDS, *PRIOR_GROUPS)
+    strangers = [name for name in names if name not in known]
+    if strangers:
+        raise table.error("variance_components", f"names {strangers[0]!r}; possible are {', '.join(known)}.")
+    return names
 
 
 def _datum_choice(table: Table, key: str, datum: Datum, wanted: Datum) -> tuple[str, ...]:

@@ -63,6 +63,10 @@ class Table:
             raise self.error(key, f"is {value!r}; possible are {_listed(choices)}.{did_you_mean(value, choices)}")
         return value
 
+    def is_flag(self, key: str) -> bool:
+        """Whether a key that is there holds true or false."""
+        return isinstance(self._get(key, None), bool)
+
     def flag(self, key: str, default: bool) -> bool:
         value = self._get(key, default)
         if not isinstance(value, bool):

@@ -12,7 +12,7 @@ from pipeline.report import thumbnails, vectors
 from pipeline.report.data import Json, ReportData, Thumbnail
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed, value_and_sigma
-from pipeline.report.verdict import suspects
+from pipeline.report.verdict import suspect_rows
 
 OPEN_FRAMES = 12  # with more frames, only those with a lost mark are unfolded
 PLOT_PX = 330.0
@@ -53,7 +53,7 @@ def frame_views(data: ReportData, shots: list[Frame]) -> list[FrameView]:
     shown = thumbnails.shown_marks(shots)
     px_per_um, most_px = thumbnail_scale(shots), thumbnails.stored_px(shown)
     by_image = residuals_by_image(data)
-    suspect = suspects(data.adjustment) if data.adjustment else []
+    suspect = suspect_rows(data.adjustment) if data.adjustment else []
     plots = _plots(data, by_image, suspect)
     views = []
     for frame in shots:

@@ -67,14 +67,10 @@ def critical_w(tests: int) -> float:
     return float(stats.norm.isf(0.5 * (1.0 - CONFIDENCE) / max(tests, 1)))
 
 
-def suspects(adjustment: Json) -> list[Json]:
-    """Observations whose standardised residual is beyond chance, the worst first.
-
-    With sigma0 above 1 it is measured against that: all residuals are larger then, and none is singled out by it.
-    """
-    rows = [row for row in adjustment["residuals"] if row["w"] is not None]
-    limit = critical_w(2 * len(rows)) * max(1.0, adjustment["sigma0"] or 1.0)
-    return sorted((row for row in rows if abs(row["w"]) > limit), key=lambda row: -abs(row["w"]))
+def suspect_rows(adjustment: Json) -> list[Json]:
+    """The residuals of image points that contradict the others beyond chance."""
+    names = {(row["group"], row["owner"], row["point"]) for row in adjustment["suspects"]}
+    return [row for row in adjustment["residuals"] if (row["kind"], row["image"], row["point"]) in names]
 
 
 def _no_solution(adjustment: Json) -> Iterator[Problem]:
@@ -145,15 +141,28 @@ def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
             "Add points or frames; until then no standard deviation here has been confirmed by the data.",
         )
     yield from _further_problems(adjustment)
-    bad = suspects(adjustment)
-    if bad:
-        names = ", ".join(f"{row['image']}/{row['point']} (w = {fixed(row['w'], 1)})" for row in bad[:MANY])
-        more = f" and {len(bad) - MANY} more" if len(bad) > MANY else ""
+    yield from _suspects(adjustment["suspects"])
+
+
+def _suspects(rows: list[Json]) -> Iterator[Problem]:
+    kept, removed = ([row for row in rows if row["removed"] is removed] for removed in (False, True))
+    if kept:
         yield Problem(
-            f"{_count(len(bad), 'observation')} beyond chance: {names}{more}.",
-            "Look at the picture: a wrong point number or a disturbed mark is rejected in comparator.csv "
-            "(status rejected), and the adjustment run again.",
+            f"{_count(len(kept), 'observation')} beyond chance: {_listed([_told(row) for row in kept])}.",
+            "Look at the picture or the records: a wrong point number or a disturbed mark is rejected in "
+            "comparator.csv (status rejected), a wrong given coordinate corrected, and the adjustment run again; "
+            "snooping = true under [adjust] leaves them out.",
         )
+    if removed:
+        yield Problem(
+            f"Left out, for beyond chance: {_listed([_told(row) for row in removed])}.",
+            "The adjustment does without them. Look at the picture or the records, and reject or correct them there.",
+        )
+
+
+def _told(row: Json) -> str:
+    alike = f"; it cannot be told apart from {', '.join(row['alike'])}" if row["alike"] else ""
+    return f"{row['name']} (w = {fixed(row['w'], 1)}{alike})"
 
 
 def _further_problems(adjustment: Json) -> Iterator[Problem]:
@@ -238,7 +247,12 @@ def _weight_notes(adjustment: Json) -> Iterator[str]:
             f"{least['image']}/{least['point']}, to {least['weight']:.2f} of what was given."
         )
     for group, factor in adjustment["variance_factors"].items():
-        yield f"Variance components: the sigmas of the group {group} were multiplied by {factor**0.5:.2f}."
+        doubt = (adjustment["variance_sigmas"].get(group) or 0.0) / (2.0 * factor**0.5)
+        yield (
+            f"Variance components: the sigmas of the group {group} were multiplied by {factor**0.5:.2f} ± {doubt:.2f}."
+            if doubt
+            else f"Variance components: the group {group} has too little redundancy and kept its sigmas."
+        )
 
 
 def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int) -> str:

@@ -10,7 +10,7 @@ import pytest
 from measure.status import Status
 from pipeline.report import Problem, ReportData, judge
 from pipeline.report.fractions import fraction_test
-from pipeline.report.verdict import critical_w, sigma0_bounds, suspects
+from pipeline.report.verdict import critical_w, sigma0_bounds
 
 Json = dict[str, Any]
 
@@ -35,19 +35,6 @@ def test_the_critical_w_grows_with_the_number_of_tests() -> None:
     """One test: 2.576; a hundred: 0.01 / 100 two-sided, 3.891 (normal table)."""
     assert critical_w(1) == pytest.approx(2.576, abs=1e-3)
     assert critical_w(100) == pytest.approx(3.891, abs=1e-3)
-
-
-def test_good_observations_are_rarely_called_suspect() -> None:
-    rng = np.random.default_rng(11)
-    called = sum(bool(suspects({"sigma0": 1.0, "residuals": _rows(rng.standard_normal((200, 2)))})) for _ in range(400))
-    assert called < 14, "one adjustment of a hundred is expected"
-
-
-def _rows(w: Any) -> list[Json]:
-    return [
-        {"image": "f1", "point": str(i), "kind": "target", "w": float(pair[np.argmax(np.abs(pair))])}
-        for i, pair in enumerate(w)
-    ]
 
 
 def changed(data: ReportData, **values: object) -> ReportData:
@@ -75,17 +62,26 @@ def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
     assert "σ₀ = 0.50 is below 0.89" in told(changed(adjusted, sigma0=0.5))
 
 
+def suspect(**values: object) -> Json:
+    row: Json = {"name": "target 1 in image f2", "group": "target", "owner": "f2", "point": "1", "w": -9.3, "alike": []}
+    return row | {"removed": False} | values
+
+
 def test_a_gross_error_is_named_with_its_image(adjusted: ReportData) -> None:
-    assert adjusted.adjustment is not None
-    rows = [*adjusted.adjustment["residuals"]]
-    rows[40] = {**rows[40], "w": -9.3}
-    assert "1 observation beyond chance: f2/1 (w = −9.3)." in told(changed(adjusted, residuals=rows))
+    text = told(changed(adjusted, suspects=[suspect()]))
+    assert "1 observation beyond chance: target 1 in image f2 (w = −9.3)." in text
+    assert "snooping = true" in text
 
 
-def test_with_a_large_sigma0_no_residual_is_singled_out_by_it(adjusted: ReportData) -> None:
-    assert adjusted.adjustment is not None
-    rows = [{**row, "w": 3.0 * (row["w"] or 0.0)} for row in adjusted.adjustment["residuals"]]
-    assert "beyond chance" not in told(changed(adjusted, sigma0=3.0, residuals=rows))
+def test_what_could_as_well_be_wrong_is_named_too(adjusted: ReportData) -> None:
+    text = told(changed(adjusted, suspects=[suspect(alike=["control point 1 Z"])]))
+    assert "target 1 in image f2 (w = −9.3; it cannot be told apart from control point 1 Z)." in text
+
+
+def test_what_was_left_out_needs_a_look(adjusted: ReportData) -> None:
+    given = suspect(name="given fiducial 7 (camera RC 20)", group="datum", removed=True)
+    text = told(changed(adjusted, suspects=[given]))
+    assert "Left out, for beyond chance: given fiducial 7 (camera RC 20) (w = −9.3)." in text
 
 
 def test_warnings_of_the_adjustment_need_a_look(adjusted: ReportData) -> None:
@@ -148,9 +144,10 @@ def test_weights_that_the_adjustment_changed_are_noted(adjusted: ReportData) -> 
     assert adjusted.adjustment is not None
     rows = [*adjusted.adjustment["residuals"]]
     rows[5] = {**rows[5], "weight": 0.25}
-    notes = " ".join(judge(changed(adjusted, residuals=rows, variance_factors={"target": 4.0})).notes)
+    factors = {"variance_factors": {"target": 4.0}, "variance_sigmas": {"target": 0.4}}
+    notes = " ".join(judge(changed(adjusted, residuals=rows, **factors)).notes)
     assert "lowered the weight of 1 observation, most that of f1/6, to 0.25" in notes
-    assert "the sigmas of the group target were multiplied by 2.00" in notes
+    assert "the sigmas of the group target were multiplied by 2.00 ± 0.10" in notes
 
 
 def test_an_adjustment_without_its_comparator_file_is_judged_all_the_same(adjusted: ReportData) -> None:
