@@ -6,7 +6,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.film_kinds import Congruent, FilmKind, Identity, Projective
+from adjust.film_kinds import Congruent, FilmKind, Identity, Projective, marks_of
 from adjust.network import Transformation
 from adjust.transformation import film_kind, marks_needed, simpler
 
@@ -15,6 +15,7 @@ Indices = NDArray[np.intp]
 
 MOST_SUBSETS = 100
 GROSS = 13.8  # squared distance, in variances of a coordinate, beyond which a mark is left out (0.1 % point)
+PLAINLY = 0.01  # of the squared distances left upright, below which those left mirrored tell that a scan is so
 LEAST_VARIANCE_MM2 = 1e-4  # of a coordinate: film and scanner may well do that
 LATTICE = np.stack(np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 8)]), axis=-1).reshape(-1, 2)
 
@@ -26,7 +27,7 @@ def fit_transformation(transformation: Transformation, comparator_mm: Array, cam
     squares, a projective one to its equations without fractions, to all marks where these agree, and otherwise to those
     that the least trimmed squares over the smallest subsets find in agreement. With fewer marks than a transformation
     takes, it is the simpler one of its family that they determine. A scan is mirrored where a mirrored similarity
-    leaves less; two marks cannot tell, and are taken as not mirrored.
+    leaves far less; two marks, and marks on one line, cannot tell, and are taken as not mirrored.
     """
     if transformation == "none":
         return np.zeros(0), False
@@ -45,12 +46,12 @@ def _is_mirrored(comparator_mm: Array, camera_mm: Array) -> bool:
     upright, mirrored = (
         _robust_fit(film_kind("similarity", mirrored), comparator_mm, camera_mm)[1] for mirrored in (False, True)
     )
-    return mirrored < upright
+    return mirrored < PLAINLY * upright
 
 
 def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple[Array, float]:
     """Parameters, and the trimmed sum of squared distances that chose them."""
-    n, fewest = len(comparator_mm), (len(kind.names) + 1) // 2
+    n, fewest = len(comparator_mm), marks_of(kind)
     half = (n + fewest + 1) // 2
     best = _fit(kind, comparator_mm, camera_mm)
     squared = _squared(kind, best, comparator_mm, camera_mm)

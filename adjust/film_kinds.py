@@ -46,6 +46,11 @@ class FilmKind(Protocol):
         """
 
 
+def marks_of(kind: FilmKind) -> int:
+    """How many marks, of two coordinates each, determine the parameters of a formula."""
+    return (len(kind.names) + 1) // 2
+
+
 @dataclass(frozen=True)
 class Identity:
     """x' = x, y' = y."""

@@ -47,12 +47,11 @@ class State:
 class Films:
     """The images with one kind of film transformation, and their observations.
 
-    images (m,): their numbers; positions (m, k) of their parameters; center_mm (m, 2), half_mm (m,) of their extents;
-    rows (n,): their observations; of (n,): the image of each of these, counted among the m.
+    positions (m, k) of the parameters of the m images; center_mm (m, 2), half_mm (m,) of their extents; rows (n,):
+    their observations; of (n,): the image of each of these, counted among the m.
     """
 
     kind: FilmKind
-    images: Indices
     positions: Indices
     center_mm: Array
     half_mm: Array
@@ -121,7 +120,6 @@ class Problem:
         rows = np.flatnonzero(place[self.image_numbers] != ABSENT)
         return Films(
             kind,
-            images,
             np.array([self.unknowns.transformation[name] for name in names], dtype=np.intp),
             np.array([extent.center_mm for extent in extents]),
             np.array([extent.half_mm for extent in extents]),

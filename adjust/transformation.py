@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.film_kinds import Conformal, Congruent, FilmKind, Identity, Mask, Polynomial, Projective
+from adjust.film_kinds import Conformal, Congruent, FilmKind, Identity, Mask, Polynomial, Projective, marks_of
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ def film_parameter_names(spelling: str) -> tuple[str, ...]:
 
 def marks_needed(spelling: str) -> int:
     """How many fiducial marks determine a transformation by themselves."""
-    return (len(film_parameter_names(spelling)) + 1) // 2
+    return marks_of(film_kind(spelling))
 
 
 def fewest_marks(spelling: str) -> int:

@@ -73,6 +73,15 @@ def test_marks_in_bad_places_give_a_tame_transformation() -> None:
     np.testing.assert_allclose(found, [5, 1, 0, 0, 5, 0, 1, 0], atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_marks_on_a_line_do_not_tell_a_mirror(seed: int) -> None:
+    comparator = np.array([(-106.0, 0.0), (0.0, 0.0), (106.0, 0.0)])
+    camera = comparator + 5.0 + np.random.default_rng(seed).normal(0.0, 0.004, (3, 2))
+    found, mirrored = fit_transformation("similarity", comparator, camera)
+    assert not mirrored
+    np.testing.assert_allclose(found, [5.0, 5.0, 1.0, 0.0], atol=0.02)
+
+
 def test_small_residuals_are_no_gross_errors() -> None:
     rng = np.random.default_rng(2)
     comparator = MARKS_MM + rng.normal(0.0, 0.005, MARKS_MM.shape)
