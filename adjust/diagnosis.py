@@ -120,6 +120,8 @@ def _named(
     left = still @ _unseen_by(seen[chosen], PURE)
     moved = [[names[i] for i in _largest(vector)] for vector in np.hstack([datum, vectors, left]).T]
     of_leads = moved[datum.shape[1] : len(moved) - left.shape[1]]
+    for own, i in zip(of_leads, chosen, strict=True):  # small as they may be, what it is named after moves
+        own += [names[k] for k in np.flatnonzero(functionals[i]) if names[k] not in own]
     sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
     for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
         sentences.append(_left_sentence(problem, state, names[int(np.argmax(np.abs(vector)))], own))

@@ -9,7 +9,7 @@ from adjust.problem import Problem, State
 
 Array = NDArray[np.float64]
 
-IN_LINE = 1e-6  # width over length of marks in an image, and base over distance of stations, that are none
+IN_LINE = 1e-3  # width over length of marks in an image, and base over distance of stations, that are next to none
 SHOWN = 3  # names that are told one by one
 
 

@@ -395,7 +395,7 @@ MISHAPS: dict[str, Mishap] = {
         ("Shift x", "Shift y", "Rotation"),
     ),
     "targets-on-a-line": Mishap(
-        "One image whose targets all lie on a line", _on_a_line, ("image f3 do not determine its own orientation",)
+        "One image whose targets all lie on a line", _on_a_line, ("all its targets lie on one line",)
     ),
     "one-ray": Mishap(
         "An unknown point in one image only", _one_ray, ("Only image f1 shows point 3",), Options(datum="minimal")
@@ -421,6 +421,7 @@ MISHAPS: dict[str, Mishap] = {
         "Relief of 2 cm under 1500 m, vertical to 0.00001 rad, c and principal point without priors",
         lambda: (given(_near.network()[0], {"x": 1.0, "y": 1.0}), _near.network()[1]),
         ("did not stand still", "principal point's x0'", "principal point's y0'", "principal distance of camera K can"),
+        Options(iteration_limit=5),
     ),
     "low-relief": Mishap(
         "Relief of 20 m under 1500 m, vertical images: regular, and highly correlated",

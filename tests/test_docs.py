@@ -1,0 +1,72 @@
+"""The pages of docs/ that speak of the code: what they name exists, and what they quote is what the program says."""
+
+import importlib
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def test_every_name_in_the_theory_exists() -> None:
+    names = set(
+        re.findall(r"`((?:adjust|pipeline|measure)(?:\.\w+)+)`", (DOCS / "theory.md").read_text(encoding="utf-8"))
+    )
+    assert len(names) > 50
+    missing = [name for name in sorted(names) if not _exists(name)]
+    assert not missing
+
+
+def _exists(name: str) -> bool:
+    """Whether a dotted name is a module, or an attribute (of an attribute) of one."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            if not (hasattr(found, part) or part in getattr(found, "__annotations__", {})):
+                return False
+            found = getattr(found, part, None)
+        return True
+    return False
+
+
+def test_every_link_of_the_pages_leads_somewhere() -> None:
+    for page in DOCS.glob("*.md"):
+        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
+            assert (DOCS / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_gallery_quotes_the_program() -> None:
+    page = (DOCS / "failure-gallery.md").read_text(encoding="utf-8")
+    assert page == script("make_gallery").text(), "run python docs/make_gallery.py"
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "filled"), [("A", (203, 203), 383), ("B", (203, 83), 2243), ("N", (83, 83), 2601)]
+)
+def test_the_matrices_of_the_figures(name: str, shape: tuple[int, int], filled: int) -> None:
+    """Ten points, eight fiducials, five images: 2 x 2 blocks in A; in B 19 elements a target's row, 4 a fiducial's."""
+    module = script("make_structure")
+    matrix = module.structure().matrices[name]
+    assert matrix.shape == shape
+    if name == "B":
+        assert filled == 100 * 19 + 80 * 4 + 23
+    if name == "N":
+        assert (abs(matrix - matrix.T) <= 1e-9 * abs(matrix).max()).all()
+    assert (DOCS / f"figure-{'ABN'.index(name) + 1}-{name}.png").stat().st_size < 150_000
+
+
+def script(name: str) -> ModuleType:
+    """A script of docs/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
