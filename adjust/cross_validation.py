@@ -15,6 +15,8 @@ from adjust.projection import ImageModel, adjusted_image
 from adjust.result import Adjustment
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 FOLDS = 5
 FEWEST_KNOWN = 10  # known points below this number stay in every fold: they carry the datum
@@ -60,22 +62,22 @@ def cross_validate(
 
     Every fold is adjusted without its points, from the whole's values on. A point of which all coordinates are given is
     projected as it is given. Any other is intersected from every second of its rays and predicted in the others, and
-    the other way round; at least two rays are needed.
+    the other way round, where they locate it.
     """
     network = adjustment.network
-    errors = []
+    errors, rows = np.empty((0, 2)), np.empty(0, dtype=np.intp)
     for points in left_out:
         fitted = _fitted_without(adjustment, points, options)
         if fitted is None:
             return None
-        errors += _errors(fitted, network, points)
-    if not errors:
+        found = _errors(fitted, network, points)
+        errors, rows = np.concatenate([errors, found[0]]), np.concatenate([rows, found[1]])
+    if not len(rows):
         return None
-    error, covariance = np.array([e for e, _ in errors]), np.array([c for _, c in errors])
-    normalised = (np.linalg.solve(covariance, error[..., None])[..., 0] * error).sum(axis=1)
-    return CrossValidation(
-        UM_PER_MM * float(np.sqrt((error**2).mean())), float(np.sqrt(normalised.mean() / 2)), len(error)
-    )
+    covariance = network.observations.covariance_mm2[rows]
+    normalised = (np.linalg.solve(covariance, errors[..., None])[..., 0] * errors).sum(axis=1)
+    rms_um = UM_PER_MM * float(np.sqrt((errors**2).mean()))
+    return CrossValidation(rms_um, float(np.sqrt(normalised.mean() / 2)), len(rows))
 
 
 def approximations_of(adjustment: Adjustment) -> Approximations:
@@ -124,61 +126,86 @@ def _fitted_without(adjustment: Adjustment, points: frozenset[str], options: Opt
     return fitted if fitted.converged else None
 
 
-def _errors(fitted: Adjustment, network: Network, points: frozenset[str]) -> list[tuple[Array, Array]]:
-    """Predicted less observed comparator coordinates (2,) of every ray, and its covariance (2, 2)."""
+def _errors(fitted: Adjustment, network: Network, points: frozenset[str]) -> tuple[Array, Array]:
+    """Predicted less observed comparator coordinates (n, 2) of all rays that can be predicted, and their rows (n,)."""
+    rays = _rays(network, points)
+    models = {name: adjusted_image(fitted, name) for name in {network.observations.image[row] for row in rays.rows}}
+    centers, directions = np.empty((len(rays.rows), 3)), np.empty((len(rays.rows), 3))
+    for image, at in rays.by_image(network).items():
+        centers[at] = models[image].station
+        directions[at] = _directions(models[image], network.observations.xy_mm[rays.rows[at]])
+    unknown = np.asarray(np.isnan(rays.known).any(axis=1))
+    given = ~unknown[rays.point]
+    errors, rows = [], []
+    for half in (False, True):
+        source = ~given & (rays.odd == half)
+        located = rays.known
+        if source.any():
+            found, _ = intersect(centers[source], directions[source], rays.point[source], rays.known)
+            located = np.where(unknown[:, None], found, rays.known)
+        there = np.asarray(np.isfinite(located).all(axis=1))
+        predicted = ~source & ~(given & half) & there[rays.point]
+        for image, at in rays.by_image(network).items():
+            chosen = at[predicted[at]]
+            xy_mm, visible = models[image].comparator_from_object(located[rays.point[chosen]])
+            errors.append((xy_mm - network.observations.xy_mm[rays.rows[chosen]])[visible])
+            rows.append(rays.rows[chosen][visible])
+    return np.concatenate(errors), np.concatenate(rows)
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """The rays (n,) of some points: their observations, the number of their point, whether second, fourth ... of it.
+
+    known (p, 3): what is given of the points, nan where nothing is.
+    """
+
+    rows: Indices
+    point: Indices
+    odd: Mask
+    known: Array
+
+    def by_image(self, network: Network) -> dict[str, Indices]:
+        """The rays of every image."""
+        images = np.array([network.observations.image[row] for row in self.rows])
+        return {str(image): np.flatnonzero(images == image) for image in np.unique(images)}
+
+
+def _rays(network: Network, points: frozenset[str]) -> _Rays:
     observations = network.observations
-    rows: dict[str, list[int]] = {point: [] for point in points}
-    for row, (point, kind) in enumerate(zip(observations.point, observations.kind, strict=True)):
-        if kind != "fiducial" and point in points:
-            rows[point].append(row)
-    images = {observations.image[row] for each in rows.values() for row in each}
-    models = {image: adjusted_image(fitted, image) for image in sorted(images)}
-    errors = []
-    for point in sorted(points):
-        ordered = sorted(rows[point], key=lambda row: observations.image[row])
-        for source, predicted in _halves(network, point, ordered):
-            xyz = _located(network, models, point, source)
-            if xyz is None:
-                continue
-            for row in predicted:
-                xy_mm, visible = models[observations.image[row]].comparator_from_object(xyz[None])
-                if visible[0]:
-                    errors.append((xy_mm[0] - observations.xy_mm[row], observations.covariance_mm2[row]))
-    return errors
+    ordered = sorted(
+        (point, image, row)
+        for row, (point, image, kind) in enumerate(
+            zip(observations.point, observations.image, observations.kind, strict=True)
+        )
+        if kind != "fiducial" and point in points
+    )
+    names = sorted({point for point, _, _ in ordered})
+    number = np.array([names.index(point) for point, _, _ in ordered], dtype=np.intp)
+    first = np.searchsorted(number, number)
+    return _Rays(
+        rows=np.array([row for _, _, row in ordered], dtype=np.intp),
+        point=number,
+        odd=(np.arange(len(number)) - first) % 2 == 1,
+        known=np.array([_known(network, name) for name in names]),
+    )
 
 
-def _halves(network: Network, point: str, rows: list[int]) -> list[tuple[list[int], list[int]]]:
-    """What locates the point, and what is then predicted."""
-    if _given(network, point).all():
-        return [([], rows)]
-    return [(a, b) for a, b in ((rows[::2], rows[1::2]), (rows[1::2], rows[::2])) if len(a) > 1]
+def _known(network: Network, point: str) -> Array:
+    """(3,) the coordinates that are given, nan where none is."""
+    each = network.point_by_id[point]
+    priors = zip((each.X, each.Y, each.Z), _given(network, point), strict=True)
+    return np.array([prior.value if prior is not None and given else np.nan for prior, given in priors])
 
 
-def _located(network: Network, models: dict[str, ImageModel], point: str, rows: list[int]) -> Array | None:
-    """The point as given, or from some of its rays."""
-    given = network.point_by_id[point]
-    priors = (given.X, given.Y, given.Z)
-    known = np.array([
-        prior.value if prior is not None and use else np.nan
-        for prior, use in zip(priors, _given(network, point), strict=True)
-    ])  # fmt: skip
-    if not rows:
-        return known
-    observations = network.observations
-    used = [models[observations.image[row]] for row in rows]
-    directions = [_direction(model, observations.xy_mm[row]) for model, row in zip(used, rows, strict=True)]
-    centers = np.array([model.station for model in used])
-    found, _ = intersect(centers, np.array(directions), np.zeros(len(rows), dtype=np.intp), known[None])
-    return found[0] if np.isfinite(found[0]).all() else None
+def _directions(model: ImageModel, xy_mm: Array) -> Array:
+    """The directions (n, 3) of rays in the object space, from observed comparator points (n, 2)."""
+    ideal, _ = model.ideal_from_observed(model.camera_from_comparator(xy_mm))
+    in_camera = np.column_stack([ideal - model.interior[1:], np.full(len(ideal), -model.interior[0])])
+    return np.asarray(in_camera @ model.rotation)
 
 
-def _direction(model: ImageModel, xy_mm: Array) -> Array:
-    """The direction of a ray in the object space, from an observed comparator point (2,)."""
-    ideal, _ = model.ideal_from_observed(model.camera_from_comparator(xy_mm[None]))
-    return np.asarray(np.array([*(ideal[0] - model.interior[1:]), -model.interior[0]]) @ model.rotation)
-
-
-def _given(network: Network, point: str) -> NDArray[np.bool_]:
+def _given(network: Network, point: str) -> Mask:
     """(3,) which coordinates of a point are given, exactly or with a standard deviation."""
     each = network.point_by_id[point]
     return np.array([prior is not None and bool(np.isfinite(prior.sigma)) for prior in (each.X, each.Y, each.Z)])

@@ -100,8 +100,9 @@ def correct(of: PolynomialSet, settings: Settings, xy: Array, principal_point: A
     coefficients = _coefficients(of, float(half[1] / half[0]))
     scaled = (xy - principal_point) / half
     (x, x_slope), (y, y_slope) = (_polynomials(of, scaled[:, axis]) for axis in (0, 1))
-    products = (x[:, :, None] * y[:, None, :]).reshape(len(xy), -1)
-    by_parameters = (products @ coefficients.reshape(-1, products.shape[1]).T).reshape(len(xy), 2, -1)
+    count = len(of.polynomials) ** 2
+    products = (x[:, :, None] * y[:, None, :]).reshape(len(xy), count)
+    by_parameters = (products @ coefficients.reshape(-1, count).T).reshape(len(xy), 2, len(of.terms))
     summed = np.einsum("akij,k->aij", coefficients, parameters)
     by_scaled = [np.einsum("aij,ni,nj->na", summed, *pair) for pair in ((x_slope, y), (x, y_slope))]
     by_xy = np.stack(by_scaled, axis=2) / half
