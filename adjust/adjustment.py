@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.approximations import approximate
 from adjust.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
-from adjust.datum_choice import chosen_coordinates, chosen_points
+from adjust.datum_choice import chosen_coordinates, chosen_points, with_held
 from adjust.diagnosis import undetermined, weak_directions
 from adjust.errors import AdjustmentError
 from adjust.iteration import factorise
@@ -55,7 +55,7 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
 def _begun_anew(network: Network, approximations: Approximations, options: Options, stopped: Adjustment) -> Adjustment:
     """The adjustment from the network's own approximations; what is there already where these are no better."""
     try:
-        own = approximate(network)
+        own = approximate(with_held(network, options.datum_coordinates))
     except AdjustmentError:
         return stopped
     if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
@@ -139,7 +139,8 @@ def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
     observed = len(last.end.v_mm)
     further_rows = sum(len(each.observed) for each in problem.further)
     conditions = int(TestedUnits(problem).sizes[weighting.used].sum()) + further_rows
-    further = tuple(further_residuals(problem, state, cofactor))
+    further_blocks, delta = last.end.rows.further, options.probabilities.noncentrality(1)
+    further = tuple(further_residuals(problem, state, further_blocks, last.solution.factor, delta))
     found = last.found if last.has_solution else None
     of_marks = residuals(last.end.v_mm, found, weighting)
     doubts = suspicions(problem.network.observations, of_marks) if last.converged else []

@@ -5,10 +5,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.elimination import Blocks, Factor
 from adjust.further_observations import square_sum
 from adjust.problem import ABSENT, Problem, State
 from adjust.reliability import UNCHECKED, Misfits, redundancies, statistics
-from adjust.result import Cofactor, FurtherResidual, Group, Residuals
+from adjust.result import FurtherResidual, Group, Residuals
 from adjust.reweighting import Weighting
 from adjust.rows import prior_differences
 from adjust.tested import TestedUnits
@@ -26,20 +27,32 @@ def residuals(v_mm: Array, found: Misfits | None, weighting: Weighting) -> Resid
     return Residuals(v_mm, redundancies(found)[:count], statistics(found, weighting.weights).w[:count])
 
 
-def further_residuals(problem: Problem, state: State, cofactor: Cofactor) -> Iterator[FurtherResidual]:
-    """The residuals of further observations: Q_vv = Q - J C_xx J', redundancy numbers the diagonal of Q_vv Q^-1."""
-    for each in problem.further:
-        by_unknowns = each.by_unknowns(state.values)
+def further_residuals(
+    problem: Problem, state: State, rows: Sequence[Blocks], factor: Factor | None, noncentrality: float
+) -> Iterator[FurtherResidual]:
+    """The residuals of further observations, whose rows these are; without a factor nothing is said of their check.
+
+    With C = L L' and H the cofactor matrix of the adjusted rows, which are of unit weight: Q_vv = L (I - H) L'.
+    """
+    for each, block in zip(problem.further, rows, strict=True):
         v = each.computed(state.values) - each.observed
-        adjusted = by_unknowns @ cofactor.of(each.positions) @ by_unknowns.T
-        cofactor_v = each.covariance - adjusted
+        root = np.linalg.cholesky(each.covariance)
+        free = np.zeros_like(root) if factor is None else _surplus(block, factor)
+        cofactor_v = root @ free @ root.T
+        weighted = np.linalg.inv(root).T @ free @ np.linalg.inv(root)
         redundancy = np.einsum("ij,ji->i", cofactor_v, np.linalg.inv(each.covariance))
-        sigma_v = np.sqrt(np.diag(cofactor_v).clip(0.0))
+        checked = redundancy > UNCHECKED
+        w = np.where(checked, v / np.sqrt(np.where(checked, np.diag(cofactor_v), 1.0)), 0.0)
+        smallest = np.where(checked, noncentrality / np.sqrt(np.where(checked, np.diag(weighted), 1.0)), np.inf)
         sigma = np.sqrt(np.diag(each.covariance))
-        checked = (redundancy > UNCHECKED) & (sigma_v > 0.0)
-        w = np.where(checked, v / np.where(checked, sigma_v, 1.0), 0.0)
-        for row in zip(each.names, each.observed, v, sigma, redundancy, w, strict=True):
+        for row in zip(each.names, each.observed, v, sigma, redundancy, w, smallest, strict=True):
             yield FurtherResidual(each.group, row[0], *map(float, row[1:]))
+
+
+def _surplus(block: Blocks, factor: Factor) -> Array:
+    """I - H (m, m) of a block without own unknowns."""
+    roots = (block.matrix / factor.scale[block.shared][:, None, :] @ factor.root_of(block.shared))[0]
+    return np.asarray(np.eye(len(roots)) - roots @ roots.T)
 
 
 def groups(

@@ -58,7 +58,7 @@ class FurtherResidual:
     """One observation beside image points and single unknowns, a distance say, in the unit of what is observed.
 
     group and name as in `FurtherObservation`; v: adjusted less observed; sigma: its a-priori standard deviation;
-    redundancy number; w: v / sigma_v.
+    redundancy number; w: v / sigma_v; detectable: the smallest error that its own test finds (Baarda), inf unchecked.
     """
 
     group: str
@@ -68,6 +68,7 @@ class FurtherResidual:
     sigma: float
     redundancy: float
     w: float
+    detectable: float
 
 
 @dataclass(frozen=True)

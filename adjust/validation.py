@@ -95,7 +95,7 @@ def _check_distances(network: Network) -> None:
         if not 0.0 < each.sigma < np.inf:
             raise AdjustmentError(
                 f"{what} needs a positive standard deviation, not {each.sigma:g}. An exact distance is not offered: "
-                f"give a standard deviation far below what matters, {1e-7 * each.value:.1g} say, or leave it out."
+                f"give a standard deviation of a hundredth of what its ends have, or leave it out."
             )
 
 

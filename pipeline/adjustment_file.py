@@ -18,7 +18,7 @@ from adjust.correlation import correlations
 from adjust.families import family, parameter_names
 from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
 from adjust.projection import adjusted_image
-from adjust.result import Adjustment
+from adjust.result import Adjustment, FurtherResidual
 from adjust.significance import group_tests, parameter_tests
 from adjust.transformation import film_parameter_names
 from pipeline.atomic import atomic_path
@@ -256,15 +256,7 @@ def _distances(adjustment: Adjustment) -> list[Json]:
     """In the unit of the object coordinates."""
     rows = (row for row in adjustment.further if row.group == "distance")
     return [
-        {
-            "from": given.start,
-            "to": given.end,
-            "distance": row.observed,
-            "sigma": row.sigma,
-            "v": row.v,
-            "redundancy": row.redundancy,
-            "w": row.w,
-        }
+        {"from": given.start, "to": given.end, "distance": row.observed, **_further_numbers(row)}
         for given, row in zip(adjustment.network.distances, rows, strict=True)
     ]
 
@@ -272,17 +264,14 @@ def _distances(adjustment: Adjustment) -> list[Json]:
 def _calibrations(adjustment: Adjustment) -> list[Json]:
     """Earlier calibrations, one row a quantity: value and sigma as they were observed; mm."""
     return [
-        {
-            "name": row.name,
-            "value": row.observed,
-            "sigma": row.sigma,
-            "v": row.v,
-            "redundancy": row.redundancy,
-            "w": row.w,
-        }
+        {"name": row.name, "value": row.observed, **_further_numbers(row)}
         for row in adjustment.further
         if row.group == "calibration"
     ]
+
+
+def _further_numbers(row: FurtherResidual) -> Json:
+    return {name: getattr(row, name) for name in _FURTHER_NUMBERS}
 
 
 def _in_camera(adjustment: Adjustment, xy_mm: Array) -> Array:
@@ -360,6 +349,7 @@ _RESIDUAL_NUMBERS = (
     "vx_um", "vy_um", "redundancy_x", "redundancy_y", "w", "weight", "sx_um", "sy_um",
     "camera_x_mm", "camera_y_mm", "camera_vx_um", "camera_vy_um",
 )  # fmt: skip
+_FURTHER_NUMBERS = ("sigma", "v", "redundancy", "w", "detectable")
 _QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
 _ADJUSTMENT = {
     "reseau": str,
@@ -394,10 +384,10 @@ _ADJUSTMENT = {
     ),
     "distances": _Each(
         list,
-        dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", "sigma", "v", "redundancy", "w"), _NUMBER),
+        dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", *_FURTHER_NUMBERS), _NUMBER),
     ),
     "correlations": _Each(list, {"parameters": list, "rho": _NUMBER, "cause": str, "remedy": str}),
-    "calibrations": _Each(list, {"name": str, **dict.fromkeys(("value", "sigma", "v", "redundancy", "w"), _NUMBER)}),
+    "calibrations": _Each(list, {"name": str, **dict.fromkeys(("value", *_FURTHER_NUMBERS), _NUMBER)}),
     "warnings": _Each(list, str),
     "variance_factors": _Each(dict, _NUMBER),
     "variance_sigmas": _Each(dict, _NUMBER),

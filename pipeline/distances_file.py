@@ -36,8 +36,7 @@ def _distance(row: Row) -> Distance:
     if sigma == 0.0:
         raise row.error(
             "sigma",
-            f"is 0, but an exact distance is not offered. Give a standard deviation far below what matters, "
-            f"{1e-7 * value:.1g} say.",
+            "is 0, but an exact distance is not offered. Give a standard deviation of a hundredth of what the ends have.",
         )
     return Distance(start, end, value, sigma)
 

@@ -118,6 +118,7 @@ def test_observed_orientations_and_distances_as_in_a_dense_adjustment() -> None:
     for row, each in zip(result.further, network.distances, strict=True):
         assert row.name == f"{each.start} to {each.end}"
         assert row.w == pytest.approx(row.v / (row.sigma * np.sqrt(row.redundancy)))
+        assert row.detectable == pytest.approx(4.13 * row.sigma / np.sqrt(row.redundancy), rel=1e-3)
     assert result.groups["distance"].redundancy == pytest.approx(sum(row.redundancy for row in result.further))
 
 
@@ -161,7 +162,7 @@ def test_a_scale_bar_removes_the_scale_defect(count: int) -> None:
     assert one.vpv == pytest.approx(free.vpv, rel=1e-9)
     assert one.redundancy == free.redundancy
     assert one.further[0].redundancy == pytest.approx(0.0, abs=1e-7)
-    assert one.further[0].w == 0.0
+    assert (one.further[0].w, one.further[0].detectable) == (0.0, np.inf)
     assert two.redundancy == free.redundancy + 1
     assert camera(one) == pytest.approx(camera(free), rel=1e-9)
     size = between(*(np.array([one.value(f"PT.{id}.{axis}") for axis in "XYZ"]) for id in "01"))
@@ -215,7 +216,7 @@ def test_approximations_of_a_model_have_the_size_of_the_distances() -> None:
         (Distance("0", "no", 1.0, 0.1), ["from 0 to no", "neither"]),
         (Distance("0", "0", 1.0, 0.1), ["same point"]),
         (Distance("0", "1", -1.0, 0.1), ["positive number"]),
-        (Distance("0", "1", 100.0, 0.0), ["exact distance is not offered", "1e-05"]),
+        (Distance("0", "1", 100.0, 0.0), ["exact distance is not offered", "a hundredth"]),
         (Distance("0", "1", 100.0, np.inf), ["positive standard deviation"]),
         (Distance("0", "lonely", 100.0, 0.1), ["no image shows the point lonely"]),
     ],

@@ -128,25 +128,30 @@ def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
     assert check_against_opencv(first).cameras["C"].verdict == "not possible"
 
 
-def calibrated_twice(folder: Path, change: Callable[[str], str] = str) -> tuple[Adjustment, Adjustment]:
-    """The reference case adjusted, and once more with the result as the earlier calibration of a changed camera."""
-    case = json.loads((CASES / "iii_selfcal_mixed.json").read_text(encoding="utf-8"))
-    for name in ("earlier", "later"):
-        (folder / name).mkdir()
-        write_project(case, folder / name)
-    first = adjusted(folder / "earlier")
-    write_adjustment(first, folder / "earlier" / "adjustment.json")
-    camera = folder / "later" / "camera.toml"
-    text = camera.read_text(encoding="utf-8").replace(
-        "[sigma]\n", '[sigma]\ncalibration = "../earlier/adjustment.json"\n'
-    )
-    camera.write_text(change(text), encoding="utf-8")
-    return first, adjusted(folder / "later")
+@pytest.fixture(scope="module")
+def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Adjustment]:
+    """The folder of a reference case, and its adjustment."""
+    folder = tmp_path_factory.mktemp("earlier")
+    write_project(json.loads((CASES / "iii_selfcal_mixed.json").read_text(encoding="utf-8")), folder)
+    first = adjusted(folder)
+    write_adjustment(first, folder / "adjustment.json")
+    return folder, first
 
 
-def test_an_earlier_calibration_through_files(tmp_path: Path) -> None:
+def once_more(earlier: Path, folder: Path, change: Callable[[str], str] = str) -> Adjustment:
+    """The same observations adjusted again, with that result as the earlier calibration of a changed camera."""
+    for file in ("project.toml", "points.csv", "comparator.csv"):
+        (folder / file).write_bytes((earlier / file).read_bytes())
+    text = (earlier / "camera.toml").read_text(encoding="utf-8")
+    key = f'calibration = "{(earlier / "adjustment.json").as_posix()}"'
+    (folder / "camera.toml").write_text(change(text.replace("[sigma]\n", f"[sigma]\n{key}\n", 1)), encoding="utf-8")
+    return adjusted(folder)
+
+
+def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     """The same observations twice: the same values, and smaller sigmas."""
-    first, second = calibrated_twice(tmp_path)
+    folder, first = earlier
+    second = once_more(folder, tmp_path)
     assert second.converged
     for name in ("c", "x0", "y0", "k3"):
         sigma = first.sigma(f"IO.C.{name}")
@@ -162,30 +167,33 @@ def test_an_earlier_calibration_through_files(tmp_path: Path) -> None:
     assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
 
 
-def test_the_fiducials_of_an_earlier_calibration_can_be_left_out(tmp_path: Path) -> None:
-    _, second = calibrated_twice(
-        tmp_path, lambda text: text.replace("[sigma]", "[sigma]\ncalibration_fiducials = false", 1)
-    )
+def test_the_fiducials_of_an_earlier_calibration_can_be_left_out(
+    earlier: tuple[Path, Adjustment], tmp_path: Path
+) -> None:
+    keys = "[sigma]\ncalibration_fiducials = false"
+    second = once_more(earlier[0], tmp_path, lambda text: text.replace("[sigma]", keys, 1))
     assert {row.name.split(".")[0] for row in second.further} == {"IO"}
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("../earlier/adjustment.json", "../earlier/no.json", ["no.json", "no such file"]),
+        ("adjustment.json", "no.json", ["no.json", "no such file"]),
         ("[distortion]", '[distortion]\nfamily = "brown"\n[unused]', ["family = 'torlegard'", "'brown'"]),
         ('decentering = "paper"', 'decentering = "reduced"', ["decentering = 'paper'"]),
         ("r0_mm = 0.0", "r0_mm = 50.0", ["r0_mm = 0.0"]),
         ("\nk7 = 0.0\n", "\nk7 = 1e-20\n", ["held k7 fixed at 0", "standard deviation of 0"]),
     ],
 )
-def test_a_calibration_of_another_lens_is_refused(old: str, new: str, words: list[str], tmp_path: Path) -> None:
+def test_a_calibration_of_another_lens_is_refused(
+    old: str, new: str, words: list[str], earlier: tuple[Path, Adjustment], tmp_path: Path
+) -> None:
     def changed(text: str) -> str:
         assert old in text
         return re.sub(r"\[unused\].*?(?=\[\[fiducial)", "", text.replace(old, new, 1), flags=re.DOTALL)
 
     with pytest.raises(InputError) as error:
-        calibrated_twice(tmp_path, changed)
+        once_more(earlier[0], tmp_path, changed)
     for word in words:
         assert word in str(error.value)
 
