@@ -36,7 +36,7 @@ def _distance(row: Row) -> Distance:
     if sigma == 0.0:
         raise row.error(
             "sigma",
-            "is 0, but an exact distance is not offered. Give a standard deviation of a hundredth of what the ends have.",
+            "is 0, but an exact distance is not offered. Give it a hundredth of the standard deviations of its ends.",
         )
     return Distance(start, end, value, sigma)
 
