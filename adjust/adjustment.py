@@ -215,14 +215,12 @@ def _warnings(last: Run, cofactor: Cofactor) -> tuple[str, ...]:
             f"The weights did not settle within {ROUNDS} rounds of robust estimation, variance components or data "
             f"snooping."
         )
-    if last.has_solution or last.solution.termination == "diverged":
-        weak = weak_directions(
-            problem, last.end.state, last.numbering.free, factorise(last.numbering, last.end, camera_priors=False)
-        )
-        warnings += [
-            f"Practically singular without priors: {', '.join(each.parameters)}. {each.cause} {each.remedy}"
-            for each in weak
-        ]
+    without_priors = factorise(last.numbering, last.end, camera_priors=False)
+    weak = weak_directions(problem, last.end.state, last.numbering.free, without_priors, last.singular)
+    warnings += [
+        f"Practically singular without priors: {', '.join(each.parameters)}. {each.cause} {each.remedy}"
+        for each in weak
+    ]
     if last.converged:
         warnings += filter(None, [undetermined(problem, last.end.state, cofactor.variances)])
     return tuple(warnings + _unseen(problem) + _films_by_targets(problem))

@@ -35,14 +35,18 @@ def singular_directions(problem: Problem, state: State, free: Indices, factor: F
     return (*_within_blocks(problem, state, free, blind), *_named(problem, state, free, factor, null, PURE))
 
 
-def weak_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
+def weak_directions(
+    problem: Problem, state: State, free: Indices, factor: Factor, singular: Sequence[NullDirection] = ()
+) -> tuple[NullDirection, ...]:
     """What the observations hardly see, and priors do not settle: there the solution is made by noise.
 
     The factor is to be that without the cameras' priors. Of all directions below WEAK those are told in which these
     priors weigh less than SETTLED times what the observations do. Directions that move fiducials with priors are no
-    cause for alarm: their priors are meant to place them.
+    cause for alarm: their priors are meant to place them. singular: the null directions, which are not told again.
     """
     hardly, told = null_space(factor, blind_blocks(factor), WEAK)
+    if singular and (told <= SINGULAR).all():
+        return ()
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
     sigma = np.where(
         np.char.startswith(np.array(problem.unknowns.names)[free], "IO."), problem.unknowns.sigma[free], np.inf
@@ -53,7 +57,14 @@ def weak_directions(problem: Problem, state: State, free: Indices, factor: Facto
     of_unit_weight = hardly @ kept @ np.linalg.inv(np.linalg.qr(np.maximum(told, SINGULAR)[:, None] * kept, mode="r"))
     _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)
     unsettled = of_unit_weight @ right[weight < SETTLED].T
-    return _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
+    found = _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
+    again = {_motion(each) for each in singular}
+    return tuple(each for each in found if _motion(each) not in again)
+
+
+def _motion(direction: NullDirection) -> str:
+    """What moves first of all, without what follows it."""
+    return direction.cause.split(", followed by")[0]
 
 
 def undetermined(problem: Problem, state: State, variances: Array) -> str:

@@ -394,6 +394,11 @@ MISHAPS: dict[str, Mishap] = {
         Setup(CONVERGENT, kind="congruent").network,
         ("Shift x", "Shift y", "Rotation"),
     ),
+    "projective": Mishap(
+        "Projective transformations: the tilts too",
+        Setup(CONVERGENT, kind="projective").network,
+        ("Shift x", "Shift y", "Rotation", "Scale", "Tilt x", "Tilt y"),
+    ),
     "targets-on-a-line": Mishap(
         "One image whose targets all lie on a line", _on_a_line, ("all its targets lie on one line",)
     ),

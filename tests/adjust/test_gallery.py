@@ -1,9 +1,10 @@
 """The gallery of failures: every network of the catalogue, how many null directions, their words, and the remedies."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
-from gallery import AXES, CATALOGUE, CONVERGENT, DEFORMATIONS, MISHAPS, Setup, given, sentences
+from gallery import AXES, CATALOGUE, CONVERGENT, DEFORMATIONS, DISTANCE, MISHAPS, Setup, given, sentences
 
 from adjust.adjustment import adjust
 from adjust.network import Network, Transformation
@@ -80,7 +81,15 @@ def test_other_mishaps_are_told_in_words(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "defects"), [("affine", (4, 3, 1, 2, 0)), ("similarity", (4, 3, 1, 2, 0)), ("congruent", (3, 3, 1, 1, 0))]
+    ("kind", "defects"),
+    [
+        ("affine", (4, 3, 1, 2, 0)),
+        ("similarity", (4, 3, 1, 2, 0)),
+        ("congruent", (3, 3, 1, 1, 0)),
+        ("projective", (6, 5, 3, 4, 0)),
+        ("bilinear", (4, 3, 1, 2, 0)),
+        ("conformal(2)", (4, 3, 1, 2, 0)),
+    ],
 )
 def test_a_good_network_has_the_defect_of_the_priors_that_are_dropped(
     kind: Transformation, defects: tuple[int, ...]
@@ -90,6 +99,21 @@ def test_a_good_network_has_the_defect_of_the_priors_that_are_dropped(
     point = {"x0": 1.0, "y0": 1.0}
     for kept, defect in zip(({}, {"c": 1.0}, {"c": 1.0, **point}, point, {"x": 1.0, "y": 1.0}), defects, strict=True):
         assert len(adjust(given(network, kept), start).singular) == defect
+
+
+def test_a_singular_network_tells_too_what_is_nearly_singular() -> None:
+    """Axes parallel within half a degree: c is not quite undetermined, but to mend the rest alone is no use."""
+    setup = replace(
+        CATALOGUE["known-flat-vertical"].setup,
+        attitudes=((0.004, 0, 0.1), (0, 0.003, 1.6), (-0.004, 0, 3), (0, -0.003, -1.5)),
+    )
+    result = adjust(*setup.network())
+    assert len(result.singular) == 4
+    assert [("Practically singular" in warning, DISTANCE[0] in warning) for warning in result.warnings] == [
+        (True, True)
+    ]
+    for name in ("known-flat-vertical", "known-flat-two", "unknown-pair"):
+        assert adjust(*CATALOGUE[name].setup.network(), CATALOGUE[name].options).warnings == ()
 
 
 def causes(result: Adjustment, words: tuple[str, ...]) -> list[str]:
