@@ -150,6 +150,8 @@ def as_mark(name: str, fitted: FittedCorner | None, missing: str) -> MarkMeasure
         "damaged_fraction": corner.damaged_fraction,
         "moved_px": fitted.moved_px,
     }
+    if corner.junction_px is not None:
+        quality |= {"junction_col_px": corner.junction_px[0], "junction_row_px": corner.junction_px[1]}
     weak = corner.damaged_fraction > WEAK_DAMAGE
     reason = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit" if weak else ""
     status = Status.WEAK if weak else Status.MEASURED

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf, ndtr, owens_t
 
-from measure.noise import correlated, noise_model, robust_scale
+from measure.junction import junction
+from measure.noise import NoiseModel, correlated, noise_model, robust_scale
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -25,6 +26,8 @@ PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little
 TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
 MAX_ITERATIONS = 30
+LARGEST_WINDOW_PX = 3.5  # the standard deviation of the gradients' window about a crossing
+UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
 # Plain, then thrice robust: the scale of the residuals is taken once before each, so that it settles.
 STAGES_TOLERANCE_PX = (0.05, 0.05, 0.01, 0.001)
 SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
@@ -34,8 +37,9 @@ SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
 class Corner:
     """A corner as fitted; where reason is not empty the fit failed, and the numbers are its last.
 
-    center_px (2,), covariance_px2 (2, 2); contrast_dn: the grey value between the two steps less that beside them,
-    negative where it is dark between them; blur_px: the standard deviation.
+    center_px (2,), covariance_px2 (2, 2): as matched; contrast_dn: the grey value between the two steps less that
+    beside them, negative where it is dark between them; blur_px: the standard deviation. junction_px and its
+    covariance: where the gradients' lines meet (`measure.junction`); None where they do not, and for no crossing.
     """
 
     center_px: Array
@@ -45,6 +49,8 @@ class Corner:
     blur_px: float
     damaged_fraction: float
     reason: str = ""
+    junction_px: Array | None = None
+    junction_covariance_px2: Array | None = None
 
 
 def fit_corner(
@@ -136,6 +142,7 @@ class _CornerFit:
         design, residuals = self._linearised()
         used = self.weights > 0.05
         covariance, noise = np.full((2, 2), np.inf), float("nan")
+        meeting, meeting_covariance = None, None
         if used.sum() > self.unknowns and not self.reason:
             model = noise_model(residuals, used, self.unknowns)
             noise = float(np.sqrt(model.variance_dn2))
@@ -144,6 +151,8 @@ class _CornerFit:
             covariance = (inverse @ _products(weighted, correlated(weighted, model)) @ inverse)[:2, :2]
             if not 2 * abs(self.linear[0]) > 4 * noise:
                 self.reason = "no edges stand out from the noise"
+            elif self.bends:
+                meeting, meeting_covariance = self._junction(residuals, model)
         return Corner(
             center_px=self.center + origin,
             covariance_px2=(covariance + covariance.T) / 2,
@@ -152,7 +161,19 @@ class _CornerFit:
             blur_px=float(np.sqrt(max(self.variance - PIXEL_VARIANCE_PX2, 0.0))),
             damaged_fraction=float(1 - self.weights.sum() / max(self._area().sum(), 1e-9)),
             reason=self.reason,
+            junction_px=None if meeting is None else meeting + origin,
+            junction_covariance_px2=meeting_covariance,
         )
+
+    def _junction(self, residuals: Array, noise: NoiseModel) -> tuple[Array, Array] | tuple[None, None]:
+        """Where the gradients' lines meet, and its covariance. Damage is painted over with what was fitted."""
+        area = self._area()
+        damaged = self.weights < UNDAMAGED * area
+        window_px = min(LARGEST_WINDOW_PX, float(self.reach.min()) / 2)
+        meeting, by_grey = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, window_px, area)
+        if not np.hypot(*(meeting - self.center)) < window_px:
+            return None, None
+        return meeting, _products(by_grey, correlated(by_grey, noise))
 
     def _adjust(self, tolerance_px: float) -> None:
         for _ in range(MAX_ITERATIONS):

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from measure.coma import one_definition
 from measure.errors import MeasurementError
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
@@ -38,7 +39,17 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
         for done, future in enumerate(as_completed(futures), 1):
             future.result()
             count(futures[future], done, len(futures))
-    return tuple(future.result() for future in futures)
+    return _one_definition(project, [future.result() for future in futures])
+
+
+def _one_definition(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
+    """The crossings of all scans of a camera in one definition of their place."""
+    frames = {scan.scan: scan.frame for scan in measured}
+    for camera in project.cameras.values():
+        own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
+        for scan, marks in zip(own, one_definition([scan.frame.marks for scan in own]), strict=True):
+            frames[scan.scan] = replace(scan.frame, marks=marks)
+    return tuple(replace(scan, frame=frames[scan.scan]) for scan in measured)
 
 
 def _workers(scans: int) -> Executor:

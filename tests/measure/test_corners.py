@@ -68,6 +68,21 @@ def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) ->
     assert np.abs(np.mean(errors, axis=0)).max() < 0.4
 
 
+@pytest.mark.parametrize("blur_px", [0.5, 1.5])
+def test_the_junction_errs_as_its_sigma_says(blur_px: float) -> None:
+    rng = np.random.default_rng(7)
+    errors = []
+    for _ in range(8):
+        center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
+        clean = square_picture(center, steps, blur_px, False)
+        for _ in range(12):
+            corner = fitted(clean + rng.normal(0, NOISE, clean.shape), center, steps, False)
+            assert corner.junction_px is not None
+            assert corner.junction_covariance_px2 is not None
+            errors.append(whitened(corner.junction_px - center, corner.junction_covariance_px2))
+    assert 0.87 < np.sqrt(np.mean(np.square(errors))) < 1.13
+
+
 def test_trap_pixel_locking() -> None:
     """Without noise the error stays below 0.004 px wherever the corner lies in its pixel: no grid of any kind."""
     rng = np.random.default_rng(3)
