@@ -1,0 +1,202 @@
+"""A second, dense implementation of the combined model, for comparison: formulas point by point, complex steps only.
+
+It shares nothing with the adjustment but the network and the names of the unknowns. Angles are unknowns themselves, and
+all functions F1 to F9 with their priors stand in one full system.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import EXTERIOR_NAMES, Network, Prior
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Values = dict[str, complex]
+
+STEP = 1e-40
+
+
+@dataclass(frozen=True)
+class DenseResult:
+    """By name of unknown: value and a-priori standard deviation; v'Pv and the redundancy."""
+
+    values: dict[str, float]
+    sigmas: dict[str, float]
+    vpv: float
+    redundancy: int
+
+
+def solve_densely(network: Network, start: dict[str, float], mirrored: frozenset[str]) -> DenseResult:
+    """Iterate from values by name (of free and of fixed quantities) until nothing moves."""
+    priors = _priors(network)
+    names = [name for name in start if name not in priors or priors[name].sigma > 0.0]
+    rows = range(len(network.observations))
+    touched = {name: [row for row in rows if _touches(network, row, name)] for name in names}
+    names = [name for name in names if touched[name]]
+    pseudo = [name for name in names if name in priors and np.isfinite(priors[name].sigma)]
+    x = dict(start)
+    observed = network.observations.xy_mm
+    adjusted = observed.copy()
+    for _ in range(6):
+        values: Values = dict(x)
+        f = np.array([_function(network, values, row, adjusted[row], mirrored) for row in rows])
+        a = np.array(
+            [
+                np.column_stack(
+                    [
+                        _function(network, values, row, adjusted[row] + 1j * STEP * unit, mirrored).imag / STEP
+                        for unit in np.eye(2)
+                    ]
+                )
+                for row in rows
+            ]
+        )
+        b = np.zeros((len(observed), 2, len(names)))
+        for k, name in enumerate(names):
+            moved = values | {name: values[name] + 1j * STEP}
+            for row in touched[name]:
+                b[row, :, k] = _function(network, moved, row, adjusted[row], mirrored).imag / STEP
+        w = -f.real - np.einsum("nij,nj->ni", a, observed - adjusted)
+        root = np.linalg.cholesky(a @ network.observations.covariance_mm2 @ a.transpose(0, 2, 1))
+        whitened = np.linalg.solve(root, np.concatenate([b, w[..., None]], axis=2)).reshape(-1, len(names) + 1)
+        of_priors = np.zeros((len(pseudo), len(names) + 1))
+        for i, name in enumerate(pseudo):
+            of_priors[i, names.index(name)] = 1.0 / priors[name].sigma
+            of_priors[i, -1] = _difference(name, priors[name].value - x[name]) / priors[name].sigma
+        system = np.vstack([whitened, of_priors])
+        scale = np.linalg.norm(system[:, :-1], axis=0)
+        q, r = np.linalg.qr(system[:, :-1] / scale)
+        dx = np.linalg.solve(r, q.T @ system[:, -1]) / scale
+        lagrange = np.linalg.solve(
+            a @ network.observations.covariance_mm2 @ a.transpose(0, 2, 1), (w - b @ dx)[..., None]
+        )
+        v = (network.observations.covariance_mm2 @ a.transpose(0, 2, 1) @ lagrange)[..., 0]
+        adjusted = observed + v
+        x |= {name: x[name] + step for name, step in zip(names, dx.tolist(), strict=True)}
+        inverse = np.linalg.inv(r) / scale[:, None]
+        sigmas = np.sqrt((inverse**2).sum(axis=1))
+        if np.abs(dx / sigmas).max() < 1e-7:
+            break
+    vpv = float((np.linalg.solve(network.observations.covariance_mm2, v[..., None])[..., 0] * v).sum())
+    vpv += sum((_difference(name, priors[name].value - x[name]) / priors[name].sigma) ** 2 for name in pseudo)
+    redundancy = len(system) - len(names)
+    return DenseResult(x, dict(zip(names, sigmas.tolist(), strict=True)), vpv, redundancy)
+
+
+def _priors(network: Network) -> dict[str, Prior]:
+    priors: dict[str, Prior | None] = {}
+    for camera in network.cameras:
+        owner = f"IO.{camera.name}"
+        priors |= {f"{owner}.c": camera.principal_distance_mm, f"{owner}.x0": camera.x0_mm, f"{owner}.y0": camera.y0_mm}
+        priors |= {f"{owner}.{name}": Prior(0.0) for name in _LENS[camera.distortion.family]}
+        priors |= {f"{owner}.{name}": prior for name, prior in camera.distortion.parameters.items()}
+        for id_, mark in camera.fiducials.items():
+            priors |= {f"FID.{camera.name}.{id_}.x": mark.x_mm, f"FID.{camera.name}.{id_}.y": mark.y_mm}
+    for point in network.points:
+        priors |= {f"PT.{point.id}.{axis}": getattr(point, axis) for axis in "XYZ"}
+    for image in network.images:
+        if image.exterior is not None:
+            for name, value, sigma in zip(EXTERIOR_NAMES, image.exterior.values, image.exterior.sigmas, strict=True):
+                priors[f"EO.{image.name}.{name}"] = Prior(float(value), float(sigma))
+    return {name: prior for name, prior in priors.items() if prior is not None}
+
+
+def _touches(network: Network, row: int, name: str) -> bool:
+    observations = network.observations
+    image = network.image_by_name[observations.image[row]]
+    kind, owner = name.split(".")[0], name.split(".")[1]
+    target = observations.kind[row] != "fiducial"
+    match kind:
+        case "T":
+            return owner == image.name
+        case "EO":
+            return target and owner == image.name
+        case "IO":
+            return target and owner == image.camera
+        case "PT":
+            return target and owner == observations.point[row]
+    return not target and (owner, name.split(".")[2]) == (image.camera, observations.point[row])
+
+
+def _difference(name: str, difference: float) -> float:
+    is_angle = name.startswith("EO.") and name.endswith(("omega", "phi", "kappa"))
+    return float(np.angle(np.exp(1j * difference))) if is_angle else difference
+
+
+def _function(network: Network, x: Values, row: int, xy: Array | Complex, mirrored: frozenset[str]) -> Complex:
+    """F1 and F2 of a target, F3 and F4 of a fiducial."""
+    observations = network.observations
+    image = network.image_by_name[observations.image[row]]
+    point = observations.point[row]
+    place = _film(
+        image.transformation,
+        {k: x[f"T.{image.name}.{k}"] for k in _FILM[image.transformation]},
+        xy,
+        image.name in mirrored,
+    )
+    if observations.kind[row] == "fiducial":
+        return np.asarray(place - np.array([x[f"FID.{image.camera}.{point}.{axis}"] for axis in "xy"]))
+    o, p, k = (x[f"EO.{image.name}.{name}"] for name in ("omega", "phi", "kappa"))
+    so, co, sp, cp, sk, ck = (f(angle) for angle in (o, p, k) for f in (np.sin, np.cos))
+    m = np.array(
+        [
+            [cp * ck, co * sk + so * sp * ck, so * sk - co * sp * ck],
+            [-cp * sk, co * ck - so * sp * sk, so * ck + co * sp * sk],
+            [sp, -so * cp, co * cp],
+        ]
+    )
+    station = np.array([x[f"EO.{image.name}.{axis}"] for axis in ("X0", "Y0", "Z0")])
+    u, v, w = m @ (np.array([x[f"PT.{point}.{axis}"] for axis in "XYZ"]) - station)
+    io = {name: x[f"IO.{image.camera}.{name}"] for name in ("c", "x0", "y0")}
+    d = _distortion(network, image.camera, x, place - np.array([io["x0"], io["y0"]]), place)
+    return np.asarray(place - np.array([io["x0"], io["y0"]]) + io["c"] * np.array([u / w, v / w]) - d)
+
+
+_LENS = {
+    "torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"),
+    "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
+}
+_FILM = {
+    "none": (),
+    "congruent": ("a1", "b1", "angle"),
+    "similarity": ("a1", "b1", "p", "q"),
+    "affine": ("a1", "a2", "a3", "b1", "b2", "b3"),
+    "projective": ("a1", "a2", "a3", "b1", "b2", "b3", "c1", "c2"),
+}
+
+
+def _film(kind: str, t: Values, xy: Array | Complex, is_mirrored: bool) -> Complex:
+    x, y = xy[0] + 0j, xy[1] + 0j
+    m = -1.0 if is_mirrored else 1.0
+    match kind:
+        case "none":
+            return np.array([x, y])
+        case "congruent":
+            c, s = np.cos(t["angle"]), np.sin(t["angle"])
+            return np.array([t["a1"] + c * x - m * s * y, t["b1"] + s * x + m * c * y])
+        case "similarity":
+            return np.array([t["a1"] + t["p"] * x - m * t["q"] * y, t["b1"] + t["q"] * x + m * t["p"] * y])
+    divisor = 1 + t["c1"] * x + t["c2"] * y if kind == "projective" else 1.0
+    upper = [t["a1"] + t["a2"] * x + t["a3"] * y, t["b1"] + t["b2"] * x + t["b3"] * y]
+    return np.array([upper[0] / divisor, upper[1] / divisor])
+
+
+def _distortion(network: Network, camera: str, x: Values, r: Complex, place: Complex) -> Complex:
+    distortion = network.camera_by_name[camera].distortion
+    q = {name: x[f"IO.{camera}.{name}"] for name in _LENS[distortion.family]}
+    r2 = r[0] ** 2 + r[1] ** 2
+    if distortion.family == "torlegard":
+        z = distortion.r0_mm**2
+        radial = q["k3"] * (r2 - z) + q["k5"] * (r2**2 - z**2) + q["k7"] * (r2**3 - z**3)
+        growth = 1 + q["p3"] * r2 + q["p4"] * r2**2
+        ex, ey = place if distortion.decentering == "paper" else r
+        affinity = 0.0
+    else:
+        radial = q["k1"] * r2 + q["k2"] * r2**2 + q["k3"] * r2**3
+        growth, (ex, ey) = 1.0, r
+        affinity = q["b1"] * r[0] + q["b2"] * r[1]
+    dx = r[0] * radial + (q["p1"] * (r2 + 2 * ex**2) + 2 * q["p2"] * ex * ey) * growth + affinity
+    dy = r[1] * radial + (2 * q["p1"] * ex * ey + q["p2"] * (r2 + 2 * ey**2)) * growth
+    return np.array([dx, dy])
