@@ -8,7 +8,9 @@ from typing import Any, NoReturn
 import made_up_calibration
 import numpy as np
 import pytest
+from gallery import Setup, vertical
 
+from adjust.adjustment import adjust
 from adjust.network import ObjectPoint, Prior
 from adjust.result import Adjustment, Residuals
 from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
@@ -106,6 +108,17 @@ def test_points_that_nobody_saw_are_left_out(adjustment: Adjustment, tmp_path: P
     network = replace(adjustment.network, points=(*adjustment.network.points, unseen))
     write_adjustment(replace(adjustment, network=network), tmp_path / "adjustment.json")
     assert "unseen" not in read_adjustment(tmp_path / "adjustment.json")["points"]
+
+
+def test_what_trades_off_stands_in_words(tmp_path: Path) -> None:
+    """A low relief under vertical photographs: c and the flying height."""
+    network, start = Setup(vertical(0.0, 1.6, 3.1, -1.5), relief=20.0, prior=1.0).network()
+    write_adjustment(adjust(network, start), tmp_path / "adjustment.json")
+    first = read_adjustment(tmp_path / "adjustment.json")["correlations"][0]
+    assert first["parameters"] == ["IO.K.c", "EO.*.Z0"]
+    assert 0.95 < first["rho"] <= 1.0
+    assert "flying height and principal distance trade off" in first["cause"]
+    assert first["remedy"]
 
 
 def test_the_files_are_equal_when_written_twice(adjustment: Adjustment, path: Path) -> None:

@@ -169,6 +169,15 @@ def test_a_singular_network_names_cause_and_remedy(singular: ReportData) -> None
     assert "There is no solution to draw it from." in text
 
 
+def test_what_trades_off_is_told_with_the_cameras_parameters(adjusted: ReportData) -> None:
+    stored = adjusted.adjustment or {}
+    (camera,) = stored["cameras"]
+    pair = {"parameters": [f"IO.{camera}.c", "EO.*.Z0"], "rho": 0.98, "cause": "c and Z0 trade off.", "remedy": "Tilt."}
+    text = rendered(replace(adjusted, adjustment={**stored, "correlations": [pair]})).text
+    assert "What trades off, with the datum of the fiducials taken out:" in text
+    assert "c and Z0 trade off. Tilt." in text
+
+
 def test_what_the_user_named_is_escaped(adjusted: ReportData) -> None:
     name = '<script>alert("x")</script> & Co'
     first = replace(adjusted.comparator[0], status=Status.WEAK, reason=name)
