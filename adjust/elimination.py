@@ -169,7 +169,10 @@ class Factor:
         if self.shared_count <= WIDE:
             return self.shared_root[shared]
         places = shared[:, :, None] * self.shared_count + shared[:, None, :]
-        return np.asarray(np.linalg.cholesky(self._shared_cofactor.take(places)), dtype=np.float64)
+        try:
+            return np.asarray(np.linalg.cholesky(self._shared_cofactor.take(places)), dtype=np.float64)
+        except np.linalg.LinAlgError:  # the condition of the cofactor matrix is the square of that of its root
+            return self.shared_root[shared]
 
     def _roots(self, block: BlockFactors) -> tuple[Array, Array]:
         """Roots of the own unknowns' cofactor matrix: for shared unknowns held fixed, and what these add."""

@@ -28,6 +28,7 @@ Indices = NDArray[np.intp]
 TOLD_APART = 7.0  # difference of two statistics from which on one explanation is clearly the better: odds of 30 to 1
 ALIKE_SHOWN = 3
 PAIRED = 300  # units among which pairs are looked for that hide each other
+MOST_PAIRED = 2000  # what is tested in a network where they are looked for at all
 AT_ONCE = 20  # columns of the residuals' cofactor matrix that are made in one pass
 MOST_SUSPECT = 0.25  # part of all that is tested: where more contradicts the rest, who is to say which
 MOST_AT_ONCE = 60  # in one adjustment; the next one goes on
@@ -132,8 +133,11 @@ def _chosen(search: Search, covariance: "_Covariance", limits: Array) -> list[in
 def _hidden_pair(search: Search, covariance: "_Covariance", chosen: Sequence[int], limits: Array) -> list[int]:
     """Two units that hide each other: each contradicts the others without the other one, and both do together.
 
-    Looked for where all that is left contradicts itself (the test of v'Pv), and among the PAIRED worst units alone.
+    Looked for where all that is left contradicts itself (the test of v'Pv), and among the PAIRED worst units alone. In
+    large networks, where no unit bears on so much of another's residual, they are not.
     """
+    if len(limits) > MOST_PAIRED:
+        return []
     finite = np.isfinite(limits)
     raised = float((limits[finite] / search.critical[finite]).max(initial=1.0))
     rest, redundancy = _rest(search, covariance, chosen)

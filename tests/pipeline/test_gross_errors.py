@@ -1,0 +1,70 @@
+"""Data snooping, weight functions and variance components through files: keys, result, verdict, report."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_cases import CASES, write_project
+
+from pipeline.cli import run
+from pipeline.errors import InputError
+from pipeline.project_file import read_project
+
+CASE = "i_five_images_affine_reduced"
+POINT = "7"
+
+
+def spoilt_project(folder: Path, adjust: str) -> Path:
+    """The reference network with one target wrong by 0.1 mm."""
+    if not (CASES / f"{CASE}.json").exists():
+        pytest.skip(f"the reference case {CASE} is not beside the project")
+    case: dict[str, Any] = json.loads((CASES / f"{CASE}.json").read_text(encoding="utf-8"))
+    row = next(row for row in case["input"]["obs"] if str(row[1]) == POINT)
+    row[2] += 0.1
+    write_project(case, folder)
+    file = folder / "project.toml"
+    file.write_text(file.read_text(encoding="utf-8") + adjust + "\n", encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("adjust", "removed"),
+    [("", False), ("snooping = true\nvariance_components = true", True), ('robust = "igg3"', True)],
+)
+def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, tmp_path: Path) -> None:
+    project = spoilt_project(tmp_path, adjust)
+    assert run(["adjust", str(project)]) == 1
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    (suspect,) = result["suspects"]
+    name = f"target {POINT} in image {suspect['owner']}"
+    assert (suspect["name"], suspect["removed"]) == (name, removed)
+    assert suspect["error"][0] == pytest.approx(0.1, abs=0.02)
+    row = next(row for row in result["residuals"] if (row["image"], row["point"]) == (suspect["owner"], POINT))
+    assert (row["weight"] < 1e-9) is removed
+    assert row["smallest_error_x_um"] > 0.0
+    outer = {each["parameter"]: each for each in result["reliability"]["outer"]}
+    assert outer["IO.C.c"]["cause"]
+    given = {each["name"]: each for each in result["reliability"]["given"]}
+    assert given["given fiducial 3 x (camera C)"]["smallest_error"] > 0.0
+    assert run(["report", str(project)]) == 1
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"{'Left out, for' if removed else '1 observation'} beyond chance: {name} (w = " in report
+    assert "of an undetected error in" in report
+    if "variance" in adjust:
+        assert result["variance_sigmas"].keys() == {"target", "fiducial"}
+        assert "Variance components: what the variances" in report
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('robust = "tukey"', "possible are"),
+        ('variance_components = ["targets"]', "names 'targets'; possible are target, tie, fiducial"),
+        ("robust = true\nsnooping = true", "Set one of the two to false"),
+    ],
+)
+def test_wrong_keys_are_told(line: str, words: str, tmp_path: Path) -> None:
+    project = spoilt_project(tmp_path, line)
+    with pytest.raises(InputError, match=words):
+        read_project(project)
