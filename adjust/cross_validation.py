@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from adjust.adjustment import Options, adjust
 from adjust.errors import AdjustmentError
 from adjust.intersection import intersect
-from adjust.network import Approximations, Network, Observations
+from adjust.network import Approximations, Network
 from adjust.projection import ImageModel, adjusted_image
 from adjust.result import Adjustment
 
@@ -111,13 +111,7 @@ def _fitted_without(adjustment: Adjustment, points: frozenset[str], options: Opt
     reduced = replace(
         network,
         points=tuple(point for point in network.points if point.id not in points),
-        observations=Observations(
-            tuple(observations.image[row] for row in kept),
-            tuple(observations.point[row] for row in kept),
-            tuple(observations.kind[row] for row in kept),
-            observations.xy_mm[kept],
-            observations.covariance_mm2[kept],
-        ),
+        observations=observations.only(np.array(kept, dtype=np.intp)),
     )
     try:
         fitted = adjust(reduced, approximations_of(adjustment), options)

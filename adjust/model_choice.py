@@ -29,6 +29,7 @@ from adjust.errors import AdjustmentError
 from adjust.models import Model, given_model, lenses, transformations
 from adjust.network import Network, Transformation
 from adjust.result import Adjustment
+from adjust.reweighting import NO_WEIGHT
 from adjust.significance import LEVEL
 
 Array = NDArray[np.float64]
@@ -102,15 +103,16 @@ def choose(
 ) -> Choice:
     """Compare the models that a network allows.
 
-    own: the network as it was adjusted with a model of its own, and the weights that robust estimation and variance
-    components ended with there: all candidates are given these. options: those of that adjustment. half_mm: by camera
-    half the frame, for the self-calibration sets; without it for every camera they are left out.
+    own: the network as it was adjusted with a model of its own, and the weights that robust estimation, data snooping
+    and variance components left its image points there: all candidates are given these. options: those of that
+    adjustment. half_mm: by camera half the frame, for the self-calibration sets; without it for every camera they are
+    left out.
     """
     options = options or Options()
     half_mm = half_mm or {}
     given = given_model(own.network)
-    held = replace(options, robust=False, variance_components=False)
-    fits = _Fits(_weighed(own), held, half_mm, progress, {given.transformation: own})
+    held = replace(options, robust=False, variance_components=False, snooping=False)
+    fits = _Fits(weighed(own), held, half_mm, progress, {given.transformation: own})
     chosen = _chosen(
         fits, given.transformation, with_sets=all(camera.name in half_mm for camera in own.network.cameras)
     )
@@ -188,14 +190,14 @@ def _solved(candidates: Sequence[Candidate]) -> list[Candidate]:
     return [each for each in candidates if not each.problem]
 
 
-def _weighed(own: Adjustment) -> Network:
-    """The network with the weights that an adjustment ended with."""
+def weighed(own: Adjustment) -> Network:
+    """The network with the weights that its image points ended with in an adjustment; without those that have none."""
     observations = own.network.observations
-    groups = ("fiducial" if kind == "fiducial" else "target" for kind in observations.kind)
-    factors = [own.variance_factors.get(group, 1.0) for group in groups]
     weights = own.weights if len(own.weights) else np.ones(len(observations))
-    covariance = observations.covariance_mm2 * (np.array(factors) / weights)[:, None, None]
-    return replace(own.network, observations=replace(observations, covariance_mm2=covariance))
+    factors = np.array([own.variance_factors.get(kind, 1.0) for kind in observations.kind])
+    covariance_mm2 = observations.covariance_mm2 * (factors / weights)[:, None, None]
+    kept = replace(observations, covariance_mm2=covariance_mm2).only(np.flatnonzero(weights > NO_WEIGHT))
+    return replace(own.network, observations=kept)
 
 
 @dataclass

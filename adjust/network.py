@@ -16,6 +16,7 @@ from adjust.families import parameter_names
 from adjust.transformation import film_kind
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 Decentering = Literal["reduced", "paper"]
 Transformation = str  # as `adjust.transformation` spells it
@@ -153,6 +154,16 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.image)
+
+    def only(self, rows: Indices) -> "Observations":
+        """Some of the rows."""
+        return Observations(
+            tuple(self.image[row] for row in rows),
+            tuple(self.point[row] for row in rows),
+            tuple(self.kind[row] for row in rows),
+            self.xy_mm[rows],
+            self.covariance_mm2[rows],
+        )
 
 
 @dataclass(frozen=True)

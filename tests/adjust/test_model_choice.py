@@ -10,9 +10,10 @@ from simulated import HALF_MM, Truth, field_points, simulated
 from adjust.adjustment import Options, adjust
 from adjust.approximations import approximate
 from adjust.cross_validation import CrossValidation, cross_validate, folds
-from adjust.model_choice import Candidate, Choice, choose, f_test, nested_tests, simplest_sufficient
+from adjust.model_choice import Candidate, Choice, choose, f_test, nested_tests, simplest_sufficient, weighed
 from adjust.models import Model, lenses
 from adjust.network import Distortion, Network, ObjectPoint, Prior, Transformation
+from adjust.reweighting import WeightFunction
 
 Array = NDArray[np.float64]
 
@@ -160,6 +161,22 @@ def test_the_ladder_is_of_the_cameras_own_family_and_the_networks_own_model_is_o
     assert names[-3:] == ["congruent, ebner", "congruent, legendre(3)", "congruent, brown k1 b1"]
     with_affinity, without = (lenses(own, film, with_sets=True)[-3] for film in ("congruent", "bilinear"))
     assert set(with_affinity.parameters) - set(without.parameters) == {"b1", "b2"}
+
+
+@pytest.mark.parametrize("robust", ["huber", "igg3"])
+def test_all_candidates_get_the_weights_of_the_networks_own_adjustment(robust: WeightFunction) -> None:
+    """Held, these weights lead to the very same result."""
+    network = network_of(1, "none", "none", points=12)
+    xy = network.observations.xy_mm.copy()
+    xy[5] += 0.06
+    spoiled = replace(network, observations=replace(network.observations, xy_mm=xy))
+    start = approximate(spoiled)
+    own = adjust(spoiled, start, Options(robust=robust, variance_components=True))
+    again = adjust(weighed(own), start)
+    assert own.weights[5] < 0.5
+    assert len(again.network.observations) == (48 if robust == "huber" else 47)
+    assert again.vpv == pytest.approx(own.vpv, rel=1e-6)
+    assert again.value("IO.K.c") == pytest.approx(own.value("IO.K.c"), abs=1e-6)
 
 
 def test_what_is_singular_is_named_and_does_not_stop_the_choice() -> None:
