@@ -42,17 +42,17 @@ def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> Ob
     moved = generators.copy()
     moved[problem.exterior[:, 3:]] *= extent  # an angle's motion as that of a point
     hindered = moved[np.isfinite(problem.unknowns.sigma)]
-    rows = np.vstack([hindered / np.sqrt(max(len(hindered), 1)), _further_motions(problem, state, moved)])
+    rows = np.vstack([hindered / np.sqrt(max(len(hindered), 1)), _further_motions(problem, state, generators)])
     _, singular, right = np.linalg.svd(rows, full_matrices=False)
     return ObjectDatum(center, extent, generators, right[singular <= tolerance].T)
 
 
-def _further_motions(problem: Problem, state: State, moved: Array) -> Array:
+def _further_motions(problem: Problem, state: State, generators: Array) -> Array:
     """How further observations change (m, 7), each by one unit at most, however short a distance may be."""
     rows = [np.zeros((7, 7))]
     for further in problem.further:
         by_unknowns = further.by_unknowns(state.values)
-        motions = by_unknowns @ moved[further.positions]
+        motions = by_unknowns @ generators[further.positions]
         lengths = np.linalg.norm(motions, axis=1, keepdims=True)
         seen = lengths[:, 0] > EXACT * np.linalg.norm(by_unknowns, axis=1)
         rows.append(motions[seen] / lengths[seen])

@@ -1,4 +1,4 @@
-"""What is observed beside image points and single unknowns: distances, earlier calibrations of a camera.
+"""What is observed beside image points and single unknowns: distances, earlier calibrations, antennas.
 
 Each is a group of correlated observations l = f(x) + v of some of the unknowns. One concept serves all: positions of
 the unknowns in f, the observed values with their covariance, computed values and derivatives at a state.
@@ -11,7 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import Network
+from adjust.network import Exterior, Network
+from adjust.rotation import cross_matrix, rotation_from_angles, vector_by_angles
 from adjust.unknowns import Unknowns
 
 Array = NDArray[np.float64]
@@ -47,7 +48,11 @@ class FurtherObservation(Protocol):
 
 def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherObservation, ...]:
     """All of a validated network."""
-    return (*_distances(network, unknowns), *_calibrations(network, unknowns))
+    return (
+        *_distances(network, unknowns),
+        *_calibrations(network, unknowns),
+        *_antennas(network, unknowns),
+    )
 
 
 @dataclass(frozen=True)
@@ -115,8 +120,56 @@ def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCali
             )
 
 
+@dataclass(frozen=True)
+class ObservedAntenna:
+    """Coordinates of a point that is fixed to the camera; positions (6,): the image's exterior orientation.
+
+    axes (m,): which coordinates are observed; offset (3,) from the projection centre along the camera's axes;
+    keeps_angles: whether the attitude moves by its angles and not by a rotation vector.
+    """
+
+    names: tuple[str, ...]
+    positions: Indices
+    observed: Array
+    covariance: Array
+    axes: Indices
+    offset: Array
+    keeps_angles: bool
+    group: str = "antenna"
+
+    def computed(self, values: Array) -> Array:
+        rotation = rotation_from_angles(values[self.positions[3:]])
+        return np.asarray((values[self.positions[:3]] + rotation.T @ self.offset)[self.axes])
+
+    def by_unknowns(self, values: Array) -> Array:
+        """A rotation by the vector t on top of M takes M' a to M' (a - t x a)."""
+        angles = values[self.positions[3:]]
+        by_attitude = rotation_from_angles(angles).T @ cross_matrix(self.offset)
+        if self.keeps_angles:
+            by_attitude = by_attitude @ vector_by_angles(angles)
+        return np.hstack([np.eye(3), by_attitude])[self.axes]
+
+
+def _antennas(network: Network, unknowns: Unknowns) -> Iterator[ObservedAntenna]:
+    for image in network.images:
+        exterior = image.exterior
+        if exterior is None or not exterior.has_antenna or image.name in network.unoriented:
+            continue
+        axes = np.flatnonzero(np.isfinite(exterior.sigmas[:3]))
+        if len(axes):
+            yield ObservedAntenna(
+                names=tuple(f"{image.name} {'XYZ'[axis]}" for axis in axes),
+                positions=unknowns.exterior[image.name],
+                observed=exterior.values[axes],
+                covariance=np.diag(exterior.sigmas[axes] ** 2),
+                axes=axes,
+                offset=np.array(exterior.antenna),
+                keeps_angles=unknowns.keeps_angles(image.name),
+            )
+
+
 def at_computed(network: Network, unknowns: Unknowns, values: Array) -> Network:
-    """The network with distances and calibrations as if they had been observed without error."""
+    """The network with distances, calibrations and antennas as if they had been observed without error."""
     distances = tuple(
         replace(each, value=float(observed.computed(values)[0]))
         for each, observed in zip(network.distances, _distances(network, unknowns), strict=True)
@@ -125,7 +178,20 @@ def at_computed(network: Network, unknowns: Unknowns, values: Array) -> Network:
     calibrations = tuple(
         replace(each, values=np.array([values[number[name]] for name in each.names])) for each in network.calibrations
     )
-    return replace(network, distances=distances, calibrations=calibrations)
+    seen = {each.names[0].rpartition(" ")[0]: each for each in _antennas(network, unknowns)}
+    images = tuple(
+        replace(image, exterior=_with_antenna_at(image.exterior, seen[image.name], values))
+        if image.exterior is not None and image.name in seen
+        else image
+        for image in network.images
+    )
+    return replace(network, distances=distances, calibrations=calibrations, images=images)
+
+
+def _with_antenna_at(exterior: Exterior, antenna: ObservedAntenna, values: Array) -> Exterior:
+    computed = exterior.values.copy()
+    computed[antenna.axes] = antenna.computed(values)
+    return replace(exterior, values=computed)
 
 
 def square_sum(further: tuple[FurtherObservation, ...], values: Array) -> float:

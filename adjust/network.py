@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.families import parameter_names
+from adjust.rotation import rotation_from_angles
 from adjust.transformation import film_kind
 
 Array = NDArray[np.float64]
@@ -95,10 +96,13 @@ class Exterior:
     """An exterior orientation: X0, Y0, Z0 in object units, omega, phi, kappa in rad.
 
     values (6,); sigmas (6,): inf for a mere approximation, else the standard deviation of an observed element, 0 fixed.
+    antenna: X0, Y0, Z0 are those of a point, an antenna say, that lies so far from the projection centre along the
+    camera's axes, in object units.
     """
 
     values: Array
     sigmas: Array = field(default_factory=lambda: np.full(6, np.inf))
+    antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.values.shape != (6,) or self.sigmas.shape != (6,):
@@ -108,6 +112,15 @@ class Exterior:
                 f"an exterior orientation must be of finite numbers, its standard deviations 0 (fixed), positive or "
                 f"inf (free), not {self.values} and {self.sigmas}"
             )
+
+    @property
+    def has_antenna(self) -> bool:
+        return any(self.antenna)
+
+    @property
+    def center(self) -> Array:
+        """The projection centre (3,)."""
+        return np.asarray(self.values[:3] - rotation_from_angles(self.values[3:]).T @ np.array(self.antenna))
 
 
 @dataclass(frozen=True)

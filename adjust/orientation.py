@@ -54,7 +54,7 @@ def _value(prior: Prior | None, firm: bool) -> float:
 
 def _checked(exterior: Exterior, block: Block, image: str) -> Pose:
     """The given orientation, or a resection where known points contradict it and it is not held fixed."""
-    given = Pose(rotation_from_angles(exterior.values[3:]), exterior.values[:3])
+    given = Pose(rotation_from_angles(exterior.values[3:]), exterior.center)
     xyz, xy_mm = known_field(block.sights[image], block.firm)
     if (exterior.sigmas == 0).any() or len(xyz) < 4:
         return given

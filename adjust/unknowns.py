@@ -175,6 +175,8 @@ def _exterior_quantities(image: Image, approximations: Approximations) -> list[Q
     if image.exterior is not None:
         rows = zip(image.exterior.values, image.exterior.sigmas, strict=True)
         priors = [Prior(float(value), float(sigma)) for value, sigma in rows]
+        if image.exterior.has_antenna:
+            priors[:3] = [None] * 3  # the antenna is observed, not the projection centre
     return list(zip(EXTERIOR_NAMES, priors, starts, strict=True))
 
 

@@ -26,6 +26,7 @@ def validate(network: Network) -> None:
     _check_names(network)
     _check_distances(network)
     _check_calibrations(network)
+    _check_antennas(network)
     _check_duplicate_observations(network.observations)
     _check_values(network.observations)
     counts = _counts(network.observations)
@@ -96,6 +97,16 @@ def _check_distances(network: Network) -> None:
             raise AdjustmentError(
                 f"{what} needs a positive standard deviation, not {each.sigma:g}. An exact distance is not offered: "
                 f"give a standard deviation of a hundredth of what its ends have, or leave it out."
+            )
+
+
+def _check_antennas(network: Network) -> None:
+    for image in network.images:
+        exterior = image.exterior
+        if exterior is not None and exterior.has_antenna and (exterior.sigmas[:3] == 0.0).any():
+            raise AdjustmentError(
+                f"image {image.name}: the station is fixed by a standard deviation of 0, but it is an antenna's, which "
+                f"can be observed only. Give it a positive standard deviation, or no offset."
             )
 
 

@@ -118,7 +118,8 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "refraction": network.line_of_sight.refraction,
         "earth_curvature": network.line_of_sight.curvature,
         "distances": _distances(adjustment),
-        "calibrations": _calibrations(adjustment),
+        "calibrations": _named(adjustment, "calibration"),
+        "antennas": _named(adjustment, "antenna"),
         "groups": {
             name: {
                 "sigma0": group.sigma0,
@@ -178,7 +179,8 @@ def _image(adjustment: Adjustment, image: Image) -> Json:
     exterior: Json = {}
     for i, element in enumerate(EXTERIOR_NAMES):
         known = image.exterior
-        given = None if known is None else Prior(float(known.values[i]), float(known.sigmas[i]))
+        of_antenna = known is not None and known.has_antenna and i < 3
+        given = None if known is None or of_antenna else Prior(float(known.values[i]), float(known.sigmas[i]))
         name = f"EO.{image.name}.{element}"
         if element in ANGLES:
             exterior[f"{element}_deg"] = _quantity(adjustment, name, given, DEG_PER_RAD)
@@ -261,12 +263,12 @@ def _distances(adjustment: Adjustment) -> list[Json]:
     ]
 
 
-def _calibrations(adjustment: Adjustment) -> list[Json]:
-    """Earlier calibrations, one row a quantity: value and sigma as they were observed; mm."""
+def _named(adjustment: Adjustment, group: str) -> list[Json]:
+    """One row a quantity of an earlier calibration (mm) or a coordinate of an antenna (object unit), as observed."""
     return [
         {"name": row.name, "value": row.observed, **_further_numbers(row)}
         for row in adjustment.further
-        if row.group == "calibration"
+        if row.group == group
     ]
 
 
@@ -350,6 +352,7 @@ _RESIDUAL_NUMBERS = (
     "camera_x_mm", "camera_y_mm", "camera_vx_um", "camera_vy_um",
 )  # fmt: skip
 _FURTHER_NUMBERS = ("sigma", "v", "redundancy", "w", "detectable")
+_NAMED = {"name": str, **dict.fromkeys(("value", *_FURTHER_NUMBERS), _NUMBER)}
 _QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
 _ADJUSTMENT = {
     "reseau": str,
@@ -387,7 +390,8 @@ _ADJUSTMENT = {
         dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", *_FURTHER_NUMBERS), _NUMBER),
     ),
     "correlations": _Each(list, {"parameters": list, "rho": _NUMBER, "cause": str, "remedy": str}),
-    "calibrations": _Each(list, {"name": str, **dict.fromkeys(("value", *_FURTHER_NUMBERS), _NUMBER)}),
+    "calibrations": _Each(list, _NAMED),
+    "antennas": _Each(list, _NAMED),
     "warnings": _Each(list, str),
     "variance_factors": _Each(dict, _NUMBER),
     "variance_sigmas": _Each(dict, _NUMBER),

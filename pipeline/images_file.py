@@ -23,15 +23,18 @@ class GivenImages:
     camera: Mapping[str, str]
 
 
-def read_images(path: Path) -> GivenImages:
-    """Read images.csv. An image may be named with or without its file's ending. Raises InputError naming the line."""
+def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
+    """Read images.csv. An image may be named with or without its file's ending. Raises InputError naming the line.
+
+    antenna: the offset of the point whose X0, Y0, Z0 are given from the projection centre, as in `Exterior`.
+    """
     exterior: dict[str, Exterior | None] = {}
     camera = {}
     for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera")):
         name = image_name(row.name("image"))
         if name in exterior:
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
-        exterior[name] = _exterior(row)
+        exterior[name] = _exterior(row, antenna)
         camera[name] = row.text("camera")
     return GivenImages(exterior, camera)
 
@@ -43,7 +46,7 @@ def image_name(text: str) -> str:
     return path.stem if path.suffix.lower() in endings else path.name
 
 
-def _exterior(row: Row) -> Exterior | None:
+def _exterior(row: Row, antenna: tuple[float, float, float]) -> Exterior | None:
     values = [row.number(element) for element in ELEMENTS]
     if all(value is None for value in values):
         return None
@@ -53,8 +56,11 @@ def _exterior(row: Row) -> Exterior | None:
                 element, "is blank, but other elements of this orientation are given. Give all six or none."
             )
     sigmas = [row.sigma(sigma) for sigma in SIGMAS]
+    if any(antenna) and 0.0 in sigmas[:3]:
+        raise row.error(SIGMAS[sigmas.index(0.0)], "is 0, but an antenna can be observed only: give it a positive one.")
     to_rad = np.array([1.0, 1.0, 1.0, *[math.pi / 180.0] * 3])
     return Exterior(
         np.array(values, dtype=np.float64) * to_rad,
         np.array([math.inf if sigma is None else sigma for sigma in sigmas]) * to_rad,
+        antenna,
     )

@@ -111,8 +111,8 @@ def read_project(path: Path) -> Project:
     """Read project.toml and the camera, points and images files it names. Raises InputError with file, line and key."""
     table = read_toml(path)
     folder = path.parent
-    given_images = _given_images(table.table("object"), folder)
     objects = table.table("object")
+    given_images = _given_images(objects, folder)
     measure = table.table("measure")
     project = Project(
         path=path,
@@ -142,7 +142,10 @@ def read_project(path: Path) -> Project:
 
 
 def _given_images(objects: Table, folder: Path) -> GivenImages | None:
-    return read_images(folder / objects.text("images")) if "images" in objects else None
+    antenna = objects.triple("antenna_offset", (0.0, 0.0, 0.0))
+    if any(antenna) and "images" not in objects:
+        raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
+    return read_images(folder / objects.text("images"), antenna) if "images" in objects else None
 
 
 def _cameras(table: Table, folder: Path, images: GivenImages | None) -> Mapping[str, CameraFile]:

@@ -137,7 +137,7 @@ def _model(camera: CameraFile, exterior: Exterior, film: Film, measured: Measure
         np.array([camera.principal_distance_mm, x0, y0], dtype=np.float64),
         np.array([0.0 if prior is None else prior.value for prior in given]),
         rotation_from_angles(exterior.values[3:]),
-        exterior.values[:3],
+        exterior.center,
         film,
     )
 

@@ -166,7 +166,7 @@ def _told(row: Json) -> str:
 
 
 def _further_problems(adjustment: Json) -> Iterator[Problem]:
-    """Distances and earlier calibrations that the images contradict."""
+    """Distances, earlier calibrations and antennas that the images contradict."""
     bad = _beyond_chance(adjustment, adjustment["distances"])
     if bad:
         names = [f"{row['from']} to {row['to']} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})" for row in bad]
@@ -182,6 +182,14 @@ def _further_problems(adjustment: Json) -> Iterator[Problem]:
             f"The images contradict the earlier calibration: {_listed(names)}.",
             "The camera has changed since, or the earlier adjustment lacked something; calibrate without it and "
             "compare.",
+        )
+
+    bad = _beyond_chance(adjustment, adjustment["antennas"])
+    if bad:
+        names = [f"{row['name']} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})" for row in bad]
+        yield Problem(
+            f"{_count(len(bad), 'coordinate')} of antennas beyond chance: {_listed(names)}.",
+            "Look for a wrong image or time, and at the antenna's offset and its sign.",
         )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from simulated import ATTITUDES, STATIONS, Truth, camera_point, field_points, simulated
+from simulated import ATTITUDES, STATIONS, Truth, camera_point, field_points, rotation, simulated
 
 from adjust.adjustment import Options, adjust
 from adjust.approximations import approximate
@@ -32,6 +32,7 @@ from adjust.result import Adjustment
 Array = NDArray[np.float64]
 
 TRUTH = Truth(distortion={"k3": 1.5e-7})
+ANTENNA = (0.4, -1.1, 2.3)
 EO_SIGMAS = np.array([0.3, 0.3, 0.4, 2e-4, 2e-4, 3e-4])
 
 
@@ -44,9 +45,15 @@ def observed_network(rng: np.random.Generator) -> tuple[Network, Array]:
     points = field_points(rng, 6)
     network, _ = simulated(rng, TRUTH, "none", points, np.inf, free={"k3": 1e-8})
     exteriors = np.hstack([STATIONS, ATTITUDES]) + rng.normal(0.0, EO_SIGMAS, (4, 6))
-    images = tuple(
-        replace(image, exterior=Exterior(row, EO_SIGMAS)) for image, row in zip(network.images, exteriors, strict=True)
+    for i in (1, 3):
+        exteriors[i, :3] += rotation(*ATTITUDES[i]).T @ ANTENNA
+    exteriors_given = (
+        Exterior(exteriors[0], EO_SIGMAS),
+        Exterior(exteriors[1], EO_SIGMAS, ANTENNA),
+        Exterior(exteriors[2], EO_SIGMAS),
+        Exterior(exteriors[3], np.where(EO_SIGMAS < 1e-3, np.inf, EO_SIGMAS), ANTENNA),  # moved by a rotation vector
     )
+    images = tuple(replace(image, exterior=e) for image, e in zip(network.images, exteriors_given, strict=True))
     distances = (
         Distance("0", "1", between(points[0], points[1]) + 0.02, 0.02),
         Distance("2", "4", between(points[2], points[4]) - 0.03, 0.05),
@@ -62,8 +69,8 @@ class Dense:
 
     def __init__(self, network: Network, points: Array) -> None:
         self.network = network
-        exteriors = [image.exterior.values for image in network.images if image.exterior is not None]
-        start = np.concatenate([[TRUTH.c, TRUTH.x0, TRUTH.y0, 1.5], np.concatenate(exteriors), points.ravel()])
+        exteriors = np.hstack([STATIONS, ATTITUDES])
+        start = np.concatenate([[TRUTH.c, TRUTH.x0, TRUTH.y0, 1.5], exteriors.ravel(), points.ravel()])
         found = least_squares(self.residuals, start, jac="3-point", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
         self.values = found.x
         self.vpv = 2.0 * found.cost
@@ -80,11 +87,10 @@ class Dense:
         camera = network.cameras[0]
         given = [camera.principal_distance_mm, camera.x0_mm, camera.y0_mm, camera.distortion.parameters["k3"]]
         result += [[(v - p.value) / p.sigma] for v, p in zip((c, x0, y0, 1e-7 * k3), given, strict=True) if p]
-        result += [
-            (row - image.exterior.values) / EO_SIGMAS
-            for row, image in zip(exterior, network.images, strict=True)
-            if image.exterior is not None
-        ]
+        for row, image in zip(exterior, network.images, strict=True):
+            if image.exterior is not None:
+                observed = np.append(row[:3] + rotation(*row[3:]).T @ image.exterior.antenna, row[3:])
+                result.append((observed - image.exterior.values) / image.exterior.sigmas)
         place = {f"f{i}": row[:3] for i, row in enumerate(exterior)} | {str(i): xyz for i, xyz in enumerate(points)}
         result += [[(between(place[d.start], place[d.end]) - d.value) / d.sigma] for d in network.distances]
         return np.concatenate(result)
@@ -110,16 +116,17 @@ def test_observed_orientations_and_distances_as_in_a_dense_adjustment() -> None:
     cofactor = dense.cofactor * np.outer(scale, scale)
     np.testing.assert_allclose(result.cofactor_of(NAMES) / np.outer(sigmas, sigmas),
                                cofactor / np.outer(sigmas, sigmas), atol=1e-6)  # fmt: skip
-    conditions = 2 * 24 + 4 + 24 + 4
+    conditions = 2 * 24 + 4 + 21 + 4
     assert (result.conditions, result.redundancy) == (conditions, conditions - len(NAMES))
     assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
     distances = dense.residuals(dense.values)[-4:]
-    np.testing.assert_allclose([row.v / row.sigma for row in result.further], distances, atol=1e-6)
-    for row, each in zip(result.further, network.distances, strict=True):
-        assert row.name == f"{each.start} to {each.end}"
+    np.testing.assert_allclose([row.v / row.sigma for row in result.further[:4]], distances, atol=1e-6)
+    assert [row.name for row in result.further[:4]] == [f"{each.start} to {each.end}" for each in network.distances]
+    assert [row.name for row in result.further[4:]] == [f"{name} {axis}" for name in ("f1", "f3") for axis in "XYZ"]
+    for row in result.further:
         assert row.w == pytest.approx(row.v / (row.sigma * np.sqrt(row.redundancy)))
         assert row.detectable == pytest.approx(4.13 * row.sigma / np.sqrt(row.redundancy), rel=1e-3)
-    assert result.groups["distance"].redundancy == pytest.approx(sum(row.redundancy for row in result.further))
+    assert result.groups["distance"].redundancy == pytest.approx(sum(row.redundancy for row in result.further[:4]))
 
 
 def scaled_by_bars(count: int) -> tuple[Network, Array]:

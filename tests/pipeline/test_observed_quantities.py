@@ -11,7 +11,9 @@ import pytest
 from test_cases import CASES, write_project
 
 from adjust.errors import AdjustmentError
+from adjust.network import EXTERIOR_NAMES
 from adjust.result import Adjustment
+from adjust.rotation import rotation_from_angles
 from pipeline.adjust_stage import adjust_marks
 from pipeline.adjustment_file import read_adjustment, write_adjustment
 from pipeline.check import check_against_opencv
@@ -126,6 +128,46 @@ def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
     written = read_adjustment(tmp_path / "adjustment.json")
     assert (written["refraction"], written["earth_curvature"]) == (True, True)
     assert check_against_opencv(first).cameras["C"].verdict == "not possible"
+
+
+def with_antennas(earlier: tuple[Path, Adjustment], folder: Path, sigma: str) -> Adjustment:
+    """The reference case with antennas observed where its adjustment puts them, 2.5 units away from the lenses."""
+    source, first = earlier
+    offset = (0.5, -1.0, 2.2)
+    rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,sX0,sY0,sZ0"]
+    for image in first.network.images:
+        place = [first.value(f"EO.{image.name}.{name}") for name in EXTERIOR_NAMES]
+        antenna = np.array(place[:3]) + rotation_from_angles(np.array(place[3:])).T @ offset
+        rows.append(
+            ",".join([image.name, *map(repr, [*antenna.tolist(), *np.degrees(place[3:]).tolist()]), *[sigma] * 3])
+        )
+    (folder / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    for file in ("camera.toml", "points.csv", "comparator.csv"):
+        (folder / file).write_bytes((source / file).read_bytes())
+    text = (source / "project.toml").read_text(encoding="utf-8")
+    keys = f'[object]\nimages = "images.csv"\nantenna_offset = {list(offset)}\n'
+    (folder / "project.toml").write_text(text.replace("[object]\n", keys), encoding="utf-8")
+    return adjusted(folder)
+
+
+def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
+    """They are where the adjustment puts them, so that nothing moves but every station becomes more certain."""
+    _, first = earlier
+    result = with_antennas(earlier, tmp_path, "0.05")
+    for image in first.network.images:
+        name = f"EO.{image.name}.Z0"
+        assert result.value(name) == pytest.approx(first.value(name), abs=1e-3 * first.sigma(name))
+        assert result.sigma(name) < first.sigma(name)
+    write_adjustment(result, tmp_path / "adjustment.json")
+    written = read_adjustment(tmp_path / "adjustment.json")
+    assert len(written["antennas"]) == 3 * len(first.network.images)
+    assert written["groups"]["antenna"]["redundancy"] > 0.0
+    assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
+
+
+def test_an_antenna_cannot_be_fixed(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="column sX0: is 0, but an antenna can be observed only"):
+        with_antennas(earlier, tmp_path, "0")
 
 
 @pytest.fixture(scope="module")
