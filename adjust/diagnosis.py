@@ -82,10 +82,10 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     if not names:
         return ""
     said = f"The observations say nothing about {', '.join(collapsed(names))}: their standard deviations stay as given"
-    interior = {f"IO.{camera}.{quantity}" for camera in unknowns.camera for quantity in ("c", "x0", "y0")}
-    if interior.isdisjoint(names):
+    cameras = [name for name in unknowns.camera if any(f"IO.{name}.{each}" in names for each in ("c", "x0", "y0"))]
+    if not cameras:
         return f"{said}. What is given is all that places them: give it well, or fix what you do not need."
-    field = field_of(problem, state)
+    field = field_of(problem, state, cameras[0])
     return f"{said}, for {field.because}. To determine them, {field.remedy}."
 
 
@@ -160,7 +160,7 @@ def _datum_part(
     count = int((cosines > 1.0 - INSIDE).sum())
     if count < datum.free.shape[1]:
         return np.zeros((len(free), 0)), [], null
-    chosen = _independent_rows(datum.free, PURE, np.arange(7))
+    chosen = _independent_rows(datum.free, PURE, np.zeros(7, dtype=np.intp))
     vectors = motion @ np.linalg.pinv(datum.free[chosen])
     return vectors, [datum_sentence(i) for i in chosen], null @ left[:, count:]
 

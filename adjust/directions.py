@@ -98,8 +98,8 @@ def camera_leads(problem: Problem, state: State) -> list[Lead]:
     fiducials, 2 interior orientation, 3 distortion.
     """
     leads = []
-    field = field_of(problem, state)
     for name, positions in problem.unknowns.camera.items():
+        field = field_of(problem, state, name)
         leads += _fiducial_leads(problem, state, name)
         leads += _tilt_leads(problem, state, name)
         leads += _interior_leads(problem, name, positions, field)
@@ -194,12 +194,12 @@ class Field:
         return f"add images tilted in different directions, or {relief}"
 
 
-def field_of(problem: Problem, state: State) -> Field:
-    """The field that the observed points make, and the axes of the images."""
+def field_of(problem: Problem, state: State, camera: str) -> Field:
+    """The field that the observed points make, and the axes of a camera's images."""
     positions = np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
     xyz = state.values[positions]
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False) if len(xyz) > 2 else np.zeros(3)
-    axes = state.rotations[:, 2]
+    axes = state.rotations[[image.camera == camera for image in problem.network.images], 2]
     mean = axes.mean(axis=0)
     off = np.linalg.norm(np.cross(axes, mean / (np.linalg.norm(mean) or 1.0)), axis=1)
     given = problem.network.points

@@ -3,11 +3,12 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from gallery import AXES, CATALOGUE, CONVERGENT, DEFORMATIONS, DISTANCE, MISHAPS, Setup, given, sentences
 
 from adjust.adjustment import adjust
-from adjust.network import Network, Transformation
+from adjust.network import Approximations, Exterior, Network, Prior, Transformation
 from adjust.result import Adjustment
 
 GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
@@ -99,6 +100,50 @@ def test_a_good_network_has_the_defect_of_the_priors_that_are_dropped(
     point = {"x0": 1.0, "y0": 1.0}
     for kept, defect in zip(({}, {"c": 1.0}, {"c": 1.0, **point}, point, {"x": 1.0, "y": 1.0}), defects, strict=True):
         assert len(adjust(given(network, kept), start).singular) == defect
+
+
+@pytest.mark.parametrize(
+    ("known", "gone"),
+    [
+        (("7.X",), ("shift in X",)),
+        (("7.Y",), ("shift in Y",)),
+        (("7.Z",), ("shift in Z",)),
+        (("0.Z", "1.Z", "2.Z"), ("shift in Z", "turn about X", "turn about Y")),
+        (("0.X", "0.Y", "1.X", "1.Y"), ("shift in X", "shift in Y", "turn about Z", "grow or shrink")),
+    ],
+)
+def test_coordinates_that_are_asked_for_end_their_part_of_the_datum(
+    known: tuple[str, ...], gone: tuple[str, ...]
+) -> None:
+    """Point 7 lies in the middle: a coordinate of a far point ends a turn or the scale as well as a shift."""
+    network, start = MISHAPS["no-datum"].network()
+    left = [each.cause for each in adjust(with_known(network, start, known), start).singular]
+    assert len(left) == 7 - len(gone)
+    assert not [cause for cause in left if any(words in cause for words in gone)]
+
+
+def test_images_and_points_are_mended_as_advised() -> None:
+    network, start = MISHAPS["one-ray"].network()
+    known = tuple(f"{point}.{axis}" for point in "0123" for axis in "XYZ")
+    assert adjust(with_known(network, start, known), start).converged
+    network, start = MISHAPS["targets-on-a-line"].network()
+    oriented = tuple(
+        replace(image, exterior=Exterior(start.exterior["f3"], np.array([1.0] * 3 + [1e-3] * 3)))
+        if image.name == "f3"
+        else image
+        for image in network.images
+    )
+    assert adjust(replace(network, images=oriented), start).converged
+
+
+def with_known(network: Network, start: Approximations, names: tuple[str, ...]) -> Network:
+    """The network with some coordinates given as they are, with a standard deviation of a centimetre."""
+    points = []
+    for point in network.points:
+        of_point = {axis: Prior(float(start.points[point.id][i]), 0.01) for i, axis in enumerate("XYZ")}
+        x, y, z = (of_point[axis] if f"{point.id}.{axis}" in names else None for axis in "XYZ")
+        points.append(replace(point, X=x or point.X, Y=y or point.Y, Z=z or point.Z))
+    return replace(network, points=tuple(points))
 
 
 def test_a_singular_network_tells_too_what_is_nearly_singular() -> None:
