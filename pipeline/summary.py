@@ -86,6 +86,9 @@ def _frame_table(frames: Mapping[str, Mapping[str, int]]) -> Table:
 def _film_table(adjustment: Json) -> Table:
     """What an adjustment of fiducials alone gives of every image."""
     title = f"Film transformations (sigma0 = {adjustment['sigma0']:.3f}, redundancy {adjustment['redundancy']})"
+    datum = adjustment["groups"].get("datum")
+    if datum:
+        title += f"; given fiducials: rms {datum['rms_x_um']:.2f}, {datum['rms_y_um']:.2f} um"
     columns = ("image", "transformation", "fiducials", "rms x, um", "rms y, um")
     table = Table(*columns, title=title, title_justify="left")
     for name, image in adjustment["images"].items():

@@ -163,7 +163,7 @@ def _quantities(entries: Json) -> tuple[tuple[str, str, str], ...]:
     return tuple(
         (name, *value_and_sigma(quantity["value"], quantity["sigma"]))
         for name, quantity in entries.items()
-        if isinstance(quantity, dict)
+        if isinstance(quantity, dict) and quantity["value"] is not None
     )
 
 

@@ -47,7 +47,9 @@ def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.C
     assert run(["run", str(project)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "Film transformations from 13 marks in 3 frames; no frame is oriented, and no camera calibrated" in printed
-    assert (tmp_path / "out" / "report.html").exists()
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert report.count("No exterior orientation") == 3
+    assert "Exterior orientation</caption>" not in report
     result = result_of(project)
     assert result["converged"]
     assert (result["unknowns"], result["redundancy"]) == (18, 8)
