@@ -104,8 +104,10 @@ def transformations(network: Network) -> tuple[Transformation, ...]:
 def lenses(network: Network, transformation: Transformation, with_sets: bool) -> tuple[Model, ...]:
     """No distortion, a ladder of the camera's own family (Torlegård's where that is none of PHYSICAL), the sets.
 
-    And the network's own, where it is none of these.
+    And the network's own, where it is none of these. Fiducials alone say nothing of a lens: then there is none.
     """
+    if len(network.idle_cameras) == len(network.cameras):
+        return (Model(transformation),)
     family = network.cameras[0].distortion.family
     ladder = family if family in PHYSICAL else "torlegard"
     models = [Model(transformation)]

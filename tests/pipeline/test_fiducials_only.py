@@ -96,3 +96,9 @@ def test_too_few_fiducials_are_told(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert run(["adjust", str(write_project(tmp_path, {"a": 2}))]) == 2
     message = " ".join(capsys.readouterr().err.split())
     assert "'a' shows the most fiducials, 2, and its affine transformation needs 3" in message
+
+
+def test_the_film_transformation_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No lens to choose, but the kind of film: these marks have two scales that differ by 0.2 %."""
+    assert run(["choose", str(write_project(tmp_path, {"a": 5, "b": 5}))]) == 0
+    assert "The data ask for affine, no distortion" in " ".join(capsys.readouterr().out.split())
