@@ -6,13 +6,15 @@ is d = -(I - H)^-1 T v, and the cofactor matrix of d is (I - H)^-1 = I + H (I - 
 prediction. Where the adjustment used a weight p times that given, its own is p I in the given weight.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.elimination import Blocks, Factor
+from adjust.further_observations import FurtherObservation
 from adjust.iteration import Linearised
 from adjust.numbering import Numbering
 from adjust.probabilities import Probabilities
@@ -23,6 +25,8 @@ from adjust.tested import Tested, TestedUnits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+Effects = tuple[Array, Callable[[int], str]]  # of errors on the cameras' parameters (k, c), and the errors' names
 
 UNCHECKED = 1e-9  # an observation of a smaller redundancy is not checked by any other
 UNCONTROLLED = 1e-4  # below this an error must be hundreds of standard deviations to be seen: told apart from the rest
@@ -194,7 +198,9 @@ def reliability(
     everywhere = both & (least > UNCHECKED * own_weight.min(axis=1))
     together = np.where(both, _over(probabilities.noncentrality(2), least, everywhere), smallest.min(axis=1))
     controlled = variance > UNCONTROLLED * own_weight
-    outer = _outer(numbering, end, factor, found, np.where(controlled, smallest, 0.0), tested)
+    shift = probabilities.noncentrality(1)
+    errors = np.where(controlled, smallest, 0.0)
+    outer = _outer(numbering, end, factor, found, errors, tested, shift)
     uncontrolled = zip(*np.nonzero(~controlled & (np.arange(2) < units.sizes[:, None])), strict=True)
     back = np.linalg.pinv(found.transform)
     return Reliability(
@@ -228,10 +234,11 @@ def _outer(
     found: Misfits,
     errors: Array,
     tested: tuple[Tested, ...],
+    shift: float,
 ) -> tuple[OuterEffect, ...]:
     """The largest effect of any of the errors (N, 2), one at a time, on every free camera parameter.
 
-    dx = C_xx B' T' T h times the error; the columns of T B R that a block has for itself meet none of the cameras'.
+    And of any error in a further observation that shifts its test by `shift`.
     """
     unknowns = numbering.problem.unknowns
     cameras = np.concatenate([*unknowns.camera.values(), *unknowns.fiducial.values()]).astype(np.intp)
@@ -240,27 +247,58 @@ def _outer(
     of_cameras = factor.shared_root[members] / factor.scale[members, None]
     by_shared = factor.shared_root @ of_cameras.T
     largest = np.zeros(len(members))
-    causes = np.full((len(members), 2), ABSENT)
-    turned = np.append(found.transform * errors[:, None, :], np.zeros((1, 2, 2)), axis=0)  # the last is of ABSENT
-    for rows in unit_rows(numbering, end, factor):
-        moved = rows.through @ by_shared[rows.shared][:, None]
-        effects = -(turned[rows.units].swapaxes(2, 3) @ moved).reshape(2 * rows.units.size, len(members))
+    causes = np.full(len(members), "", dtype=object)
+    of_units = _unit_effects(numbering, end, factor, found, errors, by_shared, tested)
+    for effects, name_of in (*of_units, *_further_effects(numbering, end, factor, by_shared, shift)):
         if len(effects) == 0:
             continue
         worst = np.abs(effects).argmax(axis=0)
         values = effects[worst, np.arange(len(members))]
-        larger = np.abs(values) > np.abs(largest)
-        largest[larger] = values[larger]
-        causes[larger] = np.column_stack([rows.units.ravel()[worst // 2], worst % 2])[larger]
+        for i in np.flatnonzero(np.abs(values) > np.abs(largest)):
+            largest[i], causes[i] = values[i], name_of(int(worst[i]))
     sigma = np.sqrt((of_cameras**2).sum(axis=1))
     return tuple(
-        OuterEffect(
-            unknowns.names[position],
-            float(value),
-            float(abs(value) / s),
-            tested[cause[0]].coordinate_name(cause[1]) if cause[0] != ABSENT else "",
-        )
-        for position, value, s, cause in sorted(
-            zip(free[members], largest, sigma, causes, strict=True), key=lambda entry: int(entry[0])
-        )
+        OuterEffect(unknowns.names[free[members[i]]], float(largest[i]), float(abs(largest[i]) / sigma[i]), causes[i])
+        for i in np.argsort(free[members])
     )
+
+
+def _unit_effects(
+    numbering: Numbering,
+    end: Linearised,
+    factor: Factor,
+    found: Misfits,
+    errors: Array,
+    by_shared: Array,
+    tested: tuple[Tested, ...],
+) -> Iterator[Effects]:
+    """dx = C_xx B' T' T h times the error; what a block has for itself is not correlated with the cameras."""
+    turned = np.append(found.transform * errors[:, None, :], np.zeros((1, 2, 2)), axis=0)  # the last is of ABSENT
+    for rows in unit_rows(numbering, end, factor):
+        moved = rows.through @ by_shared[rows.shared][:, None]
+        effects = -(turned[rows.units].swapaxes(2, 3) @ moved).reshape(2 * rows.units.size, by_shared.shape[1])
+        units = rows.units.ravel()
+        yield effects, partial(_unit_name, tested, units)
+
+
+def _unit_name(tested: tuple[Tested, ...], units: Indices, row: int) -> str:
+    return tested[int(units[row // 2])].coordinate_name(row % 2)
+
+
+def _further_effects(
+    numbering: Numbering, end: Linearised, factor: Factor, by_shared: Array, shift: float
+) -> Iterator[Effects]:
+    """The same of further observations, whose whitened rows are L^-1 J: dx = C_xx J' L^-T L^-1 h times the error."""
+    for each, block in zip(numbering.problem.further, end.rows.further, strict=True):
+        inward = np.linalg.inv(np.linalg.cholesky(each.covariance))
+        through = block.matrix[0] / factor.scale[block.shared[0]]
+        roots = through @ factor.root_of(block.shared)[0]
+        variance = np.diag(inward.T @ (np.eye(len(roots)) - roots @ roots.T) @ inward)
+        controlled = variance > UNCONTROLLED * (inward**2).sum(axis=0)
+        errors = np.where(controlled, _over(shift, variance, controlled), 0.0)
+        effects = errors[:, None] * (inward.T @ (through @ by_shared[block.shared[0]]))
+        yield effects, partial(_further_name, each)
+
+
+def _further_name(each: FurtherObservation, row: int) -> str:
+    return f"{each.group} {each.names[row]}"

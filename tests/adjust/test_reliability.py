@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from simulated import Truth, simulated
 
 from adjust.adjustment import Options, adjust
-from adjust.network import Approximations, Camera, Exterior, Network, ObservationKind, Prior
+from adjust.network import Approximations, Calibration, Camera, Exterior, Network, ObservationKind, Prior
 from adjust.probabilities import Probabilities
 from adjust.result import Adjustment, Reliability
 
@@ -150,6 +150,27 @@ def test_an_error_in_the_least_favourable_direction_shifts_the_test_of_the_point
     mean = np.mean(statistics)
     wave = np.hypot(np.mean(statistics * np.cos(2 * turns)), np.mean(statistics * np.sin(2 * turns)))
     assert mean - 2.0 * wave == pytest.approx(Probabilities().noncentrality(2) ** 2, rel=5e-3)
+
+
+def test_an_undetected_error_of_an_earlier_calibration_moves_the_camera_as_told() -> None:
+    """Its values are correlated; the one that does most harm is wrong."""
+    truth = Truth()
+    network, start = simulated(np.random.default_rng(3), truth, noise=False, free={"k3": np.inf})
+    camera = replace(network.cameras[0], principal_distance_mm=Prior(truth.c, np.inf))
+    names = ("IO.K.c", "IO.K.k3")
+    values = np.array([truth.c, truth.distortion["k3"]])
+    sigmas = np.array([0.002, 1e-9])
+    covariance = np.array([[1.0, -0.6], [-0.6, 1.0]]) * np.outer(sigmas, sigmas)
+
+    def with_calibration(error: Array) -> Network:
+        return replace(network, cameras=(camera,), calibrations=(Calibration(names, values + error, covariance),))
+
+    clean = adjust(with_calibration(np.zeros(2)), start)
+    told = {outer.parameter: outer for outer in reliability_of(clean).outer}
+    for name in names:
+        i = [f"calibration {each}" for each in names].index(told[name].cause)
+        wrong = adjust(with_calibration(clean.further[i].detectable * np.eye(2)[i]), start)
+        assert wrong.value(name) - clean.value(name) == pytest.approx(told[name].effect, rel=0.01)
 
 
 def test_the_redundancies_of_everything_add_up() -> None:
