@@ -191,9 +191,11 @@ def _of_images(
         of = "all images" if count > 1 else f"image {images[0]}"
     else:
         more = len(images) - SHOWN
-        of = f"images {', '.join(images[:SHOWN])}" + (f" and {more} more" if more > 0 else "")
+        of = f"image{'s' * (len(images) > 1)} {', '.join(images[:SHOWN])}" + (f" and {more} more" if more > 0 else "")
     what = elements[0] if len(elements) == 1 else DIRECTIONS[direction]
-    other = "along" if direction == ALONG else "turn" if direction == TURN else "across"
+    other = (
+        "along" if direction == ALONG else "turn" if direction == TURN else "across" if direction < ALONG else "tilt"
+    )
     why, remedy = _why(kind.group, other, known)
     cause = f"{kind} of camera {camera} and {what} of {of} are correlated by {rho:.3f}: {why}."
     owner = "*" if len(images) > 1 else images[0]
@@ -213,6 +215,7 @@ def _why(first: str, second: str, known: bool) -> tuple[str, str]:
     pair = frozenset((first, second))
     relief = "a field with more relief" if known else "known points at different heights"
     tilted = f"Images tilted in different directions, or {relief}, would tell them apart."
+    wider = "Targets out to the corners of the frame would tell them apart, in a wider field of view."
     apart = tilted
     if not known:
         apart = "Images turned by 90 and 180 degrees about their axes, and tilted ones, would tell them apart."
@@ -222,13 +225,14 @@ def _why(first: str, second: str, known: bool) -> tuple[str, str]:
             "flying height and principal distance trade off",
             tilted,
         ),
-        ({"point", "across"}, "the principal point and a shift or tilt of the camera trade off", None),
+        ({"point", "across"}, "the principal point and a shift of the camera trade off", None),
+        ({"point", "tilt"}, "the principal point and a tilt of the camera trade off in a narrow field of view", wider),
         (
             {"point", "decentering"},
             "decentering distortion with a tilt looks like a shift of the principal point",
-            f"{apart} Use the two together, or fix the decentering where it is not significant.",
+            f"{wider} Else use the two together, or fix the decentering where it is not significant.",
         ),
-        ({"decentering", "across"}, "decentering distortion looks like a tilt with a shift of the camera", None),
+        ({"decentering", "tilt"}, "decentering distortion looks like a tilt with a shift of the camera", wider),
         (
             {"radial"},
             "neighbouring powers of the radius are alike within the frame",

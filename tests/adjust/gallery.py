@@ -317,6 +317,16 @@ _deformed = Setup(
 )
 
 
+_narrow = Setup(
+    vertical(0.0, 0.0, 0.0, 0.0),
+    ((0.0, 0.0, HEIGHT), (100.0, 20.0, HEIGHT), (-100.0, 0.0, 1400.0), (20.0, -80.0, 1450.0)),
+    prior=10.0,
+    points=np.random.default_rng(4).uniform(-1.0, 1.0, (20, 3)) * [150.0, 150.0, 300.0],
+    distortion={"k3": FREE, "p1": FREE, "p2": FREE},
+    noise=True,
+)
+
+
 def _on_a_line() -> tuple[Network, Approximations]:
     """All targets of image f3 on a line, those of the others not."""
     points = np.vstack([field_points(np.random.default_rng(1), 9), _line])
@@ -432,6 +442,17 @@ MISHAPS: dict[str, Mishap] = {
         "Relief of 20 m under 1500 m, vertical images: regular, and highly correlated",
         _deformed.network,
         ("c of camera K and Z0 of all images", "", ""),
+    ),
+    "narrow-field": Mishap(
+        "A narrow field of view, with decentering: 20 points within 6 degrees, priors of 10 mm",
+        _narrow.network,
+        (
+            "x0' of camera K and phi",
+            "y0' of camera K and omega",
+            "c of camera K",
+            "p1 of camera K and phi",
+            "x0' and p1",
+        ),
     ),
     "three-targets": Mishap(
         "An image with three targets", _three_targets, ("Nothing checks the orientation of image f3", "c of camera K")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gallery import CONVERGENT, FREE, Setup, given, vertical
+from gallery import CONVERGENT, FREE, MISHAPS, Setup, given, sentences, vertical
 from simulated import STATIONS
 
 from adjust.adjustment import adjust
@@ -48,6 +48,16 @@ def test_the_remedy_lowers_the_correlation() -> None:
     for setup, told in ((LOW_RELIEF, True), (tilted, False)):
         pairs = [each.parameters[0] for each in correlations(adjust(*setup.network()))]
         assert ("IO.K.c" in pairs) == told
+
+
+def test_a_wider_field_tells_the_principal_point_from_tilts_and_decentering() -> None:
+    said = " ".join(sentences(adjust(*MISHAPS["narrow-field"].network())))
+    assert "x0' and p1 of camera K are correlated by" in said
+    assert "Targets out to the corners of the frame" in said
+    points = np.random.default_rng(4).uniform(-1.0, 1.0, (20, 3)) * [1100.0, 1100.0, 300.0]
+    free = {"k3": FREE, "p1": FREE, "p2": FREE}
+    wide = Setup(vertical(0.0, 0.0, 0.0, 0.0), prior=10.0, points=points, distortion=free)
+    assert correlations(adjust(*wide.network())) == ()
 
 
 def test_a_turn_of_the_camera_about_its_axis_changes_nothing() -> None:
