@@ -202,7 +202,8 @@ def _warnings(last: Run, cofactor: Cofactor) -> tuple[str, ...]:
     warnings = []
     if last.solution.termination == "iteration limit":
         warnings.append(
-            f"The iteration did not stand still within {len(last.solution.history)} steps: the values are not final."
+            f"The iteration did not stand still within {len(last.solution.history)} steps: the values are not final. "
+            f"The largest residuals are those of {_worst(last)}."
         )
     if last.solution.termination == "diverged":
         warnings.append(
