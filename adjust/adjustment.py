@@ -74,19 +74,12 @@ def _begun_anew(network: Network, approximations: Approximations, options: Optio
 def adjust_problem(problem: Problem, options: Options, held: Iterable[int] = ()) -> Adjustment:
     """The same with a network whose quantities are numbered; those at the positions `held` stay where they start."""
     members = chosen_points(problem, options.datum_points)
-    solved = _without_bending_for_a_datum(with_datum(problem, options))
+    solved = with_datum(problem, options)
     solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options)
     if options.datum == "free":
         solution = _freed(problem, solution, members, options)
-    return _result(solution, _cofactor(problem, solution, members if options.datum == "free" else None), options)
-
-
-def _without_bending_for_a_datum(problem: Problem) -> Problem:
-    """Straight lines of sight where the datum is lacking: bent ones would hold it, but by next to nothing."""
-    bent = not problem.network.line_of_sight.is_straight
-    if bent and object_datum(problem, problem.start()).free.shape[1] > 0:
-        return replace(problem, network=replace(problem.network, line_of_sight=STRAIGHT))
-    return problem
+    result = _result(solution, _cofactor(problem, solution, members if options.datum == "free" else None), options)
+    return replace(result, network=problem.network)
 
 
 def with_datum(problem: Problem, options: Options) -> Problem:
@@ -96,7 +89,15 @@ def with_datum(problem: Problem, options: Options) -> Problem:
         unknowns = unknowns.fixed_as_given(chosen_coordinates(problem, options.datum_coordinates))
     elif options.datum != "control":
         unknowns = unknowns.fixed(minimal_datum(problem))
-    return replace(problem, unknowns=unknowns)
+    return _without_bending_for_a_datum(replace(problem, unknowns=unknowns))
+
+
+def _without_bending_for_a_datum(problem: Problem) -> Problem:
+    """Straight lines of sight where the datum is lacking: bent ones would hold it, but by next to nothing."""
+    bent = not problem.network.line_of_sight.is_straight
+    if bent and object_datum(problem, problem.start()).free.shape[1] > 0:
+        return replace(problem, network=replace(problem.network, line_of_sight=STRAIGHT))
+    return problem
 
 
 def _freed(problem: Problem, last: Run, members: Indices, options: Options) -> Run:

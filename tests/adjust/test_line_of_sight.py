@@ -12,6 +12,7 @@ from simulated import Truth, camera_point, field_points, simulated, start_of
 from adjust.adjustment import Options, adjust
 from adjust.line_of_sight import EARTH_RADIUS_M, sight_vectors
 from adjust.network import LineOfSight, Network
+from adjust.planning import plan
 from adjust.projection import approximate_image
 
 Array = NDArray[np.float64]
@@ -184,7 +185,10 @@ def test_a_free_network_under_bent_lines_of_sight() -> None:
     )
     network = replace(network, points=unknown, cameras=(replace(network.cameras[0], fiducials={}),))
     start = start_of(truth, "none", points)
-    assert len(adjust(network, start).singular) == 7
+    lacking = adjust(network, start)
+    assert len(lacking.singular) == 7
+    assert lacking.network.line_of_sight == BENT
+    assert len(plan(network, start).singular) == 7
     minimal, free = adjust(network, start, Options("minimal")), adjust(network, start, Options("free"))
     sigma = np.sqrt(minimal.cofactor_of(["IO.K.c"])[0, 0])
     assert abs(free.value("IO.K.c") - minimal.value("IO.K.c")) < 0.01 * sigma
