@@ -19,7 +19,7 @@ from pipeline.design.variations import Variations
 from pipeline.errors import InputError
 
 SCENES = Path(str(resources.files("synthetic_images").joinpath("scenes")))
-JUHL = SCENES / "juhl_crosswise.toml"
+JUHL = SCENES / "juhl_example.toml"
 PAPER_UM = {"t1": 0.7, "t2": 0.7, "t3": 0.5, "t4": 0.4, "r1": 1.8, "r2": 1.7, "r3": 0.4, "af": 0.8, "sh": 0.6}
 
 SMALL = """

@@ -53,7 +53,13 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def test_the_ready_scenes_are_those_that_are_documented() -> None:
-    assert READY == ["aerial_five.toml", "calibration_field.toml", "demo.toml", "juhl_crosswise.toml"]
+    assert READY == [
+        "aerial_five.toml",
+        "calibration_field.toml",
+        "demo.toml",
+        "juhl_crosswise.toml",
+        "juhl_example.toml",
+    ]
 
 
 @pytest.mark.parametrize("name", READY)

@@ -1,0 +1,375 @@
+"""The tables and figures of docs/design-study.md.
+
+python benchmarks/design_study.py [FOLDER]
+
+The expected precision of fiducial marks, interior orientation and distortion, the study that Torlegård announces: "for
+various testfields, cameras and photogrammetric network design"; and Juhl's table and figures 1 and 2.
+"""
+
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import synthetic_images
+from pipeline.design.alone import alone
+from pipeline.design.alternatives import gains
+from pipeline.design.expected import INTERIOR, UM_PER_MM, expect, rms
+from pipeline.design.settings import Sweep
+from pipeline.design.sweeps import Swept, over_layouts, sweep
+from pipeline.design.variations import Variations
+
+Row = Sequence[str | float]
+
+JUHL = Path(synthetic_images.__file__).parent / "scenes" / "juhl_example.toml"
+PAPER_UM = {"t1": 0.7, "t2": 0.7, "t3": 0.5, "t4": 0.4, "r1": 1.8, "r2": 1.7, "r3": 0.4, "af": 0.8, "sh": 0.6}
+LAYOUTS = 30
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera and how far away it is used: mm and object units (m)."""
+
+    name: str
+    frame_mm: float
+    c_mm: float
+    distance: float
+
+
+WIDE = Camera("wide angle, 23 x 23 / 15", 230.0, 150.0, 1500.0)
+NORMAL = Camera("normal angle, 23 x 23 / 30", 230.0, 300.0, 3000.0)
+HANDY = Camera("6 x 6 / 60 (close range)", 55.0, 60.0, 4.0)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One plan of the study; what is not said is the standard one.
+
+    relief: height of the field, both ways together, in parts of the distance. control: known, heights or unknown.
+    tilt_deg: of the outer photographs towards the middle; kappas_deg: theirs, in turn, counter-clockwise.
+    point_um: standard deviation of the given coordinates at image scale.
+    """
+
+    camera: Camera = WIDE
+    points: int = 100
+    relief: float = 0.0
+    control: str = "known"
+    photos: int = 5
+    tilt_deg: float = 0.0
+    kappas_deg: tuple[float, ...] = (0.0, 180.0, 90.0, 270.0)
+    point_um: float = 0.0
+    fiducials: int = 8
+    transformation: str = "affine"
+    target_um: float = 5.0
+    fiducial_um: float = 3.0
+    layouts: int = 5
+
+    def scene(self) -> dict[str, Any]:
+        """The scene file's values."""
+        camera = self.camera
+        half = camera.frame_mm / 2
+        side = camera.frame_mm / camera.c_mm * camera.distance  # of what a vertical photograph shows
+        sigma: float | str = self.point_um / 1000.0 * camera.distance / camera.c_mm
+        plane = {"known": sigma, "heights": "free", "unknown": "free"}[self.control]
+        height = {"known": sigma, "heights": sigma, "unknown": "free"}[self.control]
+        marks = [(x, y) for x in (1, -1) for y in (1, -1)] + [(1, 0), (-1, 0), (0, 1), (0, -1)]
+        return {
+            "camera": {
+                "name": camera.name,
+                "frame_mm": [camera.frame_mm, camera.frame_mm],
+                "principal_distance_mm": camera.c_mm,
+                "sigma": {"principal_distance_mm": "free", "principal_point_mm": "free"},
+                "distortion": {
+                    "family": "torlegard",
+                    "sigma": {"k3": "free", "k5": "free", "p1": "free", "p2": "free"},
+                },
+                "fiducial": [
+                    {"id": str(i + 1), "xy_mm": [0.92 * half * x, 0.92 * half * y], "sigma_mm": "free"}
+                    for i, (x, y) in enumerate(marks[: self.fiducials])
+                ],
+            },
+            "field": {
+                "diameter_mm": 10.0,
+                "scatter": [
+                    {
+                        "first": 1,
+                        "points": self.points,
+                        "right": [0.9 * side, 0.0, 0.0],
+                        "up": [0.0, 0.9 * side, 0.0],
+                        "relief": self.relief / 2 * camera.distance,
+                    }
+                ],
+            },
+            "scan": {"pitch_um": 20.0},
+            "image": [self._image(i) for i in range(self.photos)],
+            "design": {
+                "transformation": self.transformation,
+                "datum": "control" if self.control == "known" else "minimal",
+                "sigma_target_um": self.target_um,
+                "sigma_fiducial_um": self.fiducial_um,
+                "sigma_planimetry": plane,
+                "sigma_height": height,
+                "radii_mm": [0.435 * camera.frame_mm],
+            },
+        }
+
+    def _image(self, number: int) -> dict[str, Any]:
+        """The first over the middle, the others on a circle about it, a tenth of the distance away, or tilted to it."""
+        distance = self.camera.distance
+        if number == 0:
+            return {"name": "1", "position": [0.0, 0.0, distance], "angles_deg": [0.0, 0.0, 0.0]}
+        kappa = self.kappas_deg[(number - 1) % len(self.kappas_deg)]
+        around = 2 * math.pi * (number - 1) / max(self.photos - 1, 1)
+        tilt = math.radians(self.tilt_deg)
+        out = max(math.sin(tilt), 0.1) * distance
+        # Turned about the axis across the direction outwards, so that it looks at the middle of the field.
+        axis = np.array([-math.sin(around), math.cos(around), 0.0])
+        omega, phi, kappa_rad = _angles(axis, -tilt, math.radians(kappa))
+        return {
+            "name": str(number + 1),
+            "position": [out * math.cos(around), out * math.sin(around), math.cos(tilt) * distance],
+            "angles_deg": [math.degrees(omega), math.degrees(phi), math.degrees(kappa_rad)],
+        }
+
+
+def _angles(axis: np.ndarray[Any, Any], turn: float, kappa: float) -> tuple[float, float, float]:
+    """omega, phi, kappa of a camera that looks down, is turned about a level axis and then about its own."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    tilted = np.eye(3) + math.sin(turn) * cross + (1 - math.cos(turn)) * cross @ cross
+    roll = np.array([[math.cos(kappa), math.sin(kappa), 0], [-math.sin(kappa), math.cos(kappa), 0], [0, 0, 1]])
+    m = roll @ tilted
+    return math.atan2(-m[2, 1], m[2, 2]), math.asin(m[2, 0]), math.atan2(-m[1, 0], m[0, 0])
+
+
+HEADS = ("fiducials", "c", "x0', y0'", "radial", "tangential")
+
+
+def row(plan: Plan) -> tuple[list[float], int]:
+    """HEADS in um, of the photographs alone in the fiducials' frame, mean over layouts; the null directions.
+
+    inf: not determined. The distortion at 0.435 frame widths, 100 mm of an aerial camera.
+    """
+    scene = Variations(Path("study"), plan.scene())
+    found = []
+    defect = 0
+    for layout in range(plan.layouts):
+        expected = expect(scene.setup(layout))
+        sigmas = alone(expected)
+        marks = [sigma for name, sigma in sigmas.items() if name.startswith("FID.")]
+        c, x0, y0 = (sigmas[f"IO.{expected.camera}.{name}"] for name in INTERIOR)
+        at = expected.curve[0]
+        found.append([UM_PER_MM * rms(marks), UM_PER_MM * c, UM_PER_MM * rms([x0, y0]), at.radial_um, at.tangential_um])
+        defect = sum(sigma == math.inf for sigma in sigmas.values())
+    return [float(value) for value in np.mean(found, axis=0)], defect
+
+
+def study() -> Iterable[tuple[str, str, list[tuple[str, Plan]]]]:
+    """Key, title and plans of every table."""
+    fields = [
+        ("known, flat", Plan()),
+        ("known, relief 5 %", Plan(relief=0.05)),
+        ("known, relief 20 %", Plan(relief=0.2)),
+        ("heights only, flat", Plan(control="heights")),
+        ("heights only, relief 20 %", Plan(control="heights", relief=0.2)),
+        ("unknown (self-calibration), flat", Plan(control="unknown")),
+        ("unknown (self-calibration), relief 20 %", Plan(control="unknown", relief=0.2)),
+    ]
+    yield "fields-vertical", "Test fields, five vertical photographs", fields
+    convergent = [(words, replace(plan, tilt_deg=30.0)) for words, plan in fields]
+    yield "fields-convergent", "Test fields, one vertical and four convergent photographs (30°)", convergent
+    cameras = [
+        (f"{camera.name}, {words}", replace(plan, camera=camera))
+        for camera in (WIDE, NORMAL, HANDY)
+        for words, plan in (
+            ("vertical, relief 20 %", Plan(relief=0.2)),
+            ("convergent 30°, flat", Plan(tilt_deg=30.0)),
+        )
+    ]
+    yield "cameras", "Cameras, known field", cameras
+    yield (
+        "kappa",
+        "Kappa, five convergent photographs (30°)",
+        [
+            (f"{words}, {kind}", Plan(tilt_deg=30.0, kappas_deg=kappas, control=kind))
+            for kind in ("known", "unknown")
+            for words, kappas in (
+                ("all alike", (0.0,)),
+                ("0, 180", (0.0, 180.0)),
+                ("0, 90", (0.0, 90.0)),
+                ("0, 180, 90, 270", (0.0, 180.0, 90.0, 270.0)),
+                ("0, 90, 180, 270: the same side of the camera towards the field", (0.0, 90.0, 180.0, 270.0)),
+            )
+        ],
+    )
+    yield (
+        "transformations",
+        "Fiducials and film transformations, five convergent photographs (30°), known field",
+        [
+            (f"{kind}, {count} fiducials", Plan(tilt_deg=30.0, transformation=kind, fiducials=count))
+            for kind in ("congruent", "similarity", "affine", "bilinear", "projective", "polynomial(2)")
+            for count in (4, 8)
+            if not (kind == "polynomial(2)" and count == 4)
+        ],
+    )
+    base = Plan(tilt_deg=30.0)
+    yield (
+        "photos",
+        "Number of photographs, the first vertical, flat known field",
+        [(f"{n}", replace(base, photos=n, kappas_deg=(0.0,))) for n in (2, 3, 4, 5, 9, 17)],
+    )
+    yield (
+        "convergence",
+        "Tilt of the outer four photographs, flat known field",
+        [(f"{t}", replace(base, tilt_deg=float(t))) for t in (0, 2, 5, 10, 20, 30, 40)],
+    )
+    yield "points", "Number of points", [(f"{n}", replace(base, points=n)) for n in (12, 25, 50, 100, 200)]
+    yield (
+        "control",
+        "Standard deviation of the given coordinates, um at image scale",
+        [(f"{s:g}", replace(base, point_um=s)) for s in (0.0, 2.0, 5.0, 10.0, 20.0, 50.0)],
+    )
+    yield (
+        "fiducial-sigma",
+        "Standard deviation of the measured fiducials, um",
+        [(f"{s:g}", replace(base, fiducial_um=s)) for s in (1.0, 3.0, 5.0, 9.0)],
+    )
+
+
+def tables(folder: Path) -> str:
+    """All tables in Markdown; the numeric ones as figures too."""
+    text = []
+    for key, title, plans in study():
+        rows = [(words, row(plan)[0]) for words, plan in plans]
+        text.append(f"## {key}: {title}\n\n" + markdown(("", *HEADS), [(words, *values) for words, values in rows]))
+        print(text[-1], flush=True)
+        if key in ("photos", "convergence", "points", "control"):
+            draw_study(folder / f"{key}.png", title, rows)
+    return "\n".join(text)
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Row]) -> str:
+    """A table; numbers to two digits, a dash for what is not determined."""
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    lines += ["| " + " | ".join(_cell(cell) for cell in cells) + " |" for cells in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(cell: str | float) -> str:
+    if isinstance(cell, str):
+        return cell
+    if not math.isfinite(cell):
+        return "–"
+    return f"{cell:.0f}" if abs(cell) >= 9.95 else f"{cell:.1f}" if abs(cell) >= 0.995 else f"{cell:.2f}"
+
+
+def draw_study(path: Path, title: str, rows: list[tuple[str, list[float]]]) -> None:
+    """Standard deviations over the quantity of a table."""
+    figure, axes = _figure()
+    places = np.arange(len(rows))
+    for k, head in enumerate(HEADS):
+        values = [values[k] if math.isfinite(values[k]) else math.nan for _, values in rows]
+        axes.plot(places, values, marker="o", markersize=4, label=head)
+    axes.set_yscale("log")
+    axes.set_xticks(places, [words for words, _ in rows])
+    axes.set_xlabel(title)
+    axes.set_ylabel("expected sigma, µm")
+    axes.grid(visible=True, which="both", color="0.9")
+    axes.legend(frameon=False, fontsize=8)
+    figure.savefig(path)
+
+
+def juhl(folder: Path) -> str:
+    """His table, his figures and his fourth photograph."""
+    scene = Variations.read(JUHL)
+    scene.values["design"]["layouts"] = LAYOUTS
+    points = sweep(scene, 1, Sweep("field.points", (75, 100, 125, 150, 175, 200)))
+    heights = sweep(scene, 2, Sweep("design.sigma_height", (0.001, 0.01, 0.02, 0.04, 0.075, 0.11, 0.15, 0.225, 0.3)))
+    standard = next(step for step in points.steps if step.value == 150)
+    fourth = Variations(scene.path, scene.values | {"image": [*scene.values["image"], _fourth(scene)]})
+    after = over_layouts(fourth, expect(fourth.setup()))
+    gain = gains(standard.sigmas.mean, after.mean)
+    rows: list[Row] = [
+        (
+            name,
+            paper,
+            f"{standard.sigmas.mean[name]:.2f}",
+            f"{standard.sigmas.spread[name]:.2f}",
+            f"{100 * (standard.sigmas.mean[name] / paper - 1):+.0f} %",
+            f"{points.slope(name):.2f}",
+            f"{gain[name]:.0f} %",
+        )
+        for name, paper in PAPER_UM.items()
+    ]
+    heads = ("", "paper", "here, mean", "spread", "difference", "slope of figure 1", "fourth photograph")
+    _draw_points(folder / "juhl-figure-1.png", points)
+    _draw_heights(folder / "juhl-figure-2.png", heights)
+    by_height: list[Row] = [
+        (f"{1000 * float(step.value) / 1500:.4f}", *(f"{step.sigmas.mean[name]:.2f}" for name in PAPER_UM))
+        for step in heights.steps
+    ]
+    return markdown(heads, rows) + "\n" + markdown(("heights, per mille of H", *PAPER_UM), by_height)
+
+
+def _fourth(scene: Variations) -> dict[str, Any]:
+    return dict(scene.values["design"]["photo"][0])
+
+
+def _draw_points(path: Path, swept: Swept) -> None:
+    figure, axes = _figure()
+    counts = np.array([float(step.value) for step in swept.steps])
+    for name in PAPER_UM:
+        axes.plot(counts, [step.sigmas.mean[name] for step in swept.steps], marker="o", markersize=4, label=name)
+    first = swept.steps[0].sigmas.mean["t1"]
+    for slope, style in ((-0.5, ":"), (-0.62, "--")):
+        axes.plot(counts, 1.25 * first * (counts / counts[0]) ** slope, style, color="0.5", label=f"slope {slope}")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xticks(counts, [f"{count:g}" for count in counts])
+    axes.set_xticks([], minor=True)
+    axes.set_yticks([0.3, 0.5, 1.0, 2.0, 3.0], ["0.3", "0.5", "1", "2", "3"])
+    axes.set_yticks([], minor=True)
+    axes.set_xlabel("number of points")
+    axes.set_ylabel("expected sigma, µm")
+    axes.grid(visible=True, color="0.9")
+    axes.legend(frameon=False, fontsize=8, ncols=3)
+    figure.savefig(path)
+
+
+def _draw_heights(path: Path, swept: Swept) -> None:
+    figure, axes = _figure()
+    per_mille = [1000 * float(step.value) / 1500 for step in swept.steps]
+    for name in ("r1", "r2", "t1", "af"):
+        axes.plot(per_mille, [step.sigmas.mean[name] for step in swept.steps], marker="o", markersize=4, label=name)
+    axes.axvline(0.05, color="0.5", linestyle=":", label='0.05 ‰, the paper\'s "maybe"')
+    axes.set_xlabel("standard deviation of the heights, ‰ of the flying height")
+    axes.set_ylabel("expected sigma, µm")
+    axes.set_ylim(bottom=0.0)
+    axes.grid(visible=True, color="0.9")
+    axes.legend(frameon=False, fontsize=8)
+    figure.savefig(path)
+
+
+def _figure() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(6.0, 4.0), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.add_subplot()
+
+
+def main() -> None:
+    """Print the tables, write the figures."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path("docs/design")
+    folder.mkdir(parents=True, exist_ok=True)
+    print(juhl(folder), flush=True)
+    tables(folder)
+
+
+if __name__ == "__main__":
+    main()
