@@ -16,6 +16,7 @@ from synthetic_images.scene import SceneImage
 Array = NDArray[np.float64]
 
 QUARTER = math.pi / 2
+FOUND = 100.0  # the gain where only the changed plan determines a quantity
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def gains(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, 
 
 def _gain(before: float, after: float) -> float:
     if math.isinf(before):
-        return math.nan if math.isinf(after) else 100.0
+        return math.nan if math.isinf(after) else FOUND
     return -math.inf if math.isinf(after) else 100.0 * (1.0 - after / before)
 
 

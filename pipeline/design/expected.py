@@ -131,6 +131,7 @@ class Expected:
         values = np.array([adjustment.value(f"IO.{self.camera}.{name}") for name in self._parameters])
         lens = Lens(self.camera, self.network.cameras[0].distortion, interior, values)
         by_c_and_parameters = displacement(lens, radius_mm * outward).by_unknowns_um
+        by_c_and_parameters[np.abs(by_c_and_parameters) < ROUNDING_UM] = 0.0  # most families do not depend on c
         radial = np.einsum("di,dik->dk", outward, by_c_and_parameters)
         tangential = np.einsum("di,dik->dk", across, by_c_and_parameters)
         ray = _ray_by_unknowns(lens, radius_mm * outward)

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.design.alternatives import Alternative
+from pipeline.design.alternatives import FOUND, Alternative
 from pipeline.design.expected import Expected, rms
 from pipeline.design.reliability import error_unit
 from pipeline.design.sweeps import Layouts, Swept
@@ -183,6 +183,9 @@ def _sigma(sigma: float) -> str:
 
 
 def _gain(percent: float) -> str:
+    """Of a standard deviation; found: what was not determined is, lost: the reverse."""
     if math.isnan(percent):
-        return "–"
+        return NONE
+    if percent == FOUND:
+        return "found"
     return "lost" if math.isinf(percent) else fixed(percent, 0)
