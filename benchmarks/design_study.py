@@ -278,6 +278,7 @@ def draw_study(path: Path, title: str, rows: list[tuple[str, list[float]]]) -> N
         values = [values[k] if math.isfinite(values[k]) else math.nan for _, values in rows]
         axes.plot(places, values, marker="o", markersize=4, label=head)
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xticks(places, [words for words, _ in rows])
     axes.set_xlabel(title)
     axes.set_ylabel("expected sigma, µm")
@@ -329,7 +330,7 @@ def _draw_points(path: Path, swept: Swept) -> None:
         axes.plot(counts, [step.sigmas.mean[name] for step in swept.steps], marker="o", markersize=4, label=name)
     first = swept.steps[0].sigmas.mean["t1"]
     for slope, style in ((-0.5, ":"), (-0.62, "--")):
-        axes.plot(counts, 1.25 * first * (counts / counts[0]) ** slope, style, color="0.5", label=f"slope {slope}")
+        axes.plot(counts, 1.8 * first * (counts / counts[0]) ** slope, style, color="0.5", label=f"slope {slope}")
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xticks(counts, [f"{count:g}" for count in counts])
@@ -339,7 +340,7 @@ def _draw_points(path: Path, swept: Swept) -> None:
     axes.set_xlabel("number of points")
     axes.set_ylabel("expected sigma, µm")
     axes.grid(visible=True, color="0.9")
-    axes.legend(frameon=False, fontsize=8, ncols=3)
+    figure.legend(frameon=False, fontsize=8, ncols=6, loc="outside upper center")
     figure.savefig(path)
 
 
