@@ -84,11 +84,15 @@ def contradictions(search: Search) -> list[Contradiction]:
     scale. That is learnt without what contradicts the others, for in a small network one gross error spoils all.
     """
     covariance = _Covariance(search)
-    scale = _start_scale(search)
+    most = min(int(MOST_SUSPECT * len(search.critical)), MOST_AT_ONCE)
+    scale = _median_scale(search, covariance, []) if len(search.end.v_mm) > MANY else 1.0
     while True:
         limits = scale**2 * search.critical
-        chosen = _chosen(search, covariance, limits)
-        learnt = significant_scale(*_rest(search, covariance, chosen), search.probabilities)
+        chosen = _chosen(search, covariance, limits, most)
+        if len(chosen) < most:
+            learnt = significant_scale(*_rest(search, covariance, chosen), search.probabilities)
+        else:  # there may be more, which the sum of squares would take for a bad scale
+            learnt = _median_scale(search, covariance, chosen)
         if learnt <= RAISED * scale:
             return [_contradiction(search, covariance, chosen, unit, limits) for unit in chosen]
         scale = learnt
@@ -106,17 +110,14 @@ def limits(search: Search) -> Array:
     return np.asarray(scale**2 * search.critical)
 
 
-def _start_scale(search: Search) -> float:
-    """1, and what the median tells where image points are so many that some gross errors do not move it."""
-    observed = len(search.end.v_mm)
-    if observed < MANY:
-        return 1.0
-    tests = statistics(search.found, search.weighting.weights)
-    return max(1.0, robust_scale(tests.statistic[:observed], tests.sizes[:observed]))
+def _median_scale(search: Search, covariance: "_Covariance", left_out: Sequence[int]) -> float:
+    """What the median of the other image points' statistics tells, no less than 1."""
+    points = np.setdiff1d(np.arange(len(search.end.v_mm)), left_out)
+    sizes = np.where(np.isfinite(search.critical[points]), 2, 0)
+    return max(1.0, robust_scale(_without(search, covariance, left_out)[points], sizes))
 
 
-def _chosen(search: Search, covariance: "_Covariance", limits: Array) -> list[int]:
-    most = min(int(MOST_SUSPECT * len(limits)), MOST_AT_ONCE)
+def _chosen(search: Search, covariance: "_Covariance", limits: Array, most: int) -> list[int]:
     chosen: list[int] = []
     for _ in range(2 * most):
         statistic = _without(search, covariance, chosen)
