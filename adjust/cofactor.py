@@ -16,8 +16,6 @@ from adjust.rotation import vector_by_angles
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-AT_ONCE = 300  # quantities whose cofactors are computed together
-
 
 @dataclass(frozen=True)
 class NoCofactor:
@@ -79,9 +77,12 @@ class FactorCofactor:
         plain = self.factor.variances()
         entries = np.diff(self.by_free.indptr)
         variances = self.by_free.multiply(self.by_free) @ plain
-        several = np.flatnonzero(entries > 1)  # those of one image stand together, and so do their parts here
-        for part in np.split(several, range(AT_ONCE, len(several), AT_ONCE)):
-            variances[part] = np.diag(self.factor.cofactor_of(self.by_free[part]))
+        for count in np.unique(entries[entries > 1]):  # functions of so many unknowns, all of one image
+            rows = np.flatnonzero(entries == count)
+            functions = self.by_free[rows]
+            by_unknowns = functions.data.reshape(-1, 1, count)
+            cofactors = self.factor.cofactors(functions.indices.reshape(-1, count).astype(np.intp))
+            variances[rows] = (by_unknowns @ cofactors @ by_unknowns.swapaxes(1, 2))[:, 0, 0]
         return np.asarray(variances if self.datum is None else np.maximum(variances + self.datum.variances, 0.0))
 
 

@@ -108,6 +108,23 @@ class Factor:
             variances[block.own] = (own**2).sum(axis=2) + (through**2).sum(axis=2)
         return variances / self.scale**2
 
+    def cofactors(self, groups: Indices) -> Array:
+        """The cofactor matrices (g, k, k) of groups of unknowns (g, k), each of one block's own or of shared ones."""
+        cofactors = np.empty((*groups.shape, groups.shape[1]))
+        shared = groups[:, 0] < self.shared_count
+        cofactors[shared] = self._shared_cofactor[groups[shared][:, :, None], groups[shared][:, None, :]]
+        row = np.full(len(self.scale), -1, dtype=np.intp)
+        for block in self.blocks:
+            row[block.own] = np.arange(block.own.size).reshape(block.own.shape)
+            members = np.flatnonzero(row[groups[:, 0]] >= 0)
+            if len(members):
+                root = np.concatenate(self._roots(block), axis=2)
+                root = root.reshape(block.own.size, root.shape[2])[row[groups[members]]]
+                cofactors[members] = root @ root.swapaxes(1, 2)
+            row[block.own] = -1
+        scale = self.scale[groups]
+        return cofactors / (scale[:, :, None] * scale[:, None, :])
+
     def cofactor_of(self, functions: csr_array) -> Array:
         """The cofactor matrix (k, k) of linear functions (k, n) of the unknowns."""
         columns = (functions / self.scale).tocsc()

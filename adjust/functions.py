@@ -97,11 +97,13 @@ def derivatives(problem: Problem, state: State, xy_mm: Array) -> Derivatives:
         by_attitude = -by_in_camera @ cross_matrix(in_camera) @ attitude[images]
         by_camera_xy[rows] = at.by_xy
         seen = _sight(problem, state, rows)
-        by_unknowns[rows, :, EXTERIOR] = np.concatenate([by_vector @ seen.by_station, by_attitude], axis=2)
-        by_unknowns[rows, :, PLACE] = by_vector @ seen.by_point
+        of_targets = np.zeros((len(rows), *by_unknowns.shape[1:]))
+        of_targets[:, :, EXTERIOR] = np.concatenate([by_vector @ seen.by_station, by_attitude], axis=2)
+        of_targets[:, :, PLACE] = by_vector @ seen.by_point
         by_camera = np.concatenate([at.by_interior, at.by_parameters], axis=2)
         first = problem.camera_columns.start
-        by_unknowns[rows, :, first : first + by_camera.shape[2]] = by_camera
+        of_targets[:, :, first : first + by_camera.shape[2]] = by_camera
+        by_unknowns[rows] = of_targets
     by_film = film.by_parameters + (by_camera_xy - np.eye(2)) @ at_distorted.by_parameters
     by_unknowns[:, :, problem.film_columns] = by_film
     return Derivatives(film.by_xy if problem.by_elements else by_camera_xy @ film.by_xy, by_unknowns)

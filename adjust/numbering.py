@@ -20,7 +20,8 @@ class Touched:
     """What b blocks of equal shape touch: their own and shared free unknowns, and where every derivative goes.
 
     rows (b, m): the observations of every block; own (b, o), shared (b, s): numbers of unknowns. columns (b, m, k): the
-    column, own unknowns first, of every derivative; one column behind the last for what is fixed or absent.
+    column, own unknowns first, of every derivative; one column behind the last for what is fixed or absent. Where all
+    blocks or all observations agree, b or m is 1.
     """
 
     rows: Indices
@@ -182,4 +183,12 @@ def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterat
             rows = order[first_row[some][:, None] + np.arange(height)]
             own_and_shared = unknown[first[some][:, None] + np.arange(width)]
             of_rows = np.where(columns[rows] == ABSENT, width, columns[rows])
-            yield Touched(rows, own_and_shared[:, :own_count], own_and_shared[:, own_count:], of_rows)
+            yield Touched(rows, own_and_shared[:, :own_count], own_and_shared[:, own_count:], _agreed(of_rows))
+
+
+def _agreed(columns: Indices) -> Indices:
+    for axis in (0, 1):
+        first = columns.take(range(min(1, columns.shape[axis])), axis=axis)
+        if (columns == first).all():
+            columns = first
+    return columns

@@ -85,11 +85,9 @@ class Problem:
         for positions, by_centred in self.films_by_centred(state):
             values[positions] = state.values[positions] + (by_centred @ step[positions][..., None])[..., 0]
         rotations = rotation_from_vector(step[self.exterior[:, 3:]]) @ state.rotations
-        for i, positions in enumerate(self.exterior[:, 3:]):
-            if self.keeps_angles[i]:
-                rotations[i] = rotation_from_angles(values[positions])
-            else:
-                values[positions] = angles_near(rotations[i], state.values[positions])
+        kept, told = self.exterior[self.keeps_angles, 3:], self.exterior[~self.keeps_angles, 3:]
+        rotations[self.keeps_angles] = rotation_from_angles(values[kept])
+        values[told] = angles_near(rotations[~self.keeps_angles], state.values[told])
         return State(values, rotations)
 
     def attitude_by_unknowns(self, state: State) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.distortion import image_equations
-from adjust.families import parameter_names
+from adjust.families import family, parameter_names
 from adjust.line_of_sight import sight_vectors
 from adjust.network import EXTERIOR_NAMES, STRAIGHT, Approximations, Distortion, Image, LineOfSight, Network
 from adjust.result import Adjustment
@@ -123,15 +123,19 @@ def camera_from_ray(distortion: Distortion, interior: Array, parameters: Array, 
     The correction is defined at the observed point, so that it is inverted by Newton's method. Where the distortion
     folds the image over, which a polynomial does far enough outside, nothing is found.
     """
-    xy_mm = interior[1:] + interior[0] * ray
-    tolerance_mm = NEWTON_TOLERANCE * (abs(interior[0]) + np.abs(xy_mm).max(initial=0.0))
+    c, principal_point = interior[0], interior[1:]
+    xy_mm = principal_point + c * ray
+    tolerance_mm = NEWTON_TOLERANCE * (abs(c) + np.abs(xy_mm).max(initial=0.0))
     found = np.zeros(len(ray), dtype=bool)
+    of = family(distortion.family)
     with np.errstate(over="ignore", invalid="ignore"):
+        imaged = of.image(ray, parameters)
+        ideal_mm, unfolded = principal_point + c * imaged.value, _unfolded(imaged.by_ray)
         for _ in range(NEWTON_STEPS):
-            at = image_equations(distortion, interior, parameters, xy_mm, ray)
-            step, regular = _solved(at.by_xy, at.value)
+            correction = of.correct(distortion, xy_mm, principal_point, parameters)
+            step, regular = _solved(np.eye(2) - correction.by_xy, xy_mm - ideal_mm - correction.value)
             xy_mm = xy_mm - step
-            found = regular & _unfolded(at.by_ray) & (np.abs(step).max(axis=1) <= 4 * tolerance_mm)
+            found = regular & unfolded & (np.abs(step).max(axis=1) <= 4 * tolerance_mm)
             if found.all():
                 break
     return xy_mm, found

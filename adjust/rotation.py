@@ -24,21 +24,24 @@ def rotation_from_angles(angles_rad: Array) -> Array:
 
 
 def angles_from_rotation(rotation: Array) -> Array:
-    """omega, phi, kappa (3,) of a rotation matrix; omega is set to 0 where phi is +-90 degrees."""
-    cos_phi = np.hypot(rotation[2, 1], rotation[2, 2])
-    phi = np.arctan2(rotation[2, 0], cos_phi)
-    if cos_phi < GIMBAL_LOCK:
-        return np.array([0.0, phi, np.arctan2(rotation[0, 1], rotation[1, 1])])
-    omega = np.arctan2(-rotation[2, 1], rotation[2, 2])
-    return np.array([omega, phi, np.arctan2(-rotation[1, 0], rotation[0, 0])])
+    """omega, phi, kappa (..., 3) of rotation matrices (..., 3, 3); omega is set to 0 where phi is +-90 degrees."""
+    cos_phi = np.hypot(rotation[..., 2, 1], rotation[..., 2, 2])
+    locked = cos_phi < GIMBAL_LOCK
+    omega = np.where(locked, 0.0, np.arctan2(-rotation[..., 2, 1], rotation[..., 2, 2]))
+    phi = np.arctan2(rotation[..., 2, 0], cos_phi)
+    free = np.arctan2(-rotation[..., 1, 0], rotation[..., 0, 0])
+    kappa = np.where(locked, np.arctan2(rotation[..., 0, 1], rotation[..., 1, 1]), free)
+    return np.stack([omega, phi, kappa], axis=-1)
 
 
 def angles_near(rotation: Array, reference_rad: Array) -> Array:
-    """omega, phi, kappa (3,) of a rotation matrix, of all triples that describe it the nearest to the reference."""
-    omega, phi, kappa = angles_from_rotation(rotation)
-    triples = np.array([[omega, phi, kappa], [omega + np.pi, np.pi - phi, kappa + np.pi]])
+    """omega, phi, kappa (..., 3) of rotation matrices, of all triples for one the nearest to the reference."""
+    angles = angles_from_rotation(rotation)
+    other = np.array([np.pi, np.pi, np.pi]) + angles * np.array([1.0, -1.0, 1.0])
+    triples = np.stack([angles, other])
     triples += 2.0 * np.pi * np.round((reference_rad - triples) / (2.0 * np.pi))
-    return np.asarray(triples[np.argmin(((triples - reference_rad) ** 2).sum(axis=1))])
+    first, second = ((triples - reference_rad) ** 2).sum(axis=-1)
+    return np.asarray(np.where((first <= second)[..., None], triples[0], triples[1]))
 
 
 def rotation_from_vector(vector_rad: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from adjust.elimination import Blocks, Sums
 from adjust.functions import Derivatives
 from adjust.further_observations import FurtherObservation
-from adjust.numbering import Numbering, Touched
+from adjust.numbering import ELEMENTS_AT_ONCE, Numbering, Touched
 from adjust.problem import ABSENT, Problem, State
 
 Array = NDArray[np.float64]
@@ -17,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WhitenedRows:
-    """Rows of unit weight; in turn the blocks of `Numbering.touched`, each put together as it is asked for.
+    """Rows of unit weight; in turn the blocks of `Numbering.touched`, of large networks put together as asked for.
 
     A block for each further observation follows. root (n, 2, 2): the factor L of A C A' = L L'; matrix (n, 2, k): by
     the unknowns of `Numbering.used`; right (n, 2).
@@ -30,6 +31,13 @@ class WhitenedRows:
     further: tuple[Blocks, ...]
 
     def __iter__(self) -> Iterator[Blocks]:
+        yield from self._at_hand if self.matrix.size <= ELEMENTS_AT_ONCE else self._put_together()
+
+    @cached_property
+    def _at_hand(self) -> list[Blocks]:
+        return list(self._put_together())
+
+    def _put_together(self) -> Iterator[Blocks]:
         for touched in self.numbering.touched:
             yield _blocks(touched, self.matrix[touched.rows], self.right[touched.rows])
         yield from self.further
@@ -73,8 +81,13 @@ def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
     """The rows (b, m, 2, k) of blocks of equal shape with every derivative in its unknown's column."""
     (count, height), width = touched.rows.shape, touched.own.shape[1] + touched.shared.shape[1]
     dense = np.zeros((count, height, 2, width + 1))
-    columns = np.broadcast_to(touched.columns[:, :, None, :], matrix.shape)
-    np.put_along_axis(dense, columns, matrix, axis=3)
+    if len(touched.columns) == 1 and touched.columns.shape[1] <= count:
+        for row, columns in enumerate(touched.columns[0]):
+            rows = slice(None) if touched.columns.shape[1] == 1 else slice(row, row + 1)
+            dense[:, rows, :, columns] = matrix[:, rows]
+    else:
+        columns = np.broadcast_to(touched.columns[:, :, None, :], matrix.shape)
+        np.put_along_axis(dense, columns, matrix, axis=3)
     dense = dense[..., :width].reshape(count, 2 * height, width)
     return Blocks(touched.own, touched.shared, dense, right.reshape(count, 2 * height))
 

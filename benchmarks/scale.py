@@ -1,0 +1,337 @@
+"""Time and memory of large adjustments beside OpenCV, SciPy and Ceres, each in a process of its own with one thread.
+
+python benchmarks/scale.py                      the whole table
+python benchmarks/scale.py known reseau 200     one measurement: task, program, views
+python benchmarks/scale.py unknown ceres 200 20000
+
+A single measurement is of as many threads as OPENBLAS_NUM_THREADS says.
+
+Ceres is measured where pycolmap is installed, which brings it. CPU seconds are told, so that other work does not count.
+"""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import splu
+
+from adjust.adjustment import adjust
+from adjust.iteration import linearise
+from adjust.network import (
+    Approximations,
+    Camera,
+    Distortion,
+    Exterior,
+    Image,
+    Network,
+    ObjectPoint,
+    Observations,
+    Prior,
+)
+from adjust.numbering import Numbering
+from adjust.problem import ABSENT, number
+from adjust.rotation import rotation_from_angles
+
+Array = NDArray[np.float64]
+Figures = dict[str, Any]
+
+VIEWS, VIEWS_OF_RESEAU_ALONE = (50, 200, 1000), (4000,)
+NETWORKS = ((50, 2000), (200, 20000))  # images and unknown points
+PATIENCE_S = 900.0
+SIGMA_MM = 0.005
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
+FOCAL_MM, FRAME_MM = 100.0, 200.0
+ESTIMATED = {"known": ("k1", "k2", "p1", "p2", "k3"), "unknown": ("k1", "k2")}
+TRUE = {"k1": -0.05, "k2": 0.02}
+FLIP = np.diag([1.0, -1.0, -1.0])  # from axes with y up, looking along -z, to OpenCV's
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A network to adjust, with what other programs need of it.
+
+    points (p, 3); seen: per image the points' numbers and their places (m, 2) in mm, y up.
+    """
+
+    network: Network
+    start: Approximations
+    points: Array
+    seen: list[tuple[NDArray[np.intp], Array]]
+
+
+def main() -> None:
+    """One measurement, or all of them."""
+    if len(sys.argv) > 1:
+        task, program, *sizes = sys.argv[1:]
+        print(json.dumps(PROGRAMS[task, program](*map(int, sizes))))
+        return
+    print("100 known points, full covariance of the camera; CPU seconds of one thread, peak MiB")
+    print(f"{'views':>7} {'reseau':>16} {'OpenCV':>16} {'ratio':>7}")
+    for views in VIEWS:
+        ours, theirs = measured("known", "reseau", views), measured("known", "opencv", views)
+        ratio = f"{theirs['seconds'] / ours['seconds']:7.1f}" if "seconds" in theirs else f"{'':>7}"
+        print(f"{views:7} {_figures(ours)} {_figures(theirs)} {ratio}")
+    for views in VIEWS_OF_RESEAU_ALONE:
+        print(f"{views:7} {_figures(measured('known', 'reseau', views))}")
+    print("\nUnknown points; the covariance that each gives in the time behind +")
+    for images, points in NETWORKS:
+        print(f"{images} images, {points} points")
+        vpv = {}
+        for program in ("reseau", "scipy", "ceres"):
+            found = measured("unknown", program, images, points)
+            print(f"    {program:8} {_figures(found)}  {found.get('says', '')}")
+            if "vpv" in found and found.get("finished", True):
+                vpv[program] = found["vpv"]
+        different = [name for name in vpv if abs(vpv[name] / vpv["reseau"] - 1.0) > 1e-6]
+        same = ", ".join(name for name in vpv if name not in different)
+        print(f"    the same minimum v'Pv = {vpv['reseau']:.6f}: {same}")
+        if different:
+            sys.exit(f"another minimum: {', '.join(f'{name} {vpv[name]:.6f}' for name in different)}")
+
+
+def measured(task: str, program: str, *sizes: int) -> Figures:
+    """The figures of one measurement in a process of its own."""
+    command = [sys.executable, __file__, task, program, *map(str, sizes)]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=2 * PATIENCE_S, check=False, env=os.environ | ONE_THREAD
+        )
+    except subprocess.TimeoutExpired:
+        return {"says": f"not done in {2 * PATIENCE_S:.0f} s"}
+    if done.returncode:
+        return {"says": f"not measured: {done.stderr.strip().splitlines()[-1]}"}
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def _figures(found: Figures) -> str:
+    if "seconds" not in found:
+        return f"{'-':>16}"
+    covariance = f"+{found['covariance_seconds']:.1f}" if "covariance_seconds" in found else ""
+    return f"{found['seconds']:.2f}{covariance} s {found['mib']:.0f}".rjust(16)
+
+
+def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    begin = time.process_time()
+    result = work()
+    return result, time.process_time() - begin
+
+
+def _peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def known(views: int) -> Scene:
+    """A board of 100 points with some relief, all of them in every view."""
+    rng = np.random.default_rng(views)
+    grid = (np.arange(10) - 4.5) * 0.1
+    plan = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    points = np.column_stack([plan, 0.05 * rng.normal(size=len(plan))])
+    angles = np.column_stack([rng.uniform(-0.5, 0.5, (views, 2)), rng.uniform(-3.0, 3.0, views)])
+    offset = np.column_stack([0.1 * rng.normal(size=(views, 2)), np.full(views, -1.2)])
+    stations = -np.einsum("nij,ni->nj", rotation_from_angles(angles), offset)
+    return _scene(rng, points, stations, angles, "known", np.zeros(len(points)), 0.002)
+
+
+def unknown(images: int, points: int) -> Scene:
+    """An aerial block of 60 % overlap along and across, attitudes within some degrees, one point in a hundred known."""
+    rng = np.random.default_rng(images)
+    across = int(np.sqrt(images / 2))
+    base, height = 0.4 * FRAME_MM, 1.0 * FOCAL_MM
+    place = np.array([(i * base, j * base) for i in range(images // across) for j in range(across)])
+    low, high = place.min(axis=0) - 0.3 * base, place.max(axis=0) + 0.3 * base
+    xyz = np.column_stack([rng.uniform(low, high, (points, 2)), rng.uniform(-10.0, 10.0, points)])
+    stations = np.column_stack([place, np.full(len(place), height)]) + rng.normal(size=(len(place), 3))
+    angles = (
+        0.05 * rng.normal(size=(len(place), 3))
+        + np.array([0.0, 0.0, 1.0]) * rng.integers(0, 4, (len(place), 1)) * np.pi / 2
+    )
+    sigma = np.where(np.arange(points) % 100 == 0, 0.0, np.inf)
+    return _scene(rng, xyz, stations, angles, "unknown", sigma, 0.02)
+
+
+def _scene(
+    rng: np.random.Generator, points: Array, stations: Array, angles: Array, task: str, sigma: Array, error: float
+) -> Scene:
+    """What OpenCV projects, with noise; approximations wrong by an error in object units, hundredths of it in rad."""
+    matrix = np.diag([FOCAL_MM, FOCAL_MM, 1.0])
+    lens = np.array([TRUE["k1"], TRUE["k2"], 0.0, 0.0, 0.0])
+    seen = []
+    for station, rotation in zip(stations, FLIP @ rotation_from_angles(angles), strict=True):
+        vector = cv2.Rodrigues(rotation)[0]
+        projected = cv2.projectPoints(points, vector, -rotation @ station, matrix, lens)[0].reshape(-1, 2)
+        inside = np.flatnonzero((np.abs(projected) < FRAME_MM / 2).all(axis=1))
+        places = projected[inside] * (1.0, -1.0) + SIGMA_MM * rng.normal(size=(len(inside), 2))
+        seen.append((inside, places))
+    rays = np.bincount(np.concatenate([inside for inside, _ in seen]), minlength=len(points))
+    names = [f"i{i}" for i in range(len(seen))]
+    free = {name: Prior(0.0, np.inf) for name in ESTIMATED[task]}
+    free_point = Prior(FOCAL_MM, np.inf), Prior(0.0, np.inf), Prior(0.0, np.inf)
+    seen = [(inside[rays[inside] > 1], places[rays[inside] > 1]) for inside, places in seen]
+    network = Network(
+        (Camera("K", *free_point, Distortion("opencv", free)),),
+        tuple(Image(name, "K", "none") for name in names),
+        tuple(
+            ObjectPoint(str(i), *(Prior(float(x)) if s == 0.0 else None for x in xyz))
+            for i, (xyz, s) in enumerate(zip(points, sigma, strict=True))
+        ),
+        Observations(
+            tuple(name for name, (inside, _) in zip(names, seen, strict=True) for _ in inside),
+            tuple(str(i) for inside, _ in seen for i in inside),
+            tuple("target" for inside, _ in seen for _ in inside),
+            np.concatenate([places for _, places in seen]),
+            np.tile(SIGMA_MM**2 * np.eye(2), (sum(len(inside) for inside, _ in seen), 1, 1)),
+        ),
+    )
+    start = Approximations(
+        {"K": np.array([FOCAL_MM * 1.005, 0.0, 0.0])},
+        {
+            name: np.concatenate([station + error * rng.normal(size=3), angle + 0.01 * error * rng.normal(size=3)])
+            for name, station, angle in zip(names, stations, angles, strict=True)
+        },
+        {},
+        {str(i): xyz + error * rng.normal(size=3) for i, xyz in enumerate(points)},
+    )
+    return Scene(network, start, points, seen)
+
+
+def reseau(scene: Scene) -> Figures:
+    """With the standard deviations of everything."""
+    result, seconds = _timed(lambda: adjust(scene.network, scene.start))
+    assert result.converged
+    cameras = [name for name in result.names if name.startswith("IO.")]
+    _, more = _timed(lambda: (result.cofactor.variances, result.cofactor_of(cameras)))
+    return {"seconds": seconds + more, "mib": _peak_mib(), "vpv": result.vpv, "says": "everything"}
+
+
+def opencv(scene: Scene) -> Figures:
+    """OpenCV's calibration with its standard deviations, from the same principal distance."""
+    cv2.setNumThreads(1)
+    model = [scene.points[inside].astype(np.float32) for inside, _ in scene.seen]
+    imaged = [((places * (1.0, -1.0) + FRAME_MM / 2) * 10.0).astype(np.float32) for _, places in scene.seen]
+    size = int(10 * FRAME_MM)
+    start = np.array([[10 * FOCAL_MM * 1.005, 0.0, size / 2], [0.0, 10 * FOCAL_MM * 1.005, size / 2], [0.0, 0.0, 1.0]])
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO
+    found, seconds = _timed(
+        lambda: cv2.calibrateCameraExtended(model, imaged, (size, size), start, np.zeros(5), flags=flags)
+    )
+    count = sum(len(inside) for inside, _ in scene.seen)
+    return {"seconds": seconds, "mib": _peak_mib(), "vpv": found[0] ** 2 * count / (10 * SIGMA_MM) ** 2}
+
+
+def scipy(scene: Scene) -> Figures:
+    """Trust region with LSMR on the same residuals and their analytic sparse Jacobian; then the camera's covariance."""
+    exterior = np.full(6, np.inf)
+    exterior[3:] = 1e6  # angles as unknowns, all but free: they add up
+    images = tuple(
+        replace(image, exterior=Exterior(scene.start.exterior[image.name], exterior)) for image in scene.network.images
+    )
+    problem = number(replace(scene.network, images=images), scene.start)
+    numbering, first = Numbering(problem), problem.start()
+    numbers = numbering.numbers[problem.columns[:, numbering.used]]
+    covariance = problem.network.observations.covariance_mm2
+
+    def at(x: Array) -> tuple[Array, csr_array]:
+        step = np.zeros(len(problem.unknowns))
+        step[numbering.free] = x
+        linear = linearise(numbering, covariance, problem.moved(first, step))
+        assert linear is not None
+        by = -np.linalg.solve(linear.at.by_observation, linear.rows.root @ linear.rows.matrix) / SIGMA_MM
+        used = np.broadcast_to((numbers != ABSENT)[:, None, :], by.shape)
+        rows = np.broadcast_to(np.arange(2 * len(by)).reshape(-1, 2, 1), by.shape)
+        columns = np.broadcast_to(numbers[:, None, :], by.shape)
+        shape = 2 * len(by), len(x)
+        return linear.v_mm.ravel() / SIGMA_MM, csr_array((by[used], (rows[used], columns[used])), shape=shape)
+
+    begin = time.process_time()
+
+    def patient(**_: Any) -> None:
+        if time.process_time() - begin > PATIENCE_S:
+            raise StopIteration
+
+    zero = np.zeros(len(numbering.free))
+    solve: Any = least_squares
+    found = solve(
+        lambda x: at(x)[0], zero, lambda x: at(x)[1], x_scale="jac", method="trf", tr_solver="lsmr",
+        ftol=1e-10, xtol=1e-10, gtol=1e-10, max_nfev=200, callback=lambda intermediate_result: patient(),
+    )  # fmt: skip
+    seconds = time.process_time() - begin
+    says = f"{found.nfev} evaluations" + ("" if found.status > 0 else ", stopped before it converged")
+
+    def of_camera() -> Array:
+        jacobian = found.jac
+        scale = diags_array(1.0 / np.sqrt((jacobian**2).sum(axis=0)))
+        normal = (scale @ jacobian.T @ jacobian @ scale).tocsc()
+        factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        camera = numbering.numbers[problem.unknowns.camera["K"]]
+        return np.asarray(factor.solve(np.eye(len(zero))[:, camera[camera != ABSENT]]))
+
+    _, more = _timed(of_camera)
+    return {
+        "seconds": seconds, "covariance_seconds": more, "mib": _peak_mib(), "vpv": 2.0 * float(found.cost),
+        "finished": found.status > 0, "says": f"{says}; covariance of the camera alone",
+    }  # fmt: skip
+
+
+def ceres(scene: Scene) -> Figures:
+    """COLMAP's bundle adjustment by Ceres, and its covariance of camera, images and points by the Schur complement."""
+    import pycolmap
+
+    unit = 1.0 / SIGMA_MM  # pixels of unit weight
+    parameters = unit * np.array([FOCAL_MM * 1.005, 0.0, 0.0, 0.0, 0.0])
+    block = pycolmap.Reconstruction()
+    block.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="RADIAL", width=1, height=1, params=parameters)
+    )
+    config = pycolmap.BundleAdjustmentConfig()
+    tracks: dict[int, Any] = {}
+    for number_, (image, (inside, places)) in enumerate(zip(scene.network.images, scene.seen, strict=True), 1):
+        start = scene.start.exterior[image.name]
+        rotation = FLIP @ rotation_from_angles(start[3:])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ start[:3])
+        marks = pycolmap.Point2DList([pycolmap.Point2D(place * (unit, -unit)) for place in places])
+        shown = pycolmap.Image(image_id=number_, camera_id=1, name=image.name, points2D=marks)
+        block.add_image_with_trivial_frame(shown, pose)
+        config.add_image(number_)
+        for place, i in enumerate(inside):
+            tracks.setdefault(int(i), pycolmap.Track()).add_element(number_, place)
+    numbers = {i: block.add_point3D(scene.start.points[str(i)], track) for i, track in tracks.items()}
+    for i, number_ in numbers.items():
+        if scene.network.points[i].X is not None:
+            block.points3D[number_].xyz = scene.points[i]
+            config.add_constant_point(number_)
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+    solver = options.ceres.solver_options
+    solver.num_threads, solver.max_num_iterations = 1, 100
+    solver.function_tolerance = 1e-12
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, block)
+    summary, seconds = _timed(adjuster.solve)
+    wanted = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
+    covariance, more = _timed(lambda: pycolmap.estimate_ba_covariance(wanted, block, adjuster))
+    return {
+        "seconds": seconds, "covariance_seconds": more, "mib": _peak_mib(),
+        "vpv": 2.0 * summary.ceres_summary.final_cost,
+        "says": "everything" if covariance is not None else "its covariance failed",
+    }  # fmt: skip
+
+
+PROGRAMS: dict[tuple[str, str], Callable[..., Figures]] = {
+    ("known", "reseau"): lambda views: reseau(known(views)),
+    ("known", "opencv"): lambda views: opencv(known(views)),
+    ("unknown", "reseau"): lambda images, points: reseau(unknown(images, points)),
+    ("unknown", "scipy"): lambda images, points: scipy(unknown(images, points)),
+    ("unknown", "ceres"): lambda images, points: ceres(unknown(images, points)),
+}
+
+if __name__ == "__main__":
+    main()
