@@ -30,6 +30,9 @@ class NoCofactor:
     def of(self, at: Indices) -> Array:
         return np.zeros((len(at), len(at)))
 
+    def of_each(self, groups: Indices) -> Array:
+        return np.zeros((*groups.shape, groups.shape[1]))
+
 
 @dataclass(frozen=True)
 class Datum:
@@ -70,6 +73,21 @@ class FactorCofactor:
         """The cofactor matrix (k, k) of some quantities, by their positions in the result."""
         cofactor = self.factor.cofactor_of(self.by_free[at])
         return cofactor if self.datum is None else cofactor + self.datum.of(at)
+
+    def of_each(self, groups: Indices) -> Array:
+        """The cofactor matrices (g, k, k) of groups of quantities (g, k), each of one point's or of one image's."""
+        functions = self.by_free[groups.ravel()]
+        if np.diff(functions.indptr).max(initial=0) > 1:  # angles and film parameters, of images: these are few
+            return np.array([self.of(at) for at in groups])
+        number = np.full(groups.shape, -1, dtype=np.intp)
+        number.reshape(-1)[np.diff(functions.indptr) == 1] = functions.indices
+        free = number >= 0
+        cofactors = np.zeros((*groups.shape, groups.shape[1]))
+        some = free.any(axis=1)
+        stand_in = number.max(axis=1, keepdims=True)  # for what is fixed
+        cofactors[some] = self.factor.cofactors(np.where(free, number, stand_in)[some])
+        cofactors *= free[:, :, None] & free[:, None, :]
+        return cofactors if self.datum is None else cofactors + np.array([self.datum.of(at) for at in groups])
 
     @cached_property
     def variances(self) -> Array:

@@ -26,7 +26,7 @@ Indices = NDArray[np.intp]
 
 ROWS_PER_COLUMN = 4  # rows in the shared unknowns are condensed when there are more of them than this
 CONDENSED_ROWS = 2000  # and more than this
-REFLECTED = 1e10  # rows times columns squared in the shared unknowns up to which these rows are factorised themselves
+REFLECTED = 1e9  # rows times columns squared in the shared unknowns up to which these rows are factorised themselves
 SAFE = 1e-6  # reciprocal condition of the shared triangle down to which their normal equations will do
 WIDE = 500  # shared unknowns up to which roots of cofactors run over all of them
 

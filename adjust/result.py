@@ -97,6 +97,10 @@ class Cofactor(Protocol):
         """The matrix (k, k) of some quantities, by their positions."""
         ...
 
+    def of_each(self, groups: Indices) -> Array:
+        """The matrices (g, k, k) of groups of quantities (g, k), each of one point's or of one image's."""
+        ...
+
 
 @dataclass(frozen=True)
 class OuterEffect:

@@ -48,7 +48,7 @@ Figures = dict[str, Any]
 
 VIEWS, VIEWS_OF_RESEAU_ALONE = (50, 200, 1000), (4000,)
 NETWORKS = ((50, 2000), (200, 20000))  # images and unknown points
-PATIENCE_S = 900.0
+PATIENCE_S = 300.0  # of CPU time, for SciPy
 SIGMA_MM = 0.005
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
 FOCAL_MM, FRAME_MM = 100.0, 200.0
@@ -262,8 +262,9 @@ def scipy(scene: Scene) -> Figures:
     zero = np.zeros(len(numbering.free))
     solve: Any = least_squares
     found = solve(
-        lambda x: at(x)[0], zero, lambda x: at(x)[1], x_scale="jac", method="trf", tr_solver="lsmr",
-        ftol=1e-10, xtol=1e-10, gtol=1e-10, max_nfev=200, callback=lambda intermediate_result: patient(),
+        lambda x: at(x)[0], zero, lambda x: at(x)[1], x_scale="jac", method="trf",
+        tr_solver="lsmr", tr_options={"atol": 1e-10, "btol": 1e-10},
+        ftol=1e-10, xtol=1e-10, gtol=1e-10, max_nfev=5000, callback=lambda intermediate_result: patient(),
     )  # fmt: skip
     seconds = time.process_time() - begin
     says = f"{found.nfev} evaluations" + ("" if found.status > 0 else ", stopped before it converged")

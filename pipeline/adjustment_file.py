@@ -22,6 +22,7 @@ from adjust.result import Adjustment, FurtherResidual
 from adjust.significance import group_tests, parameter_tests
 from adjust.transformation import film_parameter_names
 from pipeline.atomic import atomic_path
+from pipeline.covariance_arrays import covariance_arrays, covariance_note
 from pipeline.errors import InputError
 from pipeline.reliability_json import point_tests, reliability_json, suspect_json
 
@@ -69,12 +70,7 @@ def write_adjustment(adjustment: Adjustment, path: Path) -> None:
     """
     text = json.dumps(without_nan(adjustment_json(adjustment)), indent=1, ensure_ascii=False, allow_nan=False)
     arrays = io.BytesIO()
-    np.savez_compressed(
-        arrays,
-        names=np.array(adjustment.names, dtype=np.str_),
-        values=adjustment.values,
-        matrix=adjustment.sigma0**2 * adjustment.cofactor_of(adjustment.names),
-    )
+    np.savez_compressed(arrays, allow_pickle=False, **covariance_arrays(adjustment))
     # Both are whole before either takes its place: a covariance belongs to its adjustment.
     with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
         covariance.write_bytes(arrays.getvalue())
@@ -98,6 +94,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "redundancy": adjustment.redundancy,
         "vpv": adjustment.vpv,
         "sigma0": adjustment.sigma0,
+        "covariance": covariance_note(adjustment),
         "singular": [
             {"parameters": list(null.parameters), "cause": null.cause, "remedy": null.remedy}
             for null in adjustment.singular

@@ -295,6 +295,16 @@ def test_mirrored_scans_are_ordinary() -> None:
         )
 
 
+def test_cofactors_of_each_are_parts_of_the_whole_matrix() -> None:
+    """Of points and of images, in a free network and in one with fixed coordinates."""
+    for result in free_network()[1:]:
+        for prefix, count in (("PT.", 3), ("EO.", 6)):
+            groups = np.flatnonzero(np.char.startswith(result.names, prefix)).reshape(-1, count)
+            expected = [result.cofactor.of(at) for at in groups]
+            found = result.cofactor.of_each(groups)
+            np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize("datum", ["minimal", "free"])
 def test_a_datum_that_is_given_is_left_alone(datum: Datum) -> None:
     """Known points, and points with standard deviations: nothing is free, and nothing more is fixed."""

@@ -75,6 +75,9 @@ class Dense:
     def of(self, at: NDArray[np.intp]) -> Array:
         return self.matrix[np.ix_(at, at)]
 
+    def of_each(self, groups: NDArray[np.intp]) -> Array:
+        return self.matrix[groups[:, :, None], groups[:, None, :]]
+
 
 @cache
 def adjustment() -> Adjustment:

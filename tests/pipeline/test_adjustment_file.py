@@ -13,6 +13,7 @@ from gallery import Setup, vertical
 from adjust.adjustment import adjust
 from adjust.network import ObjectPoint, Prior
 from adjust.result import Adjustment, Residuals
+from pipeline import covariance_arrays
 from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
 from pipeline.errors import InputError
 
@@ -171,3 +172,27 @@ def test_a_missing_or_broken_covariance_is_named(path: Path) -> None:
     file.unlink()
     with pytest.raises(InputError, match="there is no such file"):
         read_covariance(path)
+
+
+def test_of_a_large_network_points_and_images_stand_by_themselves(
+    adjustment: Adjustment, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the order in which they become too many: points first, then images; the cameras stay together."""
+    whole = read_covariance(path)
+    cameras = [name for name in adjustment.names if name.startswith(("IO.", "FID."))]
+    images = [name for name in adjustment.names if name.startswith(("EO.", "T."))]
+    for affordable, together, kinds in (
+        (len(adjustment.names) - 1, [*cameras, *images], ("point",)),
+        (len(cameras), cameras, ("point", "image")),
+    ):
+        monkeypatch.setattr(covariance_arrays, "AFFORDABLE", affordable)
+        write_adjustment(adjustment, path)
+        covariance = read_covariance(path)
+        assert sorted(covariance.names) == sorted(together)
+        np.testing.assert_array_equal(covariance.of(cameras), whole.of(cameras))
+        assert f"every {' and every '.join(kinds)} by itself" in read_adjustment(path)["covariance"]
+        with np.load(covariance_path(path)) as arrays:
+            for kind in kinds:
+                for names, matrix in zip(arrays[f"{kind}_names"], arrays[f"{kind}_matrices"], strict=True):
+                    np.testing.assert_array_equal(matrix, whole.of(names))
+            assert arrays["point_names"].shape == (24, 3)
