@@ -1,18 +1,21 @@
 """Cross-validation over object points: how well a model predicts the images of points that had no part in its fit."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.adjustment import Options, adjust
+from adjust.adjustment import Options, with_datum
 from adjust.errors import AdjustmentError
 from adjust.intersection import intersect
 from adjust.network import Approximations, Network
-from adjust.projection import ImageModel, adjusted_image
+from adjust.problem import number
+from adjust.projection import ImageModel, approximate_image
 from adjust.result import Adjustment
+from adjust.runs import run
+from adjust.validation import validate
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -82,25 +85,36 @@ def cross_validate(
 
 def approximations_of(adjustment: Adjustment) -> Approximations:
     """The values of an adjustment as a start of another one."""
-    values: dict[str, list[float]] = {}
-    for name, value in zip(adjustment.names, adjustment.values.tolist(), strict=True):
-        values.setdefault(name.rsplit(".", 1)[0], []).append(value)
+    values = _by_owner(adjustment.names, adjustment.values)
+    return _as_approximations(adjustment.network, values, adjustment.mirrored)
 
+
+def _by_owner(names: Sequence[str], values: Array) -> dict[str, Array]:
+    """The values of every camera, image and point: by "IO.<camera>", "EO.<image>" and the like."""
+    collected: dict[str, list[float]] = {}
+    for name, value in zip(names, values.tolist(), strict=True):
+        collected.setdefault(name.rsplit(".", 1)[0], []).append(value)
+    return {owner: np.array(each) for owner, each in collected.items()}
+
+
+def _as_approximations(network: Network, values: dict[str, Array], mirrored: frozenset[str]) -> Approximations:
     def of(kind: str) -> dict[str, Array]:
-        return {owner[len(kind) :]: np.array(each) for owner, each in values.items() if owner.startswith(kind)}
+        return {owner[len(kind) :]: each for owner, each in values.items() if owner.startswith(kind)}
 
-    images = adjustment.network.images
     transformation = of("T.")
     return Approximations(
         interior={camera: each[:3] for camera, each in of("IO.").items()},
         exterior=of("EO."),
-        transformation={image.name: transformation.get(image.name, np.empty(0)) for image in images},
+        transformation={image.name: transformation.get(image.name, np.empty(0)) for image in network.images},
         points=of("PT."),
-        mirrored=adjustment.mirrored,
+        mirrored=mirrored,
     )
 
 
-def _fitted_without(adjustment: Adjustment, points: frozenset[str], options: Options) -> Adjustment | None:
+def _fitted_without(
+    adjustment: Adjustment, points: frozenset[str], options: Options
+) -> Mapping[str, ImageModel] | None:
+    """The images as the other points determine them, without the tests that take longest; None where these do not."""
     network = adjustment.network
     observations = network.observations
     kept = [
@@ -113,17 +127,28 @@ def _fitted_without(adjustment: Adjustment, points: frozenset[str], options: Opt
         points=tuple(point for point in network.points if point.id not in points),
         observations=observations.only(np.array(kept, dtype=np.intp)),
     )
+    if reduced.unoriented - network.unoriented:
+        return None
     try:
-        fitted = adjust(reduced, approximations_of(adjustment), options)
+        validate(reduced)
+        problem = number(reduced, approximations_of(adjustment), options.method == "elements")
+        last = run(with_datum(problem, options), options)
     except AdjustmentError:
         return None
-    return fitted if fitted.converged else None
+    if not last.converged:
+        return None
+    values = _by_owner(problem.unknowns.names, last.end.state.values)
+    fitted = _as_approximations(reduced, values, adjustment.mirrored)
+    oriented = [image for image in reduced.images if image.name not in reduced.unoriented]
+    return {
+        image.name: replace(approximate_image(reduced, fitted, image.name), parameters=values[f"IO.{image.camera}"][3:])
+        for image in oriented
+    }
 
 
-def _errors(fitted: Adjustment, network: Network, points: frozenset[str]) -> tuple[Array, Array]:
+def _errors(models: Mapping[str, ImageModel], network: Network, points: frozenset[str]) -> tuple[Array, Array]:
     """Predicted less observed comparator coordinates (n, 2) of all rays that can be predicted, and their rows (n,)."""
     rays = _rays(network, points)
-    models = {name: adjusted_image(fitted, name) for name in {network.observations.image[row] for row in rays.rows}}
     centers, directions = np.empty((len(rays.rows), 3)), np.empty((len(rays.rows), 3))
     for image, at in rays.by_image(network).items():
         centers[at] = models[image].station
