@@ -57,7 +57,7 @@ def print_design(
         console.print(_reliability_table(expected))
         console.print(_outer_table(expected))
     if helpful:
-        console.print(_help_table(expected, helpful))
+        console.print(_help_table(expected, helpful, layouts))
     for one in swept:
         console.print(_sweep_table(one))
     for word, path in files.items():
@@ -143,9 +143,11 @@ def _outer_table(expected: Expected) -> Table:
     return table
 
 
-def _help_table(expected: Expected, helpful: tuple[Alternative, ...]) -> Table:
+def _help_table(expected: Expected, helpful: tuple[Alternative, ...], layouts: Layouts) -> Table:
     names = list(expected.camera_sigmas)
     title = "What would help: by how many percent the sigmas shrink"
+    if layouts.count > 1:
+        title += ", of the first layout"
     table = Table("change", *(LABELS.get(name, name) for name in names), title=title, title_justify="left")
     for one in helpful:
         table.add_row(Text(one.change), *(_gain(one.gain_percent[name]) for name in names))
