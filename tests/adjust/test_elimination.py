@@ -1,6 +1,7 @@
 """The blockwise elimination against a dense solution of the same rows."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from adjust import elimination
 from adjust.adjustment import adjust
 from adjust.elimination import Blocks, Factor, eliminate
 from adjust.iteration import Linearised, factorise, linearise
-from adjust.network import Approximations, Network
+from adjust.network import Approximations, Network, Observations
 from adjust.numbering import Numbering
 from adjust.problem import number
 from adjust.rows import prior_root_weights
@@ -216,3 +217,31 @@ def test_what_is_badly_conditioned_is_reflected(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(factorise(numbering, at).triangle, expected.triangle)
     rough = factorise(numbering, at, camera_priors=False)
     assert np.linalg.svd(rough.triangle)[1][-7:] == pytest.approx(np.full(7, 1e-6), rel=0.01)
+
+
+def test_large_networks_are_adjusted_alike_whatever_the_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By normal equations: the same bits again, and the same to rounding from observations in another order."""
+    monkeypatch.setattr(elimination, "REFLECTED", 0.0)
+    monkeypatch.setattr(elimination, "WIDE", 0)
+    rng = np.random.default_rng(12)
+    network, start = simulated(rng, points=field_points(rng, 18), point_sigma=0.05, free={"k3": np.inf})
+    first, again = adjust(network, start), adjust(network, start)
+    np.testing.assert_array_equal(again.values, first.values)
+    np.testing.assert_array_equal(again.cofactor.variances, first.cofactor.variances)
+    np.testing.assert_array_equal(again.residuals.w, first.residuals.w)
+
+    rows = network.observations
+    order = rng.permutation(len(rows))
+    shuffled = Observations(
+        tuple(rows.image[i] for i in order),
+        tuple(rows.point[i] for i in order),
+        tuple(rows.kind[i] for i in order),
+        rows.xy_mm[order],
+        rows.covariance_mm2[order],
+    )
+    other = adjust(replace(network, images=network.images[::-1], observations=shuffled), start)
+    sigmas = np.sqrt(first.cofactor.variances)
+    for i, name in enumerate(first.names):
+        assert abs(other.value(name) - first.values[i]) <= 1e-7 * sigmas[i]
+        assert other.sigma(name) / other.sigma0 == pytest.approx(sigmas[i], rel=1e-7)
+    np.testing.assert_allclose(other.residuals.w, first.residuals.w[order], atol=1e-6)
