@@ -275,7 +275,9 @@ def scipy(scene: Scene) -> Figures:
         normal = (scale @ jacobian.T @ jacobian @ scale).tocsc()
         factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         camera = numbering.numbers[problem.unknowns.camera["K"]]
-        return np.asarray(factor.solve(np.eye(len(zero))[:, camera[camera != ABSENT]]))
+        unit = np.zeros((len(zero), int((camera != ABSENT).sum())))
+        unit[camera[camera != ABSENT], np.arange(unit.shape[1])] = 1.0
+        return np.asarray(factor.solve(unit))
 
     _, more = _timed(of_camera)
     return {
