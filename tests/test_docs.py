@@ -44,7 +44,12 @@ def test_every_link_of_the_pages_leads_somewhere() -> None:
 
 def test_the_gallery_quotes_the_program() -> None:
     page = (DOCS / "failure-gallery.md").read_text(encoding="utf-8")
-    assert page == script("make_gallery").text(), "run python docs/make_gallery.py"
+    assert leveled(page) == leveled(script("make_gallery").text()), "run python docs/make_gallery.py"
+
+
+def leveled(text: str) -> str:
+    """A text without what rounding decides: which unknown leads where several null vectors are equally good."""
+    return re.sub(r"\(\w+ most\)", "", text)
 
 
 @pytest.mark.parametrize(

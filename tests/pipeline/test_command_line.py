@@ -172,6 +172,7 @@ def test_scan_of_another_camera_is_said_to_be_one(project: Path, capsys: SAID) -
     tifffile.imwrite(
         project / "scans" / "frame4.tif", picture, resolution=(1e4 / 45, 1e4 / 45), resolutionunit="CENTIMETER"
     )
+    replaced(project / "project.toml", "scans/*.tif", "scans/frame4.tif")
     code = run(["measure", str(project / "project.toml"), "--json"])
     summary = json.loads(capsys.readouterr().out)
     assert code == 1
