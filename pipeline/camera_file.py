@@ -15,17 +15,27 @@ from pipeline.mark_table import read_mark
 from pipeline.spelling import did_you_mean
 from pipeline.tables import Table, read_toml
 
+NO_MARK = "none"  # a fiducial that is not to be looked for in scans
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
 
 
 @dataclass(frozen=True)
 class GivenFiducial:
-    """A fiducial of the camera file; mark None: it can be adjusted but not measured."""
+    """A fiducial of the camera file; mark None: it can be adjusted but not measured. passed_over: and need not be."""
 
     id: str
     xy_mm: shapes.Point
     sigma_mm: shapes.Point
     mark: shapes.Mark | None
+    passed_over: bool = False
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the numbers of a camera file come from, and from how many calibration reports."""
+
+    text: str
+    reports: int
 
 
 @dataclass(frozen=True)
@@ -46,20 +56,30 @@ class CameraFile:
     distortion: network.Distortion
     fiducials: tuple[GivenFiducial, ...]
     calibration: EarlierCalibration | None = None
+    source: Source | None = None
+
+    @property
+    def drawn(self) -> tuple[shapes.LayoutMark, ...]:
+        """The fiducials that can be found in a scan."""
+        return tuple(
+            shapes.LayoutMark(one.id, one.xy_mm, one.sigma_mm, one.mark)
+            for one in self.fiducials
+            if one.mark is not None
+        )
 
     def layout(self) -> shapes.FiducialLayout:
-        """The marks to be measured. Raises InputError where one has no drawing or the frame's size is missing."""
+        """The marks to be measured. Raises InputError where one has no drawing, and is not to be passed over, or the
+        frame's size is missing."""
         if self.frame_mm is None:
             raise InputError(f"{self.path}: frame_mm is missing: the size of the exposed frame, [width, height] in mm.")
-        marks = []
         for fiducial in self.fiducials:
-            if fiducial.mark is None:
+            if fiducial.mark is None and not fiducial.passed_over:
                 raise InputError(
                     f"{self.path}: fiducial {fiducial.id!r} has no mark, and so cannot be found in a scan. "
-                    'Add mark = "NAME" to it and a table [mark.NAME] that draws it.'
+                    'Add mark = "NAME" to it and a table [mark.NAME] that draws it, or mark = "none" to pass it over; '
+                    "a camera of the library is copied with `reseau cameras NAME` for that."
                 )
-            marks.append(shapes.LayoutMark(fiducial.id, fiducial.xy_mm, fiducial.sigma_mm, fiducial.mark))
-        return shapes.FiducialLayout(tuple(marks), self.frame_mm)
+        return shapes.FiducialLayout(self.drawn, self.frame_mm)
 
     def camera(self, center_mm: tuple[float, float] = (0.0, 0.0)) -> network.Camera:
         """The camera for the adjustment. center_mm: where the principal point is sought when the file has none."""
@@ -112,10 +132,17 @@ def parse_camera(table: Table) -> CameraFile:
         principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (default_sigma, default_sigma)),
         distortion=_distortion(table.table("distortion"), frame),
         fiducials=fiducials,
+        source=_source(table.table("source")) if "source" in table else None,
     )
     camera = replace(camera, calibration=read_calibration(sigma, camera.camera()))
     sigma.done()
     return camera
+
+
+def _source(table: Table) -> Source:
+    source = Source(table.text("text"), int(table.number("reports", 0.0, least=0.0)))
+    table.done()
+    return source
 
 
 def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
@@ -125,10 +152,11 @@ def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
         id = entry.text("id")
         if id in fiducials:
             raise entry.error("id", f"fiducial {id!r} is given twice. Every mark has an id of its own.")
-        mark = entry.text("mark", choices=tuple(marks)) if "mark" in entry else None
+        mark = entry.text("mark", choices=(*marks, NO_MARK)) if "mark" in entry else None
         xy = entry.pair("xy_mm")
         sigma = entry.sigma_pair("sigma_mm", (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM))
-        fiducials[id] = GivenFiducial(id, xy, sigma, None if mark is None else _placed(*marks[mark], xy))
+        drawn = None if mark is None or mark not in marks else _placed(*marks[mark], xy)
+        fiducials[id] = GivenFiducial(id, xy, sigma, drawn, mark == NO_MARK and drawn is None)
         entry.done()
     return tuple(fiducials.values())
 

@@ -15,10 +15,12 @@ from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from pipeline import stages
 from pipeline.adjustment_file import without_nan
+from pipeline.camera_trials import identify, print_identification
 from pipeline.choose_stage import choice_json, print_choice, run_choose
 from pipeline.demo import run_demo
 from pipeline.design.run import run_design
 from pipeline.errors import InputError
+from pipeline.library import PREFIX, library_json, library_path, print_library, read_library
 from pipeline.progress import Reporter
 from pipeline.project_file import Project, read_project
 from pipeline.scene_file import render_project
@@ -166,6 +168,38 @@ def template(
         raise InputError(f"there is no template {kind!r}; possible are {', '.join(TEMPLATES)}.")
     typer.echo(resources.files("pipeline").joinpath("templates", f"{kind}.toml").read_text(encoding="utf-8"), nl=False)
     return DONE
+
+
+@app.command()
+def cameras(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Print this camera's file, to start from.")
+    ] = None,
+    scan: Annotated[
+        Path | None, typer.Option("--scan", metavar="FILE", help="Try the cameras on this scan, name the best ones.")
+    ] = None,
+    pitch_um: Annotated[
+        float | None,
+        typer.Option("--pitch", metavar="UM", min=0.1, help="The scan's pixel in um, if its file is mute."),
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """The camera library: its list, one of its files, or which of its cameras a scan is of."""
+    if name is not None:
+        typer.echo(library_path(name.removeprefix(PREFIX)).read_text(encoding="utf-8"), nl=False)
+        return DONE
+    if scan is None:
+        if as_json:
+            typer.echo(json.dumps(library_json(), indent=1, ensure_ascii=False))
+        else:
+            print_library(Console())
+        return DONE
+    identification = identify(scan, read_library(), pitch_um, Reporter())
+    if as_json:
+        typer.echo(json.dumps(identification.as_json(), indent=1, ensure_ascii=False))
+    else:
+        print_identification(identification, Console())
+    return DONE if identification.best else LOOK
 
 
 def _with_project(path: Path, stage: Callable[[Project, Reporter], Summary], as_json: bool) -> int:

@@ -88,7 +88,7 @@ def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
 
 
 def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> FrameMeasurement:
-    if not camera.fiducials:
+    if all(fiducial.passed_over for fiducial in camera.fiducials):
         return FrameMeasurement(name, ())
     pitch = project.pitch_um or scan.pitch_um
     measured = measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=project.pose))

@@ -17,6 +17,7 @@ from pipeline.camera_file import CameraFile, read_camera
 from pipeline.distances_file import GivenDistance, read_distances
 from pipeline.errors import InputError
 from pipeline.images_file import GivenImages, image_name, read_images
+from pipeline.library import camera_path
 from pipeline.points_file import GivenPoints, read_points
 from pipeline.tables import Table, read_toml
 from pipeline.target_table import TargetSettings, read_targets
@@ -150,12 +151,12 @@ def _given_images(objects: Table, folder: Path) -> GivenImages | None:
 
 def _cameras(table: Table, folder: Path, images: GivenImages | None) -> Mapping[str, CameraFile]:
     default = table.text("camera")
-    if default.startswith("library:"):
-        raise table.error(
-            "camera", "there is no camera library yet. Give a camera file; `reseau template camera` starts one."
-        )
+    try:
+        camera_path(default, folder)
+    except InputError as error:
+        raise table.error("camera", str(error)) from None
     names = [default, *sorted({name for name in images.camera.values() if name} if images else set())]
-    cameras = {name: read_camera(folder / name) for name in dict.fromkeys(names)}
+    cameras = {name: read_camera(camera_path(name, folder)) for name in dict.fromkeys(names)}
     titles: dict[str, str] = {}
     for name, camera in cameras.items():
         if camera.name in titles:

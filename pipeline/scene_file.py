@@ -13,6 +13,7 @@ from pipeline.camera_file import CameraFile, parse_camera, read_camera
 from pipeline.design.settings import read_design
 from pipeline.errors import InputError
 from pipeline.field_table import read_field
+from pipeline.library import camera_path
 from pipeline.scene_project import Given, SceneFile, write_project
 from pipeline.tables import Table, read_toml
 from synthetic_images import areas, scene
@@ -90,7 +91,7 @@ def _made(path: Path, make: Callable[[], Made]) -> Made:
 def _camera(table: Table) -> CameraFile:
     """The camera, written in the scene file or in a file of its own."""
     if isinstance(table.values.get("camera"), str):
-        camera = read_camera(table.file.parent / table.text("camera"))
+        camera = read_camera(camera_path(table.text("camera"), table.file.parent))
     else:
         inline = table.table("camera")
         camera = parse_camera(inline)

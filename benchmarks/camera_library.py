@@ -1,0 +1,360 @@
+"""The camera library's files from calibration reports: run as `camera_library.py REPORTS_FOLDER OUT_FOLDER`.
+
+The folder holds usgs_reports.csv (a line a report: camera, focal length, coordinates and separations of the marks),
+cameras.json and OSL_1785.json (single cameras, written out). What is typed there has errors, and some cameras of a
+model had other marks: medians are taken, spreads are 1.4826 times the median of absolute deviations, and what lies
+outside of a camera's gate is left out and printed. The plate of crosses, hasselblad-reseau, has no reports: its file
+is written by hand.
+"""
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# Numbered as in the reports of the US Geological Survey, x' to the right and y' up, the data strip to the left.
+PLACES = {"ll": "1", "ur": "2", "ul": "3", "lr": "4", "ml": "5", "mr": "6", "mt": "7", "mb": "8"}
+CORNERS, SIDES = ("ll", "ur", "ul", "lr"), ("ml", "mr", "mt", "mb")
+DIRECTIONS = {"ll": (-1, -1), "ur": (1, 1), "ul": (-1, 1), "lr": (1, -1)} | {
+    "ml": (-1, 0),
+    "mr": (1, 0),
+    "mt": (0, 1),
+    "mb": (0, -1),
+}
+SEPARATIONS = {"lr_dist": "left to right", "tb_dist": "top to bottom", "llur_dist": "1 to 2", "ullr_dist": "3 to 4"}
+
+MAD_TO_SIGMA = 1.4826  # of normally distributed values
+ENOUGH = 5  # reports for a spread
+LEAST_SIGMA_MM = 0.005  # what the reports give as their own accuracy
+PRINCIPAL_POINT_MM = 0.02  # the rms of nine cameras written out is 0.013 mm an axis
+CONE_MM = 6.0  # how far a focal length may lie from its cone's nominal one
+CONE_SPREAD = 0.002  # of the focal length, where a cone has too few reports for a spread of its own
+
+
+@dataclass(frozen=True)
+class Report:
+    """One calibration: the coordinates of the marks by place, separations by name, mm."""
+
+    source: str
+    model: str
+    serial: str
+    focal_mm: float
+    marks_mm: Mapping[str, tuple[float, float]]
+    separations_mm: Mapping[str, float]
+
+    def key(self) -> tuple[object, ...]:
+        """Equal for a report that was typed twice."""
+        marks, separations = tuple(self.marks_mm.items()), tuple(self.separations_mm.items())
+        return (self.model, self.serial, self.focal_mm, marks, separations)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of camera: the models in the reports that count as it, and what the reports do not say.
+
+    cones_mm: nominal focal lengths. gate_mm: farther from the median is another kind of mark, or a typing error.
+    separated: take the marks' places from their separations. sigma_mm: of coordinates with too few reports for a
+    spread. drawn: places whose marks are drawn, by the drawing `mark`, which `shape` tells about.
+    """
+
+    file: str
+    title: str
+    models: tuple[str, ...]
+    cones_mm: tuple[int, ...]
+    frame_mm: float
+    places: tuple[str, ...]
+    gate_mm: float
+    sigma_mm: float
+    shape: str
+    separated: bool = False
+    drawn: tuple[str, ...] = ()
+    mark: str = ""
+    notes: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class TypicalMark:
+    """A mark of a kind of camera: the median of so many reports."""
+
+    place: str
+    xy_mm: tuple[float, float]
+    sigma_mm: tuple[float, float]
+    reports: int
+    spread: bool  # whether sigma_mm is the reports' own
+
+    def lines(self, kind: Kind) -> list[str]:
+        x, y = self.xy_mm
+        sx, sy = self.sigma_mm
+        few = "" if self.spread else ": too few cameras for a spread"
+        lines = [
+            "[[fiducial]]",
+            f'id = "{PLACES[self.place]}"',
+            f"xy_mm = [{x:.3f}, {y:.3f}]",
+            f"sigma_mm = [{sx:.3f}, {sy:.3f}]               # of {self.reports} report{'s' * (self.reports > 1)}{few}",
+        ]
+        if not kind.mark:
+            return lines
+        return [
+            *lines,
+            'mark = "drawn"'
+            if self.place in kind.drawn
+            else 'mark = "none"                           # its shape is not known',
+        ]
+
+
+RING_CROSS = """kind = "ring-cross"
+ring_mm = 0.80
+ring_line_mm = 0.17
+arm_mm = 1.75
+line_mm = 0.10
+gap_mm = 0.08
+angle_deg = 45
+polarity = "light"
+"""
+PLAIN_CROSS = """kind = "cross"
+arm_mm = 1.75
+line_mm = 0.12
+gap_mm = 0.25
+angle_deg = 45
+polarity = "light"
+"""
+RMK_NOTCH = """kind = "polygon"                        # the frame's dark block, drawn as on the right side, x outwards
+vertices_mm = [[0.0, 0.0], [1.2, 1.8], [-0.2, 3.4], [-0.2, 5.0], [4.0, 5.0],
+               [4.0, -5.0], [-0.2, -5.0], [-0.2, -3.4], [1.2, -1.8]]
+polarity = "dark"
+rotate = "radial"
+"""
+OLD_WILD = "the corners: from two Wild frames of 1968 and 1972 that do not name their model"
+NEW_WILD = "the corners: from three Wild frames of 1985 to 1997 that do not name their model"
+UNKNOWN = "not known"
+KINDS = (
+    Kind("wild-rc5", "Wild RC5", ("RC5", "RC5A", "RC5/8"), (153,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False,
+         CORNERS, PLAIN_CROSS),
+    Kind("wild-rc8", "Wild RC8", ("RC8",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, OLD_WILD, False,
+         CORNERS, PLAIN_CROSS),
+    Kind("wild-rc9", "Wild RC9", ("RC9",), (88,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False, CORNERS, PLAIN_CROSS),
+    Kind("wild-rc10", "Wild RC10", ("RC10", "RC10A", "RC10A*"), (88, 153, 214, 305), 228.0, CORNERS + SIDES, 0.3,
+         0.01, NEW_WILD, False, CORNERS, RING_CROSS,
+         ("Eleven reports, rejected here, have the side marks at 112.5 mm.",)),
+    Kind("wild-rc30", "Wild RC30", ("RC30",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, NEW_WILD, False,
+         CORNERS, RING_CROSS),
+    Kind("zeiss-rmk-a", "Zeiss RMK A",
+         ("RMK A 8.5/23", "RMK A 15/23", "RMK 15/23", "RMK AR 15/23", "RMK A 21/23", "RMK A 30/23", "RMK 30/23",
+          "RMK AR 30/23"), (86, 153, 209, 305), 230.0, CORNERS + SIDES, 0.5, 0.02,
+         "the sides: from a frame of 1978 with four notches 226 mm apart", False, SIDES, RMK_NOTCH,
+         ("Many cameras have no corner marks; seven reports, rejected here, have them at 105.0 mm.",)),
+    Kind("zeiss-rmk-top", "Zeiss RMK TOP", ("RMK TOP",), (153, 305), 230.0, CORNERS + SIDES, 0.3, 0.02, UNKNOWN),
+    Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, UNKNOWN),
+    Kind("fairchild-k17", "Fairchild K-17", ("K-17", "K-17 (modified)", "K-17B", "K-17B (modified)",
+         "K-17C (modified)"), (153, 210, 305), 228.6, SIDES, 2.0, 0.2, UNKNOWN, True),
+    Kind("fairchild-t11", "Fairchild T-11", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, UNKNOWN),
+    Kind("fairchild-t12", "Fairchild T-12", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1, UNKNOWN, notes=(
+        "Corner marks, where there are any, lie anywhere from 105.6 to 116.3 mm: none are given.",
+        "Seven reports, rejected here, have the side marks at 110 mm.")),
+    Kind("fairchild-kc1", "Fairchild KC-1", ("KC-1", "KC-1A", "KC-1B"), (153,), 228.6, SIDES, 1.0, 0.1, UNKNOWN),
+    Kind("fairchild-kc6a", "Fairchild KC-6A", ("KC-6A",), (152,), 228.6, SIDES, 1.0, 0.1, UNKNOWN),
+)  # fmt: skip
+
+
+def main() -> None:
+    """Write every camera of the library, and print what was left out."""
+    reports_folder, out = Path(sys.argv[1]), Path(sys.argv[2])
+    reports = list({report.key(): report for report in [*_typed(reports_folder), *_single(reports_folder)]}.values())
+    for kind in KINDS:
+        own = [report for report in reports if report.model in kind.models]
+        marks = _separated(kind, own) if kind.separated else _coordinates(kind, own)
+        for cone_mm in kind.cones_mm:
+            of_cone = [report for report in own if abs(report.focal_mm - cone_mm) < CONE_MM]
+            path = out / f"{kind.file}-{cone_mm}.toml"
+            path.write_text(_camera(kind, cone_mm, of_cone, own, marks), encoding="utf-8")
+        no_cone = [
+            f"{report.focal_mm:g}"
+            for report in own
+            if all(abs(report.focal_mm - cone) >= CONE_MM for cone in kind.cones_mm)
+        ]
+        print(f"{kind.title}: {len(own)} reports; focal lengths of no cone: {', '.join(no_cone) or 'none'}")
+
+
+def _typed(folder: Path) -> Iterable[Report]:
+    with (folder / "usgs_reports.csv").open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            pairs = {place: (_number(row[f"{place}x"]), _number(row[f"{place}y"])) for place in PLACES}
+            separations = {name: _number(row[name]) for name in SEPARATIONS}
+            yield Report(
+                "USGS",
+                _model(row["camera_model"]),
+                row["camera_serial"],
+                _number(row["focal"]),
+                {place: pair for place, pair in pairs.items() if not math.isnan(sum(pair))},
+                {name: value for name, value in separations.items() if not math.isnan(value)},
+            )
+
+
+def _single(folder: Path) -> Iterable[Report]:
+    lmk = json.loads((folder / "OSL_1785.json").read_text(encoding="utf-8"))
+    yield _single_report(lmk, "LMK", lmk["calibrated_focal_length_mm"], lmk["fiducials_mm"].values())
+    for camera in json.loads((folder / "cameras.json").read_text(encoding="utf-8")):
+        name, fiducials = camera["name"], camera.get("fiducials_mm", [])
+        model = next((known for known in ("RC30", "RMK TOP", "RMK A") if known.lower() in name.lower()), None)
+        if model is None:
+            continue
+        focal = camera["ppa_f_mm"][2] if "ppa_f_mm" in camera else camera.get("f_mm", math.nan)
+        places = fiducials.values() if isinstance(fiducials, dict) else fiducials
+        yield _single_report(camera, "RMK A 15/23" if model == "RMK A" else model, focal, places)
+
+
+def _single_report(camera: Mapping[str, Any], model: str, focal_mm: float, xy: Iterable[Sequence[float]]) -> Report:
+    marks = {_place(x, y): (x, y) for x, y in xy}
+    serial = str(camera.get("camera_serial", camera.get("name")))
+    return Report("single", model, serial, focal_mm, dict(sorted(marks.items())), {})
+
+
+def _place(x_mm: float, y_mm: float) -> str:
+    side = (round(x_mm / 100.0), round(y_mm / 100.0))
+    return next(place for place, direction in DIRECTIONS.items() if direction == side)
+
+
+def _model(model: str) -> str:
+    if "LMK" in model:
+        return "LMK"
+    return "RMK TOP" if "TOP" in model else model
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _camera(
+    kind: Kind, cone_mm: int, of_cone: Sequence[Report], own: Sequence[Report], marks: Sequence[TypicalMark]
+) -> str:
+    """camera.toml: the focal length of the cone's reports, the marks of all."""
+    focal = np.array([report.focal_mm for report in of_cone])
+    c_mm, c_sigma_mm = float(np.median(focal)), _spread(focal)
+    c_note = f"the spread of {_count(focal, 'report')}"
+    if _cameras(of_cone) < ENOUGH:
+        c_sigma_mm = CONE_SPREAD * c_mm
+        c_note = f"0.2 %, as of other cones: only {_count(focal, 'report')}"
+    point_sigma = max(PRINCIPAL_POINT_MM, float(np.median([mark.sigma_mm for mark in marks])))
+    lines = [
+        f"# {kind.title}, the {cone_mm} mm cone. From the library of reseau: typical values, not those of one camera.",
+        "# Sigmas are the spread over the reports about their median. Seen with the data strip to the left.",
+        *(f"# {note}" for note in kind.notes),
+        *_separation_lines(kind, own),
+        f"# Shape of the marks: {kind.shape}." + ("" if kind.mark else " Draw them, or they cannot be found in scans."),
+        "",
+        f'name = "{kind.title}, {cone_mm} mm"',
+        f"frame_mm = [{kind.frame_mm}, {kind.frame_mm}]",
+        f"principal_distance_mm = {c_mm:.3f}",
+        "principal_point_mm = [0.0, 0.0]         # the reports count from it",
+        "",
+        "[source]",
+        f"reports = {len(own)}",
+        f'text = "{_source(own)}"',
+        "",
+        "[sigma]",
+        f"principal_distance_mm = {max(c_sigma_mm, LEAST_SIGMA_MM):.3f}           # {c_note}",
+        f"principal_point_mm = {point_sigma:.3f}",
+        "",
+        "[distortion]                            # the reports' tables are not typed: the adjustment finds it",
+        'family = "torlegard"',
+        "[distortion.sigma]",
+        *(f'{name} = "free"' for name in ("k3", "k5", "p1", "p2")),
+    ]
+    for mark in marks:
+        lines += ["", *mark.lines(kind)]
+    if kind.mark:
+        lines += ["", "[mark.drawn]", kind.mark.rstrip()]
+    return "\n".join(lines) + "\n"
+
+
+def _coordinates(kind: Kind, own: Sequence[Report]) -> list[TypicalMark]:
+    marks = []
+    for group in (CORNERS, SIDES):
+        places = [place for place in group if place in kind.places]
+        used = _within(kind, own, places) if places else []
+        for place in places:
+            xy = np.array([report.marks_mm[place] for report in used])
+            x, y = np.median(xy, axis=0)
+            sigma = (kind.sigma_mm, kind.sigma_mm)
+            enough = _cameras(used) >= ENOUGH
+            if enough:
+                sigma = (max(_spread(xy[:, 0]), LEAST_SIGMA_MM), max(_spread(xy[:, 1]), LEAST_SIGMA_MM))
+            marks.append(TypicalMark(place, (float(x), float(y)), sigma, len(xy), enough))
+    return marks
+
+
+def _within(kind: Kind, own: Sequence[Report], places: Sequence[str]) -> list[Report]:
+    """The reports with all of these marks, each within the gate of its median."""
+    whole = [report for report in own if all(place in report.marks_mm for place in places)]
+    xy = np.array([[report.marks_mm[place] for place in places] for report in whole])
+    off = np.abs(xy - np.median(xy, axis=0)).max(axis=(1, 2))
+    for report, distance in zip(whole, off, strict=True):
+        if distance > kind.gate_mm:
+            first = report.marks_mm[places[0]]
+            print(f"  {kind.title} {report.serial}: off by {distance:.2f} mm, {places[0]} at {first}: left out")
+    return [report for report, distance in zip(whole, off, strict=True) if distance <= kind.gate_mm]
+
+
+def _separated(kind: Kind, own: Sequence[Report]) -> list[TypicalMark]:
+    """Half the separations. The sigma is that of a whole one: where its middle lies is not known either."""
+    marks = []
+    for place in kind.places:
+        right, up = DIRECTIONS[place]
+        values = _separations(own, "lr_dist" if right else "tb_dist", kind.gate_mm)
+        half, sigma = float(np.median(values)) / 2, _spread(values)
+        marks.append(TypicalMark(place, (half * right, half * up), (sigma, sigma), len(values), True))
+    return marks
+
+
+def _separation_lines(kind: Kind, own: Sequence[Report]) -> list[str]:
+    lines = []
+    for name, words in SEPARATIONS.items():
+        wanted = SIDES[0] if name in ("lr_dist", "tb_dist") else CORNERS[0]
+        values = _separations(own, name, kind.gate_mm)
+        if wanted in kind.places and len(values) > 1:
+            median, spread = np.median(values), _spread(values)
+            lines.append(f"# Separation {words}: {median:.3f} mm, spread {spread:.3f} ({len(values)} reports).")
+    return lines
+
+
+def _separations(own: Sequence[Report], name: str, gate_mm: float) -> np.ndarray:
+    values = np.array([report.separations_mm[name] for report in own if name in report.separations_mm])
+    return values[np.abs(values - np.median(values)) <= 2 * gate_mm] if len(values) else values
+
+
+def _spread(values: np.ndarray) -> float:
+    return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values))))
+
+
+def _source(own: Sequence[Report]) -> str:
+    typed = [report for report in own if report.source == "USGS"]
+    single = [report for report in own if report.source != "USGS"]
+    parts = []
+    if typed:
+        parts.append(_count(typed, "USGS calibration report"))
+    if single:
+        parts.append(f"{_count(single, 'calibration')} published singly")
+    cameras = _cameras(own)
+    return f"{' and '.join(parts)}, {cameras} camera{'s' * (cameras > 1)}"
+
+
+def _cameras(reports: Sequence[Report]) -> int:
+    """How many cameras they are of: one that was calibrated often tells little of the others."""
+    return len({report.serial for report in reports})
+
+
+def _count(things: Sequence[object] | np.ndarray, word: str) -> str:
+    return f"{len(things)} {word}{'s' * (len(things) > 1)}"
+
+
+if __name__ == "__main__":
+    main()

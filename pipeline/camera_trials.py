@@ -1,0 +1,225 @@
+"""Which camera a scan is of: every camera of the library whose marks are drawn is tried on it."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from adjust.fiducial_fit import fit_transformation
+from adjust.transformation import film_kind
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.results import FrameMeasurement
+from measure.scan import Scan, open_scan
+from measure.shapes import FiducialLayout, LayoutMark
+from pipeline.camera_file import CameraFile
+from pipeline.progress import Reporter
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+
+_ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
+_STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is so deformed
+_OUTSTANDING = 2.0  # times what chance finds
+_CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
+_AFFINE = 6  # parameters
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What became of the cameras that share a layout of marks.
+
+    found: marks that are observations, of drawn ones. likeness: their mean correlation with the drawing; snr: the
+    median of contrast over noise. score: 0 to 1, as `_score` has it. chance: the score of the same marks in wrong
+    places, the layout stretched. residual_sigmas, residual_mm: what an affine transformation leaves, per axis, in
+    standard deviations of marks and given places; None where it leaves nothing over.
+    """
+
+    cameras: tuple[str, ...]
+    found: int
+    drawn: int
+    likeness: float
+    snr: float
+    score: float
+    chance: float
+    residual_sigmas: float | None
+    residual_mm: float | None
+    reason: str
+    seconds: float
+
+    @property
+    def stands_out(self) -> bool:
+        return self.score > 0.0 and self.score >= _OUTSTANDING * self.chance
+
+
+@dataclass(frozen=True)
+class Identification:
+    """The trials, best first, and what follows from them."""
+
+    scan: Path
+    trials: tuple[Trial, ...]
+
+    @property
+    def best(self) -> tuple[Trial, ...]:
+        """The trial that stands out, and those that come too near to be told from it."""
+        standing = [trial for trial in self.trials if trial.stands_out]
+        return tuple(trial for trial in standing if trial.score >= _CLOSE * standing[0].score)
+
+    def sentence(self) -> str:
+        if not self.best:
+            return (
+                f"{self.scan.name}: no camera of the library stands out. Its marks may be none of those drawn, or too "
+                "faint; --pitch helps where the scan's file does not say it."
+            )
+        first = self.best[0]
+        told = (
+            f"{self.scan.name}: {' or '.join(first.cameras)}, score {first.score:.2f}: {first.found} of {first.drawn} "
+            f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; the same marks in wrong places "
+            f"score {first.chance:.2f}."
+        )
+        if len(self.best) > 1:
+            told += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
+        elif len(first.cameras) > 1:
+            told += " Their marks are alike; the data strip or the focal length must decide."
+        return told
+
+    def as_json(self) -> Json:
+        trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
+        best = [name for trial in self.best for name in trial.cameras]
+        return {"scan": str(self.scan), "best": best, "sentence": self.sentence(), "trials": trials}
+
+
+def identify(
+    path: Path, cameras: Mapping[str, CameraFile], pitch_um: float | None, reporter: Reporter
+) -> Identification:
+    """Try every camera with drawn marks on the scan, those with the same marks once.
+
+    Raises MeasurementError for a scan that cannot be read.
+    """
+    groups = _alike(cameras)
+    trials = []
+    with open_scan(path) as scan, reporter.stage("trying") as count:
+        pitch = scan.pitch_um if pitch_um is None else (pitch_um, pitch_um)
+        for done, names in enumerate(groups):
+            count(", ".join(names), done, len(groups))
+            trials.append(_trial(scan, names, cameras[names[0]].layout(), pitch))
+    return Identification(path, tuple(sorted(trials, key=lambda trial: -trial.score)))
+
+
+def print_identification(identification: Identification, console: Console) -> None:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("score", "chance", "marks", "likeness", "SNR", "residual", "cameras", "seconds"):
+        table.add_column(heading, overflow="fold")
+    for trial in identification.trials:
+        residual = "" if trial.residual_mm is None else f"{trial.residual_mm:.3f} mm, {trial.residual_sigmas:.0f} sigma"
+        table.add_row(
+            f"{trial.score:.2f}",
+            f"{trial.chance:.2f}" if trial.found else "",
+            f"{trial.found} of {trial.drawn}",
+            f"{trial.likeness:.2f}" if trial.found else "",
+            f"{trial.snr:.1f}" if trial.found else "",
+            residual,
+            ", ".join(trial.cameras) + (f": {trial.reason}" if trial.reason else ""),
+            f"{trial.seconds:.0f}",
+        )
+    console.print(table)
+    console.print(identification.sentence(), highlight=False, soft_wrap=True)
+
+
+def _alike(cameras: Mapping[str, CameraFile]) -> list[tuple[str, ...]]:
+    """The names of cameras with drawn marks, those together whose marks a scan cannot tell apart."""
+    groups: list[list[str]] = []
+    for name, camera in cameras.items():
+        own = next((group for group in groups if _same(cameras[group[0]].drawn, camera.drawn)), None)
+        if own is not None:
+            own.append(name)
+        elif camera.drawn:
+            groups.append([name])
+    return [tuple(group) for group in groups]
+
+
+def _same(first: Sequence[LayoutMark], second: Sequence[LayoutMark]) -> bool:
+    return len(first) == len(second) and all(
+        _kind(a) == _kind(b) and np.hypot(a.xy_mm[0] - b.xy_mm[0], a.xy_mm[1] - b.xy_mm[1]) < _ALIKE_MM
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+def _kind(mark: LayoutMark) -> str:
+    return repr(mark.mark)
+
+
+def _trial(scan: Scan, names: tuple[str, ...], layout: FiducialLayout, pitch_um: tuple[float, float] | None) -> Trial:
+    start = time.perf_counter()
+    frame = measure_fiducials(scan, layout, pitch_um)
+    seen = [mark for mark in frame.marks if mark.status.is_observation]
+    score = _score(frame)
+    # What is not found needs no comparison with chance.
+    chance = _score(measure_fiducials(scan, _stretched(layout), pitch_um)) if score else 0.0
+    residual = _residual(frame, layout)
+    return Trial(
+        cameras=names,
+        found=len(seen),
+        drawn=len(layout.marks),
+        likeness=float(np.mean([mark.quality["likeness"] for mark in seen])) if seen else 0.0,
+        snr=float(np.median([mark.quality["snr"] for mark in seen])) if seen else 0.0,
+        score=score,
+        chance=chance,
+        residual_sigmas=None if residual is None else residual[0],
+        residual_mm=None if residual is None else residual[1],
+        reason="" if seen else frame.marks[0].reason,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _score(frame: FrameMeasurement) -> float:
+    """The mean, over all marks, of likeness times the share of the mark that is undamaged. What belongs to another
+    mark, the ring about a cross that is drawn without one, counts as damage; a mark that is not found counts 0."""
+    return float(
+        np.mean(
+            [
+                mark.quality["likeness"] * (1.0 - mark.quality["damaged_fraction"])
+                if mark.status.is_observation
+                else 0.0
+                for mark in frame.marks
+            ]
+        )
+    )
+
+
+def _stretched(layout: FiducialLayout) -> FiducialLayout:
+    x, y = _STRETCH
+    return replace(
+        layout, marks=tuple(replace(mark, xy_mm=(x * mark.xy_mm[0], y * mark.xy_mm[1])) for mark in layout.marks)
+    )
+
+
+def _residual(frame: FrameMeasurement, layout: FiducialLayout) -> tuple[float, float] | None:
+    """Per axis, in standard deviations and in mm, what an affine transformation of the marks leaves."""
+    pairs = [(m, given) for m, given in zip(frame.marks, layout.marks, strict=True) if m.status.is_observation]
+    redundancy = 2 * len(pairs) - _AFFINE
+    if redundancy <= 0 or frame.pixel_from_camera is None:
+        return None
+    px_per_mm = float(np.sqrt(abs(np.linalg.det(frame.pixel_from_camera[:, :2]))))
+    given_mm = np.array([given.xy_mm for _, given in pairs])
+    comparator_mm = np.array([mark.center_px for mark, _ in pairs]) * (1.0, -1.0) / px_per_mm
+    parameters, mirrored = fit_transformation("affine", comparator_mm, given_mm)
+    residuals_mm = film_kind("affine", mirrored).apply(parameters, comparator_mm) - given_mm
+    sigma_mm = np.array([_sigma_mm(mark.covariance_px2, given, px_per_mm) for mark, given in pairs])
+    return (
+        float(np.sqrt(((residuals_mm / sigma_mm) ** 2).sum() / redundancy)),
+        float(np.sqrt((residuals_mm**2).sum() / redundancy)),
+    )
+
+
+def _sigma_mm(covariance_px2: Array | None, given: LayoutMark, px_per_mm: float) -> Array:
+    """Of mark, given place and film in x' and y'; the mark's own is small and nearly round, so its turn is left out."""
+    own = 0.0 if covariance_px2 is None else float(np.trace(covariance_px2)) / 2 / px_per_mm**2
+    film = FiducialOptions().film_sigma_mm
+    return np.asarray(np.sqrt(np.square(given.sigma_mm) + own + film**2))

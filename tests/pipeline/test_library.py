@@ -1,0 +1,173 @@
+"""The camera library: its files, a project that names one, and which camera a scan is of."""
+
+import json
+import re
+from importlib import resources
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.against_truth import compare_with_truth
+from pipeline.camera_file import CameraFile, read_camera
+from pipeline.camera_trials import Identification, Trial, identify
+from pipeline.cli import run
+from pipeline.errors import InputError
+from pipeline.library import library_names, library_path, read_library
+from pipeline.progress import Reporter
+from pipeline.project_file import read_project
+from pipeline.scene_file import render_project
+
+LIBRARY = read_library()
+SCENE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")
+RENDERED = "wild-rc10-153"
+SEPARATION = re.compile(r"# Separation (.+): ([\d.]+) mm, spread ([\d.]+) \((\d+) reports\)")
+ENDS = {"left to right": ("5", "6"), "top to bottom": ("7", "8"), "1 to 2": ("1", "2"), "3 to 4": ("3", "4")}
+
+
+@pytest.fixture(scope="module")
+def frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project of one rendered frame of a library camera, which it names."""
+    folder = tmp_path_factory.mktemp("library")
+    start, end = SCENE.index("[camera]\n"), SCENE.index("[field]\n")
+    scene = SCENE[:start] + f'camera = "library:{RENDERED}"\n' + SCENE[end:]
+    scene = scene[: scene.rindex("[[image]]")].replace("pitch_um = 45.0", "pitch_um = 100.0")
+    (folder / "scene.toml").write_text(scene, encoding="utf-8")
+    render_project(folder / "scene.toml", folder)
+    (folder / "project.toml").write_text(
+        f'camera = "library:{RENDERED}"\nscans = ["scans/*.tif"]\n[measure]\npose = "0"\n', encoding="utf-8"
+    )
+    return folder / "project.toml"
+
+
+def distance(camera: CameraFile, first: str, second: str) -> float:
+    places = {one.id: np.array(one.xy_mm) for one in camera.fiducials}
+    return float(np.hypot(*(places[first] - places[second])))
+
+
+def test_every_camera_is_listed_with_its_source(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cameras", "--json"]) == 0
+    listed = {entry["name"]: entry for entry in json.loads(capsys.readouterr().out)}
+    assert tuple(listed) == library_names()
+    assert len(listed) >= 20
+    assert all(entry["source"] for entry in listed.values())
+    assert listed["wild-rc8-153"]["drawn"] == ["1", "2", "3", "4"]
+    assert listed["jena-lmk-153"]["drawn"] == []
+    assert run(["cameras"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in listed)
+    assert "not known" in printed
+
+
+@pytest.mark.parametrize("name", library_names())
+def test_a_camera_is_typical_and_its_spread_is_one_of_cameras(name: str) -> None:
+    """Coordinates against the separations, which the reports give as figures of their own."""
+    camera = LIBRARY[name]
+    nominal = float(name.rsplit("-", 1)[1])
+    assert camera.principal_distance_mm == pytest.approx(nominal, abs=1.2)
+    assert 0.0 < camera.principal_distance_sigma_mm < 0.011 * nominal
+    sigmas = np.array([one.sigma_mm for one in camera.fiducials])
+    assert (sigmas >= 0.005).all()
+    assert (sigmas < (0.3 if name.startswith("fairchild") else 0.05)).all()
+    assert len(camera.fiducials) in (4, 8, 25)
+    for words, mm, spread, _ in SEPARATION.findall(library_path(name).read_text(encoding="utf-8")):
+        assert distance(camera, *ENDS[words]) == pytest.approx(float(mm), abs=max(0.02, 1.5 * float(spread)))
+
+
+def test_the_reseau_is_a_lattice_of_ten_mm() -> None:
+    camera = LIBRARY["hasselblad-reseau-60"]
+    assert min(distance(camera, a.id, b.id) for a, b in combinations(camera.fiducials, 2)) == 10.0
+    assert distance(camera, "11", "55") == pytest.approx(40.0 * np.sqrt(2.0))
+
+
+def test_a_printed_camera_is_a_file_to_start_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cameras", "zeiss-rmk-a-153"]) == 0
+    (tmp_path / "camera.toml").write_text(capsys.readouterr().out, encoding="utf-8")
+    camera = read_camera(tmp_path / "camera.toml")
+    assert camera.fiducials == LIBRARY["zeiss-rmk-a-153"].fiducials
+    assert camera.source == LIBRARY["zeiss-rmk-a-153"].source
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [
+        ("wild-rc8", "'wild-rc8-153'"),
+        ("wild-rc10", "'wild-rc10-153' or 'wild-rc10-214'"),
+        ("wild-rc9-87", "'wild-rc9-88'"),
+    ],
+)
+def test_a_misspelt_camera_is_told_its_neighbours(
+    name: str, near: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "project.toml").write_text(f'output = "out"\ncamera = "library:{name}"\n', encoding="utf-8")
+    assert run(["measure", str(tmp_path / "project.toml")]) == 2
+    said = capsys.readouterr().err
+    assert f"project.toml, line 2: camera: the camera library has no '{name}'. Did you mean {near}" in said
+    assert "`reseau cameras`" in said
+    assert run(["cameras", name]) == 2
+    assert near in capsys.readouterr().err
+
+
+def test_a_name_like_no_other_is_told_where_they_stand() -> None:
+    with pytest.raises(InputError, match=r"no 'xyz'\. `reseau cameras` lists them"):
+        library_path("xyz")
+
+
+def test_images_may_name_a_camera_of_the_library(tmp_path: Path) -> None:
+    (tmp_path / "images.csv").write_text("image,camera\na,library:wild-rc9-88\nb,\n", encoding="utf-8")
+    (tmp_path / "comparator.csv").write_text("image,point,kind,x_mm,y_mm\n", encoding="utf-8")
+    text = 'camera = "library:wild-rc8-153"\n[object]\nimages = "images.csv"\n'
+    (tmp_path / "project.toml").write_text(text, encoding="utf-8")
+    project = read_project(tmp_path / "project.toml")
+    assert [project.camera_of(name).name for name in "ab"] == ["Wild RC9, 88 mm", "Wild RC8, 153 mm"]
+
+
+def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
+    """All drawn marks within a tenth of a pixel of the truth; those that are not drawn are passed over."""
+    assert run(["measure", str(frame)]) == 0
+    measured = frame.parent / "out" / "measurement.json"
+    (compared,) = compare_with_truth(frame.parent / "truth.json", measured).frames
+    assert compared.observed["fiducial"] == 4
+    assert compared.wrong == ()
+    assert np.abs(compared.errors_px).max() < 0.1
+    assert (frame.parent / "comparator.csv").read_text(encoding="utf-8").count(",fiducial,") == 4
+
+
+def test_a_camera_with_marks_of_unknown_shape_is_not_measured(frame: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = frame.with_name("other.toml")
+    other.write_text(frame.read_text(encoding="utf-8").replace(RENDERED, "jena-lmk-153"), encoding="utf-8")
+    assert run(["measure", str(other)]) == 2
+    assert "jena-lmk-153.toml: fiducial '1' has no mark, and so cannot be found in a scan" in capsys.readouterr().err
+
+
+def test_the_frame_is_told_from_another_camera(frame: Path) -> None:
+    """A ring with a cross holds the plain cross of older cameras too: the ring then counts as damage."""
+    (scan,) = (frame.parent / "scans").glob("*.tif")
+    few = {name: LIBRARY[name] for name in ("jena-lmk-153", "wild-rc5-153", "wild-rc8-153", RENDERED)}
+    found = identify(scan, few, None, Reporter())
+    assert [trial.cameras for trial in found.trials] == [(RENDERED,), ("wild-rc5-153", "wild-rc8-153")]
+    assert [trial.cameras for trial in found.best] == [(RENDERED,)]
+    best = found.trials[0]
+    assert (best.found, best.drawn, best.chance) == (4, 4, 0.0)
+    assert best.likeness > 0.8
+    assert best.residual_sigmas is not None
+    assert best.residual_sigmas < 2.0
+    assert RENDERED in found.sentence()
+
+
+def trial(cameras: tuple[str, ...], score: float, chance: float = 0.0) -> Trial:
+    return Trial(cameras, 4, 4, 0.9, 10.0, score, chance, 1.0, 0.01, "", 2.0)
+
+
+def test_what_chance_finds_as_well_does_not_stand_out() -> None:
+    found = Identification(Path("a.tif"), (trial(("a",), 0.5, 0.3), trial(("b",), 0.0)))
+    assert found.best == ()
+    assert "no camera of the library stands out" in found.sentence()
+    assert found.as_json()["best"] == []
+
+
+def test_cameras_that_come_close_are_all_named() -> None:
+    found = Identification(Path("a.tif"), (trial(("a", "b"), 0.9), trial(("c",), 0.85), trial(("d",), 0.4)))
+    assert found.as_json()["best"] == ["a", "b", "c"]
+    assert "c comes close with 0.85" in found.sentence()
