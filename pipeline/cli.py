@@ -185,6 +185,8 @@ def cameras(
     as_json: AsJson = False,
 ) -> int:
     """The camera library: its list, one of its files, or which of its cameras a scan is of."""
+    if (name is not None and (scan is not None or as_json)) or (pitch_um is not None and scan is None):
+        raise InputError("give NAME alone, or --scan with or without --pitch, or neither for the list.")
     if name is not None:
         typer.echo(library_path(name.removeprefix(PREFIX)).read_text(encoding="utf-8"), nl=False)
         return DONE

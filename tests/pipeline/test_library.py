@@ -114,6 +114,12 @@ def test_a_name_like_no_other_is_told_where_they_stand() -> None:
         library_path("xyz")
 
 
+@pytest.mark.parametrize("words", [["wild-rc9-88", "--scan", "a.tif"], ["wild-rc9-88", "--json"], ["--pitch", "20"]])
+def test_options_that_do_not_go_together(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cameras", *words]) == 2
+    assert "give NAME alone" in capsys.readouterr().err
+
+
 def test_images_may_name_a_camera_of_the_library(tmp_path: Path) -> None:
     (tmp_path / "images.csv").write_text("image,camera\na,library:wild-rc9-88\nb,\n", encoding="utf-8")
     (tmp_path / "comparator.csv").write_text("image,point,kind,x_mm,y_mm\n", encoding="utf-8")
