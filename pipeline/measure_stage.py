@@ -18,6 +18,7 @@ from measure.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scan import Scan, open_scan
 from pipeline.camera_file import CameraFile
+from pipeline.coded_sheet import CodedSheet
 from pipeline.errors import InputError
 from pipeline.measurement_file import MeasuredScan
 from pipeline.progress import Reporter
@@ -33,6 +34,8 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     """
     if not project.scans:
         raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
+    if project.targets is not None and project.targets.code is not None:
+        CodedSheet.of(project, project.targets)
     _check_readable(list(project.scans.values()))
     with reporter.stage("measured") as count, _workers(len(project.scans)) as workers:
         futures = {workers.submit(measure_scan, project, name): name for name in project.scans}

@@ -20,6 +20,7 @@ from measure.shapes import Polarity
 from measure.status import Status
 from measure.targets import TargetOptions, TargetPrediction, measure_disks
 from pipeline.camera_file import CameraFile
+from pipeline.coded_sheet import CodedSheet, measure_sheet
 from pipeline.comparator_file import comparator_from_pixel, pixel_from_comparator
 from pipeline.disks import disk_images, disk_normals, plane_normal
 from pipeline.identification import PatternOptions, assign, recognise
@@ -69,6 +70,9 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
         # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
         notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
         return with_targets(measured, board.marks, (*problems, *notes))
+    if settings.code is not None:
+        marks, problems = measure_sheet(scan, CodedSheet.of(project, settings))
+        return with_targets(measured, marks, problems)
     field = target_field(project)
     model, why = approximate_model(project, measured)
     if model is not None:

@@ -1,27 +1,33 @@
 """The table [targets] of project.toml: what is to be measured beside the fiducials."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import cast
 
 from measure.board_specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec
+from measure.ring_codes import RingCode
 from measure.shapes import Polarity
 from pipeline.tables import Table
 
-KINDS = ("disk", "chessboard", "circle-grid", "aruco", "charuco")
-NOT_YET = ("cross", "coded-ring")
+KINDS = ("disk", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco")
+NOT_YET = ("cross",)
 
 
 @dataclass(frozen=True)
 class TargetSettings:
     """What the targets are: single disks, or a board whose corners or dots have their places on it.
 
-    diameter_mm: of the disks, also those of a board, in object space; None for corners.
+    diameter_mm: of the disks, also those of a board, in object space; None for corners, and where nothing is to be
+    corrected. code: the ring about some of the disks; numbers: the point that each number of that code is, those of
+    numbers that are not named here having the number as their name.
     """
 
     kind: str
     diameter_mm: float | None = None
     polarity: Polarity = "auto"
     board: BoardSpec | None = None
+    code: RingCode | None = None
+    numbers: Mapping[int, str] = field(default_factory=dict)
 
 
 def read_targets(table: Table) -> TargetSettings:
@@ -32,6 +38,8 @@ def read_targets(table: Table) -> TargetSettings:
     kind = table.text("kind", choices=KINDS)
     if kind == "disk":
         settings = TargetSettings(kind, table.number("diameter_mm", above=0.0), _polarity(table))
+    elif kind == "coded-ring":
+        settings = _coded(table)
     else:
         try:
             board = _board(kind, table)
@@ -41,6 +49,32 @@ def read_targets(table: Table) -> TargetSettings:
         settings = TargetSettings(kind, diameter, board=board)
     table.done()
     return settings
+
+
+def _coded(table: Table) -> TargetSettings:
+    default = RingCode()
+    diameter = table.number("diameter_mm", above=0.0) if "diameter_mm" in table else None
+    bits = table.whole("bits", default.bits)
+    try:
+        code = RingCode(bits, table.pair("ring", default.ring))
+    except ValueError as error:
+        raise table.error("kind", f"this coded-ring is impossible: {error}.") from None
+    return TargetSettings("coded-ring", diameter, _polarity(table), code=code, numbers=_numbers(table, code))
+
+
+def _numbers(table: Table, code: RingCode) -> dict[int, str]:
+    """The point of each number that the table names, the number as it is read from a picture."""
+    codes = table.table("codes")
+    points: dict[int, str] = {}
+    for point in codes.names():
+        written = codes.whole(point)
+        if not 0 < written < 2**code.bits - 1:
+            raise codes.error(point, f"{written} is no number of {code.bits} bits with some set and some not.")
+        number = code.least_turn(written)
+        if number in points:
+            raise codes.error(point, f"{written} is, turned, the code of {points[number]} too. Codes are to differ.")
+        points[number] = point
+    return points
 
 
 def _polarity(table: Table) -> Polarity:
