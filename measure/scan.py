@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from copy import copy
 from pathlib import Path
 from types import TracebackType
 
@@ -19,6 +20,7 @@ from measure.tiff_scan import open_tiff
 Array = NDArray[np.float32]
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
+GREEN = (0.0, 1.0, 0.0)
 CACHE_BYTES = 64 << 20
 
 
@@ -43,6 +45,15 @@ class Scan:
         self.notes = notes
         self._segments = segments
         self._cache = SegmentCache(segments)
+        self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
+
+    def green(self) -> "Scan":
+        """The same scan with its green for grey value, if it has colours. A lens draws red and blue at scales of their
+        own, some 1e-4 off; a mark in a mixture of all has no one place."""
+        scan = copy(self)
+        if self.channels == len(GREEN):
+            scan._grey_weights = GREEN
+        return scan
 
     def window(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
         """(height, width) float32 grey values; parts outside of the scan repeat its edge.
@@ -88,7 +99,7 @@ class Scan:
 
     def _weights(self, weights: Sequence[float] | None) -> Array:
         if weights is None:
-            weights = (1.0,) if self.channels == 1 else LUMINANCE
+            weights = self._grey_weights
         if len(weights) != self.channels:
             raise ValueError(f"{self.name}: {len(weights)} weights for {self.channels} channels")
         return np.asarray(weights, np.float32)

@@ -21,7 +21,8 @@ IDLE_ROUNDS = 3  # after which names that come and go are not followed any furth
 GROWN = 8  # suggestions, the best ones, that are followed to their end
 LEAST_NAMED = 8
 LEAST_SHARE = 0.5  # of the sheet's points in the picture
-GATE_SIGMAS, LEAST_GATE_PX = 6.0, 3.0
+GATE_SIGMAS, LEAST_GATE_PX = 6.0, 2.0
+SHAPE = 1.35  # radii of a dot's ellipse over those expected, in any direction, or the reverse
 LARGEST_RADIAL = 0.6  # at the picture's corner, relative
 
 
@@ -122,9 +123,7 @@ def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | st
         if best is not None and not best.strangers:
             break
     if best is None:
-        return (
-            f"the {len(dots.coded)} coded targets recognised do not put the other points of the sheet where dots are"
-        )
+        return f"the {len(dots.coded)} coded targets recognised do not put the other points of the sheet where dots are"
     return best
 
 
@@ -202,10 +201,10 @@ def _pairs(view: SheetView, sheet: Array, centers_px: Array, among: Indices) -> 
     if len(seen) < 2 or not len(centers_px):
         return {}
     tree = cKDTree(places[np.isfinite(places).all(axis=1)])
-    spacing, _ = tree.query(places[seen], k=2)
-    distance, dot = cKDTree(centers_px).query(places[seen])
-    _, back = cKDTree(places[seen]).query(centers_px)
-    mutual = (back[dot] == np.arange(len(seen))) & (distance < NEAR * spacing[:, 1])
+    spacing = np.asarray(tree.query(places[seen], k=[2])[0])[:, 0]
+    distance, dot = (np.asarray(found) for found in cKDTree(centers_px).query(places[seen]))
+    back = np.asarray(cKDTree(places[seen]).query(centers_px)[1])
+    mutual = (back[dot] == np.arange(len(seen))) & (distance < NEAR * spacing)
     return {int(point): int(one) for point, one in zip(seen[mutual], dot[mutual], strict=True)}
 
 
@@ -269,17 +268,19 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     def is_alone(point: int) -> bool:
         return len(tree.query_ball_point(places[point], gate_px)) == 1
 
+    shapes = _shapes(view, sheet, dots, pairs)
+    like = _alike(dots.pixel_from_disk[list(pairs.values())], shapes[points])
     named = {
         point: dot
-        for (point, dot), distance in zip(pairs.items(), np.hypot(*off.T), strict=True)
-        if distance <= gate_px and (dots.coded.get(dot) == point or is_alone(point))
+        for (point, dot), distance, right in zip(pairs.items(), np.hypot(*off.T), like, strict=True)
+        if right and distance <= gate_px and (dots.coded.get(dot) == point or is_alone(point))
     }
     expected = int(np.sum(np.all((places >= 0.0) & (places <= np.array(view.size_px) - 1.0), axis=1)))
     right = sum(named.get(point) == dot for dot, point in dots.coded.items())
     strangers = tuple(dot for dot, point in dots.coded.items() if named.get(point) != dot)
     if len(named) < max(LEAST_NAMED, LEAST_SHARE * expected) or right < 2 or right <= len(strangers):
         return None
-    return Naming(places, _shapes(view, sheet, dots, named), named, gate_px, strangers)
+    return Naming(places, shapes, named, gate_px, strangers)
 
 
 def _unevenness(sheet: Array, points: Indices, residuals: Array) -> Array:
@@ -292,9 +293,15 @@ def _unevenness(sheet: Array, points: Indices, residuals: Array) -> Array:
     return np.asarray(np.nanmedian(of_neighbours, axis=1))
 
 
-def _shapes(view: SheetView, sheet: Array, dots: Dots, named: Mapping[int, int]) -> Array:
-    """(n, 2, 2) how the dots of all points should look, of the radius on the sheet that the named ones have."""
+def _shapes(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Array:
+    """(n, 2, 2) how the dots of all points should look, of the radius on the sheet that most have."""
     step = 0.01 * float(np.ptp(sheet, axis=0).max())
     unit = view.pixel_from_disks(sheet, step) / step
-    areas = np.abs(np.linalg.det(dots.pixel_from_disk[list(named.values())]) / np.linalg.det(unit[list(named)]))
+    areas = np.abs(np.linalg.det(dots.pixel_from_disk[list(pairs.values())]) / np.linalg.det(unit[list(pairs)]))
     return np.asarray(unit * np.sqrt(np.nanmedian(areas)))
+
+
+def _alike(seen: Array, expected: Array) -> NDArray[np.bool_]:
+    """(n,) whether ellipses (n, 2, 2) are of the size and the shape expected."""
+    radii = np.linalg.svd(np.linalg.solve(expected, seen), compute_uv=False)
+    return np.asarray(np.all((radii < SHAPE) & (radii > 1.0 / SHAPE), axis=1))

@@ -1,4 +1,4 @@
-"""A flat sheet of dots, some of them ring-coded: found in the whole picture and named with no approximate orientation."""
+"""A flat sheet of dots, some of them ring-coded: found in the whole picture, named without any orientation."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -54,19 +54,22 @@ class CodedSheet:
                 )
         places = np.array(list(xyz.values())).reshape(-1, 3)
         if len(places) < 4:
-            raise InputError(f"{project.path}: [object] points: {len(places)} points with X, Y and Z are no sheet; give 4.")
+            raise InputError(
+                f"{project.path}: [object] points: {len(places)} points with X, Y and Z are no sheet; give 4."
+            )
         spread = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
         height = np.ptp((places - places.mean(axis=0)) @ spread.Vh[2])
         if height > _FLAT * np.ptp((places - places.mean(axis=0)) @ spread.Vh[0]):
             raise InputError(
                 f"{project.path}: [object] points: coded targets are named on flat sheets only, and these points leave "
-                f"their plane by {height:.3g}. Measure such a field as disks, with approximate orientations in images.csv."
+                f"their plane by {height:.3g}. Measure such a field as disks, with orientations in images.csv."
             )
         return cls(tuple(xyz), (places - places.mean(axis=0)) @ spread.Vh[:2].T, settings)
 
 
 def measure_sheet(scan: Scan, sheet: CodedSheet) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """A mark for every point of the sheet, and what is to be said of the whole."""
+    scan = scan.green()
     found = _candidates(scan, sheet)
     numbers = _numbers(scan, found, sheet)
     coded, notes = _coded(numbers, sheet)
@@ -83,10 +86,10 @@ def measure_sheet(scan: Scan, sheet: CodedSheet) -> tuple[tuple[MarkMeasurement,
         notes = (*notes, f"Rings that read as {listed(strangers)} lie where the sheet has another point, or none.")
     options = TargetOptions("light" if _sign(found, coded) > 0.0 else "dark")
     predictions = _predictions(sheet, found, naming)
-    marks = {mark.point: mark for mark in measure_disks(scan, predictions, options)}
+    measured = {mark.point: mark for mark in measure_disks(scan, predictions, options)}
     unseen = "the sheet's place in the picture does not show it"
     absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in sheet.ids}
-    return tuple((absent | marks).values()), notes
+    return tuple((absent | measured).values()), notes
 
 
 def _candidates(scan: Scan, sheet: CodedSheet) -> list[Candidate]:

@@ -9,12 +9,12 @@ from adjust.projection import adjusted_image
 from adjust.result import Adjustment
 from measure.results import MarkMeasurement
 from measure.scan import open_scan
-from measure.shapes import Polarity
 from measure.targets import TargetOptions, measure_disks
 from pipeline.measurement_file import MeasuredScan
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
 from pipeline.target_stage import Field, target_field, with_targets
+from pipeline.target_table import TargetSettings
 
 _SEARCH_PX = 2.0  # an adjusted orientation predicts to far less than that
 
@@ -34,7 +34,7 @@ def measure_again(
     with reporter.stage("looking again at") as count:
         for done, scan in enumerate(scans):
             count(scan.frame.image, done, len(scans))
-            visited.append(_visit(field, scan, adjustment, settings.polarity))
+            visited.append(_visit(field, scan, adjustment, settings))
     return tuple(visited) if any(new is not old for new, old in zip(visited, scans, strict=True)) else None
 
 
@@ -47,7 +47,7 @@ def _with_adjusted_points(field: Field, adjustment: Adjustment) -> Field:
     return replace(field, xyz=xyz)
 
 
-def _visit(field: Field, scan: MeasuredScan, adjustment: Adjustment, polarity: Polarity) -> MeasuredScan:
+def _visit(field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings) -> MeasuredScan:
     """The same object where the visit brought nothing."""
     network = adjustment.network
     if scan.frame.image not in network.image_by_name or scan.frame.image in network.unoriented:
@@ -63,7 +63,8 @@ def _visit(field: Field, scan: MeasuredScan, adjustment: Adjustment, polarity: P
     if not missed:
         return scan
     with open_scan(scan.scan) as opened:
-        marks = measure_disks(opened, missed, TargetOptions(polarity))
+        grey = opened if settings.code is None else opened.green()
+        marks = measure_disks(grey, missed, TargetOptions(settings.polarity))
     found = {mark.point: mark for mark in marks if mark.status.is_observation}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
     fresh = {point: mark for point, mark in found.items() if _is_free(mark, np.array(taken).reshape(-1, 2))}

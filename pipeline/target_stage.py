@@ -64,15 +64,14 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
     settings = project.targets
     if settings is None:
         return measured
+    if settings.code is not None:
+        return with_targets(measured, *measure_sheet(scan, CodedSheet.of(project, settings)))
     if settings.board is not None:
         board = measure_board(scan, settings.board)
         problems = (f"The board was not found: {board.reason}.",) if board.reason else ()
         # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
         notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
         return with_targets(measured, board.marks, (*problems, *notes))
-    if settings.code is not None:
-        marks, problems = measure_sheet(scan, CodedSheet.of(project, settings))
-        return with_targets(measured, marks, problems)
     field = target_field(project)
     model, why = approximate_model(project, measured)
     if model is not None:

@@ -18,8 +18,8 @@ TWELVE = RingCode()
 
 
 def ringed(number: int, code: RingCode, turn: float, light: bool = False, tilt: Array | None = None) -> Scan:
-    """A dot with the code's segments about it, the first one beginning at an angle `turn`, clockwise as seen; tilt (2,):
-    how fast the scale changes over the picture, per px."""
+    """A dot with the code's segments about it, the first one at an angle `turn`, clockwise as seen; tilt (2,): how fast
+    the scale changes over the picture, per px."""
     inverse = np.linalg.inv(SHAPE)
     bits = np.array([number >> bit & 1 for bit in range(code.bits)[::-1]], bool)
 
@@ -40,7 +40,7 @@ def ringed(number: int, code: RingCode, turn: float, light: bool = False, tilt: 
 def dot(light: bool = False, spin: float = 0.0) -> Candidate:
     """The dot as a search finds it: an ellipse, whose axes say nothing of its circle's turn."""
     turn = np.array([[np.cos(spin), -np.sin(spin)], [np.sin(spin), np.cos(spin)]])
-    return Candidate(CENTER + (0.2, -0.1), 1.03 * SHAPE @ turn, 30000.0 if light else -30000.0)
+    return Candidate(CENTER + np.array([0.2, -0.1]), 1.03 * SHAPE @ turn, 30000.0 if light else -30000.0)
 
 
 @pytest.mark.parametrize(("code", "number"), [(EIGHT, 31), (EIGHT, 37), (EIGHT, 85), (TWELVE, 0b000001011011)])

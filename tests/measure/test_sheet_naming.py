@@ -15,7 +15,7 @@ DIAGONAL = float(np.hypot(*SIZE))
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A sheet (n, 2), the dots found of it and others; origin (m,): the point that each dot is, -1 for none."""
+    """A sheet (n, 2), its dots and others; origin (m,): the point that each dot is, -1 for none."""
 
     sheet: Array
     dots: Dots
@@ -27,8 +27,8 @@ class View:
 
 
 def seen(rng: np.random.Generator, columns: int, rows: int, codes: int, uneven: float = 0.0) -> View:
-    """A sheet under a pinhole camera with a lens of up to 15 % distortion, rolled anyhow; a fifth of its dots missing, a
-    fifth as many false ones."""
+    """A sheet under a pinhole camera with a lens of up to 15 % distortion, rolled anyhow; a fifth of its dots missing,
+    a fifth as many false ones."""
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
     middle = grid.mean(axis=0)
     height = uneven * np.sin(grid[:, 0] / 2.5) * np.cos(grid[:, 1] / 3.5)
@@ -46,13 +46,17 @@ def seen(rng: np.random.Generator, columns: int, rows: int, codes: int, uneven: 
         return np.asarray(place * DIAGONAL / 1.4 + (np.array(SIZE) - 1) / 2 + (30.0, -20.0))
 
     places, radius = project(board), 0.15
-    across, up = project(board + (radius, 0, 0)), project(board + (0, radius, 0))
+    across, up = (project(board + radius * axis) for axis in np.eye(3)[:2])
     spin = np.einsum("nik,nkj->nij", np.stack([across - places, up - places], axis=-1), spins(rng, len(grid)))
     inside = np.all((places > 5) & (places < np.array(SIZE) - 6), axis=1)
     found = np.flatnonzero(inside & (rng.random(len(grid)) < 0.8))
     false = int(0.2 * len(grid))
-    centers = np.concatenate([places[found] + rng.normal(0, 0.3, (len(found), 2)), rng.uniform(0, 1, (false, 2)) * SIZE])
-    shapes = np.concatenate([spin[found] * rng.uniform(0.95, 1.05, (len(found), 1, 1)), np.tile(9 * np.eye(2), (false, 1, 1))])
+    centers = np.concatenate(
+        [places[found] + rng.normal(0, 0.3, (len(found), 2)), rng.uniform(0, 1, (false, 2)) * SIZE]
+    )
+    shapes = np.concatenate(
+        [spin[found] * rng.uniform(0.95, 1.05, (len(found), 1, 1)), np.tile(9 * np.eye(2), (false, 1, 1))]
+    )
     origin = np.concatenate([found, np.full(false, -1)])
     coded = {int(dot): int(found[dot]) for dot in rng.choice(len(found), codes, replace=False)}
     return View(grid, Dots(centers, shapes, coded), origin, int(inside.sum()))
