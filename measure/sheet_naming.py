@@ -18,6 +18,7 @@ NEIGHBOURS = 8  # of a named point on the sheet, that are looked for next
 NEAR = 0.3  # of the distance to the next point in the picture, between where a dot is expected and where it is
 RADIAL_FROM, SECOND_RADIAL_FROM = 10, 30  # named dots, from which on the lens's radial distortion is estimated too
 IDLE_ROUNDS = 3  # after which names that come and go are not followed any further
+MOST_PAIRS = 150  # of coded dots
 GROWN = 8  # suggestions, the best ones, that are followed to their end
 LEAST_NAMED = 8
 LEAST_SHARE = 0.5  # of the sheet's points in the picture
@@ -130,8 +131,9 @@ def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | st
 def _suggestions(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> list[SheetView]:
     """A view for each two coded dots, for the sheet's front and for its back, whose coordinates are left-handed."""
     pairs = [(a, b) for a, b in combinations(dots.coded, 2) if dots.coded[a] != dots.coded[b]]
+    tried = pairs[:: len(pairs) // MOST_PAIRS + 1]
     views = []
-    for hand, (first, second) in product((np.diag([1.0, -1.0]), np.eye(2)), pairs):
+    for hand, (first, second) in product((np.diag([1.0, -1.0]), np.eye(2)), tried):
         points, seen = _by_two(sheet, dots, first, second, hand)
         empty = SheetView(np.eye(3), np.zeros(2), size_px)
         homography = _homography(points, empty.undistorted(seen))
@@ -272,13 +274,13 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     like = _alike(dots.pixel_from_disk[list(pairs.values())], shapes[points])
     named = {
         point: dot
-        for (point, dot), distance, right in zip(pairs.items(), np.hypot(*off.T), like, strict=True)
-        if right and distance <= gate_px and (dots.coded.get(dot) == point or is_alone(point))
+        for (point, dot), distance, fits in zip(pairs.items(), np.hypot(*off.T), like, strict=True)
+        if fits and distance <= gate_px and (dots.coded.get(dot) == point or is_alone(point))
     }
     expected = int(np.sum(np.all((places >= 0.0) & (places <= np.array(view.size_px) - 1.0), axis=1)))
     right = sum(named.get(point) == dot for dot, point in dots.coded.items())
     strangers = tuple(dot for dot, point in dots.coded.items() if named.get(point) != dot)
-    if len(named) < max(LEAST_NAMED, LEAST_SHARE * expected) or right < 2 or right <= len(strangers):
+    if len(named) < max(min(LEAST_NAMED, len(sheet)), LEAST_SHARE * expected) or right < 2 or right <= len(strangers):
         return None
     return Naming(places, shapes, named, gate_px, strangers)
 
@@ -297,11 +299,18 @@ def _shapes(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     """(n, 2, 2) how the dots of all points should look, of the radius on the sheet that most have."""
     step = 0.01 * float(np.ptp(sheet, axis=0).max())
     unit = view.pixel_from_disks(sheet, step) / step
-    areas = np.abs(np.linalg.det(dots.pixel_from_disk[list(pairs.values())]) / np.linalg.det(unit[list(pairs)]))
+    areas = _areas(dots.pixel_from_disk[list(pairs.values())]) / _areas(unit[list(pairs)])
     return np.asarray(unit * np.sqrt(np.nanmedian(areas)))
+
+
+def _areas(shapes: Array) -> Array:
+    """(n,) of the parallelograms of (n, 2, 2); nan where a shape is nan."""
+    return np.asarray(np.abs(shapes[:, 0, 0] * shapes[:, 1, 1] - shapes[:, 0, 1] * shapes[:, 1, 0]))
 
 
 def _alike(seen: Array, expected: Array) -> NDArray[np.bool_]:
     """(n,) whether ellipses (n, 2, 2) are of the size and the shape expected."""
-    radii = np.linalg.svd(np.linalg.solve(expected, seen), compute_uv=False)
-    return np.asarray(np.all((radii < SHAPE) & (radii > 1.0 / SHAPE), axis=1))
+    known = _areas(expected) > 0.0
+    radii = np.linalg.svd(np.linalg.solve(expected[known], seen[known]), compute_uv=False)
+    known[known] = np.all((radii < SHAPE) & (radii > 1.0 / SHAPE), axis=1)
+    return known

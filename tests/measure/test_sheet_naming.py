@@ -73,7 +73,7 @@ def spins(rng: np.random.Generator, count: int) -> Array:
     return np.stack([about(2, angle)[:2, :2] for angle in rng.uniform(0, 2 * np.pi, count)])
 
 
-@pytest.mark.parametrize(("columns", "rows", "codes", "views"), [(10, 10, 4, 12), (10, 10, 2, 12), (23, 21, 6, 3)])
+@pytest.mark.parametrize(("columns", "rows", "codes", "views"), [(10, 10, 4, 8), (10, 10, 2, 8), (23, 21, 6, 2)])
 def test_a_fifth_missing_and_a_fifth_false(columns: int, rows: int, codes: int, views: int) -> None:
     rng = np.random.default_rng(columns + codes)
     for _ in range(views):
@@ -87,7 +87,7 @@ def test_a_fifth_missing_and_a_fifth_false(columns: int, rows: int, codes: int, 
 
 def test_codes_misread_are_outvoted_or_nothing_is_named() -> None:
     rng = np.random.default_rng(3)
-    for _ in range(6):
+    for _ in range(3):
         view = seen(rng, 10, 10, 5)
         points = dict(view.dots.coded)
         one_wrong = {**points, next(iter(points)): int(rng.integers(0, 100))}
