@@ -1,11 +1,15 @@
 """Ring codes read in any rotation, under perspective, in both polarities; other things about a dot are no code."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from drawn import drawn, scan_of
 from numpy.typing import NDArray
 
 from measure.disk_search import Candidate
+from measure.picture_scan import WholePicture
+from measure.resolution import NO_TAGS
 from measure.ring_codes import RingCode, read_code
 from measure.scan import Scan
 
@@ -81,3 +85,13 @@ def test_impossible_codes_are_refused() -> None:
         RingCode(2)
     with pytest.raises(ValueError, match="inner one first"):
         RingCode(12, (3.0, 2.0))
+
+
+def test_green_alone_is_the_grey_value_of_a_scan_asked_for_it() -> None:
+    colours = np.random.default_rng(8).integers(0, 65535, (20, 30, 3)).astype(np.uint16)
+    scan = Scan(Path("colours.tif"), WholePicture(colours), NO_TAGS)
+    before = scan.window(2, 3, 10, 8)
+    np.testing.assert_array_equal(scan.green().window(2, 3, 10, 8), colours[3:11, 2:12, 1])
+    np.testing.assert_array_equal(scan.window(2, 3, 10, 8), before)
+    grey = scan_of(colours[..., 0].astype(float))
+    np.testing.assert_array_equal(grey.green().window(0, 0, 30, 20), colours[..., 0])
