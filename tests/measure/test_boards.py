@@ -271,6 +271,7 @@ def test_published_calibration_of_a_chessboard() -> None:
     assert np.all(np.abs(np.array(found) - PUBLISHED) < THREE_SIGMA)
 
 
+@pytest.mark.slow
 @needs_data
 def test_hexagonal_circle_grids_of_another_project() -> None:
     spec = CircleGridSpec(24, 28, 1.2 * np.sqrt(3) / 2, 1.0, asymmetric=True, row_spacing_mm=0.6)
