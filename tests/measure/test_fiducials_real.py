@@ -70,7 +70,7 @@ def scouted(number: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDAr
     return columns[:, :2], columns[:, 2:4], columns[:, 4] == 1
 
 
-@pytest.mark.parametrize("number", [11, *(pytest.param(n, marks=pytest.mark.slow) for n in (15, 16)), 17])
+@pytest.mark.parametrize("number", [11, *(pytest.param(n, marks=pytest.mark.slow) for n in (15, 16, 17))])
 def test_the_crosses_of_a_reseau_on_a_landscape(number: int) -> None:
     """As many crosses as line profiles found, and on the same crosses no larger residuals: on all of them, those too
     that the profiles' affinity left out, and on those that it used."""
