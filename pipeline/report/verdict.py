@@ -18,6 +18,29 @@ Level = Literal["good", "look", "failed"]
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
 MANY = 8  # so many names are listed; the rest are counted
 
+# Observations other than marks, by their key in adjustment.json: what is said of one and of many, and what to do.
+FURTHER = (
+    (
+        "distances",
+        "{} distance beyond chance",
+        "{} distances beyond chance",
+        "Look for a wrong point or unit in the file of distances; two distances that contradict each other are both "
+        "named.",
+    ),
+    (
+        "calibrations",
+        "The images contradict the earlier calibration",
+        "The images contradict the earlier calibration",
+        "The camera has changed since, or the earlier adjustment lacked something; calibrate without it and compare.",
+    ),
+    (
+        "antennas",
+        "{} coordinate of antennas beyond chance",
+        "{} coordinates of antennas beyond chance",
+        "Look for a wrong image or time, and at the antenna's offset and its sign.",
+    ),
+)
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -167,30 +190,16 @@ def _told(row: Json) -> str:
 
 def _further_problems(adjustment: Json) -> Iterator[Problem]:
     """Distances, earlier calibrations and antennas that the images contradict."""
-    bad = _beyond_chance(adjustment, adjustment["distances"])
-    if bad:
-        names = [f"{row['from']} to {row['to']} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})" for row in bad]
-        yield Problem(
-            f"{_count(len(bad), 'distance')} beyond chance: {_listed(names)}.",
-            "Look for a wrong point or unit in the file of distances; two distances that contradict each other are "
-            "both named.",
-        )
-    bad = _beyond_chance(adjustment, adjustment["calibrations"])
-    if bad:
-        names = [f"{row['name']} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})" for row in bad]
-        yield Problem(
-            f"The images contradict the earlier calibration: {_listed(names)}.",
-            "The camera has changed since, or the earlier adjustment lacked something; calibrate without it and "
-            "compare.",
-        )
+    for group, one, many, remedy in FURTHER:
+        bad = _beyond_chance(adjustment, adjustment[group])
+        if bad:
+            heading = (one if len(bad) == 1 else many).format(len(bad))
+            yield Problem(f"{heading}: {_listed([_with_residual(row) for row in bad])}.", remedy)
 
-    bad = _beyond_chance(adjustment, adjustment["antennas"])
-    if bad:
-        names = [f"{row['name']} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})" for row in bad]
-        yield Problem(
-            f"{_count(len(bad), 'coordinate')} of antennas beyond chance: {_listed(names)}.",
-            "Look for a wrong image or time, and at the antenna's offset and its sign.",
-        )
+
+def _with_residual(row: Json) -> str:
+    name = row.get("name") or f"{row['from']} to {row['to']}"
+    return f"{name} (v = {row['v']:.4g}, w = {fixed(row['w'], 1)})"
 
 
 def _beyond_chance(adjustment: Json, rows: list[Json]) -> list[Json]:
