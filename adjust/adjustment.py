@@ -7,25 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.approximations import approximate
+from adjust.assessment import RunAssessment
 from adjust.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.datum_choice import chosen_coordinates, chosen_points, with_held
-from adjust.diagnosis import undetermined, weak_directions
 from adjust.errors import AdjustmentError
-from adjust.iteration import factorise
 from adjust.network import STRAIGHT, Approximations, Network
 from adjust.options import Datum, Method, Options
 from adjust.problem import Problem, number
-from adjust.reliability import Misfits, reliability
-from adjust.residuals import further_residuals, groups, residuals
 from adjust.result import Adjustment, Cofactor
-from adjust.runs import ROUNDS, Run, again, run
-from adjust.snooping import contradictions, search, suspects
-from adjust.suspicions import suspicions
-from adjust.tested import TestedUnits
-from adjust.transformation import marks_needed
+from adjust.runs import Run, again, run
 from adjust.validation import validate
-from adjust.variance_components import factor_sigmas
 
 __all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "with_datum"]
 
@@ -68,7 +60,7 @@ def _begun_anew(network: Network, approximations: Approximations, options: Optio
         f"{stopped.iterations} steps); it was begun anew from approximations found from the network itself. Check "
         "those given."
     )
-    return replace(result, warnings=(warning, *result.warnings))
+    return replace(result, remarks=(warning, *result.remarks))
 
 
 def adjust_problem(problem: Problem, options: Options, held: Iterable[int] = ()) -> Adjustment:
@@ -137,50 +129,24 @@ def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
 
 def _result(last: Run, cofactor: Cofactor, options: Options) -> Adjustment:
     problem, state, weighting = last.problem, last.end.state, last.weighting
-    observed = len(last.end.v_mm)
-    further_rows = sum(len(each.observed) for each in problem.further)
-    conditions = int(TestedUnits(problem).sizes[weighting.used].sum()) + further_rows
-    further_blocks, delta = last.end.rows.further, options.probabilities.noncentrality(1)
-    further = tuple(further_residuals(problem, state, further_blocks, last.solution.factor, delta))
-    found = last.found if last.has_solution else None
-    of_marks = residuals(last.end.v_mm, found, weighting)
-    doubts = suspicions(problem.network.observations, of_marks) if last.converged else []
-    result = Adjustment(
+    assessment = RunAssessment(last, cofactor, options.probabilities)
+    return Adjustment(
         network=problem.network,
         termination=last.solution.termination,
         iterations=len(last.solution.history),
-        conditions=conditions,
+        conditions=assessment.conditions,
         unknowns=len(last.numbering.free),
-        redundancy=conditions - len(last.numbering.free),
+        redundancy=assessment.redundancy,
         vpv=last.end.vpv,
         names=problem.unknowns.names,
         values=np.where(_meaningless(problem), np.nan, state.values),
         cofactor=cofactor,
-        residuals=of_marks,
-        groups=groups(problem, state, last.end.v_mm, found, weighting, further),
-        further=further,
+        assessment=assessment,
         singular=last.singular if last.solution.termination == "singular" else (),
-        warnings=(*_warnings(last, cofactor), *doubts),
         history=last.solution.history,
         mirrored=problem.mirrored,
-        weights=weighting.weights[:observed],
+        weights=weighting.weights[: len(last.end.v_mm)],
         variance_factors=weighting.factors,
-    )
-    return result if found is None else _tested(result, last, found, options)
-
-
-def _tested(result: Adjustment, last: Run, found: Misfits, options: Options) -> Adjustment:
-    """The result with its reliability, its suspects and the sigmas of its variance factors."""
-    probabilities, weighting = options.probabilities, last.weighting
-    at = (last.numbering, last.end, last.factor, found)
-    reliable = reliability(*at, weighting.weights, result.sigma0, result.redundancy, probabilities)
-    tests = search(*at, weighting, probabilities)
-    contradicting = contradictions(tests)
-    return replace(
-        result,
-        variance_sigmas=factor_sigmas(*at, weighting) if weighting.factors else {},
-        reliability=reliable,
-        suspects=suspects(tests, contradicting, last.removed, reliable, probabilities, result.redundancy),
     )
 
 
@@ -195,69 +161,3 @@ def _meaningless(problem: Problem) -> NDArray[np.bool_]:
         given = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
         meaningless[unknowns.camera[name][:3]] = [prior is None for prior in given]
     return meaningless
-
-
-def _warnings(last: Run, cofactor: Cofactor) -> tuple[str, ...]:
-    """What the user should look at in a result."""
-    problem = last.numbering.problem
-    warnings = []
-    if last.solution.termination == "iteration limit":
-        warnings.append(
-            f"The iteration did not stand still within {len(last.solution.history)} steps: the values are not final. "
-            f"The largest residuals are those of {_worst(last)}."
-        )
-    if last.solution.termination == "diverged":
-        warnings.append(
-            f"The iteration diverged: it came to no minimum. Look for wrong point numbers and wrong approximations; "
-            f"the largest residuals are those of {_worst(last)}."
-        )
-        warnings += [f"Where it ended, the equations are singular: {each.cause}" for each in last.singular]
-    if not last.settled:
-        warnings.append(
-            f"The weights did not settle within {ROUNDS} rounds of robust estimation, variance components or data "
-            f"snooping."
-        )
-    without_priors = factorise(last.numbering, last.end, camera_priors=False)
-    weak = weak_directions(problem, last.end.state, last.numbering.free, without_priors, last.singular)
-    warnings += [
-        f"Practically singular without priors: {', '.join(each.parameters)}. {each.cause} {each.remedy}"
-        for each in weak
-    ]
-    if last.converged:
-        warnings += filter(None, [undetermined(problem, last.end.state, cofactor.variances)])
-    return tuple(warnings + _unseen(problem) + _films_by_targets(problem))
-
-
-def _worst(last: Run) -> str:
-    """The observations with the largest residuals."""
-    observations = last.numbering.problem.network.observations
-    size = np.abs(last.end.v_mm).max(axis=1)
-    rows = np.argsort(-size)[:3]
-    return ", ".join(
-        f"{observations.kind[i]} {observations.point[i]} in image {observations.image[i]} ({size[i]:.3g} mm)"
-        for i in rows
-    )
-
-
-def _unseen(problem: Problem) -> list[str]:
-    """What is given and that no image shows."""
-    points = [point.id for point in problem.network.points if point.id not in problem.unknowns.point]
-    if not points:
-        return []
-    shown = ", ".join(points[:5]) + (f" and {len(points) - 5} more" if len(points) > 5 else "")
-    return [f"No image shows the object points {shown}: they take no part."]
-
-
-def _films_by_targets(problem: Problem) -> list[str]:
-    """Images whose film transformation takes more than their fiducial marks."""
-    images = problem.network.images
-    shown = np.bincount(problem.image_numbers[problem.is_fiducial], minlength=len(images))
-    few = [i for i, image in enumerate(images) if shown[i] < marks_needed(image.transformation)]
-    if not few:
-        return []
-    first = images[few[0]]
-    others = f" {len(few) - 1} more images are alike." if len(few) > 1 else ""
-    return [
-        f"Image {first.name} shows {shown[few[0]]} fiducial marks, and its {first.transformation} transformation takes "
-        f"{marks_needed(first.transformation)} of its own: the targets determine the rest of it.{others}"
-    ]

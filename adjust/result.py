@@ -173,6 +173,31 @@ class Suspect:
     removed: bool
 
 
+class Assessment(Protocol):
+    """What an adjustment tells of its observations, each part computed where it is asked for (see `Adjustment`)."""
+
+    @property
+    def residuals(self) -> Residuals: ...
+
+    @property
+    def groups(self) -> Mapping[str, Group]: ...
+
+    @property
+    def further(self) -> tuple[FurtherResidual, ...]: ...
+
+    @property
+    def variance_sigmas(self) -> Mapping[str, float]: ...
+
+    @property
+    def reliability(self) -> Reliability | None: ...
+
+    @property
+    def suspects(self) -> tuple[Suspect, ...]: ...
+
+    @property
+    def warnings(self) -> tuple[str, ...]: ...
+
+
 @dataclass(frozen=True)
 class Adjustment:
     """The result: values, covariance, residuals, and how it came about.
@@ -181,12 +206,12 @@ class Adjustment:
     rad), `IO.<camera>.c` / `.x0` / `.y0` / `.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`; fixed quantities included, with
     zero rows. cofactor: a-priori covariance (sigma0 = 1), computed where it is asked for; covariance is sigma0² times
     that. Without a solution (termination "singular", "diverged") it is zero and means nothing.
+    assessment: what is told of the observations, computed where it is asked for: `residuals`, `groups`, `reliability`,
+    `suspects`, `warnings` and more.
     mirrored: the images whose scan is mirrored, as in `Approximations`.
     weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
-    further: the residuals of distances and the like.
-    variance_factors: the factors found for the variances of groups, where asked for; variance_sigmas: their standard
-    deviations.
-    reliability: None where there is no solution. suspects: the worst first.
+    variance_factors: the factors found for the variances of groups, where asked for.
+    remarks: on how the adjustment came about, the first of the warnings.
     """
 
     network: Network
@@ -199,18 +224,46 @@ class Adjustment:
     names: tuple[str, ...]
     values: Array
     cofactor: Cofactor
-    residuals: Residuals
-    groups: Mapping[str, Group]
+    assessment: Assessment
     singular: tuple[NullDirection, ...]
-    warnings: tuple[str, ...]
     history: tuple[Iteration, ...]
     mirrored: frozenset[str] = frozenset()
     weights: Array = field(default_factory=lambda: np.empty(0))
     variance_factors: Mapping[str, float] = field(default_factory=dict)
-    further: tuple[FurtherResidual, ...] = ()
-    variance_sigmas: Mapping[str, float] = field(default_factory=dict)
-    reliability: Reliability | None = None
-    suspects: tuple[Suspect, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def residuals(self) -> Residuals:
+        return self.assessment.residuals
+
+    @property
+    def groups(self) -> Mapping[str, Group]:
+        return self.assessment.groups
+
+    @property
+    def further(self) -> tuple[FurtherResidual, ...]:
+        """The residuals of distances and the like."""
+        return self.assessment.further
+
+    @property
+    def variance_sigmas(self) -> Mapping[str, float]:
+        """The standard deviations of the variance factors."""
+        return self.assessment.variance_sigmas
+
+    @property
+    def reliability(self) -> Reliability | None:
+        """None where there is no solution."""
+        return self.assessment.reliability
+
+    @property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """The worst first."""
+        return self.assessment.suspects
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should look at."""
+        return (*self.remarks, *self.assessment.warnings)
 
     @property
     def converged(self) -> bool:

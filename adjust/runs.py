@@ -1,6 +1,7 @@
 """Adjustments one after the other, until the residuals ask for no other weights."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -33,11 +34,11 @@ def run(problem: Problem, options: Options) -> "Run":
 
 @dataclass(frozen=True)
 class Run:
-    """One adjustment with given weights: where it ended, and what everything that is tested contradicts the others by.
+    """One adjustment with given weights, and where it ended.
 
     problem: as it was given, `numbering` holds it with the priors' weights. singular: what is not determined at the
-    end, be that a solution or not; found: None where there is such a thing. settled: whether the residuals ask for no
-    other weights. removed: what data snooping has taken out.
+    end, be that a solution or not. settled: whether the residuals ask for no other weights. removed: what data snooping
+    has taken out.
     """
 
     problem: Problem
@@ -46,9 +47,13 @@ class Run:
     solution: Solution
     singular: tuple[NullDirection, ...]
     factor: Factor
-    found: Misfits | None
     settled: bool = True
     removed: tuple[Contradiction, ...] = ()
+
+    @cached_property
+    def found(self) -> Misfits | None:
+        """What everything that is tested contradicts the others by; None where something is not determined."""
+        return None if self.singular else misfits(self.numbering, self.end, self.factor)
 
     @property
     def end(self) -> Linearised:
@@ -87,7 +92,7 @@ def _settled(last: Run, options: Options) -> Run:
 
 def _reweighted(last: Run, options: Options, function: WeightFunction | None) -> Weighting:
     """The weights that the residuals of a run ask for; its own where there is nothing to ask, or not to be trusted."""
-    if last.found is None or not (last.converged or function):
+    if not (function or (last.weighting.factors and last.converged)) or last.found is None:
         return last.weighting
     weighting = refined_factors(last.numbering, last.found, last.weighting)
     if function:
@@ -152,13 +157,12 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
     singular = singular_directions(weighted, state, numbering.free, factor)
     if singular:
         solution = Solution(start, None, "singular", ())
-        return Run(problem, numbering, weighting, solution, singular, factor, None)
+        return Run(problem, numbering, weighting, solution, singular, factor)
     solution = iterate(numbering, covariance, start, limit)
     factor = solution.factor or factorise(numbering, solution.end)
     singular = singular_directions(weighted, solution.end.state, numbering.free, factor)
     if singular:
         ended: Termination = "singular" if solution.termination == "converged" else "diverged"
         solution = replace(solution, factor=None, termination=ended)
-        return Run(problem, numbering, weighting, solution, singular, factor, None)
-    found = misfits(numbering, solution.end, factor)
-    return Run(problem, numbering, weighting, solution, (), factor, found)
+        return Run(problem, numbering, weighting, solution, singular, factor)
+    return Run(problem, numbering, weighting, solution, (), factor)

@@ -36,7 +36,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
     warnings = (*left_out, *_unmeasured(project, network), *_not_corrected(network, uncorrected))
-    return replace(adjustment, warnings=(*adjustment.warnings, *warnings))
+    return replace(adjustment, remarks=(*adjustment.remarks, *warnings))
 
 
 def adjustment_options(project: Project) -> Options:

@@ -1,6 +1,7 @@
 """A made-up calibration of five aerial frames, and its files: result file and report are tested on its numbers."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,7 +22,16 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.result import Adjustment, Group, Iteration, NullDirection, Residuals
+from adjust.result import (
+    Adjustment,
+    FurtherResidual,
+    Group,
+    Iteration,
+    NullDirection,
+    Reliability,
+    Residuals,
+    Suspect,
+)
 from measure.status import Status
 from pipeline.adjustment_file import read_adjustment, read_covariance, write_adjustment
 from pipeline.comparator_file import ComparatorPoint
@@ -79,6 +89,19 @@ class Dense:
         return self.matrix[groups[:, :, None], groups[:, None, :]]
 
 
+@dataclass(frozen=True)
+class Told:
+    """What is told of the observations, all of it there beforehand."""
+
+    residuals: Residuals
+    groups: Mapping[str, Group]
+    further: tuple[FurtherResidual, ...] = ()
+    variance_sigmas: Mapping[str, float] = field(default_factory=dict)
+    reliability: Reliability | None = None
+    suspects: tuple[Suspect, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
 @cache
 def adjustment() -> Adjustment:
     """Converged, sigma0 within its bounds, no observation suspect; f2 is mirrored, its film sheared."""
@@ -104,14 +127,15 @@ def adjustment() -> Adjustment:
         names=names,
         values=values,
         cofactor=Dense(correlation * np.outer(sigmas, sigmas)),
-        residuals=Residuals(v, redundancy, w),
-        groups={
-            "target": Group(1.02, 3.1, 3.2, 190.0),
-            "fiducial": Group(0.97, 2.2, 2.1, 67.0),
-            "control": Group(0.0, 0.0, 0.0, 0.0),
-        },
+        assessment=Told(
+            Residuals(v, redundancy, w),
+            groups={
+                "target": Group(1.02, 3.1, 3.2, 190.0),
+                "fiducial": Group(0.97, 2.2, 2.1, 67.0),
+                "control": Group(0.0, 0.0, 0.0, 0.0),
+            },
+        ),
         singular=(),
-        warnings=(),
         history=(
             Iteration(4.1e6, 5e4, 1e-3, 2),
             *(Iteration(*pair, 0.0, 1) for pair in ((2113.0, 310.0), (262.2, 0.8), (262.1, 1e-4), (262.1, 2e-8))),

@@ -83,8 +83,10 @@ def test_residuals_stand_in_the_scan_and_in_the_camera(adjustment: Adjustment, p
 def test_w_is_the_larger_of_the_two_axes_with_its_sign(adjustment: Adjustment, tmp_path: Path) -> None:
     w = adjustment.residuals.w.copy()
     w[0], w[1], w[2] = (1.0, -2.5), (np.nan, 0.5), (np.nan, np.nan)
-    residuals = Residuals(adjustment.residuals.v_mm, adjustment.residuals.redundancy, w)
-    write_adjustment(replace(adjustment, residuals=residuals), tmp_path / "adjustment.json")
+    told = made_up_calibration.Told(
+        Residuals(adjustment.residuals.v_mm, adjustment.residuals.redundancy, w), adjustment.groups
+    )
+    write_adjustment(replace(adjustment, assessment=told), tmp_path / "adjustment.json")
     rows = read_adjustment(tmp_path / "adjustment.json")["residuals"]
     assert [row["w"] for row in rows[:3]] == [-2.5, 0.5, None]
 
