@@ -3,7 +3,7 @@
 A mark alone gives false answers on every film, so nothing is decided here: the responses go to the constellation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -30,12 +30,11 @@ FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 class Responses:
     """Correlations with the looks of the marks, over the reduced scan.
 
-    light, dark: one map (rows, columns) per look, how much the place looks like the mark lighter or darker than its
-    surroundings. reduction: by which the scan was reduced.
+    maps: by the kind of look and +1 or -1, (rows, columns) of how much the place looks like the mark lighter or darker
+    than its surroundings. reduction: by which the scan was reduced.
     """
 
-    light: tuple[Map, ...]
-    dark: tuple[Map, ...]
+    maps: Mapping[tuple[int, int], Map]
     reduction: int
 
     def reduced_px(self, scan_px: Array) -> Array:
@@ -55,8 +54,9 @@ class Look:
     linear: Array
 
 
-def respond(scan: Scan, looks: Sequence[Look]) -> tuple[Responses, tuple[int, ...]]:
-    """The responses to the looks that differ, and for every look which of the responses is its own.
+def respond(scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1)) -> tuple[Responses, tuple[int, ...]]:
+    """The responses to the looks that differ, lighter (+1) and darker (-1) than their surroundings as signs says, and
+    for every look which of the kinds is its own.
 
     Of a colour scan every channel is tried, and the one that answers best at a place counts there.
     """
@@ -64,15 +64,16 @@ def respond(scan: Scan, looks: Sequence[Look]) -> tuple[Responses, tuple[int, ..
     templates = [_template(look, reduction) for look in looks]
     kinds, index = _distinct(templates)
     details = [detail_px(looks[index.index(kind)].mark, looks[0].linear) / reduction for kind in range(len(kinds))]
-    light = [np.full(_reduced_shape(scan, reduction), -1.0, np.float32) for _ in kinds]
-    dark = [map_.copy() for map_ in light]
+    maps: dict[tuple[int, int], Map] = {}
     for weights in _channel_weights(scan):
         grey = scan.reduced(reduction, weights)
         for kind, template in enumerate(kinds):
             response = _correlation(grey, template, max(details[kind], 1.0), scan.full_scale_dn * FAINT)
-            np.maximum(light[kind], response, out=light[kind])
-            np.maximum(dark[kind], -response, out=dark[kind])
-    return Responses(tuple(light), tuple(dark), reduction), index
+            for sign in signs:
+                signed = response if sign > 0 else -response
+                known = maps.setdefault((kind, sign), signed)
+                np.maximum(known, signed, out=known)
+    return Responses(maps, reduction), index
 
 
 def peaks(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[Array, Array]:
@@ -156,10 +157,6 @@ def _correlation(grey: Map, template: Array, detail_px: float, faint_dn: float) 
     half = template.shape[0] // 2
     padded = cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE)
     return correlate(np.asarray(padded, np.float32), template, detail_px, faint_dn)
-
-
-def _reduced_shape(scan: Scan, reduction: int) -> tuple[int, int]:
-    return scan.height_px // reduction, scan.width_px // reduction
 
 
 def _channel_weights(scan: Scan) -> tuple[tuple[float, ...], ...]:

@@ -5,6 +5,7 @@ Places are complex numbers here, x + iy in mm of the scan's own axes (right, up)
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import cv2
@@ -65,22 +66,6 @@ class Placement:
         return replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, self.pixel_from_camera[:, 2]]))
 
 
-def placements(
-    marks: Sequence[LayoutMark],
-    pose: str,
-    responses: Responses,
-    look_of_mark: Sequence[int],
-    pitch_mm: tuple[float, float],
-    bounds: Bounds,
-) -> list[Placement]:
-    """The best placements of one pose that differ from one another, best first; none where no two marks respond."""
-    search = _Search(marks, pose, responses, look_of_mark, pitch_mm, bounds)
-    unsaid = any(mark.mark.polarity == "auto" for mark in marks)
-    found = [placement for polarity in ((1, -1) if unsaid else (1,)) for placement in search.run(polarity)]
-    found.sort(key=lambda placement: -placement.score)
-    return _different(found, marks, bounds.misfit_mm / pitch_mm[0])
-
-
 def same_picture(
     marks: Sequence[LayoutMark],
     first: tuple[str, Sequence[int]],
@@ -104,6 +89,11 @@ def sign_of(mark: Mark, assumed: int) -> int:
     return {"light": 1, "dark": -1, "auto": assumed}[mark.polarity]
 
 
+def signs_of(marks: Sequence[LayoutMark]) -> set[int]:
+    """Which signs the marks can have."""
+    return {sign_of(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
+
+
 def _different(found: Sequence[Placement], marks: Sequence[LayoutMark], tolerance_px: float) -> list[Placement]:
     kept: list[tuple[Placement, Array]] = []
     xy = np.array([mark.xy_mm for mark in marks])
@@ -114,39 +104,86 @@ def _different(found: Sequence[Placement], marks: Sequence[LayoutMark], toleranc
     return [placement for placement, _ in kept]
 
 
-class _Search:
-    """The search for one pose's placements."""
+class PlacementSearch:
+    """The search for placements, in one pose after another, of a frame that bounds are known of."""
 
     def __init__(
-        self,
-        marks: Sequence[LayoutMark],
-        pose: str,
-        responses: Responses,
-        look_of_mark: Sequence[int],
-        pitch_mm: tuple[float, float],
-        bounds: Bounds,
+        self, marks: Sequence[LayoutMark], responses: Responses, pitch_mm: tuple[float, float], bounds: Bounds
     ) -> None:
-        self.marks, self.pose, self.responses, self.bounds = marks, pose, responses, bounds
-        self.looks = self.kinds = np.asarray(look_of_mark)
+        self.marks, self.responses, self.bounds = marks, responses, bounds
         self.pitch = np.asarray(pitch_mm)
-        turned = np.array([mark.xy_mm for mark in marks]) @ up_from_camera(pose).T
-        self.camera: Complex = turned[:, 0] + 1j * turned[:, 1]
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, 1.5)
+        self.layers = {key: _Layer(map_, self.tolerance_px) for key, map_ in responses.maps.items()}
 
-    def run(self, polarity: int) -> list[Placement]:
-        maps = [*self.responses.light, *self.responses.dark]
-        dark = np.array([sign_of(mark.mark, polarity) < 0 for mark in self.marks])
-        self.kinds = self.looks + len(self.responses.light) * dark
-        candidates = [self._candidates(map_) for map_ in maps]
-        scale, offset = self._hypotheses(candidates)
+    def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:
+        """The best placements of a pose that differ from one another, best first; none where no two marks respond.
+
+        look_of_mark: of the responses' kinds, that of each mark in this pose.
+        """
+        unsaid = any(mark.mark.polarity == "auto" for mark in self.marks)
+        found: list[Placement] = []
+        for polarity in (1, -1) if unsaid else (1,):
+            signs = [sign_of(mark.mark, polarity) for mark in self.marks]
+            layers = [self.layers[key] for key in zip(look_of_mark, signs, strict=True)]
+            found += _Constellation(self, pose, layers).placements(polarity)
+        found.sort(key=lambda placement: -placement.score)
+        return _different(found, self.marks, self.bounds.misfit_mm / float(self.pitch[0]))
+
+
+class _Layer:
+    """The responses to one look, and what is asked of them in every pose."""
+
+    def __init__(self, map_: Map, tolerance_px: float) -> None:
+        self.map, self.tolerance_px = map_, tolerance_px
+
+    @cached_property
+    def candidates(self) -> Array:
+        """(n, 2) px of the map."""
+        return peaks(self.map, _CANDIDATES, _LEAST_RESPONSE)[0]
+
+    @cached_property
+    def wide(self) -> "_Reach":
+        return _Reach(self.map, self.tolerance_px)
+
+    @cached_property
+    def near(self) -> "_Reach":
+        return _Reach(self.map, max(_NARROWED * self.tolerance_px, 1.5))
+
+
+class _Reach:
+    """The highest response within a radius of every place, and what chance places answer: nineteen in twenty of them
+    stay below it."""
+
+    def __init__(self, map_: Map, radius_px: float) -> None:
+        self.map = _dilated(map_, radius_px)
+        self.chance = max(float(np.percentile(self.map[::3, ::3], 95)), 0.0)
+
+    def strength(self, col: NDArray[np.intp], row: NDArray[np.intp]) -> Array:
+        """How much the places (n,) answer beyond chance; places outside of the map do not."""
+        rows, cols = self.map.shape
+        inside = (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
+        response = np.where(inside, self.map[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0.0).astype(float)
+        return np.asarray(np.maximum(np.maximum(response, 0.0) ** 2 - self.chance**2, 0.0))
+
+
+class _Constellation:
+    """The marks as one pose names them, each with the layer that answers to it."""
+
+    def __init__(self, search: PlacementSearch, pose: str, layers: Sequence[_Layer]) -> None:
+        self.search, self.pose, self.layers = search, pose, layers
+        self.responses, self.bounds, self.pitch = search.responses, search.bounds, search.pitch
+        turned = np.array([mark.xy_mm for mark in search.marks]) @ up_from_camera(pose).T
+        self.camera: Complex = turned[:, 0] + 1j * turned[:, 1]
+
+    def placements(self, polarity: int) -> list[Placement]:
+        scale, offset = self._hypotheses()
         if len(scale) == 0:
             return []
-        wide = [_dilated(map_, self.tolerance_px) for map_ in maps]
-        scores, _ = self._scores(wide, scale, offset)
-        near = [_dilated(map_, max(_NARROWED * self.tolerance_px, 1.5)) for map_ in maps]
+        scores, _ = self._scores([layer.wide for layer in self.layers], scale, offset)
+        near = [layer.near for layer in self.layers]
         result: list[Placement] = []
         for index in np.argsort(-scores, kind="stable")[:_KEPT]:
-            a, b = self._refined(maps, complex(scale[index]), complex(offset[index]))
+            a, b = self._refined(complex(scale[index]), complex(offset[index]))
             score, supported = self._scores(near, np.array([a]), np.array([b]))
             result.append(
                 Placement(
@@ -161,10 +198,6 @@ class _Search:
             )
         return result
 
-    def _candidates(self, map_: Map) -> Complex:
-        places, _ = peaks(map_, _CANDIDATES, _LEAST_RESPONSE)
-        return self._complex(self.responses.scan_px(places))
-
     def _complex(self, scan_px: Array) -> Complex:
         scaled = scan_px * self.pitch
         return np.asarray(scaled[..., 0] - 1j * scaled[..., 1])
@@ -172,11 +205,12 @@ class _Search:
     def _scan_px(self, places: Complex) -> Array:
         return np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.pitch)
 
-    def _hypotheses(self, candidates: Sequence[Complex]) -> tuple[Complex, Complex]:
+    def _hypotheses(self) -> tuple[Complex, Complex]:
         """Every similarity within bounds that takes two marks to two of their candidates."""
+        candidates = {layer: self._complex(self.responses.scan_px(layer.candidates)) for layer in set(self.layers)}
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
         for first, second in self._pairs():
-            of_first, of_second = candidates[self.kinds[first]], candidates[self.kinds[second]]
+            of_first, of_second = candidates[self.layers[first]], candidates[self.layers[second]]
             base = self.camera[second] - self.camera[first]
             scale = (of_second[None, :] - of_first[:, None]) / base
             allowed = (np.abs(np.abs(scale) - 1) < self.bounds.scale_tolerance) & (
@@ -195,27 +229,23 @@ class _Search:
         step = max(1.0, len(far) / _PAIRS)
         return [far[int(index * step)] for index in range(min(len(far), _PAIRS))]
 
-    def _scores(self, maps: Sequence[Map], scale: Complex, offset: Complex) -> tuple[Array, Array]:
+    def _scores(self, reached: Sequence[_Reach], scale: Complex, offset: Complex) -> tuple[Array, Array]:
         """Scores and numbers of supporting marks of many placements at once."""
         places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
-        rows, cols = maps[0].shape
         nearest = np.rint(places).astype(int)
+        rows, cols = reached[0].map.shape
         inside = (nearest >= 0).all(axis=-1) & (nearest[..., 0] < cols) & (nearest[..., 1] < rows)
-        stack = np.stack(maps)
-        col, row = np.clip(nearest[..., 0], 0, cols - 1), np.clip(nearest[..., 1], 0, rows - 1)
-        response = np.where(inside, stack[self.kinds, row, col], 0.0).astype(float)
-        # What chance places answer is no support: nineteen in twenty of them stay below their map's own level.
-        chance = np.array([np.percentile(map_[::3, ::3], 95) for map_ in maps])[self.kinds]
-        strength = np.maximum(response, 0.0) ** 2 - np.maximum(chance, 0.0) ** 2
-        score = np.maximum(strength, 0.0).sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
+        strength = np.stack([reach.strength(*nearest[:, k].T) for k, reach in enumerate(reached)], axis=1)
+        score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
         return score, (strength > 0).sum(axis=1)
 
-    def _refined(self, maps: Sequence[Map], scale: complex, offset: complex) -> tuple[complex, complex]:
+    def _refined(self, scale: complex, offset: complex) -> tuple[complex, complex]:
         """The similarity through the responses about its predictions, each weighed by its strength."""
-        for tolerance_px in (self.tolerance_px, max(_NARROWED * self.tolerance_px, 1.5)):
+        widest = self.search.tolerance_px
+        for tolerance_px in (widest, max(_NARROWED * widest, 1.5)):
             predicted = self.responses.reduced_px(self._scan_px(scale * self.camera + offset))
             found = [
-                _highest(maps[look], place, tolerance_px) for look, place in zip(self.kinds, predicted, strict=True)
+                _highest(layer.map, place, tolerance_px) for layer, place in zip(self.layers, predicted, strict=True)
             ]
             weight = np.array([max(height - _LEAST_WEIGHED, 0.0) for _, height in found])
             if (weight > 0).sum() < 2:

@@ -52,8 +52,9 @@ def _part_coverage(part: Part, cell_from_mark: Array, width: int, height: int) -
     col0, row0 = np.clip(np.floor(outline.min(axis=0)).astype(int) - 1, 0, (width, height))
     col1, row1 = np.clip(np.ceil(outline.max(axis=0)).astype(int) + 2, 0, (width, height))
     mark_from_cell: Array = np.linalg.inv(cell_from_mark[:, :2]).astype(np.float64)
-    cell = np.stack(np.meshgrid(np.arange(col0, col1, dtype=float), np.arange(row0, row1, dtype=float)))
-    x, y = np.tensordot(mark_from_cell, cell - cell_from_mark[:, 2, None, None], axes=1)
+    col = np.arange(col0, col1) - cell_from_mark[0, 2]
+    row = np.arange(row0, row1) - cell_from_mark[1, 2]
+    x, y = (line[0] * col[None, :] + line[1] * row[:, None] for line in mark_from_cell)
     covered = np.zeros((height, width))
     if isinstance(part, Bar):
         covered[row0:row1, col0:col1] = _bar_coverage(part, x, y, mark_from_cell)

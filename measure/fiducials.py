@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.candidates import Look, respond
-from measure.constellation import Bounds, Placement, placements, same_picture
+from measure.constellation import Bounds, Placement, PlacementSearch, same_picture, signs_of
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame, measure_frame
 from measure.pose_decision import decide_pose
@@ -99,17 +99,15 @@ def _placements(
     poses = POSES if options.pose == "auto" else (options.pose,)
     flip = np.diag([1 / pitch_mm[0], -1 / pitch_mm[1]])
     looks = [Look(mark.mark, flip @ up_from_camera(pose)) for pose in poses for mark in layout.marks]
-    responses, index = respond(scan, looks)
+    responses, index = respond(scan, looks, signs_of(layout.marks))
     bounds = Bounds(tolerance, float(np.deg2rad(options.rotation_deg)), options.search_mm(layout))
+    search = PlacementSearch(layout.marks, responses, pitch_mm, bounds)
     count = len(layout.marks)
     searched: list[tuple[str, tuple[int, ...], list[Placement]]] = []
     for number, pose in enumerate(poses):
         own = index[number * count : (number + 1) * count]
         twin = next((s for s in searched if same_picture(layout.marks, (s[0], s[1]), (pose, own), bounds)), None)
-        if twin:
-            found = [placement.posed(pose) for placement in twin[2]]
-        else:
-            found = placements(layout.marks, pose, responses, own, pitch_mm, bounds)
+        found = [placement.posed(pose) for placement in twin[2]] if twin else search.of_pose(pose, own)
         searched.append((pose, own, found))
     return [placement for _, _, found in searched for placement in found]
 

@@ -17,16 +17,35 @@ POINTS, KEPT = 32, 8  # along a pixel's side; asked, and left for the blur
 def brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
     """(height, width) shares of the pixels inside of the mark, after a Gaussian blur."""
     pad = int(np.ceil(5 * blur_px)) + 1
-    place = [(np.arange((size + 2 * pad) * POINTS) + 0.5) / POINTS - 0.5 - pad for size in (width, height)]
-    offset = np.stack(np.meshgrid(*place)) - pixel_from_mark[:, 2, None, None]
-    x, y = np.tensordot(np.linalg.inv(pixel_from_mark[:, :2]), offset, axes=1)
-    inside = np.zeros(x.shape, dtype=bool)
-    for part in mark.parts:
-        inside |= is_inside(part, x, y)
     rows, cols = height + 2 * pad, width + 2 * pad
+    inside = np.zeros((rows * POINTS, cols * POINTS), dtype=bool)
+    mark_from_pixel = np.linalg.inv(pixel_from_mark[:, :2])
+    for part in mark.parts:
+        places = corners_mm(part) @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2] + pad
+        first = np.clip(np.floor(places.min(axis=0)).astype(int) - 1, 0, (cols, rows)) * POINTS
+        last = np.clip(np.ceil(places.max(axis=0)).astype(int) + 2, 0, (cols, rows)) * POINTS
+        col, row = (
+            (np.arange(a, b) + 0.5) / POINTS - 0.5 - pad - center
+            for a, b, center in zip(first, last, pixel_from_mark[:, 2], strict=True)
+        )
+        x, y = (line[0] * col[None, :] + line[1] * row[:, None] for line in mark_from_pixel)
+        inside[first[1] : last[1], first[0] : last[0]] |= is_inside(part, x, y)
     kept = inside.reshape(rows * KEPT, POINTS // KEPT, cols * KEPT, POINTS // KEPT).mean(axis=(1, 3))
     blurred = gaussian_filter(kept, blur_px * KEPT, truncate=5) if blur_px > 0 else kept
     return np.asarray(blurred.reshape(rows, KEPT, cols, KEPT).mean(axis=(1, 3))[pad:-pad, pad:-pad])
+
+
+def corners_mm(part: Part) -> Array:
+    """(n, 2) points whose bounds hold the part: only there is anybody asked."""
+    if isinstance(part, Disk | Ring):
+        reach = part.radius_mm + (part.line_mm if isinstance(part, Ring) else 0.0)
+        return np.asarray(part.center_mm) + reach * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    if isinstance(part, Bar):
+        ends, half = np.array([part.from_mm, part.to_mm]), part.line_mm
+        return np.concatenate(
+            [ends + offset for offset in ((-half, -half), (half, -half), (half, half), (-half, half))]
+        )
+    return np.array(part.vertices_mm)
 
 
 def is_inside(part: Part, x: Array, y: Array) -> NDArray[np.bool_]:

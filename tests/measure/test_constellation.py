@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.candidates import Responses, peaks
-from measure.constellation import Bounds, Placement, placements, same_picture
+from measure.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.poses import POSES, up_from_camera
 from measure.shapes import LayoutMark, MarkShape, dot
 
@@ -22,7 +22,11 @@ def responses(places_px: NDArray[np.float64], heights: NDArray[np.float64], seed
     for (col, row), height in zip(np.rint(places_px).astype(int), heights, strict=True):
         light[row - 1 : row + 2, col - 1 : col + 2] = 0.6 * height
         light[row, col] = height
-    return Responses((light,), (-light,), 1)
+    return Responses({(0, 1): light}, 1)
+
+
+def placements(pose: str, answers: Responses) -> list[Placement]:
+    return PlacementSearch(MARKS, answers, (PITCH_MM, PITCH_MM), BOUNDS).of_pose(pose, [0] * 6)
 
 
 def seen(pose: str, scale: float = 1.015, angle: float = 0.03) -> NDArray[np.float64]:
@@ -43,20 +47,19 @@ def test_the_place_is_found_among_brighter_false_answers() -> None:
         false = rng.uniform(20, 500, (40, 2))
         places = np.concatenate([true, false])
         heights = np.concatenate([np.full(6, 0.6), rng.uniform(0.5, 0.9, 40)])
-        found = placements(MARKS, pose, responses(places, heights), [0] * 6, (PITCH_MM, PITCH_MM), BOUNDS)
+        found = placements(pose, responses(places, heights))
         assert np.abs(predicted(found[0]) - true).max() < 1.5
         assert found[0].supported == 6
 
 
 def test_missing_marks_do_not_hinder() -> None:
     true = seen("0")
-    found = placements(MARKS, "0", responses(true[:4], np.full(4, 0.5)), [0] * 6, (PITCH_MM, PITCH_MM), BOUNDS)
+    found = placements("0", responses(true[:4], np.full(4, 0.5)))
     assert np.abs(predicted(found[0]) - true).max() < 2.0
 
 
 def test_nothing_that_answers_gives_no_placement() -> None:
-    empty = Responses((np.zeros((300, 300), np.float32),), (np.zeros((300, 300), np.float32),), 1)
-    assert placements(MARKS, "0", empty, [0] * 6, (PITCH_MM, PITCH_MM), BOUNDS) == []
+    assert placements("0", Responses({(0, 1): np.zeros((300, 300), np.float32)}, 1)) == []
 
 
 def test_peaks_come_in_order_and_apart() -> None:
