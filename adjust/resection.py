@@ -56,7 +56,7 @@ def resect(
     """
     field = _Field.of(xyz, xy_mm, principal_distance_mm)
     triples = _triples(field.tangents, rng)
-    rotations, shifts = _triple_poses(field.points[triples], field.tangents[triples])
+    rotations, shifts, _ = triple_poses(field.points[triples], field.tangents[triples])
     if not len(rotations):
         return None
     scored = rng.permutation(len(xyz))[:MAX_SCORED_POINTS] if len(xyz) > MAX_SCORED_POINTS else np.arange(len(xyz))
@@ -79,8 +79,8 @@ def refine(resection: Resection, xyz: Array, xy_mm: Array, principal_distance_mm
 def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
     """All poses (up to four) from which three points appear where they are observed. xyz (3, 3), xy_mm (3, 2)."""
     field = _Field.of(xyz, xy_mm, principal_distance_mm)
-    rotations, shifts = _triple_poses(field.points[None], field.tangents[None])
-    rotations, shifts = _refined(rotations, shifts, field.points, field.tangents, np.ones((len(rotations), 3)))
+    rotations, shifts, _ = triple_poses(field.points[None], field.tangents[None])
+    rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, np.ones((len(rotations), 3)))
     exact = _squared(rotations, shifts, field.points, field.tangents).max(axis=1) < EXACT
     poses: list[Pose] = []
     for rotation, shift in zip(rotations[exact], shifts[exact], strict=True):
@@ -132,8 +132,9 @@ def _triples(tangents: Array, rng: np.random.Generator) -> NDArray[np.intp]:
     return np.asarray(triples[large][:MAX_TRIPLES])
 
 
-def _triple_poses(points: Array, tangents: Array) -> tuple[Array, Array]:
-    """Rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, of every triple: points (m, 3, 3), tangents (m, 3, 2).
+def triple_poses(points: Array, tangents: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, of every triple, and which one (k,) each is of: points
+    (m, 3, 3), tangents (m, 3, 2).
 
     Grunert's solution (Haralick et al. 1994, eqs. 7-9): a quartic in the ratio of two of the three distances.
     """
@@ -152,7 +153,7 @@ def _triple_poses(points: Array, tangents: Array) -> tuple[Array, Array]:
         rotations = _triad(seen) @ np.swapaxes(_triad(points), 1, 2)[:, None]
         shifts = seen.mean(axis=2) - np.einsum("mkij,mj->mki", rotations, points.mean(axis=1))
     usable = (distances > 0).all(axis=2) & np.isfinite(rotations).all(axis=(2, 3)) & np.isfinite(shifts).all(axis=2)
-    return rotations[usable], shifts[usable]
+    return rotations[usable], shifts[usable], np.nonzero(usable)[0]
 
 
 def _grunert_quartic(a: Array, c: Array, cos_a: Array, cos_b: Array, cos_g: Array) -> Array:
@@ -204,7 +205,7 @@ def _best_of(rotations: Array, shifts: Array, points: Array, tangents: Array) ->
     rotations, shifts = rotations[order], shifts[order]
     for _ in range(2):
         kept = _smallest_half(_squared(rotations, shifts, points, tangents))
-        rotations, shifts = _refined(rotations, shifts, points, tangents, kept)
+        rotations, shifts = refined_poses(rotations, shifts, points, tangents, kept)
     best = int(np.argmin(_trimmed_cost(rotations, shifts, points, tangents)))
     return rotations[[best]], shifts[[best]]
 
@@ -227,8 +228,13 @@ def _trimmed_cost(rotations: Array, shifts: Array, points: Array, tangents: Arra
     return np.asarray(squared[:, : _half(len(points))].sum(axis=1))
 
 
-def _refined(rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array) -> tuple[Array, Array]:
-    """Levenberg-Marquardt on a rotation vector and a shift, for all poses (k) at once; weights (k, n)."""
+def refined_poses(
+    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
+) -> tuple[Array, Array]:
+    """Levenberg-Marquardt on a rotation vector and a shift, for all poses (k) at once; weights (k, n).
+
+    points (n, 3) and tangents (n, 2) are the same for all, or (k, n, 3) and (k, n, 2).
+    """
     damping = np.full(len(rotations), 1e-4)
     cost = (weights * _squared(rotations, shifts, points, tangents)).sum(axis=1)
     for _ in range(LM_ITERATIONS):
@@ -282,7 +288,7 @@ def _on_a_line(points: Array) -> bool:
 
 def _fitted(rotations: Array, shifts: Array, field: _Field, inliers: NDArray[np.bool_], sigma_mm: float) -> Resection:
     """The one pose (1, 3, 3), (1, 3) fitted to its inliers, back in object units."""
-    rotations, shifts = _refined(rotations, shifts, field.points, field.tangents, inliers[None].astype(np.float64))
+    rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, inliers[None].astype(np.float64))
     squared = _squared(rotations, shifts, field.points, field.tangents)[0]
     pose = field.pose(rotations[0], shifts[0])
     return Resection(pose, _distances(squared, field.c), inliers, sigma_mm)

@@ -1,0 +1,125 @@
+"""Which mark of an image is which object point, where nothing is known of the image's orientation.
+
+Hypothesis and test. Three object points that lie close together are taken to be three marks that do; the poses from
+which they would be are tested on the points about them, the best ones grow over the whole image, and what has grown is
+believed only if chance would hardly do as well (a contrario: Desolneux, Moisan and Morel 2008). Then it is tried
+whether the same marks could bear other names: a field that looks the same from another side has none, and that is said.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.naming_growth import Grown, View, grow
+from adjust.naming_hypotheses import Cluster, Poses, clusters, mark_triples, point_triples, promising
+from adjust.resection import Pose
+from adjust.unnamed_marks import Marks
+
+Array = NDArray[np.float64]
+
+LEAST_POINTS = 5
+MOST_LOG10_CHANCE = -6.0
+LEAST_SHARE = 0.4  # of the points that the image should show
+ALIKE_SHARE = 0.7  # of the named marks, from which on other names explain the image as well
+MOST_POSES = 1_000_000  # that are tried: they bound the time
+OTHER_CLUSTERS = 8  # named clusters that are tried as other points: with half of them seen, one case in 256 escapes
+
+
+@dataclass(frozen=True, eq=False)
+class Names:
+    """mark: the mark (index) of each object point (index) that has one. pose, principal_distance_mm, radial: from which
+    they are seen so, images being p (1 + radial p²), p in principal distances; expected: how many points the image
+    should show; log10_chance: of the expected number of agreements as good by chance; gate_mm: how far marks may lie
+    from their points' places."""
+
+    mark: dict[int, int]
+    pose: Pose
+    principal_distance_mm: float
+    radial: float
+    expected: int
+    log10_chance: float
+    gate_mm: float
+
+
+def name_marks(
+    xyz: Array,
+    normals: Array,
+    xy_mm: Array,
+    frame_mm: tuple[Array, Array],
+    principal_distance_mm: float,
+    sigma_mm: float,
+) -> Names | str:
+    """Name the marks of an image of known points; or why they have no names.
+
+    xyz (n, 3), normals (n, 3): where the points face, nan where that is not known; xy_mm (m, 2): ideal coordinates of
+    the marks about the principal point, y up, sigma_mm each; frame_mm: the least and the greatest (2,) that were
+    searched; principal_distance_mm: right to some percent. The same input gives the same names.
+    """
+    n, m = len(xyz), len(xy_mm)
+    if min(n, m) < LEAST_POINTS:
+        return f"{m} marks and {n} points are too few: {LEAST_POINTS} that agree are needed"
+    origin, size = xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0)))
+    marks = Marks.of(xy_mm, *frame_mm, sigma_mm, principal_distance_mm)
+    search = _Search((xyz - origin) / size, normals, marks, clusters((xyz - origin) / size, normals, m / n))
+    found = search.first()
+    if found is None:
+        return f"the {m} marks found do not make the pattern that the {n} points would from any side"
+    other = search.other(found)
+    if other is not None:
+        return (
+            f"the points look the same from another side, or moved on, as a regular grid does: {len(found.mark)} marks "
+            f"agree with one naming, {len(other.mark)} with another one"
+        )
+    pose = Pose(found.view.rotation, origin - size * found.view.rotation.T @ found.view.shift)
+    c = principal_distance_mm * (1.0 + found.view.scale)
+    gate_mm = found.gate * principal_distance_mm
+    return Names(found.mark, pose, c, found.view.radial, found.expected, found.log10_chance, gate_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """xyz, normals (n, 3) in units of the field's size about its middle; the marks; clusters to begin with."""
+
+    xyz: Array
+    normals: Array
+    marks: Marks
+    clusters: Sequence[Cluster]
+
+    def first(self) -> Grown | None:
+        """The first naming that is believed, the clusters that need fewest trials first."""
+        tried = 0
+        for cluster in self.clusters:
+            poses = promising(
+                self.xyz, self.normals, self.marks, cluster.triple[None], mark_triples(cluster, self.marks)
+            )
+            found = self._believed(poses)
+            tried += poses.tried
+            if found is not None or tried > MOST_POSES:
+                return found
+        return None
+
+    def other(self, found: Grown) -> Grown | None:
+        """Another naming that explains the image as well, if there is one: named clusters taken for other points."""
+        named = [cluster for cluster in self.clusters if all(int(point) in found.mark for point in cluster.triple)]
+        for cluster in named[:OTHER_CLUSTERS]:
+            seen = np.array([[found.mark[int(point)] for point in cluster.triple]])
+            points = point_triples(cluster, self.xyz)
+            poses = promising(self.xyz, self.normals, self.marks, points, seen)
+            for grown in self._grown(poses):
+                same = sum(found.mark.get(point) == mark for point, mark in grown.mark.items())
+                if same < 0.5 * len(grown.mark) and len(grown.mark) >= ALIKE_SHARE * len(found.mark):
+                    return grown
+        return None
+
+    def _believed(self, poses: Poses) -> Grown | None:
+        return next((g for g in self._grown(poses) if g.log10_chance < MOST_LOG10_CHANCE), None)
+
+    def _grown(self, poses: Poses) -> list[Grown]:
+        grown = [
+            grow(View(rotation, shift), *named, self.xyz, self.normals, self.marks)
+            for rotation, shift, named in zip(poses.rotations, poses.shifts, poses.named, strict=True)
+        ]
+        enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
+        return sorted(enough, key=lambda one: one.log10_chance)

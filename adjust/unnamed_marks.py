@@ -1,0 +1,67 @@
+"""The marks of an image before they have names: which one is nearest to a place, and how likely by chance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_CELLS = 600  # of the look-up along either side of the frame
+_COARSE_CELLS = 60  # of that of the density
+_CROWD = 6  # marks about a place that tell how dense they are there
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """places (m, 2): ideal image coordinates about the principal point, y up, over the principal distance; least,
+    greatest (2,): the corners of the frame that was searched; sigma: of one coordinate. All in principal distances."""
+
+    places: Array
+    least: Array
+    greatest: Array
+    sigma: float
+    tree: cKDTree
+    nearest_of_cell: Indices
+    density_of_cell: Array
+
+    @classmethod
+    def of(cls, xy_mm: Array, least_mm: Array, greatest_mm: Array, sigma_mm: float, c: float) -> "Marks":
+        """Marks (m, 2) in mm, of which there is at least one, in a frame between two corners."""
+        places, least, greatest = xy_mm / c, np.asarray(least_mm) / c, np.asarray(greatest_mm) / c
+        tree = cKDTree(places)
+        nearest = np.asarray(tree.query(_centres(least, greatest, _CELLS))[1], dtype=np.intp)
+        crowd = min(_CROWD, len(places))
+        reach = np.asarray(tree.query(_centres(least, greatest, _COARSE_CELLS), k=[crowd])[0])[:, 0]
+        mean = len(places) / float(np.prod(greatest - least))
+        density = np.maximum(crowd / (np.pi * np.maximum(reach, 1e-12) ** 2), mean)
+        return cls(places, least, greatest, sigma_mm / c, tree, nearest, density)
+
+    def inside(self, places: Array) -> NDArray[np.bool_]:
+        """Which of the places (..., 2) lie in the frame."""
+        return np.asarray(((places >= self.least) & (places <= self.greatest)).all(axis=-1))
+
+    def nearest(self, places: Array) -> Indices:
+        """The mark next to each place (..., 2) in the frame, to the fineness of the look-up."""
+        return self.nearest_of_cell[self._cell(places, _CELLS)]
+
+    def chance(self, places: Array, reach: Array) -> Array:
+        """The probability that some mark lies within reach (...) of places (..., 2) if marks lie where they like, as
+        dense as they are there."""
+        expected = self.density_of_cell[self._cell(places, _COARSE_CELLS)] * np.pi * reach**2
+        return np.asarray(-np.expm1(-expected))
+
+    def _cell(self, places: Array, cells: int) -> Indices:
+        share = (places - self.least) / (self.greatest - self.least)
+        with np.errstate(invalid="ignore"):
+            cell = np.clip(np.nan_to_num(share * cells), 0, cells - 1).astype(np.intp)
+        return np.asarray(cell[..., 1] * cells + cell[..., 0], dtype=np.intp)
+
+
+def _centres(least: Array, greatest: Array, cells: int) -> Array:
+    """(cells², 2) the centres of the cells, row by row."""
+    share = (np.arange(cells) + 0.5) / cells
+    x, y = (low + share * (high - low) for low, high in zip(least, greatest, strict=True))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -1,0 +1,110 @@
+"""Marks named with no orientation, by simulated frames: how many are right, refused and wrong, and how long it takes.
+
+Fields of 20, 100 and 500 points, in a plane (jittered lattice) and in space (at random in a box); a frame from a random
+side and distance, turned at random; 0, 10 or 20 % of the points missing and as many marks that are none; the principal
+distance wrong by 2 %, the lens's radial distortion not known, marks off by 0.5 px.
+
+    python benchmarks/identification.py [--frames 50] [--points 20 100 500] [--seed 1]
+"""
+
+import argparse
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.naming import Names, name_marks
+from adjust.resection import Pose
+
+Array = NDArray[np.float64]
+
+C_MM, HALF_MM, PITCH_MM = 50.0, np.array([18.0, 12.0]), 0.006
+SIGMA_PX = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """xyz, normals (n, 3): the field; xy_mm (m, 2): the marks; point (m,): which each is, -1 for none."""
+
+    xyz: Array
+    normals: Array
+    xy_mm: Array
+    point: NDArray[np.intp]
+
+
+def planar(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """A lattice, each point moved by up to a third of a step."""
+    columns = int(np.ceil(np.sqrt(1.5 * n)))
+    row, column = np.divmod(np.arange(n), columns)
+    xy = np.stack([column, row], axis=1) + rng.uniform(-0.33, 0.33, (n, 2))
+    xyz = np.column_stack([(xy - xy.mean(axis=0)) / columns, np.zeros(n)])
+    return xyz, np.tile([0.0, 0.0, 1.0], (n, 1))
+
+
+def spatial(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Points in a box that is half as deep as wide; where they face is not known."""
+    xyz = rng.uniform(-0.5, 0.5, (n, 3)) * (1.0, 0.7, 0.5)
+    return xyz, np.full((n, 3), np.nan)
+
+
+def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator) -> Frame:
+    """A picture from within 45 degrees of the z axis that the field fills more or less."""
+    tilt, around, roll = rng.uniform(0.0, np.pi / 4), rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 2 * np.pi)
+    sight = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
+    right = np.cross([np.cos(roll), np.sin(roll), 0.3], sight)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(sight, right), sight])
+    pose = Pose(rotation, sight * rng.uniform(1.3, 2.2) + rng.normal(0.0, 0.03, 3))
+    camera = (xyz - pose.center) @ rotation.T
+    p = camera[:, :2] / -camera[:, 2:]
+    p *= 1.0 + rng.uniform(-0.03, 0.03) * (p**2).sum(axis=1, keepdims=True) / 0.18
+    xy = C_MM * (1.0 + rng.normal(0.0, 0.02)) * p + rng.normal(0.0, SIGMA_PX * PITCH_MM, p.shape)
+    seen = np.flatnonzero((np.abs(xy) < HALF_MM).all(axis=1) & (camera[:, 2] < 0.0))
+    kept = seen[rng.random(len(seen)) >= share]
+    false = rng.uniform(-HALF_MM, HALF_MM, (round(share * len(seen)), 2))
+    marks, point = np.concatenate([xy[kept], false]), np.concatenate([kept, np.full(len(false), -1)])
+    order = rng.permutation(len(marks))
+    return Frame(xyz, normals, marks[order], point[order])
+
+
+def named(one: Frame) -> Names | str:
+    return name_marks(one.xyz, one.normals, one.xy_mm, (-HALF_MM, HALF_MM), C_MM, SIGMA_PX * PITCH_MM)
+
+
+def verdict(one: Frame, names: Names | str) -> str:
+    """right: most of the points seen have their names; wrong: more than one mark in fifty has another's."""
+    if isinstance(names, str):
+        return "refused"
+    good = sum(one.point[mark] == point for point, mark in names.mark.items())
+    if len(names.mark) - good > max(0.02 * len(names.mark), 1):
+        return "wrong"
+    return "right" if good >= 0.8 * (one.point >= 0).sum() else "few"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=50)
+    parser.add_argument("--points", type=int, nargs="+", default=[20, 100, 500])
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    print("| points | field | missing, false | right | few named | refused | wrong | s, median | s, longest |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for n in options.points:
+        for name, field in (("planar", planar), ("spatial", spatial)):
+            for share in (0.0, 0.1, 0.2):
+                results, seconds = [], []
+                for index in range(options.frames):
+                    rng = np.random.default_rng([options.seed, n, name == "planar", round(100 * share), index])
+                    one = frame(*field(n, rng), share, rng)
+                    start = time.perf_counter()
+                    names = named(one)
+                    seconds.append(time.perf_counter() - start)
+                    results.append(verdict(one, names))
+                counts = " | ".join(str(results.count(kind)) for kind in ("right", "few", "refused", "wrong"))
+                times = f"{np.median(seconds):.2f} | {max(seconds):.2f}"
+                print(f"| {n} | {name} | {share:.0%} | {counts} | {times} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
