@@ -124,7 +124,7 @@ class _Site:
         columns = [np.ones_like(row), col / width, row / height]
         if mark is not None:
             rendering = render(mark, np.column_stack([linear, self.center]), width, height, self.fit.blur_px)
-            shown = [rendering.pixels(part) for part in (rendering.value, rendering.by_col, rendering.by_row)]
+            shown = [rendering.value, rendering.by_col, rendering.by_row]
             for other, known in self.known:
                 if np.abs(other - shown[0]).max() < 0.05:
                     return known

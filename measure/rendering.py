@@ -4,30 +4,26 @@ with the derivatives that least-squares matching needs."""
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.coverage import CELLS, cell_coverage, outline_mm, pixel_means
+from measure.coverage import CELLS, cell_coverage, outline_mm
 from measure.shapes import Mark, MarkTemplate
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """A mark's picture and its derivatives, each (height * cells, width * cells): by column and row in px, and the
-    second derivative by place, which is twice that by the blur's variance."""
+    """A mark's picture and its derivatives, each (height, width): by column and row in px, and the second derivative
+    by place, which is twice that by the blur's variance."""
 
     value: Array
     by_col: Array
     by_row: Array
     laplacian: Array
-    cells: int
-
-    def pixels(self, cell_values: Array) -> Array:
-        return pixel_means(cell_values, self.cells)
 
 
 def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Rendering:
@@ -36,7 +32,29 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
     A drawn mark is 1 inside and 0 outside; a chip keeps its own grey values, to which the blur is added.
     pixel_from_mark: (2, 3), from (x_mm, y_mm, 1) to (col, row) of the window.
     """
-    pad = int(np.ceil(4 * blur_px)) + 1
+    sharp, cells = _sharp(mark, pixel_from_mark, width, height, blur_px)
+    over, across, twice_across = _averages(blur_px, cells, width, sharp.shape[1])
+    along, down, twice_down = _averages(blur_px, cells, height, sharp.shape[0])
+    smooth_rows = along @ sharp
+    return Rendering(
+        value=np.asarray(smooth_rows @ over.T, float),
+        by_col=np.asarray(smooth_rows @ across.T, float),
+        by_row=np.asarray(down @ sharp @ over.T, float),
+        laplacian=np.asarray(smooth_rows @ twice_across.T + twice_down @ sharp @ over.T, float),
+    )
+
+
+def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
+    """(height, width): the mark as `render` makes it, without derivatives."""
+    sharp, cells = _sharp(mark, pixel_from_mark, width, height, blur_px)
+    over, _, _ = _averages(blur_px, cells, width, sharp.shape[1])
+    along, _, _ = _averages(blur_px, cells, height, sharp.shape[0])
+    return np.asarray(along @ sharp @ over.T, float)
+
+
+def _sharp(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> tuple[Single, int]:
+    """The mark without blur in a window as much larger as the blur reaches, in cells, so many along a pixel's side."""
+    pad = int(np.ceil(4 * blur_px)) + 2
     shifted = np.array(pixel_from_mark, dtype=float)
     shifted[:, 2] += pad
     size = width + 2 * pad, height + 2 * pad
@@ -46,26 +64,7 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
     else:
         cells = CELLS if blur_px < 1.5 else CELLS // 2  # blur hides what coarser cells get wrong
         sharp = cell_coverage(mark, shifted, *size, cells)
-    sharp = sharp.astype(np.float32)
-    smooth, slope, bend = _kernels(blur_px * cells)
-    inner = slice(pad * cells, -pad * cells)
-
-    def filtered(along_cols: Array, along_rows: Array) -> Array:
-        return np.asarray(cv2.sepFilter2D(sharp, cv2.CV_32F, along_cols, along_rows)[inner, inner])
-
-    return Rendering(
-        value=filtered(smooth, smooth),
-        by_col=filtered(slope, smooth) * cells,
-        by_row=filtered(smooth, slope) * cells,
-        laplacian=(filtered(bend, smooth) + filtered(smooth, bend)) * cells**2,
-        cells=cells,
-    )
-
-
-def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
-    """(height, width): the mark as `render` makes it, without derivatives."""
-    rendering = render(mark, pixel_from_mark, width, height, blur_px)
-    return rendering.pixels(rendering.value)
+    return sharp.astype(np.float32), cells
 
 
 def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
@@ -86,6 +85,20 @@ def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: in
     col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
     rows, cols = mark.image.shape
     return np.asarray((col >= 1) & (col <= cols - 2) & (row >= 1) & (row <= rows - 2))
+
+
+def _averages(blur_px: float, cells: int, pixels: int, padded: int) -> tuple[Single, Single, Single]:
+    """Three matrices (pixels, padded cells): the mean over every pixel of the blurred cells, and of their first and
+    second derivative in px. Blur and mean in one product cost a fraction of a filter over the cells."""
+    first = (padded - pixels * cells) // 2 + cells * np.arange(pixels)
+    matrices = []
+    for kernel, per_px in zip(_kernels(blur_px * cells), (1, cells, cells**2), strict=True):
+        mean = np.convolve(kernel, np.full(cells, per_px / cells))
+        reach = len(kernel) // 2
+        matrix = np.zeros((pixels, padded), np.float32)
+        matrix[np.arange(pixels)[:, None], first[:, None] - reach + np.arange(len(mean))] = mean
+        matrices.append(matrix)
+    return matrices[0], matrices[1], matrices[2]
 
 
 @lru_cache(maxsize=256)

@@ -1,0 +1,127 @@
+"""One mark's adjustment: plain, then robust, then on what is undamaged, and at last weighed by the grain."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.noise import robust_scale
+from measure.picture_model import PictureModel
+from measure.rendering import chip_mask, render
+from measure.robust import damage, solution, tukey_loss, tukey_weights
+from measure.shapes import MarkTemplate
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
+_DAMAGE_FLOOR = 0.005  # of the contrast, under the scale of smoothed residuals, for the same reason
+_HALVINGS = 4
+_OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
+
+
+class PictureFit:
+    """The fit in progress. area: the pixels about the mark that are there; used: those of them that are undamaged;
+    reason: why it failed."""
+
+    def __init__(self, model: PictureModel, usable: Mask) -> None:
+        self.model, self.usable = model, usable
+        self.options = model.options
+        self.area = self.used = usable
+        self.variance_dn2 = 1.0
+        self.reason = ""
+
+    def run(self) -> None:
+        """Plain, then robust, then on what is undamaged; stops with a reason where something gives way."""
+        self._choose_area()
+        if not self.reason and np.ptp(self.model.grey[self.area]) == 0.0:
+            self.reason = "the picture is even there: nothing stands out"
+        if not self.reason:
+            self._adjust(robust=False, tolerance_px=0.05)
+        if not self.reason:
+            self._choose_area()
+        if not self.reason:
+            self._adjust(robust=True, tolerance_px=0.005)
+        for round_ in range(self.options.damage_rounds):
+            if self.reason:
+                return
+            floor_dn = _DAMAGE_FLOOR * self.contrast_dn
+            undamaged = self.area & ~damage(self.model.residuals, self.area, self.options.damage_sigmas, floor_dn)
+            if round_ > 0 and np.array_equal(undamaged, self.used):
+                return
+            self.used = undamaged
+            if self.used.sum() < 3 * len(self.model.design):
+                self.reason = "too little of the mark is undamaged"
+                return
+            self._adjust(robust=False, tolerance_px=0.002)
+
+    @property
+    def contrast_dn(self) -> float:
+        return abs(float(self.model.state.greys[0]))
+
+    def _choose_area(self) -> None:
+        """The pixels within margin_px of the mark: beyond it the background only disturbs."""
+        height, width = self.model.grey.shape
+        mark, place = self.model.mark, self.model.state.pixel_from_mark
+        if isinstance(mark, MarkTemplate):
+            near = chip_mask(mark, place, width, height)
+        else:
+            outside = (render(mark, place, width, height, _OUTLINE_BLUR_PX).value < _SHOWN).astype(np.uint8)
+            near = cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= self.options.margin_px
+            if outside.all():
+                self.reason = "the mark lies outside of its window"
+        self.area = self.used = self.usable & near
+        if self.area.sum() < 0.5 * near.sum() or self.area.sum() < 40:
+            self.reason = self.reason or "most of the mark lies outside of the scan"
+
+    def _adjust(self, robust: bool, tolerance_px: float) -> None:
+        """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""
+        model = self.model
+        model.linearise(self.used)
+        self.variance_dn2 = self._tukey_scale() ** 2
+        scale_dn = self._tukey_scale() if robust else np.inf
+        for _ in range(self.options.max_iterations):
+            step = self._solve(self.used * tukey_weights(model.residuals, scale_dn))
+            if step is None:
+                self.reason = "the picture does not determine the mark's place"
+                return
+            before, cost = model.state, self._cost(scale_dn)
+            moved = model.step(step)
+            if moved < tolerance_px:
+                model.residuals = model.residuals - np.tensordot(step, model.design, axes=1)
+                return
+            model.linearise(self.used)
+            for _ in range(_HALVINGS):
+                if self._cost(scale_dn) <= cost:
+                    break
+                step = step / 2
+                model.state = before
+                moved = model.step(step)
+                model.linearise(self.used)
+            self.reason = model.ran_away()
+            if self.reason or moved < tolerance_px:
+                return
+        self.reason = "the adjustment did not converge"
+
+    def _cost(self, scale_dn: float) -> float:
+        """What the adjustment makes small: Tukey's loss, squares where the scale is infinite, and the priors'."""
+        priors = np.sum(self.model.prior_weights() * self.model.departures() ** 2)
+        return float(tukey_loss(self.model.residuals[self.used], scale_dn) + self.variance_dn2 * priors)
+
+    def _tukey_scale(self) -> float:
+        return max(robust_scale(self.model.residuals[self.used]), _SCALE_FLOOR * self.contrast_dn, 1e-9)
+
+    def _solve(self, weights: Array) -> Array | None:
+        """The step, None where it is not determined. A blur at its limit stays there instead of pulling the others."""
+        model = self.model
+        priors = model.prior_weights() * self.variance_dn2
+        seen = weights > 0
+        design = model.design[:, seen]
+        weighted = design * weights[seen]
+        normal = weighted @ design.T + np.diag(priors)
+        right = weighted @ model.residuals[seen] - priors * model.departures()
+        free = np.ones(len(right), dtype=bool)
+        step = solution(normal, right, free)
+        if step is not None and model.blur_is_held(step):
+            free[model.blur] = False
+            step = solution(normal, right, free)
+        return step

@@ -1,0 +1,155 @@
+"""The model of a window that shows a mark: `gain * picture(mark) + offset + slopes`, its state and its derivatives."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.match_options import Freedom, MatchOptions
+from measure.rendering import render
+from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+GREY = 4  # unknowns: gain, offset and two slopes, the last ones
+# Changes of the mark's linear part: (I + e G) times it, G a generator.
+_TURN, _SCALE = ((0.0, -1.0), (1.0, 0.0)), ((1.0, 0.0), (0.0, 1.0))
+_STRETCH, _SHEAR = ((1.0, 0.0), (0.0, -1.0)), ((0.0, 1.0), (1.0, 0.0))
+_GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]], ...]] = {
+    "shift": (),
+    "similarity": (_SCALE, _TURN),
+    "affine": (_SCALE, _STRETCH, _SHEAR, _TURN),
+    "ellipse": (_SCALE, _STRETCH, _SHEAR),
+}
+_BLUR_RANGE_PX = (0.3, 6.0)
+_LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """pixel_from_mark (2, 3); variance_px2 of the blur; greys (4,): gain, offset, slopes, 0 until fitted."""
+
+    pixel_from_mark: Array
+    variance_px2: float
+    greys: Array
+
+
+class PictureModel:
+    """The model at its present state: design (unknowns, height, width) and residuals (height, width). The unknowns are
+    column and row, the generators' parameters, the blur's variance if it is estimated, and the greys."""
+
+    def __init__(
+        self, grey: Array, mark: Mark, start: Array, options: MatchOptions, background_px: float | None = None
+    ) -> None:
+        self.mark, self.start, self.options = mark, start, options
+        self.background_px = background_px
+        self.grey = self._detail(grey)
+        generators = [g for g in _GENERATORS[options.freedom] if not (g is _TURN and is_round(mark))]
+        self.generators = np.array(generators).reshape(-1, 2, 2)
+        self.linear = slice(2, 2 + len(self.generators))
+        self.blur = 2 + len(self.generators) if options.estimate_blur else None
+        # A chip already has its scan's blur: where none is estimated, none is added.
+        sharp = isinstance(mark, MarkTemplate) and not options.estimate_blur
+        self.state = State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
+        self.residuals = np.zeros_like(grey)
+        self.design = np.zeros((0, *grey.shape))
+
+    def linearise(self, used: Mask) -> None:
+        """Design and residuals of the present state; the greys from a linear fit to what is used, at first."""
+        height, width = self.grey.shape
+        place, blur_px = self.state.pixel_from_mark, float(np.sqrt(self.state.variance_px2))
+        shown = render(self.mark, place, width, height, blur_px)
+        greys = np.stack([self._detail(shown.value), *self.ground()])
+        if not self.state.greys.any():
+            solved = np.linalg.lstsq(greys[:, used].T, self.grey[used], rcond=None)[0]
+            self.state = State(place, self.state.variance_px2, np.asarray(solved, dtype=float))
+        gain = self.state.greys[0]
+        columns = [shown.by_col, shown.by_row]
+        col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
+        for (xx, xy), (yx, yy) in self.generators:
+            columns.append(shown.by_col * (xx * col + xy * row) + shown.by_row * (yx * col + yy * row))
+        if self.blur is not None:
+            columns.append(-0.5 * shown.laplacian)
+        self.design = np.concatenate([[-gain * self._detail(column) for column in columns], greys])
+        self.residuals = self.grey - np.tensordot(self.state.greys, greys, axes=1)
+
+    def step(self, step: Array) -> float:
+        """Take a step, shortened where it leaves the range of a linearisation; its length in px."""
+        shift, linear = step[:2], step[self.linear]
+        longest = max(np.hypot(*shift) / _LONGEST_SHIFT_PX, np.abs(linear).max(initial=0.0) / _LONGEST_CHANGE, 1.0)
+        place = self.state.pixel_from_mark.copy()
+        place[:, 2] += shift / longest
+        place[:, :2] += np.tensordot(linear / longest, self.generators, axes=1) @ place[:, :2]
+        variance = self.state.variance_px2
+        if self.blur is not None:
+            near = np.clip(variance + step[self.blur] / longest, variance / 2 - 0.05, variance * 2 + 0.3)
+            variance = float(np.clip(near, *self._variance_range()))
+        self.state = State(place, variance, self.state.greys + step[-GREY:] / longest)
+        reach = max(self.grey.shape) / 4
+        return float(np.hypot(*shift) + reach * _LONGEST_CHANGE * np.abs(linear).max(initial=0.0))
+
+    def blur_is_held(self, step: Array) -> bool:
+        """Whether a step would take the blur out of its range, at whose limit it is already."""
+        if self.blur is None:
+            return False
+        low, high = self._variance_range()
+        variance, change = self.state.variance_px2, step[self.blur]
+        return bool((variance <= low and change < 0) or (variance >= high and change > 0))
+
+    def prior_weights(self) -> Array:
+        """1 / variance of the priors of rotation, scale and shear; 0 for all else."""
+        weights = np.zeros(len(self.design))
+        weights[self.linear] = 1 / self.options.linear_sigma**2
+        return weights
+
+    def departures(self) -> Array:
+        """How far the parameters under a prior are from where they started."""
+        departures = np.zeros(len(self.design))
+        distortion = self._distortion()
+        for index, generator in enumerate(self.generators):
+            departures[2 + index] = np.sum(distortion * generator) / np.sum(generator**2)
+        return departures
+
+    def ran_away(self) -> str:
+        """Why the present state is no mark where one was expected; empty where it may be."""
+        moved = float(np.hypot(*(self.state.pixel_from_mark[:, 2] - self.start[:, 2])))
+        if moved > self.options.max_shift_px:
+            return f"the fit ran {moved:.1f} px away from where the mark was expected"
+        if np.abs(self._distortion()).max() > self.options.max_distortion:
+            return "the fit wants a mark of another size or direction than the one drawn"
+        return ""
+
+    def ground(self) -> Array:
+        """(3, height, width) offset and slopes of the background."""
+        height, width = self.grey.shape
+        scale = max(height, width) / 2
+        row, col = np.mgrid[:height, :width].astype(float)
+        return np.stack([np.ones_like(col), (col - (width - 1) / 2) / scale, (row - (height - 1) / 2) / scale])
+
+    def _detail(self, image: Array) -> Array:
+        """Grey values, or their model, without what is coarser than the mark's lines."""
+        if self.background_px is None:
+            return image
+        return np.asarray(image - cv2.GaussianBlur(image, (0, 0), self.background_px))
+
+    def _variance_range(self) -> tuple[float, float]:
+        low, high = _BLUR_RANGE_PX
+        return (0.0 if isinstance(self.mark, MarkTemplate) else low**2), high**2
+
+    def _distortion(self) -> Array:
+        return np.asarray(self.state.pixel_from_mark[:, :2] @ np.linalg.inv(self.start[:, :2]) - np.eye(2))
+
+
+def background_px(mark: Mark, pixel_from_mark: Array) -> float:
+    """The standard deviation of a blur that leaves nothing of the mark's lines."""
+    scale = float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
+    return max(1.5 * scale * thinnest_mm(mark), 1.0) + 1.0
+
+
+def is_round(mark: Mark) -> bool:
+    """Whether every rotation leaves the mark as it is."""
+    if isinstance(mark, MarkTemplate):
+        return False
+    return all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in mark.parts)
