@@ -32,7 +32,7 @@ def singular_directions(problem: Problem, state: State, free: Indices, factor: F
     """The null directions of the factor of a state, at its computed observations; none where it is regular."""
     blind = blind_blocks(factor)
     null, _ = null_space(factor, blind, SINGULAR)
-    return (*_within_blocks(problem, state, free, blind), *_named(problem, state, free, factor, null, PURE))
+    return (*_within_blocks(problem, state, free, blind), *_named(problem, state, free, factor, blind, null, PURE))
 
 
 def weak_directions(
@@ -44,7 +44,8 @@ def weak_directions(
     priors weigh less than SETTLED times what the observations do. Directions that move fiducials with priors are no
     cause for alarm: their priors are meant to place them. singular: the null directions, which are not told again.
     """
-    hardly, told = null_space(factor, blind_blocks(factor), WEAK)
+    blind = blind_blocks(factor)
+    hardly, told = null_space(factor, blind, WEAK)
     if singular and (told <= SINGULAR).all():
         return ()
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
@@ -57,7 +58,7 @@ def weak_directions(
     of_unit_weight = hardly @ kept @ np.linalg.inv(np.linalg.qr(np.maximum(told, SINGULAR)[:, None] * kept, mode="r"))
     _, weight, right = np.linalg.svd(of_unit_weight / (factor.scale * sigma)[:, None], full_matrices=False)
     unsettled = of_unit_weight @ right[weight < SETTLED].T
-    found = _named(problem, state, free, factor, np.linalg.qr(unsettled)[0], MIXED)
+    found = _named(problem, state, free, factor, blind, np.linalg.qr(unsettled)[0], MIXED)
     again = {_motion(each) for each in singular}
     return tuple(each for each in found if _motion(each) not in again)
 
@@ -112,13 +113,19 @@ def _within_blocks(
 
 
 def _named(
-    problem: Problem, state: State, free: Indices, factor: Factor, null: Array, part: float
+    problem: Problem,
+    state: State,
+    free: Indices,
+    factor: Factor,
+    blind: Sequence[BlindBlock],
+    null: Array,
+    part: float,
 ) -> tuple[NullDirection, ...]:
     """Sentences for the vectors (n, d) of a null space: the object datum first, then the camera, then what is left."""
     if null.shape[1] == 0:
         return ()
     names = [problem.unknowns.names[i] for i in free]
-    datum, sentences, rest = _datum_part(problem, state, free, factor, null)
+    datum, sentences, rest = _datum_part(problem, state, free, factor, blind, null)
     still = _with_points_still(problem, free, datum, rest)
     leads = camera_leads(problem, state)
     functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
@@ -150,11 +157,16 @@ def _left_sentence(problem: Problem, state: State, most: str, moved: Sequence[st
 
 
 def _datum_part(
-    problem: Problem, state: State, free: Indices, factor: Factor, null: Array
+    problem: Problem, state: State, free: Indices, factor: Factor, blind: Sequence[BlindBlock], null: Array
 ) -> tuple[Array, list[tuple[str, str]], Array]:
-    """The vectors (n, k) of the object datum in a null space, their sentences, and the rest (n, d - k) of the space."""
+    """The vectors (n, k) of the object datum in a null space, their sentences, and the rest (n, d - k) of the space.
+
+    Without what a block moves in its own null directions, as in all these vectors.
+    """
     datum = object_datum(problem, state)
     motion = (datum.generators @ datum.free)[free] * factor.scale[:, None]
+    for block in blind:
+        motion[block.own] -= block.right @ (block.right.T @ motion[block.own])
     orthonormal = np.linalg.qr(motion)[0]
     left, cosines, _ = np.linalg.svd(null.T @ orthonormal)
     count = int((cosines > 1.0 - INSIDE).sum())

@@ -9,26 +9,24 @@ adjustment: a modern synthesis). Blocks of equal shape are factorised together.
 Rows that connect what no single block owns are blocks without own unknowns: what they touch must be shared.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dtrcon
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 
-from adjust.normal_equations import Groups, border_square
+from adjust.fronts import Fronts
+from adjust.multifrontal import of_normal_equations, reflected, reflections_cost, triangle_of
+from adjust.normal_equations import Groups, border_square, spread_squares
+from adjust.triangle import Triangle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-ROWS_PER_COLUMN = 4  # rows in the shared unknowns are condensed when there are more of them than this
-CONDENSED_ROWS = 2000  # and more than this
 REFLECTED = 1e9  # rows times columns squared in the shared unknowns up to which these rows are factorised themselves
 SAFE = 1e-6  # reciprocal condition of the shared triangle down to which their normal equations will do
-WIDE = 500  # shared unknowns up to which roots of cofactors run over all of them
 
 
 @dataclass(frozen=True)
@@ -69,14 +67,14 @@ class ReducedRows:
 
 @dataclass(frozen=True)
 class Factor:
-    """The square root of the normal equations: the blocks' triangles, and that of the shared unknowns (s, s).
+    """The square root of the normal equations: the blocks' triangles, and that of the s shared unknowns.
 
     All columns are scaled: the unknowns are those of the rows times `scale` (n,), which makes every column's norm 1.
     The shared unknowns are the first s.
     """
 
     blocks: tuple[BlockFactors, ...]
-    triangle: Array
+    triangle: Triangle
     right: Array
     scale: Array
 
@@ -87,7 +85,7 @@ class Factor:
     def solution(self) -> Array:
         """The unknowns (n,). Raises numpy.linalg.LinAlgError where a triangle is singular."""
         solution = np.empty(len(self.scale))
-        shared = solve_triangular(self.triangle, self.right)
+        shared = self.triangle.solve(self.right)
         solution[: self.shared_count] = shared
         for block in self.blocks:
             through = (block.border @ shared[block.shared][..., None])[..., 0]
@@ -102,7 +100,7 @@ class Factor:
     def variances(self) -> Array:
         """The diagonal (n,) of the cofactor matrix."""
         variances = np.empty(len(self.scale))
-        variances[: self.shared_count] = (self.shared_root**2).sum(axis=1)
+        variances[: self.shared_count] = self.triangle.variances
         for block in self.blocks:
             own, through = self._roots(block)
             variances[block.own] = (own**2).sum(axis=2) + (through**2).sum(axis=2)
@@ -112,7 +110,7 @@ class Factor:
         """The cofactor matrices (g, k, k) of groups of unknowns (g, k), each of one block's own or of shared ones."""
         cofactors = np.empty((*groups.shape, groups.shape[1]))
         shared = groups[:, 0] < self.shared_count
-        cofactors[shared] = self._shared_cofactor[groups[shared][:, :, None], groups[shared][:, None, :]]
+        cofactors[shared] = self.triangle.cofactors_of(groups[shared])
         row = np.full(len(self.scale), -1, dtype=np.intp)
         for block in self.blocks:
             row[block.own] = np.arange(block.own.size).reshape(block.own.shape)
@@ -138,7 +136,7 @@ class Factor:
                 root = np.asarray(solve_triangular(block.triangle[i], own[rows].T, trans="T"), dtype=np.float64)
                 cofactor[np.ix_(rows, rows)] += root.T @ root
                 shared[np.ix_(rows, block.shared[i])] -= root.T @ block.border[i]
-        through = solve_triangular(self.triangle, shared.T, trans="T")
+        through = self.triangle.solve_transposed(shared.T)
         return np.asarray(cofactor + through.T @ through)
 
     def cofactor_times(self, columns: Array) -> Array:
@@ -150,7 +148,7 @@ class Factor:
             own.append(np.linalg.solve(block.triangle.transpose(0, 2, 1), scaled[block.own]))
             np.subtract.at(shared, block.shared, block.border.transpose(0, 2, 1) @ own[-1])
         result = np.empty_like(scaled)
-        shared = solve_triangular(self.triangle, solve_triangular(self.triangle, shared, trans="T"))
+        shared = self.triangle.cofactor_times(shared)
         result[: self.shared_count] = shared
         for block, root in zip(self.blocks, own, strict=True):
             result[block.own] = np.linalg.solve(block.triangle, root - block.border @ shared[block.shared])
@@ -162,7 +160,7 @@ class Factor:
         The adjusted rows are the matrix times the unknowns.
         """
         for rows in self.reduced_rows(blocks):
-            yield np.concatenate([rows.own, rows.through @ self.root_of(rows.shared)], axis=2)
+            yield np.concatenate([rows.own, rows.through @ self.triangle.root_of(rows.shared)], axis=2)
 
     def reduced_rows(self, blocks: Iterable[Blocks]) -> Iterator["ReducedRows"]:
         """The adjusted rows of blocks that own and share what those factorised do, one after the other."""
@@ -172,29 +170,10 @@ class Factor:
             own = matrix[..., :count] @ np.linalg.inv(block.triangle)
             yield ReducedRows(own, rows.shared, matrix[..., count:] - own @ block.border)
 
-    @cached_property
-    def shared_root(self) -> Array:
-        """The inverse (s, s) of the shared triangle, R where R R' is the cofactor matrix of scaled shared unknowns."""
-        return np.asarray(solve_triangular(self.triangle, np.eye(self.shared_count)), dtype=np.float64)
-
-    @cached_property
-    def _shared_cofactor(self) -> Array:
-        return self.shared_root @ self.shared_root.T
-
-    def root_of(self, shared: Indices) -> Array:
-        """Roots (b, s, k) of the cofactor matrices of blocks' shared unknowns (b, s), which are scaled."""
-        if self.shared_count <= WIDE:
-            return self.shared_root[shared]
-        places = shared[:, :, None] * self.shared_count + shared[:, None, :]
-        try:
-            return np.asarray(np.linalg.cholesky(self._shared_cofactor.take(places)), dtype=np.float64)
-        except np.linalg.LinAlgError:  # the condition of the cofactor matrix is the square of that of its root
-            return self.shared_root[shared]
-
     def _roots(self, block: BlockFactors) -> tuple[Array, Array]:
         """Roots of the own unknowns' cofactor matrix: for shared unknowns held fixed, and what these add."""
         own = np.asarray(np.linalg.inv(block.triangle), dtype=np.float64)
-        return own, -own @ (block.border @ self.root_of(block.shared))
+        return own, -own @ (block.border @ self.triangle.root_of(block.shared))
 
 
 @dataclass(frozen=True)
@@ -217,6 +196,7 @@ def eliminate(
     damping: float = 0.0,
     sums: Sums | None = None,
     sharp: bool = True,
+    fronts: Fronts | None = None,
 ) -> Factor:
     """Factorise the blocks and one row an unknown for its prior.
 
@@ -227,18 +207,23 @@ def eliminate(
     `sums` tell how, their normal equations are summed up and factorised (Cholesky). That squares the condition: of
     variances the relative error is at most some 1e-16 times the squared condition, 1e-4 where the condition is 1e6;
     where it is worse, reflections take their time. Not sharp: singular values below 1e-6 need not be told from that.
+
+    fronts: of the shared unknowns, which stand in their order; a single one if they are not told.
     """
-    squares, shared_count, height = prior_root_weight**2, count, 0
+    squares, shared_count = prior_root_weight**2, count
+    heights = []
     for block in blocks:
         squares += _column_squares(block, count)
         shared_count -= block.own.size
-        height += len(block.right) * min(block.right.shape[1], block.shared.shape[1] + 1)
+        if block.shared.size:
+            heights.append((block.shared, min(block.right.shape[1], block.shared.shape[1] + 1)))
+    fronts = fronts or Fronts.single(shared_count)
     scale = np.where(squares > 0.0, np.sqrt(squares), 1.0)
     priors = _prior_rows(prior_root_weight / scale, prior_right, damping)
-    if sums is not None and height * shared_count**2 > REFLECTED:
+    if sums is not None and reflections_cost(fronts, heights) > REFLECTED:
         lift = 0.0 if sharp else SAFE**2
-        factor = _by_normal_equations(blocks, sums, scale, priors, shared_count, lift)
-        if factor is not None and (not sharp or _well_conditioned(factor)):
+        factor = _by_normal_equations(blocks, sums, scale, priors, fronts, lift)
+        if factor is not None and (not sharp or factor.triangle.reciprocal_condition > SAFE):
             return factor
     factors = []
     rests = []
@@ -246,8 +231,8 @@ def eliminate(
         eliminated, rest = _eliminate_blocks(block, scale, priors)
         factors.append(eliminated)
         rests.append((block.shared, rest))
-    triangle = _condensed(rests, _rows_of(priors, np.arange(shared_count)), shared_count)
-    return Factor(tuple(factors), triangle[:, :-1], triangle[:, -1], scale)
+    triangle, right = reflected(fronts, rests, *(prior[:shared_count] for prior in priors))
+    return Factor(tuple(factors), triangle, right, scale)
 
 
 def _columns(values: Array, blocks: Blocks) -> Array:
@@ -284,7 +269,7 @@ def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array])
     prior_rows = _rows_of(priors, blocks.own)
     rows[:, height:, :own_count] = prior_rows[..., :-1]
     rows[:, height:, -1] = prior_rows[..., -1]
-    triangle = _triangle(rows)
+    triangle = triangle_of(rows)
     own = triangle[:, :own_count]
     factor = BlockFactors(blocks.own, blocks.shared, own[..., :own_count], own[..., own_count:-1], own[..., -1])
     return factor, triangle[:, own_count:, own_count:]
@@ -295,27 +280,28 @@ def _by_normal_equations(
     sums: Sums,
     scale: Array,
     priors: tuple[Array, Array],
-    shared_count: int,
+    fronts: Fronts,
     lift: float,
 ) -> Factor | None:
     """None where the normal equations of the shared unknowns are not positive definite."""
-    root_weight, prior_right = priors[0][:shared_count], priors[1][:shared_count]
-    normal = np.diag(root_weight**2 + lift)
+    root_weight, prior_right = (prior[: fronts.count] for prior in priors)
+    normal = csr_array(diags_array(root_weight**2 + lift))
     right = root_weight * prior_right
     for rows in sums.rows:
-        matrices = rows.matrix / scale[rows.shared][:, None, :]
-        for shared, matrix, of_rows in zip(rows.shared, matrices, rows.right, strict=True):
-            normal[np.ix_(shared, shared)] += matrix.T @ matrix
-            right[shared] += matrix.T @ of_rows
+        matrix = rows.matrix / scale[rows.shared][:, None, :]
+        normal = normal + spread_squares(rows.shared, matrix.swapaxes(1, 2) @ matrix, fronts.count)
+        np.add.at(right, rows.shared, (matrix.swapaxes(1, 2) @ rows.right[..., None])[..., 0])
     factors = [_own_triangles(block, scale, priors) for block in blocks]
-    normal -= border_square(sums.groups, ((factor.shared, factor.border) for factor in factors if factor.own.size))
+    normal = normal - border_square(
+        sums.groups, ((factor.shared, factor.border) for factor in factors if factor.own.size)
+    )
     for factor in factors:
         np.subtract.at(right, factor.shared, (factor.border.swapaxes(1, 2) @ factor.right[..., None])[..., 0])
     try:
-        root = np.asarray(np.linalg.cholesky(normal), dtype=np.float64)
+        triangle, right = of_normal_equations(fronts, normal, right)
     except np.linalg.LinAlgError:
         return None
-    return Factor(tuple(factors), root.T, solve_triangular(root, right, lower=True), scale)
+    return Factor(tuple(factors), triangle, right, scale)
 
 
 def _own_triangles(blocks: Blocks, scale: Array, priors: tuple[Array, Array]) -> BlockFactors:
@@ -330,39 +316,3 @@ def _own_triangles(blocks: Blocks, scale: Array, priors: tuple[Array, Array]) ->
     right = turned[..., :height] @ blocks.right[..., None] + turned[..., height:] @ prior_rows[..., -1:]
     border = turned[..., :height] @ matrix[..., own_count:]
     return BlockFactors(blocks.own, blocks.shared, triangle, border, right[..., 0])
-
-
-def _well_conditioned(factor: Factor) -> bool:
-    """Whether the condition of the shared triangle is such that its square does no harm."""
-    reciprocal, _ = dtrcon(factor.triangle)
-    return bool(reciprocal > SAFE)
-
-
-def _condensed(rests: Sequence[tuple[Indices, Array]], shared_priors: Array, shared_count: int) -> Array:
-    """The triangle (s, s + 1) of all rows in the shared unknowns, right side behind."""
-    together = max(CONDENSED_ROWS, ROWS_PER_COLUMN * (shared_count + 1))
-    triangle = shared_priors
-    pending: list[Array] = []
-    height = 0
-    for shared, rest in rests:
-        count = max(1, together // max(1, rest.shape[1]))
-        for first in range(0, len(rest), count):
-            pending.append(_spread(shared[first : first + count], rest[first : first + count], shared_count))
-            height += len(pending[-1])
-            if height >= together:
-                triangle = _triangle(np.vstack([triangle, *pending]))
-                pending, height = [], 0
-    return _triangle(np.vstack([triangle, *pending]))[:shared_count]
-
-
-def _spread(shared: Indices, rest: Array, shared_count: int) -> Array:
-    """Rows (b, k, s + 1) in some of the shared unknowns (b, s) as rows (b k, all shared + 1)."""
-    spread = np.zeros((*rest.shape[:2], shared_count + 1))
-    columns = np.concatenate([shared, np.full((len(shared), 1), shared_count)], axis=1)
-    np.put_along_axis(spread, np.broadcast_to(columns[:, None, :], rest.shape), rest, axis=2)
-    return spread.reshape(-1, shared_count + 1)
-
-
-def _triangle(rows: Array) -> Array:
-    """The factors R (..., k, n) of Householder factorisations of rows (..., m, n), k the smaller of m and n."""
-    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)

@@ -75,8 +75,9 @@ def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera
     if not camera_priors:
         weights = np.where(of_cameras(numbering), 0.0, weights)
     differences = prior_differences(numbering.problem, at.state)[numbering.free]
+    system = len(numbering.free), weights, weights * differences
     # Without these priors the factor tells what is weak: nothing is solved with it.
-    return eliminate(at.rows, len(numbering.free), weights, weights * differences, damping, at.rows.sums, camera_priors)
+    return eliminate(at.rows, *system, damping, at.rows.sums, camera_priors, numbering.fronts)
 
 
 def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limit: int) -> Solution:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array
+from scipy.sparse import bsr_array, coo_array, csr_array
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -29,14 +29,22 @@ class Groups:
         """The unknowns of the largest group."""
         return int(self.place.max(initial=0)) + 1
 
+    @property
+    def members(self) -> Indices:
+        """(count * width,) the unknowns group by group, -1 behind those of smaller ones."""
+        members = np.full((self.count, self.width), -1, dtype=np.intp)
+        grouped = np.flatnonzero(self.group >= 0)
+        members[self.group[grouped], self.place[grouped]] = grouped
+        return members.ravel()
 
-def border_square(groups: Groups, borders: Iterable[tuple[Indices, Array]]) -> Array:
+
+def border_square(groups: Groups, borders: Iterable[tuple[Indices, Array]]) -> csr_array:
     """The sum (s, s) of B'B over blocks; of each shape the shared unknowns (b, s') and the borders B (b, o, s').
 
     As a product of sparse matrices of dense parts: a row of parts a block, a column a group. What is in no group, the
     cameras, is few.
     """
-    grouped, single = np.flatnonzero(groups.group >= 0), np.flatnonzero(groups.group < 0)
+    single = np.flatnonzero(groups.group < 0)
     place_of_single = np.zeros(len(groups.group), dtype=np.intp)
     place_of_single[single] = np.arange(len(single))
     by_height: dict[int, list[tuple[_Parts, Array]]] = {}
@@ -46,16 +54,28 @@ def border_square(groups: Groups, borders: Iterable[tuple[Indices, Array]]) -> A
         alone[block, :, place_of_single[shared[block, column]]] = border[block, :, column]
         rows = _parts(groups, shared, border), alone.reshape(-1, len(single))
         by_height.setdefault(border.shape[1], []).append(rows)
-    square = np.zeros((len(groups.group), len(groups.group)))
-    padded = groups.group[grouped] * groups.width + groups.place[grouped]
+    count = len(groups.group)
+    square = csr_array((count, count))
     for members in by_height.values():
         parts = _joined([each for each, _ in members], groups)
         alone = np.concatenate([each for _, each in members])
-        square[np.ix_(grouped, grouped)] += (parts.T @ parts).toarray()[np.ix_(padded, padded)]
-        square[np.ix_(grouped, single)] += (parts.T @ alone)[padded]
-        square[np.ix_(single, single)] += alone.T @ alone
-    square[np.ix_(single, grouped)] = square[np.ix_(grouped, single)].T
-    return square
+        square = square + _numbered(groups.members, groups.members, bsr_array(parts.T @ parts).tocoo(), count)
+        across = _numbered(groups.members, single, coo_array(parts.T @ alone), count)
+        square = square + across + across.T + _numbered(single, single, coo_array(alone.T @ alone), count)
+    return csr_array(square)
+
+
+def _numbered(rows: Indices, columns: Indices, square: coo_array, count: int) -> csr_array:
+    """A matrix whose rows and columns stand for some of all unknowns, -1 for none, as a matrix (n, n) of all."""
+    row, column = rows[square.row], columns[square.col]
+    there = (row >= 0) & (column >= 0)
+    return csr_array(coo_array((square.data[there], (row[there], column[there])), shape=(count, count)))
+
+
+def spread_squares(unknowns: Indices, squares: Array, count: int) -> csr_array:
+    """The sum (n, n) of squares (b, s, s) of some unknowns (b, s) each."""
+    rows, columns = (np.broadcast_to(at, squares.shape).ravel() for at in (unknowns[:, :, None], unknowns[:, None, :]))
+    return csr_array(coo_array((squares.ravel(), (rows, columns)), shape=(count, count)))
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from adjust.elimination import Factor
+from adjust.multifrontal import with_rows
+from adjust.triangle import Triangle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -81,51 +82,39 @@ def null_space(factor: Factor, blind: Sequence[BlindBlock], below: float) -> tup
     return np.linalg.qr(vectors)[0], singular / np.linalg.norm(vectors, axis=0)
 
 
-def _with_blind_rows(factor: Factor, blind: Sequence[BlindBlock]) -> Array:
-    """The shared triangle (s, s), where blocks have null vectors together with the rows that these leave over."""
+def _with_blind_rows(factor: Factor, blind: Sequence[BlindBlock]) -> Triangle:
+    """The shared triangle, where blocks have null vectors together with the rows that these leave over."""
     if not blind:
         return factor.triangle
-    rows = [factor.triangle]
-    for block in blind:
-        rest = np.zeros((block.left.shape[1], factor.shared_count))
-        rest[:, block.shared] = block.left.T @ block.border
-        rows.append(rest)
-    return np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
+    return with_rows(factor.triangle, [(block.shared, block.left.T @ block.border) for block in blind])
 
 
-def _smallest(triangle: Array, below: float) -> tuple[Array, Array]:
+def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:
     """The singular values (d,) of a triangle below a part of the largest, and their right vectors (s, d)."""
     if len(triangle) <= DENSE:
-        _, singular, right = np.linalg.svd(triangle)
+        _, singular, right = np.linalg.svd(triangle.toarray())
         hardly = singular <= below * singular[0]
         return singular[hardly], right[hardly].T
     largest = _largest_singular(triangle)
     count = FIRST_COUNT
     while True:
-        singular, vectors = _inverse_iteration(_lifted(triangle, ROUNDING * largest), count, below * largest)
+        singular, vectors = _inverse_iteration(triangle.lifted(ROUNDING * largest), count, below * largest)
         hardly = singular <= below * largest
         if not hardly.all() or count == len(triangle):
             return singular[hardly], vectors[:, hardly]
         count = min(2 * count, len(triangle))
 
 
-def _largest_singular(triangle: Array) -> float:
+def _largest_singular(triangle: Triangle) -> float:
     """By power iteration, to a few percent."""
     vector = np.random.default_rng(0).normal(size=len(triangle))
     for _ in range(20):
-        vector = triangle.T @ (triangle @ vector)
+        vector = triangle.transposed_times(triangle.times(vector))
         vector /= np.linalg.norm(vector)
-    return float(np.linalg.norm(triangle @ vector))
+    return float(np.linalg.norm(triangle.times(vector)))
 
 
-def _lifted(triangle: Array, least: float) -> Array:
-    """The triangle with no diagonal element nearer to 0 than rounding: no singular value changes by more than that."""
-    diagonal = np.diag(triangle)
-    lift = np.where(np.abs(diagonal) < least, np.where(diagonal < 0.0, -least, least) - diagonal, 0.0)
-    return np.asarray(triangle + np.diag(lift))
-
-
-def _inverse_iteration(triangle: Array, count: int, limit: float) -> tuple[Array, Array]:
+def _inverse_iteration(triangle: Triangle, count: int, limit: float) -> tuple[Array, Array]:
     """The smallest singular values (count,) and right vectors (s, count) by orthogonal iteration with the inverse.
 
     Those above the limit need not have converged. Source: Golub and Van Loan, Matrix Computations, section 8.2.
@@ -133,9 +122,9 @@ def _inverse_iteration(triangle: Array, count: int, limit: float) -> tuple[Array
     vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(len(triangle), count)))[0]
     before = np.full(count, np.inf)
     for _ in range(ITERATIONS):
-        half = np.linalg.qr(solve_triangular(triangle, vectors, trans="T"))[0]
-        vectors = np.linalg.qr(solve_triangular(triangle, half))[0]
-        _, singular, right = np.linalg.svd(triangle @ vectors, full_matrices=False)
+        half = np.linalg.qr(triangle.solve_transposed(vectors))[0]
+        vectors = np.linalg.qr(triangle.solve(half))[0]
+        _, singular, right = np.linalg.svd(triangle.times(vectors), full_matrices=False)
         vectors, singular = vectors @ right[::-1].T, singular[::-1]
         if (np.abs(before - singular)[singular <= limit] <= STANDSTILL * limit).all():
             break

@@ -6,7 +6,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
+from adjust.fronts import Fronts, band_order, fronts_of
 from adjust.normal_equations import Groups
 from adjust.problem import ABSENT, Problem
 
@@ -44,10 +46,14 @@ class Numbering:
 
     @cached_property
     def free(self) -> Indices:
-        """Positions of the free unknowns."""
+        """Positions of the free unknowns; the shared ones as they are eliminated."""
         free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
-        is_own = np.isin(free, self._blocks.owned)
-        return np.concatenate([free[~is_own], free[is_own]])
+        return np.concatenate([self._shared.positions, free[np.isin(free, self._blocks.owned)]])
+
+    @property
+    def fronts(self) -> Fronts:
+        """In which the shared unknowns are eliminated."""
+        return self._shared.fronts
 
     @cached_property
     def used(self) -> Indices:
@@ -76,19 +82,60 @@ class Numbering:
     @cached_property
     def groups(self) -> Groups:
         """The shared unknowns of every image, or of every point."""
-        group = np.full(self._shared_count + 1, -1, dtype=np.intp)  # the last stands for what is not shared
-        place = np.zeros_like(group)
-        numbers = self.numbers[self._others.owned]
-        numbers[(numbers == ABSENT) | (numbers >= self._shared_count)] = self._shared_count
-        group[numbers] = np.arange(len(numbers))[:, None]
-        place[numbers] = np.arange(numbers.shape[1])
-        group[-1] = -1
-        return Groups(group[:-1], place[:-1])
+        group = self._group[self._shared.positions]
+        first = np.flatnonzero(np.diff(group, prepend=-2))  # those of a group stand together
+        place = np.arange(len(group)) - np.repeat(first, np.diff(first, append=len(group)))
+        return Groups(group, np.where(group >= 0, place, 0))
 
     @property
     def _shared_count(self) -> int:
-        owned = self.numbers[self._blocks.owned]
-        return len(self.free) - int((owned != ABSENT).sum())
+        return len(self._shared.positions)
+
+    @cached_property
+    def _shared(self) -> "_Shared":
+        """The shared unknowns: images, or points, that are neighbours one after the other, what is of none behind.
+
+        As they are numbered where all of them are one front.
+        """
+        free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
+        shared = free[~np.isin(free, self._blocks.owned)]
+        group = self._group[shared]
+        sizes = np.bincount(group[group >= 0], minlength=len(self._grouped))
+        present = np.flatnonzero(sizes)
+        met = self._met[:, present]
+        order = band_order(met)
+        fronts = fronts_of(met[:, order], sizes[present[order]], int((group < 0).sum()))
+        if len(fronts) == 1:
+            return _Shared(shared, fronts)
+        rank = np.full(len(sizes) + 1, len(sizes), dtype=np.intp)  # the last stands for what is in no group
+        rank[present[order]] = np.arange(len(order))
+        return _Shared(shared[np.argsort(rank[group], kind="stable")], fronts)
+
+    @property
+    def _grouped(self) -> Indices:
+        """Positions (g, k) of the unknowns of every image, or of every point: those that blocks do not own."""
+        return self._of_images if self._points_own else self._of_points
+
+    @cached_property
+    def _group(self) -> Indices:
+        """By position: of which image or point, of those that are grouped, it is, ABSENT for others and at the end."""
+        group = np.full(len(self.problem.unknowns) + 1, ABSENT, dtype=np.intp)
+        group[self._grouped] = np.arange(len(self._grouped))[:, None]
+        group[ABSENT] = ABSENT
+        return group
+
+    @property
+    def _met(self) -> csr_array:
+        """Which groups (b, g) every block of observations meets, and behind these every further observation."""
+        groups = [self._group[self.problem.columns].max(axis=1)]
+        blocks = [self._blocks.of]
+        for i, further in enumerate(self.problem.further):
+            groups.append(self._group[further.positions])
+            blocks.append(np.full(len(further.positions), len(self._blocks.owned) + i))
+        group, block = np.concatenate(groups), np.concatenate(blocks)
+        some = group >= 0
+        shape = len(self._blocks.owned) + len(self.problem.further), len(self._grouped)
+        return csr_array((np.ones(int(some.sum())), (block[some], group[some])), shape=shape)
 
     @property
     def _blocks(self) -> "_Blocks":
@@ -112,21 +159,31 @@ class Numbering:
         return tied
 
     @cached_property
-    def _by_image(self) -> "_Blocks":
+    def _of_images(self) -> Indices:
+        """Positions (images, k) of the unknowns of every image, ABSENT behind those that have less."""
         unknowns = self.problem.unknowns
-        owned = _side_by_side(
+        return _side_by_side(
             [
                 np.concatenate([unknowns.exterior[image.name], unknowns.transformation[image.name]])
                 for image in self.problem.network.images
             ]
         )
+
+    @cached_property
+    def _of_points(self) -> Indices:
+        """Positions (points, 3) of the unknowns of every point."""
+        return np.array(list(self.problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
+
+    @cached_property
+    def _by_image(self) -> "_Blocks":
+        owned = self._of_images.copy()
         owned[self._tied[owned].any(axis=1)] = ABSENT
         return _Blocks(owned, self.problem.image_numbers)
 
     @cached_property
     def _by_point(self) -> "_Blocks":
         problem, unknowns = self.problem, self.problem.unknowns
-        points = np.array(list(unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
+        points = self._of_points
         points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~self._tied[points].any(axis=1)]
         of_point = np.full(len(unknowns) + 1, len(points), dtype=np.intp)  # the last stands for ABSENT
         of_point[points[:, 0]] = np.arange(len(points))
@@ -134,6 +191,14 @@ class Numbering:
         nothing = np.full((len(problem.network.images), 3), ABSENT, dtype=np.intp)
         others = block == len(points)
         return _Blocks(np.concatenate([points, nothing]), block + np.where(others, problem.image_numbers, 0))
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """positions (s,) of the shared unknowns as they are eliminated, and in which fronts."""
+
+    positions: Indices
+    fronts: Fronts
 
 
 @dataclass(frozen=True)

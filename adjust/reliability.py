@@ -61,7 +61,7 @@ def misfits(numbering: Numbering, end: Linearised, factor: Factor) -> Misfits:
     transform = _transforms(numbering.problem, end, units)
     hat = np.zeros((len(units) + 1, 2, 2))  # the last stands for ABSENT
     for rows in unit_rows(numbering, end, factor):
-        roots = np.concatenate([rows.own, rows.through @ factor.root_of(rows.shared)[:, None]], axis=3)
+        roots = np.concatenate([rows.own, rows.through @ factor.triangle.root_of(rows.shared)[:, None]], axis=3)
         hat[rows.units] = roots @ roots.swapaxes(2, 3)
     hat = hat[:-1]
     hat[units.sizes == 1, 1, 1] = 1.0
@@ -244,8 +244,9 @@ def _outer(
     cameras = np.concatenate([*unknowns.camera.values(), *unknowns.fiducial.values()]).astype(np.intp)
     free = numbering.free[: factor.shared_count]
     members = np.flatnonzero(np.isin(free, cameras))
-    of_cameras = factor.shared_root[members] / factor.scale[members, None]
-    by_shared = factor.shared_root @ of_cameras.T
+    of_cameras = np.zeros((factor.shared_count, len(members)))
+    of_cameras[members, np.arange(len(members))] = 1.0 / factor.scale[members]
+    by_shared = factor.triangle.cofactor_times(of_cameras)
     largest = np.zeros(len(members))
     causes = np.full(len(members), "", dtype=object)
     of_units = _unit_effects(numbering, end, factor, found, errors, by_shared, tested)
@@ -256,7 +257,7 @@ def _outer(
         values = effects[worst, np.arange(len(members))]
         for i in np.flatnonzero(np.abs(values) > np.abs(largest)):
             largest[i], causes[i] = values[i], name_of(int(worst[i]))
-    sigma = np.sqrt((of_cameras**2).sum(axis=1))
+    sigma = np.sqrt((of_cameras * by_shared).sum(axis=0))
     return tuple(
         OuterEffect(unknowns.names[free[members[i]]], float(largest[i]), float(abs(largest[i]) / sigma[i]), causes[i])
         for i in np.argsort(free[members])
@@ -292,7 +293,7 @@ def _further_effects(
     for each, block in zip(numbering.problem.further, end.rows.further, strict=True):
         inward = np.linalg.inv(np.linalg.cholesky(each.covariance))
         through = block.matrix[0] / factor.scale[block.shared[0]]
-        roots = through @ factor.root_of(block.shared)[0]
+        roots = through @ factor.triangle.root_of(block.shared)[0]
         variance = np.diag(inward.T @ (np.eye(len(roots)) - roots @ roots.T) @ inward)
         controlled = variance > UNCONTROLLED * (inward**2).sum(axis=0)
         errors = np.where(controlled, _over(shift, variance, controlled), 0.0)

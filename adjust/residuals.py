@@ -51,7 +51,7 @@ def further_residuals(
 
 def _surplus(block: Blocks, factor: Factor) -> Array:
     """I - H (m, m) of a block without own unknowns."""
-    roots = (block.matrix / factor.scale[block.shared][:, None, :] @ factor.root_of(block.shared))[0]
+    roots = (block.matrix / factor.scale[block.shared][:, None, :] @ factor.triangle.root_of(block.shared))[0]
     return np.asarray(np.eye(len(roots)) - roots @ roots.T)
 
 

@@ -200,10 +200,12 @@ class _Covariance:
 def _columns(search: Search, units: Sequence[int]) -> dict[int, Array]:
     """The columns (N, 2, 2) of V of some units."""
     homes: dict[int, tuple[int, int, Array, Array]] = {}  # what holds the unit's block, which it is there, own rows,
-    root = search.factor.shared_root  # and the covariances of its rows with the shared unknowns
+    triangle = search.factor.triangle  # and the covariances of its rows with the shared unknowns
     for part, rows in enumerate(unit_rows(search.numbering, search.end, search.factor)):
         for block, place in np.argwhere(np.isin(rows.units, units)):
-            by_shared = root @ (root[rows.shared[block]].T @ rows.through[block, place].T)
+            through = np.zeros((len(triangle), 2))
+            np.add.at(through, rows.shared[block], rows.through[block, place].T)
+            by_shared = triangle.cofactor_times(through)
             homes[int(rows.units[block, place])] = (part, int(block), rows.own[block, place], by_shared)
     columns = {unit: np.zeros((len(search.critical) + 1, 2, 2)) for unit in units}  # the last stands for ABSENT
     for part, rows in enumerate(unit_rows(search.numbering, search.end, search.factor)):

@@ -5,9 +5,11 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from adjust.elimination import Factor
 from adjust.iteration import Linearised
+from adjust.normal_equations import spread_squares
 from adjust.numbering import Numbering
 from adjust.reliability import Misfits, unit_rows
 from adjust.residuals import group_sums
@@ -16,6 +18,7 @@ from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 
+COLUMNS_AT_ONCE = 500  # of the cofactor matrix of the shared unknowns
 LEAST_REDUNDANCY = 1.0  # a group with less redundancy keeps its variance
 
 
@@ -65,7 +68,7 @@ def _traces(numbering: Numbering, end: Linearised, factor: Factor, members: Sequ
     these is summed up first.
     """
     within = np.zeros((len(members), len(members)))
-    normals = np.zeros((len(members), factor.shared_count, factor.shared_count))
+    normals = [csr_array((factor.shared_count, factor.shared_count)) for _ in members]
     belongs = np.append(
         np.array(members), np.zeros((len(members), 1), dtype=bool), axis=1
     )  # the last stands for ABSENT
@@ -75,12 +78,28 @@ def _traces(numbering: Numbering, end: Linearised, factor: Factor, members: Sequ
         shape = len(members), count, 2 * rows.units.shape[1]
         own = (masks * rows.own).reshape(*shape, rows.own.shape[3])
         through = (masks * rows.through).reshape(*shape, rows.through.shape[3])
-        roots = through @ factor.root_of(rows.shared)
+        roots = through @ factor.triangle.root_of(rows.shared)
         for i, j in product(range(len(members)), repeat=2):
             between = roots[i] @ roots[j].swapaxes(1, 2)
             within[i, j] += ((own[i] @ own[j].swapaxes(1, 2) + between) ** 2).sum() - (between**2).sum()
-        for normal, of_group in zip(normals, through, strict=True):
-            at = rows.shared[:, :, None], rows.shared[:, None, :]
-            np.add.at(normal, at, of_group.swapaxes(1, 2) @ of_group)
-    told = factor.shared_root.T @ normals @ factor.shared_root
-    return np.asarray(within + np.einsum("ist,jst->ij", told, told))
+        for i, of_group in enumerate(through):
+            normals[i] = normals[i] + spread_squares(
+                rows.shared, of_group.swapaxes(1, 2) @ of_group, factor.shared_count
+            )
+    return within + _between(factor, normals)
+
+
+def _between(factor: Factor, normals: Sequence[csr_array]) -> Array:
+    """The traces (g, g) of N_i Q N_j Q, with N (s, s) what a group tells of the shared unknowns and Q their cofactors.
+
+    Some columns of Q at a time: all of it would be too large in a large network.
+    """
+    traces = np.zeros((len(normals), len(normals)))
+    for first in range(0, factor.shared_count, COLUMNS_AT_ONCE):
+        unit = np.eye(factor.shared_count, COLUMNS_AT_ONCE, -first)
+        some = slice(first, first + COLUMNS_AT_ONCE)
+        columns = factor.triangle.cofactor_times(unit)
+        for j, of_group in enumerate(normals):
+            told = factor.triangle.cofactor_times(of_group @ columns)
+            traces[:, j] += [np.trace(normal[some] @ told) for normal in normals]
+    return traces

@@ -8,6 +8,8 @@ from simulated import field_points
 from adjust import null_space
 from adjust.adjustment import Options, adjust
 from adjust.elimination import BlockFactors, Factor
+from adjust.fronts import Fronts
+from adjust.triangle import Triangle
 
 
 def triangle(rng: np.random.Generator, singular: Array) -> Array:
@@ -19,7 +21,8 @@ def triangle(rng: np.random.Generator, singular: Array) -> Array:
 
 def factor_of(shared: Array, *blocks: BlockFactors) -> Factor:
     count = len(shared) + sum(block.own.size for block in blocks)
-    return Factor(blocks, shared, np.zeros(len(shared)), np.ones(count))
+    dense = Triangle(Fronts.single(len(shared)), (shared,), (np.zeros((len(shared), 0)),))
+    return Factor(blocks, dense, np.zeros(len(shared)), np.ones(count))
 
 
 @pytest.mark.parametrize("below", [null_space.SINGULAR, 1e-4])
