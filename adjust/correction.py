@@ -49,15 +49,12 @@ class Imaged:
 
 def no_correction(_: Settings, xy: Array, __: Array, parameters: Array) -> Correction:
     """Of the families that distort the ray, and of none."""
-    zeros = np.zeros((len(xy), 2, 2))
-    return Correction(np.zeros((len(xy), 2)), zeros, zeros, np.zeros((len(xy), 2, len(parameters))))
+    count = len(xy)
+    nothing = [np.broadcast_to(0.0, (count, *shape)) for shape in ((2,), (2, 2), (2, 2), (2, len(parameters)))]
+    return Correction(*nothing)
 
 
 def undistorted(ray: Array, parameters: Array) -> Imaged:
     """Of the families that correct the observed point, and of none."""
-    return Imaged(ray, np.broadcast_to(np.eye(2), (len(ray), 2, 2)), np.zeros((len(ray), 2, len(parameters))))
-
-
-def matrices(a11: Array, a12: Array, a21: Array, a22: Array) -> Array:
-    """2x2 matrices (n, 2, 2) of their elements (n,)."""
-    return np.stack([np.stack([a11, a12], axis=-1), np.stack([a21, a22], axis=-1)], axis=-2)
+    count = len(ray)
+    return Imaged(ray, np.broadcast_to(np.eye(2), (count, 2, 2)), np.broadcast_to(0.0, (count, 2, len(parameters))))

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.correction import Imaged
 from adjust.families import family
 from adjust.network import Distortion
+from adjust.small_matrices import zeros
 
 Array = NDArray[np.float64]
 
@@ -40,11 +42,18 @@ def image_equations(
     interior (3,): c, x0', y0' in mm. parameters (k,): in the order of `families.parameter_names`. xy_mm (n, 2):
     observed camera coordinates. ray (n, 2): -U/W, -V/W.
     """
+    return equations_of(distortion, interior, parameters, xy_mm, family(distortion.family).image(ray, parameters))
+
+
+def equations_of(
+    distortion: Distortion, interior: Array, parameters: Array, xy_mm: Array, imaged: Imaged
+) -> ImageEquations:
+    """The same of points whose rays' images are known."""
     c, principal_point = interior[0], interior[1:]
-    of = family(distortion.family)
-    imaged = of.image(ray, parameters)
-    correction = of.correct(distortion, xy_mm, principal_point, parameters)
-    by_interior = np.concatenate([-imaged.value[..., None], -np.eye(2) - correction.by_principal_point], axis=2)
+    correction = family(distortion.family).correct(distortion, xy_mm, principal_point, parameters)
+    by_interior = zeros(len(xy_mm), 2, 3, dtype=np.result_type(imaged.value, correction.value))
+    by_interior[..., 0] = -imaged.value
+    by_interior[..., 1:] = -np.eye(2) - correction.by_principal_point
     return ImageEquations(
         value=xy_mm - principal_point - c * imaged.value - correction.value,
         by_xy=np.eye(2) - correction.by_xy,

@@ -13,6 +13,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.small_matrices import applied, determinant, solved
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -81,7 +83,7 @@ class Congruent:
     names: tuple[str, ...] = ("a1", "b1", "angle")
 
     def apply(self, parameters: Array, xy: Array) -> Array:
-        return parameters[..., :2] + _product(self._turn(parameters), xy)
+        return parameters[..., :2] + applied(self._turn(parameters), xy)
 
     def gradient(self, parameters: Array, xy: Array) -> Array:
         return np.broadcast_to(self._turn(parameters), (*xy.shape[:-1], 2, 2))
@@ -89,17 +91,17 @@ class Congruent:
     def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
         design = np.zeros((*xy.shape, 3), dtype=np.result_type(parameters, xy))
         design[..., :2] = np.eye(2)
-        design[..., 2] = _product(self._turn_by_angle(parameters), xy - center)
+        design[..., 2] = applied(self._turn_by_angle(parameters), xy - center)
         return design
 
     def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
         result = np.broadcast_to(np.eye(3), (*np.shape(half), 3, 3)).copy()
-        result[..., :2, 2] = -_product(self._turn_by_angle(parameters), center)
+        result[..., :2, 2] = -applied(self._turn_by_angle(parameters), center)
         return result
 
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
         transposed = self._turn(parameters).swapaxes(-1, -2)
-        return _product(transposed, camera_xy - parameters[..., :2]), np.ones(len(camera_xy), dtype=bool)
+        return applied(transposed, camera_xy - parameters[..., :2]), np.ones(len(camera_xy), dtype=bool)
 
     def _turn(self, parameters: Array) -> Array:
         c, s = np.cos(parameters[..., 2]), np.sin(parameters[..., 2])
@@ -234,7 +236,7 @@ class Projective:
     names: tuple[str, ...] = ("a1", "a2", "a3", "b1", "b2", "b3", "c1", "c2")
 
     def apply(self, parameters: Array, xy: Array) -> Array:
-        numerators = parameters[..., [0, 3]] + _product(self._linear(parameters), xy)
+        numerators = parameters[..., [0, 3]] + applied(self._linear(parameters), xy)
         return numerators / self._denominator(parameters, xy)[..., None]
 
     def gradient(self, parameters: Array, xy: Array) -> Array:
@@ -285,7 +287,7 @@ def _newton(kind: FilmKind, parameters: Array, camera_xy: Array, center: Array, 
     """
     xy = np.broadcast_to(center, camera_xy.shape).astype(np.float64)
     at_center = kind.gradient(parameters, xy)
-    turn = np.sign(_determinant(at_center))
+    turn = np.sign(determinant(at_center))
     found = np.zeros(len(xy), dtype=bool)
     with np.errstate(over="ignore", invalid="ignore"):
         for number in range(steps):
@@ -296,23 +298,12 @@ def _newton(kind: FilmKind, parameters: Array, camera_xy: Array, center: Array, 
             found = regular & (settled | (steps == 1))
             if found.all():
                 break
-        same_side = np.sign(_determinant(kind.gradient(parameters, xy))) == turn
+        same_side = np.sign(determinant(kind.gradient(parameters, xy))) == turn
     return xy, np.asarray(found & same_side)
 
 
 def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
     """The solutions (n, 2) of 2x2 systems (n, 2, 2), and which matrices (n,) are regular."""
-    determinant = _determinant(matrix)
-    regular = np.isfinite(determinant) & (determinant != 0.0)
-    x, y = right[..., 0], right[..., 1]
-    first = matrix[..., 1, 1] * x - matrix[..., 0, 1] * y
-    second = matrix[..., 0, 0] * y - matrix[..., 1, 0] * x
-    return np.stack([first, second], axis=-1) / np.where(regular, determinant, 1.0)[..., None], regular
-
-
-def _determinant(matrix: Array) -> Array:
-    return np.asarray(matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0])
-
-
-def _product(matrix: Array, xy: Array) -> Array:
-    return np.asarray((matrix @ xy[..., None])[..., 0])
+    of = determinant(matrix)
+    regular = np.isfinite(of) & (of != 0.0)
+    return solved(matrix, right, regular, of), regular

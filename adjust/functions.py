@@ -6,20 +6,24 @@ the adjusted observations. By elements the distortion is taken at the observed c
 F = T(x, y) - image of the ray - distortion there, which depends on the observations by T alone.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.distortion import ImageEquations, image_equations
+from adjust.correction import Imaged
+from adjust.distortion import equations_of
 from adjust.line_of_sight import SightVectors, sight_vectors
-from adjust.problem import EXTERIOR, PLACE, Problem, State
-from adjust.projection import camera_from_ray, rays
-from adjust.rotation import cross_matrix
+from adjust.network import Distortion
+from adjust.problem import Part, Problem, State
+from adjust.projection import camera_from_image, imaged_ray, rays
+from adjust.small_matrices import applied, cross, laid_out, of_each, product, zeros
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+Rows = Indices | slice
 
 
 @dataclass(frozen=True)
@@ -30,33 +34,80 @@ class Derivatives:
     by_unknowns: Array
 
 
+@dataclass(frozen=True)
+class SeenTargets:
+    """The targets of one camera as they appear for a state.
+
+    rows: their observations; ray (n, 2) and the image of it; in_camera (n, 3): the points in the camera's axes.
+    """
+
+    camera: str
+    rows: Rows
+    sight: SightVectors
+    ray: Array
+    in_camera: Array
+    imaged: Imaged
+
+
+@dataclass(frozen=True)
+class Computed:
+    """Observations (n, 2) in mm that satisfy F1 to F4, in the comparator, and what they were computed from."""
+
+    xy_mm: Array
+    targets: tuple[SeenTargets, ...]
+
+
 def computed_observations(problem: Problem, state: State) -> Array | None:
     """The comparator coordinates (n, 2) in mm that satisfy F1 to F4; None where some point has no image."""
-    camera_xy = _computed_in_camera(problem, state)
+    computed = compute(problem, state)
+    return None if computed is None else computed.xy_mm
+
+
+def compute(problem: Problem, state: State) -> Computed | None:
+    """The observations that satisfy F1 to F4, as derivatives are taken at; None where some point has no image."""
+    targets = tuple(_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items())
+    camera_xy = _computed_in_camera(problem, state, targets)
     if camera_xy is None:
         return None
     xy_mm, found = _computed_in_comparator(problem, state, camera_xy)
-    return xy_mm if found.all() else None
+    return Computed(xy_mm, targets) if found.all() else None
 
 
-def _computed_in_camera(problem: Problem, state: State) -> Array | None:
+def _computed_in_camera(problem: Problem, state: State, targets: Iterable[SeenTargets]) -> Array | None:
     """The camera coordinates (n, 2) of all marks; None where some point has no image."""
-    camera_xy = state.values[problem.places[:, :2]]  # fiducials stay, targets follow
+    camera_xy = state.values[problem.places.T[:2]].T  # fiducials stay, targets follow
     observed = _observed_in_camera(problem, state) if problem.by_elements else camera_xy
-    for name, rows in problem.targets_by_camera.items():
-        interior, parameters = np.split(state.values[problem.unknowns.camera[name]], [3])
+    for seen in targets:
+        interior, parameters, distortion = _camera(problem, state, seen.camera)
         if interior[0] <= 0.0:
             return None
-        ray, in_camera = _rays(problem, state, rows)
-        distortion = problem.network.camera_by_name[name].distortion
         if problem.by_elements:
-            at = image_equations(distortion, interior, parameters, observed[rows], ray)
-            camera_xy[rows], found = observed[rows] - at.value, np.isfinite(at.value).all(axis=1)
+            at = equations_of(distortion, interior, parameters, observed[seen.rows], seen.imaged)
+            xy_mm, found = observed[seen.rows] - at.value, np.isfinite(at.value).all(axis=1)
         else:
-            camera_xy[rows], found = camera_from_ray(distortion, interior, parameters, ray)
-        if not (found & (in_camera[:, 2] < 0.0)).all():
+            xy_mm, found = camera_from_image(distortion, interior, parameters, seen.imaged)
+        if not (found & (seen.in_camera[:, 2] < 0.0)).all():
             return None
+        camera_xy[seen.rows] = xy_mm
     return camera_xy
+
+
+def _seen(problem: Problem, state: State, camera: str, targets: Indices) -> SeenTargets:
+    """Some targets as they appear from their stations."""
+    rows = _all_of(targets, len(problem.image_numbers))
+    images = problem.image_numbers[rows]
+    stations = state.values[problem.exterior[:, :3].T[:, images]].T
+    points = state.values[problem.places.T[:, rows]].T
+    sight = sight_vectors(problem.network.line_of_sight, stations, points)
+    ray, in_camera = rays(of_each(state.rotations, images), sight.vector)
+    _, parameters, distortion = _camera(problem, state, camera)
+    return SeenTargets(camera, rows, sight, ray, in_camera, imaged_ray(distortion, parameters, ray))
+
+
+def _camera(problem: Problem, state: State, name: str) -> tuple[Array, Array, Distortion]:
+    """c, x0', y0' and the parameters of the distortion of a camera."""
+    interior, parameters = np.split(state.values[problem.unknowns.camera[name]], [3])
+    return interior, parameters, problem.network.camera_by_name[name].distortion
 
 
 def _observed_in_camera(problem: Problem, state: State) -> Array:
@@ -73,40 +124,55 @@ def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) ->
     xy_mm = np.empty_like(camera_xy)
     found = np.empty(len(camera_xy), dtype=bool)
     for films in problem.films:
-        parameters, center_mm = state.values[films.positions][films.of], films.center_mm[films.of]
-        xy_mm[films.rows], found[films.rows] = films.kind.inverse(parameters, camera_xy[films.rows], center_mm)
+        parameters, rows = state.values[films.positions][films.of], _all_of(films.rows, len(camera_xy))
+        xy_mm[rows], found[rows] = films.kind.inverse(parameters, camera_xy[rows], films.centers_mm)
     return xy_mm, found
 
 
-def derivatives(problem: Problem, state: State, xy_mm: Array) -> Derivatives:
-    """The derivatives of F1 to F4 (Torlegård) at the observations xy_mm (n, 2)."""
+def derivatives(problem: Problem, state: State, computed: Computed) -> Derivatives:
+    """The derivatives of F1 to F4 (Torlegård) at computed observations."""
+    xy_mm, parts = computed.xy_mm, problem.parts
     distorted = problem.network.observations.xy_mm if problem.by_elements else xy_mm  # where distortion is taken
     film = _film_derivatives(problem, state, xy_mm)
     at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
-    camera_xy = at_distorted.camera_xy
-    by_camera_xy = np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)).copy()
-    by_unknowns = np.zeros((len(xy_mm), 2, problem.columns.shape[1]))
-    by_unknowns[:, :, PLACE.start : PLACE.start + 2] = -np.eye(2)  # F3, F4; those of targets follow
+    by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
+    by_unknowns = zeros(len(xy_mm), 2, parts.camera.columns.stop)
+    by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
     attitude = problem.attitude_by_unknowns(state)
-    for name, rows in problem.targets_by_camera.items():
-        ray, in_camera = _rays(problem, state, rows)
-        at = _image_equations(problem, state, name, camera_xy[rows], ray)
-        images = problem.image_numbers[rows]
-        by_in_camera = at.by_ray @ _ray_by_in_camera(in_camera)
-        by_vector = by_in_camera @ state.rotations[images]
-        by_attitude = -by_in_camera @ cross_matrix(in_camera) @ attitude[images]
+    straight = problem.network.line_of_sight.is_straight
+    for seen in computed.targets:
+        interior, parameters, distortion = _camera(problem, state, seen.camera)
+        images, rows = problem.image_numbers[seen.rows], seen.rows
+        at = equations_of(distortion, interior, parameters, at_distorted.camera_xy[rows], seen.imaged)
+        by_in_camera = _by_in_camera(at.by_ray, seen)
+        by_vector = product(by_in_camera, of_each(state.rotations, images))
+        by_attitude = cross(seen.in_camera[:, None, :], by_in_camera)
+        if problem.keeps_angles.any():
+            by_attitude = product(by_attitude, of_each(attitude, images))
+        by_station = -by_vector if straight else product(by_vector, seen.sight.by_station)
+        by_point = by_vector if straight else product(by_vector, seen.sight.by_point)
         by_camera_xy[rows] = at.by_xy
-        seen = _sight(problem, state, rows)
-        of_targets = np.zeros((len(rows), *by_unknowns.shape[1:]))
-        of_targets[:, :, EXTERIOR] = np.concatenate([by_vector @ seen.by_station, by_attitude], axis=2)
-        of_targets[:, :, PLACE] = by_vector @ seen.by_point
-        by_camera = np.concatenate([at.by_interior, at.by_parameters], axis=2)
-        first = problem.camera_columns.start
-        of_targets[:, :, first : first + by_camera.shape[2]] = by_camera
-        by_unknowns[rows] = of_targets
-    by_film = film.by_parameters + (by_camera_xy - np.eye(2)) @ at_distorted.by_parameters
-    by_unknowns[:, :, problem.film_columns] = by_film
-    return Derivatives(film.by_xy if problem.by_elements else by_camera_xy @ film.by_xy, by_unknowns)
+        _fill(by_unknowns, rows, parts.exterior, by_station, by_attitude)
+        _fill(by_unknowns, rows, parts.place, by_point)
+        _fill(by_unknowns, rows, parts.camera, at.by_interior, at.by_parameters)
+    by_film = film.by_parameters + product(by_camera_xy - np.eye(2), at_distorted.by_parameters)
+    _fill(by_unknowns, slice(None), parts.film, by_film)
+    return Derivatives(film.by_xy if problem.by_elements else product(by_camera_xy, film.by_xy), by_unknowns)
+
+
+def _fill(by_unknowns: Array, rows: Rows, part: Part, *derivatives: Array) -> None:
+    """Put the derivatives (n, 2, k), side by side, that belong to a part into its columns."""
+    columns = [derivative[..., k] for derivative in derivatives for k in range(derivative.shape[2])]
+    for column, member in enumerate(part.members, part.columns.start):
+        by_unknowns[..., column][rows] = columns[member]
+
+
+def _by_in_camera(by_ray: Array, seen: SeenTargets) -> Array:
+    """Derivative (n, 2, 3) by U, V, W of what has a derivative (n, 2, 2) by the ray -U/W, -V/W."""
+    by_in_camera = zeros(len(by_ray), 2, 3)
+    by_in_camera[..., :2] = by_ray
+    by_in_camera[..., 2] = applied(by_ray, seen.ray)
+    return np.asarray(by_in_camera / -seen.in_camera[:, 2, None, None])
 
 
 @dataclass(frozen=True)
@@ -119,62 +185,42 @@ class _FilmDerivatives:
 
 
 def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
-    width = problem.film_columns.stop - problem.film_columns.start
-    result = _FilmDerivatives(np.empty_like(xy_mm), np.empty((*xy_mm.shape, 2)), np.zeros((*xy_mm.shape, width)))
+    count, width = len(xy_mm), max(films.positions.shape[1] for films in problem.films)
+    result = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), zeros(count, 2, width))
     for films in problem.films:
-        rows, xy, count = films.rows, xy_mm[films.rows], films.positions.shape[1]
+        rows = _all_of(films.rows, count)
+        xy = xy_mm[rows]
         parameters = state.values[films.positions][films.of]
-        design = films.kind.design(parameters, xy, films.center_mm[films.of], films.half_mm[films.of])
+        design = films.kind.design(parameters, xy, films.centers_mm, films.halves_mm)
         result.camera_xy[rows] = films.kind.apply(parameters, xy)
         result.by_xy[rows] = films.kind.gradient(parameters, xy)
-        result.by_parameters[rows, :, :count] = design
+        result.by_parameters[rows, :, : films.positions.shape[1]] = design
     return result
 
 
-def _rays(problem: Problem, state: State, rows: Indices) -> tuple[Array, Array]:
-    """The rays (n, 2) of some targets, and their points in the camera's axes (n, 3)."""
-    return rays(state.rotations[problem.image_numbers[rows]], _sight(problem, state, rows).vector)
-
-
-def _sight(problem: Problem, state: State, rows: Indices) -> SightVectors:
-    """Some targets as they appear from their stations."""
-    stations = state.values[problem.exterior[problem.image_numbers[rows], :3]]
-    return sight_vectors(problem.network.line_of_sight, stations, state.values[problem.places[rows]])
-
-
-def _image_equations(problem: Problem, state: State, camera: str, camera_xy: Array, ray: Array) -> ImageEquations:
-    interior, parameters = np.split(state.values[problem.unknowns.camera[camera]], [3])
-    distortion = problem.network.camera_by_name[camera].distortion
-    return image_equations(distortion, interior, parameters, camera_xy, ray)
-
-
-def _ray_by_in_camera(in_camera: Array) -> Array:
-    """Derivative (n, 2, 3) of the ray -U/W, -V/W by U, V, W."""
-    u, v, w = in_camera.T
-    zero = np.zeros_like(u)
-    first = np.stack([-1.0 / w, zero, u / w**2], axis=1)
-    second = np.stack([zero, -1.0 / w, v / w**2], axis=1)
-    return np.stack([first, second], axis=1)
+def _all_of(rows: Indices, count: int) -> Rows:
+    """Rows, in order, of so many in all: where they are all, as a slice, which takes no copy."""
+    return slice(None) if len(rows) == count else rows
 
 
 def blind_mark(problem: Problem, state: State) -> str:
     """The first mark that has no image in a state, and why; empty where all have one."""
     observations = problem.network.observations
     for name, rows in problem.targets_by_camera.items():
-        interior, parameters = np.split(state.values[problem.unknowns.camera[name]], [3])
+        interior, parameters, distortion = _camera(problem, state, name)
         if interior[0] <= 0.0:
             return f"the principal distance of camera {name} is {interior[0]:.6g} mm and must be positive"
-        ray, in_camera = _rays(problem, state, rows)
-        distortion = problem.network.camera_by_name[name].distortion
-        _, found = camera_from_ray(distortion, interior, parameters, ray)
+        seen = _seen(problem, state, name, rows)
+        _, found = camera_from_image(distortion, interior, parameters, seen.imaged)
         for bad, why in (
-            (in_camera[:, 2] >= 0.0, "lies behind the camera"),
+            (seen.in_camera[:, 2] >= 0.0, "lies behind the camera"),
             (~found, "is where the distortion folds over"),
         ):
             if bad.any():
                 row = rows[int(np.argmax(bad))]
                 return f"point {observations.point[row]} {why} in image {observations.image[row]}"
-    camera_xy = _computed_in_camera(problem, state)
+    targets = [_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
+    camera_xy = _computed_in_camera(problem, state, targets)
     if camera_xy is not None:
         _, found = _computed_in_comparator(problem, state, camera_xy)
         row = int(np.argmin(found))

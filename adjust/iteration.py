@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.elimination import Factor, eliminate
-from adjust.functions import Derivatives, computed_observations, derivatives
+from adjust.functions import Derivatives, compute, computed_observations, derivatives
 from adjust.further_observations import square_sum
 from adjust.numbering import Numbering
 from adjust.problem import Problem, State
@@ -52,21 +52,20 @@ class Solution:
 def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Linearised | None:
     """The equations at a state; None where some point has no image there."""
     problem = numbering.problem
-    computed = computed_observations(problem, state)
+    computed = compute(problem, state)
     if computed is None:
         return None
-    v = computed - problem.network.observations.xy_mm
+    v = computed.xy_mm - problem.network.observations.xy_mm
     at = derivatives(problem, state, computed)
     rows = whitened_rows(numbering, state.values, at, covariance_mm2, v)
-    return Linearised(state, computed, v, at, rows, weighted_square_sum(problem, state, v, covariance_mm2))
+    return Linearised(state, computed.xy_mm, v, at, rows, _square_sum(problem, state, rows))
 
 
-def weighted_square_sum(problem: Problem, state: State, v_mm: Array, covariance_mm2: Array) -> float:
+def _square_sum(problem: Problem, state: State, rows: WhitenedRows) -> float:
     """v'Pv of the observations, of the priors and of further observations."""
-    weighted = np.linalg.solve(covariance_mm2, v_mm[..., None])[..., 0]
     prior = problem.unknowns.has_prior
     normalised = prior_differences(problem, state)[prior] / problem.unknowns.sigma[prior]
-    return float((v_mm * weighted).sum() + (normalised**2).sum()) + square_sum(problem.further, state.values)
+    return float((rows.right**2).sum() + (normalised**2).sum()) + square_sum(problem.further, state.values)
 
 
 def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera_priors: bool = True) -> Factor:
@@ -146,9 +145,9 @@ def _step(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: 
         step = np.zeros(len(problem.unknowns))
         step[numbering.free] = solution
         if np.isfinite(step).all():
-            linear_mm = _linear_change(problem, at, step)
-            promised = at.vpv - _linear_square_sum(problem, at, covariance_mm2, step, linear_mm)
-            bent = step if damping == 0.0 else _bent(numbering, covariance_mm2, at, damping, step, linear_mm)
+            # The damping's rows, which hold the scaled unknowns where they are, take their part of the decrease.
+            promised = factor.length() ** 2 + damping * float(((factor.scale * solution) ** 2).sum())
+            bent = step if damping == 0.0 else _bent(numbering, covariance_mm2, at, damping, step)
             moved = None if bent is None else linearise(numbering, covariance_mm2, problem.moved(at.state, bent))
             if moved is not None and moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
                 gain = (at.vpv - moved.vpv) / promised if promised > VPV_ROUNDING * (1.0 + at.vpv) else 1.0
@@ -164,22 +163,7 @@ def _linear_change(problem: Problem, at: Linearised, step: Array) -> Array:
     return np.asarray(-np.linalg.solve(at.at.by_observation, along[..., None])[..., 0])
 
 
-def _linear_square_sum(problem: Problem, at: Linearised, covariance_mm2: Array, step: Array, change_mm: Array) -> float:
-    """v'Pv after a step, to the first order."""
-    v = at.v_mm + change_mm
-    weighted = np.linalg.solve(covariance_mm2, v[..., None])[..., 0]
-    prior = problem.unknowns.has_prior
-    normalised = (prior_differences(problem, at.state) - step)[prior] / problem.unknowns.sigma[prior]
-    further = 0.0
-    for each in problem.further:
-        left = each.observed - each.computed(at.state.values) - each.by_unknowns(at.state.values) @ step[each.positions]
-        further += float(left @ np.linalg.solve(each.covariance, left))
-    return float((v * weighted).sum() + (normalised**2).sum()) + further
-
-
-def _bent(
-    numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, step: Array, change_mm: Array
-) -> Array | None:
+def _bent(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, step: Array) -> Array | None:
     """A damped step with its second-order part; None where that is too large to be trusted, or cannot be found.
 
     The second derivative of the observations along the step, by a difference, takes the place of an observation:
@@ -189,7 +173,7 @@ def _bent(
     ahead = computed_observations(problem, problem.moved(at.state, PROBE * step))
     if ahead is None:
         return None
-    half_curvature_mm = ((ahead - at.computed_mm) / PROBE - change_mm) / PROBE
+    half_curvature_mm = ((ahead - at.computed_mm) / PROBE - _linear_change(problem, at, step)) / PROBE
     rows = whitened_rows(numbering, at.state.values, at.at, covariance_mm2, at.v_mm + half_curvature_mm)
     factor = factorise(numbering, replace(at, rows=rows), damping)
     bent = np.zeros_like(step)

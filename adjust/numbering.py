@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 
 from adjust.fronts import Fronts, band_order, fronts_of
 from adjust.normal_equations import Groups
-from adjust.problem import ABSENT, Problem
+from adjust.problem import ABSENT, Problem, side_by_side
 
 Indices = NDArray[np.intp]
 
@@ -56,14 +56,9 @@ class Numbering:
         return self._shared.fronts
 
     @cached_property
-    def used(self) -> Indices:
-        """The derivatives, by their place in `Problem.columns`, that are by free unknowns in some observation."""
-        return np.flatnonzero((self.numbers[self.problem.columns] != ABSENT).any(axis=0))
-
-    @cached_property
     def touched(self) -> list[Touched]:
         """What every block touches, blocks of equal shape together."""
-        return list(_arranged(self.numbers[self.problem.columns[:, self.used]], self._blocks, self.numbers))
+        return list(_arranged(self.numbers[self.problem.columns], self._blocks, self.numbers))
 
     @cached_property
     def numbers(self) -> Indices:
@@ -75,7 +70,7 @@ class Numbering:
     @cached_property
     def summed(self) -> list[Touched]:
         """What the observations touch of the shared unknowns, by image where points are blocks, by point otherwise."""
-        numbers = self.numbers[self.problem.columns[:, self.used]]
+        numbers = self.numbers[self.problem.columns]
         blocks = replace(self._others, owned=np.empty((len(self._others.owned), 0), dtype=np.intp))
         return list(_arranged(np.where(numbers < self._shared_count, numbers, ABSENT), blocks, self.numbers))
 
@@ -162,7 +157,7 @@ class Numbering:
     def _of_images(self) -> Indices:
         """Positions (images, k) of the unknowns of every image, ABSENT behind those that have less."""
         unknowns = self.problem.unknowns
-        return _side_by_side(
+        return side_by_side(
             [
                 np.concatenate([unknowns.exterior[image.name], unknowns.transformation[image.name]])
                 for image in self.problem.network.images
@@ -209,14 +204,6 @@ class _Blocks:
 
     owned: Indices
     of: Indices
-
-
-def _side_by_side(rows: list[Indices]) -> Indices:
-    """Rows of different lengths as one array, ABSENT behind the shorter."""
-    array = np.full((len(rows), max(len(row) for row in rows)), ABSENT, dtype=np.intp)
-    for own, row in zip(array, rows, strict=True):
-        own[: len(row)] = row
-    return array
 
 
 def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterator[Touched]:

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.correction import Imaged, matrices
+from adjust.correction import Imaged
+from adjust.small_matrices import matrices, product, vectors, zeros
 
 Array = NDArray[np.float64]
 
@@ -24,17 +25,19 @@ def opencv(ray: Array, parameters: Array) -> Imaged:
     pitch.
     """
     tau_x, tau_y, b1 = parameters[12:]
-    straight = _lens(ray * np.array([1.0, -1.0]), parameters[:12])
-    tilted = _tilt(straight.value, tau_x, tau_y)
     # From OpenCV's axes to the camera's: the image's y, and the ray's, turn their signs.
-    scale = np.array([1 + b1, -1.0])
+    scale, mirror = np.array([1 + b1, -1.0]), np.array([1.0, -1.0])
+    straight = _lens(ray * mirror, parameters[:12])
+    tilted = _tilt(straight.value, tau_x, tau_y)
     by_b1 = tilted.value * np.array([1.0, 0.0])
-    columns = np.concatenate([tilted.by_ray @ straight.by_parameters, tilted.by_parameters], axis=2)
-    return Imaged(
-        value=tilted.value * scale,
-        by_ray=tilted.by_ray @ straight.by_ray * scale[:, None] * np.array([1.0, -1.0]),
-        by_parameters=np.concatenate([columns * scale[:, None], by_b1[..., None]], axis=2),
-    )
+    by_lens, by_ray = straight.by_parameters, straight.by_ray
+    if tau_x or tau_y:
+        by_lens, by_ray = product(tilted.by_ray, by_lens), product(tilted.by_ray, by_ray)
+    by_parameters = zeros(len(ray), 2, len(parameters), dtype=by_lens.dtype)
+    by_parameters[..., :12] = by_lens * scale[:, None]
+    by_parameters[..., 12:14] = tilted.by_parameters * scale[:, None]
+    by_parameters[..., 14] = by_b1
+    return Imaged(tilted.value * scale, by_ray * scale[:, None] * mirror, by_parameters)
 
 
 def _lens(ray: Array, parameters: Array) -> Imaged:
@@ -53,23 +56,18 @@ def _lens(ray: Array, parameters: Array) -> Imaged:
     xd_by_r2 = x * radial_by_r2 + p2 + s1 + 2 * s2 * r2
     yd_by_r2 = y * radial_by_r2 + p1 + s3 + 2 * s4 * r2
     by_ray = matrices(
-        radial + 2 * p1 * y + 4 * p2 * x + 2 * x * xd_by_r2,
-        2 * p1 * x + 2 * y * xd_by_r2,
-        2 * p2 * y + 2 * x * yd_by_r2,
-        radial + 4 * p1 * y + 2 * p2 * x + 2 * y * yd_by_r2,
+        (radial + 2 * p1 * y + 4 * p2 * x + 2 * x * xd_by_r2, 2 * p1 * x + 2 * y * xd_by_r2),
+        (2 * p2 * y + 2 * x * yd_by_r2, radial + 4 * p1 * y + 2 * p2 * x + 2 * y * yd_by_r2),
     )
-    by_radial = np.stack([x, y], axis=1) / below[:, None]
-    zero = np.zeros_like(x)
-    columns = [
-        by_radial * r2[:, None],
-        by_radial * r2[:, None] ** 2,
-        np.stack([2 * x * y, r2 + 2 * y**2], axis=1),
-        np.stack([r2 + 2 * x**2, 2 * x * y], axis=1),
-        by_radial * r2[:, None] ** 3,
-        *[-by_radial * (radial * r2**power)[:, None] for power in (1, 2, 3)],
-        *[np.stack(pair, axis=1) for pair in ((r2, zero), (r2**2, zero), (zero, r2), (zero, r2**2))],
-    ]
-    return Imaged(np.stack([xd, yd], axis=1), by_ray, np.stack(columns, axis=2))
+    r4 = r2 * r2
+    above_by = [power / below for power in (r2, r4, r4 * r2)]  # by k1, k2, k3; those by k4, k5, k6 are -radial times it
+    xy2, zero = 2 * x * y, np.zeros_like(x)
+    (x1, x2, x3), (y1, y2, y3) = ([axis * each for each in above_by] for axis in (x, y))
+    by_parameters = matrices(
+        (x1, x2, xy2, r2 + 2 * x**2, x3, -radial * x1, -radial * x2, -radial * x3, r2, r4, zero, zero),
+        (y1, y2, r2 + 2 * y**2, xy2, y3, -radial * y1, -radial * y2, -radial * y3, zero, zero, r2, r4),
+    )
+    return Imaged(vectors(xd, yd), by_ray, by_parameters)
 
 
 def _tilt(point: Array, tau_x: float, tau_y: float) -> Imaged:
@@ -85,17 +83,25 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> Imaged:
         _placed(ry, about_y) @ _placed(rx_by_angle, about_x, 0.0),
         _placed(ry_by_angle, about_y, 0.0) @ _placed(rx, about_x),
     )
-    p = np.concatenate([point, np.ones((len(point), 1))], axis=1)
-    q = p @ rotation.T
-    depth = q[:, 2:]
-    over_depth = q[:, :2] / depth
-    by_point = rotation[2, 2] * (rotation[:2, :2] - over_depth[..., None] * rotation[2, :2]) / depth[..., None]
-    columns = []
+    *over, depth = _turned(rotation, point)
+    over, size = [each / depth for each in over], rotation[2, 2] / depth
+    by_point = [
+        [size * (row[i] - at * rotation[2, i]) for i in (0, 1)] for row, at in zip(rotation, over, strict=False)
+    ]
+    by_angles: list[list[Array]] = [[], []]
     for change in moved:
-        q_change = p @ change.T
-        over_depth_change = (q_change[:, :2] - over_depth * q_change[:, 2:]) / depth
-        columns.append(rotation[2, 2] * over_depth_change + change[2, 2] * over_depth - change[:2, 2])
-    return Imaged(rotation[2, 2] * over_depth - rotation[:2, 2], by_point, np.stack(columns, axis=2))
+        *shift, deeper = _turned(change, point)
+        for axis, at in enumerate(over):
+            by_angle = size * (shift[axis] - at * deeper) + change[2, 2] * at - change[axis, 2]
+            by_angles[axis].append(by_angle)
+    value = [rotation[2, 2] * at - rotation[axis, 2] for axis, at in enumerate(over)]
+    return Imaged(vectors(*value), matrices(*by_point), matrices(*by_angles))
+
+
+def _turned(matrix: Array, point: Array) -> list[Array]:
+    """The three coordinates (n,) of a matrix (3, 3) times (x, y, 1)."""
+    x, y = point.T
+    return [row[0] * x + row[1] * y + row[2] for row in matrix]
 
 
 def _turn(angle: float) -> tuple[Array, Array]:

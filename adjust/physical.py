@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.correction import Correction, Settings, matrices
+from adjust.correction import Correction, Settings
+from adjust.small_matrices import matrices, vectors
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ def brown(_: Settings, xy: Array, principal_point: Array, parameters: Array) -> 
     common = _radial_and_decentering(xy, principal_point, np.concatenate([parameters[:5], np.zeros(2)]), 0.0, False)
     reduced = xy - principal_point
     zero = np.zeros(len(xy))
-    by_affinity = np.stack([np.stack([reduced[:, 0], zero], axis=1), np.stack([reduced[:, 1], zero], axis=1)], axis=2)
+    by_affinity = matrices((reduced[:, 0], reduced[:, 1]), (zero, zero))
     affinity = np.array([[b1, b2], [0.0, 0.0]])
     return Correction(
         value=common.value + reduced @ affinity.T,
@@ -47,15 +48,15 @@ def _radial_and_decentering(
     rad_by_r2 = k3 + r2 * (2 * k5 + 3 * r2 * k7)
     dec = 1 + r2 * (p3 + r2 * p4)
     dec_by_r2 = p3 + 2 * r2 * p4
-    by_p1 = np.stack([r2 + 2 * x**2, 2 * x * y], axis=1)
-    by_p2 = np.stack([2 * x * y, r2 + 2 * y**2], axis=1)
+    by_p1 = vectors(r2 + 2 * x**2, 2 * x * y)
+    by_p2 = vectors(2 * x * y, r2 + 2 * y**2)
     plain = p1 * by_p1 + p2 * by_p2  # the decentering terms before dec
 
     direction = np.array([p1, p2])
     by_r2 = reduced * rad_by_r2[:, None] + direction * dec[:, None] + plain * dec_by_r2[:, None]
     by_reduced = rad[:, None, None] * np.eye(2) + by_r2[:, :, None] * 2 * reduced[:, None, :]
     by_decentering = dec[:, None, None] * matrices(
-        4 * p1 * x + 2 * p2 * y, 2 * p2 * x, 2 * p1 * y, 2 * p1 * x + 4 * p2 * y
+        (4 * p1 * x + 2 * p2 * y, 2 * p2 * x), (2 * p1 * y, 2 * p1 * x + 4 * p2 * y)
     )
     radial = [reduced * (r2**power - r02**power)[:, None] for power in (1, 2, 3)]
     decentering = [by_p1 * dec[:, None], by_p2 * dec[:, None], plain * r2[:, None], plain * r2[:, None] ** 2]
@@ -63,5 +64,5 @@ def _radial_and_decentering(
         value=reduced * rad[:, None] + plain * dec[:, None],
         by_xy=by_reduced + by_decentering,
         by_principal_point=-by_reduced if literal else -by_reduced - by_decentering,
-        by_parameters=np.stack([*radial, *decentering], axis=2),
+        by_parameters=matrices(*zip(*(column.T for column in (*radial, *decentering)), strict=True)),
     )

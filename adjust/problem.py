@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from adjust.unknowns import Unknowns, list_unknowns
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-EXTERIOR, PLACE = slice(0, 6), slice(6, 9)  # columns of an observation's derivatives; those of film and camera follow
 ABSENT = -1  # stands for the unknown of a column that an observation does not have
 
 
@@ -57,6 +57,35 @@ class Films:
     half_mm: Array
     rows: Indices
     of: Indices
+
+    @cached_property
+    def centers_mm(self) -> Array:
+        """(n, 2) of the image of every observation."""
+        return np.asarray(self.center_mm.T[:, self.of].T)
+
+    @cached_property
+    def halves_mm(self) -> Array:
+        """(n,) of the image of every observation."""
+        return self.half_mm[self.of]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some columns of an observation's derivatives: by which members of an image's elements, a place's coordinates, a
+    film's parameters or a camera's, and where they stand.
+    """
+
+    members: Indices
+    columns: slice
+
+
+class Parts(NamedTuple):
+    """The columns of an observation's derivatives."""
+
+    exterior: Part
+    place: Part
+    film: Part
+    camera: Part
 
 
 @dataclass(frozen=True)
@@ -126,16 +155,24 @@ class Problem:
         )
 
     @cached_property
-    def film_columns(self) -> slice:
-        """The columns of film parameters among an observation's derivatives."""
-        widest = max(len(positions) for positions in self.unknowns.transformation.values())
-        return slice(PLACE.stop, PLACE.stop + widest)
+    def parts(self) -> Parts:
+        """The columns of an observation's derivatives: those that are by free unknowns in some observation."""
+        free = np.append(self.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
+        shown = np.unique(self.image_numbers[~self.is_fiducial])
+        positions = (self.exterior[shown], self.places, self._film_positions, self._camera_positions[shown])
+        used = [np.flatnonzero(free[each].any(axis=0)) for each in positions]
+        ends = np.cumsum([len(members) for members in used])
+        return Parts(*(Part(members, slice(end - len(members), end)) for members, end in zip(used, ends, strict=True)))
 
     @cached_property
-    def camera_columns(self) -> slice:
-        """The columns of interior orientation and distortion among an observation's derivatives."""
-        widest = max(len(positions) for positions in self.unknowns.camera.values())
-        return slice(self.film_columns.stop, self.film_columns.stop + widest)
+    def _film_positions(self) -> Indices:
+        """(images, k) positions of the film parameters, ABSENT behind those of films that have less."""
+        return side_by_side([self.unknowns.transformation[image.name] for image in self.network.images])
+
+    @cached_property
+    def _camera_positions(self) -> Indices:
+        """(images, k) positions of interior orientation and distortion, ABSENT behind shorter ones."""
+        return side_by_side([self.unknowns.camera[image.camera] for image in self.network.images])
 
     @cached_property
     def further(self) -> tuple[FurtherObservation, ...]:
@@ -191,16 +228,22 @@ class Problem:
 
     @cached_property
     def columns(self) -> Indices:
-        """(n, k) positions of the unknowns in an observation's derivatives: EXTERIOR, PLACE, film, camera."""
-        by_image = np.full((len(self.network.images), self.camera_columns.stop), ABSENT, dtype=np.intp)
-        by_image[:, EXTERIOR] = self.exterior
-        for i, image in enumerate(self.network.images):
-            film = self.unknowns.transformation[image.name]
-            camera = self.unknowns.camera[image.camera]
-            by_image[i, self.film_columns][: len(film)] = film
-            by_image[i, self.camera_columns][: len(camera)] = camera
+        """(n, k) positions of the unknowns in an observation's derivatives, those of `parts`."""
+        exterior, place, film, camera = self.parts
+        by_image = np.empty((len(self.network.images), camera.columns.stop), dtype=np.intp)
+        of_images = ((exterior, self.exterior), (film, self._film_positions), (camera, self._camera_positions))
+        for part, positions in of_images:
+            by_image[:, part.columns] = positions[:, part.members]
         columns = by_image[self.image_numbers]
-        columns[self.is_fiducial, EXTERIOR] = ABSENT
-        columns[self.is_fiducial, self.camera_columns] = ABSENT
-        columns[:, PLACE] = self.places
+        for part in (exterior, camera):
+            columns[self.is_fiducial, part.columns] = ABSENT
+        columns[:, place.columns] = self.places[:, place.members]
         return columns
+
+
+def side_by_side(rows: list[Indices]) -> Indices:
+    """Rows of different lengths as one array, ABSENT behind the shorter."""
+    array = np.full((len(rows), max(len(row) for row in rows)), ABSENT, dtype=np.intp)
+    for own, row in zip(array, rows, strict=True):
+        own[: len(row)] = row
+    return array

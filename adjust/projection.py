@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.correction import Imaged
 from adjust.distortion import image_equations
 from adjust.families import family, parameter_names
 from adjust.line_of_sight import sight_vectors
 from adjust.network import EXTERIOR_NAMES, STRAIGHT, Approximations, Distortion, Image, LineOfSight, Network
 from adjust.result import Adjustment
 from adjust.rotation import rotation_from_angles
+from adjust.small_matrices import applied, determinant, solved
 from adjust.transformation import Film, film_parameter_names
 
 Array = NDArray[np.float64]
@@ -111,7 +113,7 @@ def rays(rotation: Array, vector: Array) -> tuple[Array, Array]:
 
     rotation (3, 3) or (n, 3, 3). A point in front of the camera has W < 0.
     """
-    in_camera = np.einsum("...ij,...j->...i", rotation, vector)
+    in_camera = applied(rotation, vector)
     depth = in_camera[..., 2:]
     # A point in the plane of the lens has no image: its ray is kept finite and W = 0 tells.
     return -in_camera[..., :2] / np.where(depth == 0.0, 1.0, depth), in_camera
@@ -123,19 +125,29 @@ def camera_from_ray(distortion: Distortion, interior: Array, parameters: Array, 
     The correction is defined at the observed point, so that it is inverted by Newton's method. Where the distortion
     folds the image over, which a polynomial does far enough outside, nothing is found.
     """
-    c, principal_point = interior[0], interior[1:]
-    xy_mm = principal_point + c * ray
-    tolerance_mm = NEWTON_TOLERANCE * (abs(c) + np.abs(xy_mm).max(initial=0.0))
-    found = np.zeros(len(ray), dtype=bool)
-    of = family(distortion.family)
+    return camera_from_image(distortion, interior, parameters, imaged_ray(distortion, parameters, ray))
+
+
+def imaged_ray(distortion: Distortion, parameters: Array, ray: Array) -> Imaged:
+    """The images of rays (n, 2) at c = 1."""
     with np.errstate(over="ignore", invalid="ignore"):
-        imaged = of.image(ray, parameters)
-        ideal_mm, unfolded = principal_point + c * imaged.value, _unfolded(imaged.by_ray)
+        return family(distortion.family).image(ray, parameters)
+
+
+def camera_from_image(distortion: Distortion, interior: Array, parameters: Array, imaged: Imaged) -> tuple[Array, Mask]:
+    """As `camera_from_ray`, of rays whose images are known."""
+    c, principal_point = interior[0], interior[1:]
+    correct = family(distortion.family).correct
+    found = np.zeros(len(imaged.value), dtype=bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        xy_mm = ideal_mm = principal_point + c * imaged.value
+        unfolded = _unfolded(determinant(imaged.by_ray))
+        tolerance_mm = 4 * NEWTON_TOLERANCE * (abs(c) + np.abs(ideal_mm).max(axis=1))
         for _ in range(NEWTON_STEPS):
-            correction = of.correct(distortion, xy_mm, principal_point, parameters)
-            step, regular = _solved(np.eye(2) - correction.by_xy, xy_mm - ideal_mm - correction.value)
+            correction = correct(distortion, xy_mm, principal_point, parameters)
+            step, regular = _newton_step(np.eye(2) - correction.by_xy, xy_mm - ideal_mm - correction.value)
             xy_mm = xy_mm - step
-            found = regular & unfolded & (np.abs(step).max(axis=1) <= 4 * tolerance_mm)
+            found = regular & unfolded & (np.abs(step).max(axis=1) <= tolerance_mm)
             if found.all():
                 break
     return xy_mm, found
@@ -148,7 +160,7 @@ def ideal_from_observed(distortion: Distortion, interior: Array, parameters: Arr
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(NEWTON_STEPS):
             at = image_equations(distortion, interior, parameters, xy_mm, ray)
-            step, regular = _solved(-at.by_ray, -at.value)
+            step, regular = _newton_step(-at.by_ray, -at.value)
             ray = ray - step
             found = regular & (np.abs(step).max(axis=1) <= 4 * NEWTON_TOLERANCE * (1.0 + np.abs(ray).max(axis=1)))
             if found.all():
@@ -156,17 +168,13 @@ def ideal_from_observed(distortion: Distortion, interior: Array, parameters: Arr
     return interior[1:] + interior[0] * ray, found
 
 
-def _unfolded(by_ray: Array) -> Mask:
-    """Which rays (n,) have neighbours that are imaged on the right side of them."""
-    determinant = np.asarray(np.linalg.det(by_ray))
-    return np.asarray(np.isfinite(determinant) & (determinant > 0.0))
+def _newton_step(by_unknown: Array, value: Array) -> tuple[Array, Mask]:
+    """Steps (n, 2), and which points (n,) have neighbours that are imaged on the right side of them."""
+    side = determinant(by_unknown)
+    regular = _unfolded(side)
+    return solved(by_unknown, value, regular, side), regular
 
 
-def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
-    """The solutions (n, 2) of 2x2 systems (n, 2, 2), and which matrices (n,) keep the image's orientation."""
-    (a, b), (c, d) = np.moveaxis(matrix, 0, -1)
-    determinant = a * d - b * c
-    regular = np.isfinite(determinant) & (determinant > 0.0)
-    x, y = right.T
-    solution = np.stack([d * x - b * y, a * y - c * x], axis=1)
-    return solution / np.where(regular, determinant, 1.0)[:, None], regular
+def _unfolded(side: Array) -> Mask:
+    """Which determinants (n,) tell that the image's orientation is kept."""
+    return np.asarray(np.isfinite(side) & (side > 0.0))

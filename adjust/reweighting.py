@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem import Problem
+from adjust.small_matrices import laid_out
 from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
@@ -37,7 +38,7 @@ class Weighting:
         sigma = problem.unknowns.sigma.copy()
         for pair, factor in zip(units.positions.T, np.sqrt(np.tile(variance[count:], (2, 1))), strict=True):
             sigma[pair[pair >= 0]] *= factor[pair >= 0]
-        covariance = problem.network.observations.covariance_mm2 * variance[:count, None, None]
+        covariance = laid_out(problem.network.observations.covariance_mm2) * variance[:count, None, None]
         if (variance[count:] == 1.0).all():
             return problem, covariance
         return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma)), covariance

@@ -12,6 +12,7 @@ from adjust.functions import Derivatives
 from adjust.further_observations import FurtherObservation
 from adjust.numbering import ELEMENTS_AT_ONCE, Numbering, Touched
 from adjust.problem import ABSENT, Problem, State
+from adjust.small_matrices import applied, lower_root, product, zeros
 
 Array = NDArray[np.float64]
 
@@ -21,7 +22,7 @@ class WhitenedRows:
     """Rows of unit weight; in turn the blocks of `Numbering.touched`, of large networks put together as asked for.
 
     A block for each further observation follows. root (n, 2, 2): the factor L of A C A' = L L'; matrix (n, 2, k): by
-    the unknowns of `Numbering.used`; right (n, 2).
+    the unknowns at `Problem.columns`; right (n, 2).
     """
 
     numbering: Numbering
@@ -39,7 +40,7 @@ class WhitenedRows:
 
     def _put_together(self) -> Iterator[Blocks]:
         for touched in self.numbering.touched:
-            yield _blocks(touched, self.matrix[touched.rows], self.right[touched.rows])
+            yield _blocks(touched, self.matrix, self.right)
         yield from self.further
 
     @property
@@ -56,7 +57,7 @@ class _Summed:
 
     def __iter__(self) -> Iterator[Blocks]:
         for touched in self.rows.numbering.summed:
-            yield _blocks(touched, self.rows.matrix[touched.rows], self.rows.right[touched.rows])
+            yield _blocks(touched, self.rows.matrix, self.rows.right)
         yield from self.rows.further
 
 
@@ -68,28 +69,31 @@ def whitened_rows(
     At computed observations F is 0, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed less observed.
     """
     a = at.by_observation
-    root = np.asarray(np.linalg.cholesky(a @ covariance_mm2 @ a.transpose(0, 2, 1)), dtype=np.float64)
-    rows = np.concatenate([at.by_unknowns[:, :, numbering.used], a @ v_mm[..., None]], axis=2)
-    rows[:, 0] /= root[:, :1, 0]
-    rows[:, 1] -= root[:, 1, :1] * rows[:, 0]
-    rows[:, 1] /= root[:, 1, 1:]
+    root = lower_root(product(product(a, covariance_mm2), a.transpose(0, 2, 1)))
+    first, below, second = root[:, 0, :1], root[:, 1, :1], root[:, 1, 1:]
+    rows = zeros(len(a), 2, at.by_unknowns.shape[2] + 1)
+    for into, of in ((rows[..., :-1], at.by_unknowns), (rows[..., -1:], applied(a, v_mm)[..., None])):
+        np.divide(of[:, 0], first, out=into[:, 0])
+        np.divide(of[:, 1] - below * into[:, 0], second, out=into[:, 1])
     further = tuple(_further_block(numbering, each, values) for each in numbering.problem.further)
     return WhitenedRows(numbering, root, rows[..., :-1], rows[..., -1], further)
 
 
 def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
-    """The rows (b, m, 2, k) of blocks of equal shape with every derivative in its unknown's column."""
+    """The rows of blocks of equal shape, of all (n, 2, k), with every derivative in its unknown's column."""
     (count, height), width = touched.rows.shape, touched.own.shape[1] + touched.shared.shape[1]
-    dense = np.zeros((count, height, 2, width + 1))
-    if len(touched.columns) == 1 and touched.columns.shape[1] <= count:
+    by_column = np.zeros((count, width + 1, height, 2))  # what an operation on a column takes stands together
+    if touched.columns.shape[:2] == (1, 1):
+        for k, column in enumerate(touched.columns[0, 0]):
+            by_column[:, column] = matrix[..., k][touched.rows]
+    elif len(touched.columns) == 1 and height <= count:
         for row, columns in enumerate(touched.columns[0]):
-            rows = slice(None) if touched.columns.shape[1] == 1 else slice(row, row + 1)
-            dense[:, rows, :, columns] = matrix[:, rows]
+            by_column[:, columns, row] = matrix[touched.rows[:, row]].swapaxes(1, 2)
     else:
-        columns = np.broadcast_to(touched.columns[:, :, None, :], matrix.shape)
-        np.put_along_axis(dense, columns, matrix, axis=3)
-    dense = dense[..., :width].reshape(count, 2 * height, width)
-    return Blocks(touched.own, touched.shared, dense, right.reshape(count, 2 * height))
+        columns = np.broadcast_to(touched.columns[:, :, None, :], (count, height, 2, matrix.shape[2]))
+        np.put_along_axis(by_column.transpose(0, 2, 3, 1), columns, matrix[touched.rows], axis=3)
+    dense = by_column[:, :width].reshape(count, width, 2 * height).swapaxes(1, 2)
+    return Blocks(touched.own, touched.shared, dense, right[touched.rows].reshape(count, 2 * height))
 
 
 def _further_block(numbering: Numbering, further: FurtherObservation, values: Array) -> Blocks:

@@ -238,7 +238,7 @@ def scipy(scene: Scene) -> Figures:
     )
     problem = number(replace(scene.network, images=images), scene.start)
     numbering, first = Numbering(problem), problem.start()
-    numbers = numbering.numbers[problem.columns[:, numbering.used]]
+    numbers = numbering.numbers[problem.columns]
     covariance = problem.network.observations.covariance_mm2
 
     def at(x: Array) -> tuple[Array, csr_array]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functions import computed_observations, derivatives
+from adjust.functions import compute, derivatives
 from adjust.network import (
     Approximations,
     Camera,
@@ -58,24 +58,24 @@ def structure() -> Structure:
     """The matrices of the network at computed observations."""
     problem = number(*network())
     state = problem.start()
-    xy_mm = computed_observations(problem, state)
-    if xy_mm is None:
+    computed = compute(problem, state)
+    if computed is None:
         raise ValueError("a point of the network has no image")
-    at = derivatives(problem, state, xy_mm)
+    at, count = derivatives(problem, state, computed), len(computed.xy_mm)
     order, unknowns = ordered_unknowns(problem)
     observed = np.argsort(problem.is_fiducial, kind="stable")  # targets first, then fiducials, each image by image
-    b = dense(problem, at.by_unknowns)[observed].reshape(2 * len(xy_mm), -1)[:, order]
+    b = dense(problem, at.by_unknowns)[observed].reshape(2 * count, -1)[:, order]
     prior = np.flatnonzero(problem.unknowns.has_prior[order])
     b = np.vstack([b, -np.eye(len(order))[prior]])  # F5 to F9: given less unknown
     a = np.eye(len(b))
     for row, each in enumerate(observed):
         a[2 * row : 2 * row + 2, 2 * row : 2 * row + 2] = at.by_observation[each]
-    variances = np.concatenate([np.full(2 * len(xy_mm), 0.005**2), problem.unknowns.sigma[order][prior] ** 2])
+    variances = np.concatenate([np.full(2 * count, 0.005**2), problem.unknowns.sigma[order][prior] ** 2])
     n = b.T @ np.linalg.solve(a @ np.diag(variances) @ a.T, b)
     targets = 2 * int((~problem.is_fiducial).sum())
     rows = {
         "F1, F2: object points": targets,
-        "F3, F4: fiducials": 2 * len(xy_mm) - targets,
+        "F3, F4: fiducials": 2 * count - targets,
         "F5, F6": 2 * len(MARKS),
         "F7 to F9, distortion": len(prior) - 2 * len(MARKS),
     }

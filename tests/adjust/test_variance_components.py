@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from simulated import field_points, simulated
 
 from adjust.adjustment import Options, adjust
-from adjust.functions import derivatives
+from adjust.functions import compute, derivatives
 from adjust.iteration import linearise
 from adjust.network import Approximations, Network
 from adjust.numbering import Numbering
@@ -41,7 +41,9 @@ def dense_sigmas(network: Network, start: Approximations, result: Adjustment) ->
     state = State(result.values, rotation_from_angles(result.values[problem.exterior[:, 3:]]))
     at = linearise(numbering, network.observations.covariance_mm2 * kinds[:, None, None], state)
     assert at is not None
-    full = derivatives(problem, state, at.computed_mm)
+    computed = compute(problem, state)
+    assert computed is not None
+    full = derivatives(problem, state, computed)
     matrix = np.zeros((len(network.observations), 2, len(sigma) + 1))
     whitened = np.linalg.solve(at.rows.root, full.by_unknowns)
     for row, columns in enumerate(problem.columns):
