@@ -49,7 +49,9 @@ def observations(result: FrameMeasurement, layout: FiducialLayout) -> tuple[NDAr
     return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
 
 
-@pytest.mark.parametrize("name", ["000b3b38", "08320661", "0b50b18e"])
+@pytest.mark.parametrize(
+    "name", ["000b3b38", *(pytest.param(n, marks=pytest.mark.slow) for n in ("08320661", "0b50b18e"))]
+)
 def test_all_four_corners_of_the_wild_frames(name: str) -> None:
     layout = square(WILD)
     with open_scan(SCANS / "aerial" / f"{name}.jpeg") as scan:
@@ -99,6 +101,7 @@ def test_a_nearly_black_frame_says_what_became_of_every_mark() -> None:
     assert len(seen) < 4 or affine_rms_px(given, seen) < 1.0
 
 
+@pytest.mark.slow
 def test_a_reseau_is_not_seen_in_a_frame_of_another_camera() -> None:
     with open_scan(SCANS / "aerial" / "0cec8b13.jpeg") as scan:
         result = measure_fiducials(scan, lattice(), (RESEAU_PITCH_UM, RESEAU_PITCH_UM))
