@@ -186,12 +186,16 @@ class _Sighter:
     def glimpse_faint(self, reach_px: float) -> None:
         """Look again at every mark that is not clear or lies off, where the others put it: what stands out of its
         texture there is this mark, the film being deformed where it lies off."""
+        faint = [
+            (index, sighting)
+            for index, sighting in enumerate(self.sightings)
+            if sighting is not None and sighting.inside and not (self.clear(index) and self.belongs[index])
+        ]
+        if not faint:
+            return
         extremes = np.percentile(self.scan.reduced(self.placement.reduction, self.weights), _EXTREMES)
         blur_px = self._blur_px()
-        for index in range(len(self.sightings)):
-            sighting = self.sightings[index]
-            if sighting is None or not sighting.inside or (self.clear(index) and self.belongs[index]):
-                continue
+        for index, sighting in faint:
             mark = self.layout.marks[index].mark
             sign = self._sign(mark)
             seen = glimpse(

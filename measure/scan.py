@@ -1,10 +1,11 @@
 """A scan file, opened by windows."""
 
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from pathlib import Path
 from types import TracebackType
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -14,14 +15,18 @@ from measure.errors import MeasurementError
 from measure.picture_scan import open_picture
 from measure.radiometry import Samples
 from measure.resolution import Pitch
-from measure.segments import BAND_ROWS, Segments
+from measure.segment_cache import SegmentCache
+from measure.segments import Segments
 from measure.tiff_scan import open_tiff
 
 Array = NDArray[np.float32]
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
 GREEN = (0.0, 1.0, 0.0)
-CACHE_BYTES = 64 << 20
+BAND_PIXELS = 2 << 20  # that a thread takes at a time
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 class Scan:
@@ -45,6 +50,7 @@ class Scan:
         self.notes = notes
         self._segments = segments
         self._cache = SegmentCache(segments)
+        self._reduced: dict[int, Array] = {}
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
     def green(self) -> "Scan":
@@ -62,29 +68,35 @@ class Scan:
         """
         if width < 1 or height < 1:
             raise ValueError(f"a window has at least one pixel, not {width} x {height}")
-        cols = np.clip(np.arange(col0, col0 + width), 0, self.width_px - 1)
-        rows = np.clip(np.arange(row0, row0 + height), 0, self.height_px - 1)
-        inner = self._grey(int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1, self._weights(weights))
-        if inner.shape == (height, width):
-            return inner
-        return inner[np.ix_(rows - rows[0], cols - cols[0])]
+        return np.asarray(self._planes(col0, row0, width, height, self._weights(weights)[None])[0])
 
     def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
         """The whole scan, area-averaged by an integer factor: pixel (i, j) is the mean over factor x factor pixels,
         its centre at column factor * j + (factor - 1) / 2. The last partial row and column are dropped.
 
-        The scan is streamed in bands of rows: memory holds the result and a band.
+        The scan is streamed in bands of rows: memory holds the result, all its channels for the next call, and a band
+        for each thread.
         """
         height, width = self.height_px // factor, self.width_px // factor
         if factor < 1 or height < 1 or width < 1:
             raise ValueError(f"{self.name}: cannot be reduced by {factor}: it is {self.width_px} x {self.height_px} px")
-        band = max(BAND_ROWS // factor, 1)
-        result = np.empty((height, width), np.float32)
-        for first in range(0, height, band):
-            last = min(first + band, height)
-            fine = self.window(0, first * factor, width * factor, (last - first) * factor, weights)
-            result[first:last] = cv2.resize(fine, (width, last - first), interpolation=cv2.INTER_AREA)
-        return result
+        if factor not in self._reduced:
+            self._reduced.clear()
+            self._reduced[factor] = self._reduced_channels(factor, width, height)
+        return weighted(self._reduced[factor], self._weights(weights))
+
+    def reduced_window(
+        self, factor: int, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None
+    ) -> Array:
+        """(height, width) pixels of the reduced scan from its column col0 and row row0 on, read from the file by
+        themselves; parts outside of the scan repeat its edge."""
+        return np.asarray(self._reduced_planes(factor, col0, row0, width, height, self._weights(weights)[None])[0])
+
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+        """What the function makes of each item, in their order, by as many threads as OpenCV may use: decoders and
+        filters run side by side."""
+        with ThreadPoolExecutor(max(cv2.getNumThreads(), 1)) as threads:
+            return list(threads.map(function, items))
 
     def close(self) -> None:
         self._segments.close()
@@ -97,6 +109,26 @@ class Scan:
     ) -> None:
         self.close()
 
+    def _reduced_channels(self, factor: int, width: int, height: int) -> Array:
+        """(height, width, channels): every segment is decoded once."""
+        result = np.empty((height, width, self.channels), np.float32)
+        single = np.eye(self.channels, dtype=np.float32)
+        band = max(BAND_PIXELS // (width * factor * factor), 1)
+
+        def fill(row0: int) -> None:
+            rows = min(band, height - row0)
+            planes = self._reduced_planes(factor, 0, row0, width, rows, single)
+            result[row0 : row0 + rows] = np.moveaxis(planes, 0, -1)
+
+        self.each(fill, range(0, height, band))
+        return result
+
+    def _reduced_planes(self, factor: int, col0: int, row0: int, width: int, height: int, weights: Array) -> Array:
+        """(n, height, width) of the reduced scan, for weights (n, channels)."""
+        fine = self._planes(col0 * factor, row0 * factor, width * factor, height * factor, weights)
+        size = (width, height)
+        return np.stack([cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in fine]).astype(np.float32)
+
     def _weights(self, weights: Sequence[float] | None) -> Array:
         if weights is None:
             weights = self._grey_weights
@@ -104,16 +136,26 @@ class Scan:
             raise ValueError(f"{self.name}: {len(weights)} weights for {self.channels} channels")
         return np.asarray(weights, np.float32)
 
-    def _grey(self, row0: int, row1: int, col0: int, col1: int, weights: Array) -> Array:
+    def _planes(self, col0: int, row0: int, width: int, height: int, weights: Array) -> Array:
+        """(n, height, width) for weights (n, channels); parts outside of the scan repeat its edge."""
+        cols = np.clip(np.arange(col0, col0 + width), 0, self.width_px - 1)
+        rows = np.clip(np.arange(row0, row0 + height), 0, self.height_px - 1)
+        inner = self._inside(int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1, weights)
+        if inner.shape[1:] == (height, width):
+            return inner
+        return inner[:, (rows - rows[0])[:, None], cols - cols[0]]
+
+    def _inside(self, row0: int, row1: int, col0: int, col1: int, weights: Array) -> Array:
         """Rows row0 to row1 and columns col0 to col1 (exclusive), all inside the scan, from the segments they touch."""
         tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
-        result = np.empty((row1 - row0, col1 - col0), np.float32)
+        result = np.empty((len(weights), row1 - row0, col1 - col0), np.float32)
         for i in range(row0 // tall, (row1 - 1) // tall + 1):
             top, bottom = max(row0, i * tall), min(row1, (i + 1) * tall)
             for j in range(col0 // wide, (col1 - 1) // wide + 1):
                 left, right = max(col0, j * wide), min(col1, (j + 1) * wide)
                 part = self._cache.read(i, j)[top - i * tall : bottom - i * tall, left - j * wide : right - j * wide]
-                result[top - row0 : bottom - row0, left - col0 : right - col0] = weighted(part, weights)
+                for plane, each in zip(result, weights, strict=True):
+                    plane[top - row0 : bottom - row0, left - col0 : right - col0] = weighted(part, each)
         return result
 
 
@@ -150,32 +192,7 @@ def first_bytes(path: Path) -> bytes:
     return start
 
 
-class SegmentCache:
-    """The segments decoded last, as many as a memory limit allows, and at least one row of the grid: reading a
-    scan from top to bottom decodes each once."""
-
-    def __init__(self, segments: Segments) -> None:
-        pixel_bytes = segments.channels * (1 if segments.full_scale_dn < 256 else 2)
-        self._limit = max(CACHE_BYTES, segments.segment_height_px * segments.width_px * pixel_bytes)
-        self._held = 0
-        self._segments = segments
-        self._decoded: OrderedDict[tuple[int, int], Samples] = OrderedDict()
-
-    def read(self, row: int, column: int) -> Samples:
-        """Segment (row, column) of the grid."""
-        key = (row, column)
-        if key in self._decoded:
-            self._decoded.move_to_end(key)
-            return self._decoded[key]
-        samples = self._segments.read(row, column)
-        self._decoded[key] = samples
-        self._held += samples.nbytes
-        while self._held > self._limit and len(self._decoded) > 1:
-            self._held -= self._decoded.popitem(last=False)[1].nbytes
-        return samples
-
-
-def weighted(samples: Samples, weights: Array) -> Array:
+def weighted(samples: Samples | Array, weights: Array) -> Array:
     """(height, width) float32 grey values of (height, width, channels) samples."""
     grey = samples[..., 0].astype(np.float32)
     if weights[0] != 1.0:

@@ -3,6 +3,7 @@
 import logging
 import struct
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +130,7 @@ class TiffSegments:
 
     def __init__(self, file: TiffFile, page: TiffPage, path: Path) -> None:
         self._file, self._page, self._path = file, page, path
+        self._reading = Lock()  # the file has one position for all threads
         self._radiometry = page_radiometry(page, path)
         self.channels, self.full_scale_dn = self._radiometry.channels, self._radiometry.full_scale_dn
         self.height_px, self.width_px = page.imagelength, page.imagewidth
@@ -157,8 +159,9 @@ class TiffSegments:
         page, handle = self._page, self._file.filehandle
         data = None
         if page.databytecounts[index]:
-            handle.seek(page.dataoffsets[index])
-            data = handle.read(page.databytecounts[index])
+            with self._reading:
+                handle.seek(page.dataoffsets[index])
+                data = handle.read(page.databytecounts[index])
         try:
             decoded, _, shape = page.decode(data, index, jpegtables=page.jpegtables, jpegheader=page.jpegheader)
         except DECODING_ERRORS as error:
@@ -188,8 +191,9 @@ class RawRows(TiffSegments):
         first = row * self.segment_height_px
         height = min(self.segment_height_px, self.height_px - first)
         handle = self._file.filehandle
-        handle.seek(self._page.dataoffsets[0] + first * self._row_samples * self._dtype.itemsize)
-        data = handle.read(height * self._row_samples * self._dtype.itemsize)
+        with self._reading:
+            handle.seek(self._page.dataoffsets[0] + first * self._row_samples * self._dtype.itemsize)
+            data = handle.read(height * self._row_samples * self._dtype.itemsize)
         if len(data) < height * self._row_samples * self._dtype.itemsize:
             raise broken(self._path, f"rows {first} to {first + height - 1} lie beyond its end")
         stored = np.frombuffer(data, self._dtype).astype(self._dtype.newbyteorder("="))

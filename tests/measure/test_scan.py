@@ -13,7 +13,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
-from measure.scan import SegmentCache, open_scan
+from measure.scan import open_scan
+from measure.segment_cache import SegmentCache
 
 HEIGHT, WIDTH = 203, 317
 
@@ -264,13 +265,44 @@ def test_a_window_decodes_only_its_tiles_and_a_whole_pass_each_tile_once(tmp_pat
         assert len(reads) == len(set(reads)) == 7 * 10
 
 
+def test_threads_that_read_a_file_side_by_side_see_what_one_sees(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture(), tile=(32, 32), compression="zstd")
+    places = [(col, row) for row in range(0, HEIGHT, 9) for col in range(0, WIDTH, 11)]
+    with open_scan(tmp_path / "s.tif") as scan:
+        scan._cache._limit = 10 * 32 * 32 * 2  # ten tiles: they are decoded over and over
+        windows = scan.each(lambda place: scan.window(*place, 40, 30), places)
+    with open_scan(tmp_path / "s.tif") as scan:
+        for window, place in zip(windows, places, strict=True):
+            np.testing.assert_array_equal(window, scan.window(*place, 40, 30))
+
+
+def test_a_damaged_tile_is_told_to_every_thread_that_wants_it(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture(), tile=(64, 64), compression="zlib")
+    with tifffile.TiffFile(tmp_path / "s.tif") as file:
+        offset = file.pages.first.dataoffsets[0]
+    content = bytearray((tmp_path / "s.tif").read_bytes())
+    content[offset : offset + 40] = bytes(40)
+    (tmp_path / "s.tif").write_bytes(content)
+    with open_scan(tmp_path / "s.tif") as scan:
+        for _ in range(2):
+            with pytest.raises(MeasurementError, match="damaged"):
+                scan.each(lambda row: scan.window(0, row, 20, 20), range(4))
+
+
+def test_a_window_of_the_reduced_scan_is_that_part_of_it(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture(np.uint8, 3), tile=(64, 64), photometric="rgb")
+    with open_scan(tmp_path / "s.tif") as scan:
+        whole = scan.reduced(3)
+        np.testing.assert_allclose(scan.reduced_window(3, 20, 11, 31, 27), whole[11:38, 20:51], rtol=1e-5)
+
+
 def test_the_cache_keeps_to_its_limit_and_holds_a_row_of_tiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("measure.scan.CACHE_BYTES", 1)
+    monkeypatch.setattr("measure.segment_cache.CACHE_BYTES", 1)
     tifffile.imwrite(tmp_path / "s.tif", picture(), tile=(32, 32), compression="lzw")
     with open_scan(tmp_path / "s.tif") as scan:
         np.testing.assert_array_equal(scan.window(0, 0, WIDTH, HEIGHT), picture())
         assert scan._cache._held <= 32 * WIDTH * 2
-        assert scan._cache._held == sum(samples.nbytes for samples in scan._cache._decoded.values())
+        assert scan._cache._held == sum(own.result().nbytes for own in scan._cache._decoded.values())
 
 
 def test_a_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:

@@ -1,0 +1,52 @@
+"""The segments of a scan decoded last, for all threads that read it."""
+
+from collections import OrderedDict
+from concurrent.futures import Future
+from threading import Lock
+
+from measure.radiometry import Samples
+from measure.segments import Segments
+
+CACHE_BYTES = 64 << 20
+
+
+class SegmentCache:
+    """As many segments as a memory limit allows, and at least one row of the grid: reading a scan from top to bottom
+    decodes each once. A thread that wants what another is decoding waits for it."""
+
+    def __init__(self, segments: Segments) -> None:
+        self._pixel_bytes = segments.channels * (1 if segments.full_scale_dn < 256 else 2)
+        self._limit = max(CACHE_BYTES, segments.segment_height_px * segments.width_px * self._pixel_bytes)
+        self._held = 0
+        self._segments = segments
+        self._decoded: OrderedDict[tuple[int, int], Future[Samples]] = OrderedDict()
+        self._lock = Lock()
+
+    def read(self, row: int, column: int) -> Samples:
+        """Segment (row, column) of the grid."""
+        key = (row, column)
+        with self._lock:
+            known = self._decoded.get(key)
+            if known is None:
+                own = self._decoded[key] = Future()
+            else:
+                self._decoded.move_to_end(key)
+        return known.result() if known is not None else self._read(key, own)
+
+    def _read(self, key: tuple[int, int], own: "Future[Samples]") -> Samples:
+        try:
+            samples = self._segments.read(*key)
+        except BaseException as error:
+            with self._lock:
+                del self._decoded[key]
+            own.set_exception(error)
+            raise
+        own.set_result(samples)
+        with self._lock:
+            self._held += samples.nbytes
+            for oldest in list(self._decoded):
+                if self._held <= self._limit:
+                    break
+                if oldest != key and self._decoded[oldest].done():
+                    self._held -= self._decoded.pop(oldest).result().nbytes
+        return samples
