@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from adjust.datum import free_motion
-from adjust.elimination import Factor
+from adjust.factor import Factor
 from adjust.numbering import Numbering
 from adjust.problem import Problem, State
 from adjust.rotation import vector_by_angles

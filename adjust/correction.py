@@ -39,12 +39,12 @@ class Correction:
 class Imaged:
     """h (n, 2), the image of the ray at c = 1, and its derivatives.
 
-    by_ray (n, 2, 2); by_parameters (n, 2, k).
+    by_ray (n, 2, 2); by_parameters: (n, 2) by each of k parameters, none where these do nothing to the ray.
     """
 
     value: Array
     by_ray: Array
-    by_parameters: Array
+    by_parameters: tuple[Array, ...] = ()
 
 
 def no_correction(_: Settings, xy: Array, __: Array, parameters: Array) -> Correction:
@@ -54,7 +54,6 @@ def no_correction(_: Settings, xy: Array, __: Array, parameters: Array) -> Corre
     return Correction(*nothing)
 
 
-def undistorted(ray: Array, parameters: Array) -> Imaged:
+def undistorted(ray: Array, _: Array) -> Imaged:
     """Of the families that correct the observed point, and of none."""
-    count = len(ray)
-    return Imaged(ray, np.broadcast_to(np.eye(2), (count, 2, 2)), np.broadcast_to(0.0, (count, 2, len(parameters))))
+    return Imaged(ray, np.broadcast_to(np.eye(2), (len(ray), 2, 2)))

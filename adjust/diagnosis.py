@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.datum import free_coordinates, object_datum
 from adjust.directions import camera_leads, datum_sentence, field_of, following
-from adjust.elimination import Factor
+from adjust.factor import Factor
 from adjust.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
 from adjust.own_directions import own_sentence, unnamed_sentence
 from adjust.problem import Problem, State

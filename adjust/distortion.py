@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.correction import Imaged
+from adjust.correction import Correction, Imaged
 from adjust.families import family
 from adjust.network import Distortion
 from adjust.small_matrices import zeros
@@ -23,15 +23,43 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ImageEquations:
-    """F (n, 2) in mm and its derivatives, by the observed point xy (n, 2, 2), the ray (n, 2, 2), the interior
-    orientation c, x0', y0' (n, 2, 3) and the family's parameters (n, 2, k).
+    """F (n, 2) in mm of points with the image of their ray and their correction, at a principal distance.
+
+    Its derivatives are those by the observed point xy (n, 2, 2), the ray (n, 2, 2), the interior orientation c, x0',
+    y0' (n, 2, 3) and the family's parameters (n, 2, k), or by a single one of these (n, 2).
     """
 
     value: Array
-    by_xy: Array
-    by_ray: Array
-    by_interior: Array
-    by_parameters: Array
+    c: float
+    imaged: Imaged
+    correction: Correction
+
+    @property
+    def by_xy(self) -> Array:
+        return np.asarray(np.eye(2) - self.correction.by_xy)
+
+    @property
+    def by_ray(self) -> Array:
+        return np.asarray(-self.c * self.imaged.by_ray)
+
+    @property
+    def by_interior(self) -> Array:
+        by_principal_point = -np.eye(2) - self.correction.by_principal_point
+        by_interior = zeros(len(self.value), 2, 3, dtype=self.value.dtype)
+        by_interior[..., 0] = -self.imaged.value
+        by_interior[..., 1:] = by_principal_point
+        return by_interior
+
+    @property
+    def by_parameters(self) -> Array:
+        by_parameters = zeros(*self.correction.by_parameters.shape, dtype=self.value.dtype)
+        for k in range(by_parameters.shape[2]):
+            by_parameters[..., k] = self.by_parameter(k)
+        return by_parameters
+
+    def by_parameter(self, k: int) -> Array:
+        by_correction = self.correction.by_parameters[..., k]
+        return -self.c * self.imaged.by_parameters[k] - by_correction if self.imaged.by_parameters else -by_correction
 
 
 def image_equations(
@@ -51,13 +79,5 @@ def equations_of(
     """The same of points whose rays' images are known."""
     c, principal_point = interior[0], interior[1:]
     correction = family(distortion.family).correct(distortion, xy_mm, principal_point, parameters)
-    by_interior = zeros(len(xy_mm), 2, 3, dtype=np.result_type(imaged.value, correction.value))
-    by_interior[..., 0] = -imaged.value
-    by_interior[..., 1:] = -np.eye(2) - correction.by_principal_point
-    return ImageEquations(
-        value=xy_mm - principal_point - c * imaged.value - correction.value,
-        by_xy=np.eye(2) - correction.by_xy,
-        by_ray=-c * imaged.by_ray,
-        by_interior=by_interior,
-        by_parameters=-c * imaged.by_parameters - correction.by_parameters,
-    )
+    value = xy_mm - principal_point - c * imaged.value - correction.value
+    return ImageEquations(value, c, imaged, correction)

@@ -6,7 +6,7 @@ the adjusted observations. By elements the distortion is taken at the observed c
 F = T(x, y) - image of the ray - distortion there, which depends on the observations by T alone.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -152,19 +152,20 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         by_station = -by_vector if straight else product(by_vector, seen.sight.by_station)
         by_point = by_vector if straight else product(by_vector, seen.sight.by_point)
         by_camera_xy[rows] = at.by_xy
-        _fill(by_unknowns, rows, parts.exterior, by_station, by_attitude)
-        _fill(by_unknowns, rows, parts.place, by_point)
-        _fill(by_unknowns, rows, parts.camera, at.by_interior, at.by_parameters)
+        by_exterior, by_interior = (by_station, by_attitude), at.by_interior
+        of_camera = [by_interior[..., k] if k < 3 else at.by_parameter(k - 3) for k in parts.camera.members]
+        _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
+        _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
+        _fill(by_unknowns, rows, parts.camera, of_camera)
     by_film = film.by_parameters + product(by_camera_xy - np.eye(2), at_distorted.by_parameters)
-    _fill(by_unknowns, slice(None), parts.film, by_film)
+    _fill(by_unknowns, slice(None), parts.film, [by_film[..., k] for k in parts.film.members])
     return Derivatives(film.by_xy if problem.by_elements else product(by_camera_xy, film.by_xy), by_unknowns)
 
 
-def _fill(by_unknowns: Array, rows: Rows, part: Part, *derivatives: Array) -> None:
-    """Put the derivatives (n, 2, k), side by side, that belong to a part into its columns."""
-    columns = [derivative[..., k] for derivative in derivatives for k in range(derivative.shape[2])]
-    for column, member in enumerate(part.members, part.columns.start):
-        by_unknowns[..., column][rows] = columns[member]
+def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Array]) -> None:
+    """Put the derivatives (n, 2) by the members of a part into its columns."""
+    for column, derivative in enumerate(derivatives, part.columns.start):
+        by_unknowns[..., column][rows] = derivative
 
 
 def _by_in_camera(by_ray: Array, seen: SeenTargets) -> Array:

@@ -1,11 +1,13 @@
 """Relinearise and solve until unknowns and adjusted observations stand still."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.elimination import Factor, eliminate
+from adjust.elimination import eliminate
+from adjust.factor import Factor
 from adjust.functions import Derivatives, compute, computed_observations, derivatives
 from adjust.further_observations import square_sum
 from adjust.numbering import Numbering
@@ -37,6 +39,11 @@ class Linearised:
     at: Derivatives
     rows: WhitenedRows
     vpv: float
+
+    @cached_property
+    def factor(self) -> Factor:
+        """The square root of the normal equations, undamped."""
+        return factorise(self.rows.numbering, self)
 
 
 @dataclass(frozen=True)
@@ -97,9 +104,9 @@ def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limi
         at = moved.end
         history.append(Iteration(at.vpv, moved.sigmas, moved.damping, moved.attempts))
         if moved.damping == 0.0 and _stands_still(history):
-            return Solution(at, factorise(numbering, at), "converged", tuple(history))
+            return Solution(at, at.factor, "converged", tuple(history))
         damping, lately = _eased(moved.damping, moved.gain), moved.damping or lately
-    return Solution(at, factorise(numbering, at), "iteration limit", tuple(history))
+    return Solution(at, at.factor, "iteration limit", tuple(history))
 
 
 def _stands_still(history: list[Iteration]) -> bool:
@@ -138,7 +145,7 @@ def _step(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: 
     while damping < LARGEST_DAMPING:
         attempts += 1
         try:
-            factor = factorise(numbering, at, damping)
+            factor = factorise(numbering, at, damping) if damping else at.factor
             solution = factor.solution()
         except np.linalg.LinAlgError:
             return None

@@ -168,6 +168,17 @@ class Observations:
     def __len__(self) -> int:
         return len(self.image)
 
+    @cached_property
+    def is_fiducial(self) -> NDArray[np.bool_]:
+        """(n,) whether it is a fiducial that is observed, and not an object point."""
+        return np.array([kind == "fiducial" for kind in self.kind], dtype=bool)
+
+    @cached_property
+    def numbered_points(self) -> tuple[tuple[str, ...], Indices]:
+        """The names of all points and fiducials, each once, and every observation's (n,) by its number among them."""
+        number = {name: i for i, name in enumerate(dict.fromkeys(self.point))}
+        return tuple(number), np.array([number[name] for name in self.point], dtype=np.intp)
+
     def only(self, rows: Indices) -> "Observations":
         """Some of the rows."""
         return Observations(
@@ -259,11 +270,28 @@ class Network:
         return {point.id: point for point in self.points}
 
     @cached_property
+    def image_numbers(self) -> Indices:
+        """(n,) the image of every observation, by its number."""
+        number = {image.name: i for i, image in enumerate(self.images)}
+        return np.array([number[name] for name in self.observations.image], dtype=np.intp)
+
+    @cached_property
+    def observed_points(self) -> frozenset[str]:
+        """The object points that are seen in an image."""
+        names, of_name = self.observations.numbered_points
+        return frozenset(names[i] for i in np.unique(of_name[~self.observations.is_fiducial]))
+
+    @cached_property
+    def observed_fiducials(self) -> frozenset[tuple[str, str]]:
+        """(camera, id) of the fiducials that are seen in an image."""
+        rows = np.flatnonzero(self.observations.is_fiducial)
+        return frozenset((self.images[self.image_numbers[row]].camera, self.observations.point[row]) for row in rows)
+
+    @cached_property
     def without_object(self) -> frozenset[str]:
         """The images that show no object point, only fiducials or nothing."""
-        rows = zip(self.observations.image, self.observations.kind, strict=True)
-        showing = {image for image, kind in rows if kind != "fiducial"}
-        return frozenset(image.name for image in self.images if image.name not in showing)
+        targets = np.bincount(self.image_numbers[~self.observations.is_fiducial], minlength=len(self.images))
+        return frozenset(self.images[i].name for i in np.flatnonzero(targets == 0))
 
     @cached_property
     def unoriented(self) -> frozenset[str]:
@@ -278,8 +306,7 @@ class Network:
 
     @cached_property
     def extent_by_image(self) -> dict[str, Extent]:
-        number_of = {image.name: i for i, image in enumerate(self.images)}
-        numbers = [number_of[name] for name in self.observations.image]
+        numbers = self.image_numbers
         lowest, highest = np.full((len(self.images), 2), np.inf), np.full((len(self.images), 2), -np.inf)
         np.minimum.at(lowest, numbers, self.observations.xy_mm)
         np.maximum.at(highest, numbers, self.observations.xy_mm)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.elimination import Factor
+from adjust.factor import Factor
 from adjust.multifrontal import with_rows
 from adjust.triangle import Triangle
 

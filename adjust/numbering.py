@@ -208,21 +208,24 @@ class _Blocks:
 
 def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterator[Touched]:
     """Blocks of equal shape together; derivatives (n, k): the numbers of their unknowns; numbers: by position."""
-    touches, owned = derivatives != ABSENT, numbers[blocks.owned]
+    owned = numbers[blocks.owned]
     count, owns = int(numbers.max(initial=ABSENT)) + 1, owned != ABSENT
     first_own = count - int(owns.sum())
+    order = np.argsort(blocks.of, kind="stable")
+    of, unknown = blocks.of[order], derivatives[order].T
     # Every pair of a block and an unknown that it touches or owns: block by block, its own unknowns first.
-    of_pair = np.concatenate([np.repeat(blocks.of, touches.sum(axis=1)), np.nonzero(owns)[0]])
-    unknown = np.concatenate([derivatives[touches], owned[owns]])
-    pairs, place = np.unique(of_pair * count + (unknown - first_own) % count, return_inverse=True)
-    unknown = (pairs % count + first_own) % count
+    pair = np.where(unknown == ABSENT, ABSENT, of * count + (unknown - first_own) % count)
+    new = pair != ABSENT  # most observations of a block touch what the one before touched
+    new[:, 1:] &= pair[:, 1:] != pair[:, :-1]
+    owned_pairs = np.nonzero(owns)[0] * count + (owned[owns] - first_own) % count
+    pairs, place = np.unique(np.concatenate([pair[new], owned_pairs]), return_inverse=True)
     first = np.searchsorted(pairs, np.arange(len(owned)) * count)
     widths = np.diff(first, append=len(pairs))
     own_counts = owns.sum(axis=1)
-    columns = np.full(derivatives.shape, ABSENT, dtype=np.intp)
-    columns[touches] = place[: int(touches.sum())] - np.repeat(first[blocks.of], touches.sum(axis=1))
+    touched = place[np.maximum(np.cumsum(new).reshape(new.shape) - 1, 0)]
+    columns = np.where(pair == ABSENT, widths[of], touched - first[of]).T  # behind the last for what is absent
+    unknown = (pairs % count + first_own) % count
 
-    order = np.argsort(blocks.of, kind="stable")
     heights = np.bincount(blocks.of, minlength=len(owned))
     first_row = np.cumsum(heights) - heights
     shapes, kinds = np.unique(np.stack([heights, own_counts, widths], axis=1), axis=0, return_inverse=True)
@@ -232,10 +235,10 @@ def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterat
         at_once = max(1, ELEMENTS_AT_ONCE // (2 * int(height) * (int(width) + 1) + 1))
         members = np.flatnonzero(kinds == kind)
         for some in np.split(members, range(at_once, len(members), at_once)):
-            rows = order[first_row[some][:, None] + np.arange(height)]
+            ordered = first_row[some][:, None] + np.arange(height)
             own_and_shared = unknown[first[some][:, None] + np.arange(width)]
-            of_rows = np.where(columns[rows] == ABSENT, width, columns[rows])
-            yield Touched(rows, own_and_shared[:, :own_count], own_and_shared[:, own_count:], _agreed(of_rows))
+            own, shared = own_and_shared[:, :own_count], own_and_shared[:, own_count:]
+            yield Touched(order[ordered], own, shared, _agreed(columns[ordered]))
 
 
 def _agreed(columns: Indices) -> Indices:

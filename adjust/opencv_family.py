@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.correction import Imaged
-from adjust.small_matrices import matrices, product, vectors, zeros
+from adjust.small_matrices import applied, matrices, product, vectors
 
 Array = NDArray[np.float64]
 
@@ -32,11 +32,9 @@ def opencv(ray: Array, parameters: Array) -> Imaged:
     by_b1 = tilted.value * np.array([1.0, 0.0])
     by_lens, by_ray = straight.by_parameters, straight.by_ray
     if tau_x or tau_y:
-        by_lens, by_ray = product(tilted.by_ray, by_lens), product(tilted.by_ray, by_ray)
-    by_parameters = zeros(len(ray), 2, len(parameters), dtype=by_lens.dtype)
-    by_parameters[..., :12] = by_lens * scale[:, None]
-    by_parameters[..., 12:14] = tilted.by_parameters * scale[:, None]
-    by_parameters[..., 14] = by_b1
+        by_lens = tuple(applied(tilted.by_ray, column) for column in by_lens)
+        by_ray = product(tilted.by_ray, by_ray)
+    by_parameters = *(column * scale for column in (*by_lens, *tilted.by_parameters)), by_b1
     return Imaged(tilted.value * scale, by_ray * scale[:, None] * mirror, by_parameters)
 
 
@@ -61,11 +59,16 @@ def _lens(ray: Array, parameters: Array) -> Imaged:
     )
     r4 = r2 * r2
     above_by = [power / below for power in (r2, r4, r4 * r2)]  # by k1, k2, k3; those by k4, k5, k6 are -radial times it
+    by_k = [vectors(x * each, y * each) for each in above_by]
     xy2, zero = 2 * x * y, np.zeros_like(x)
-    (x1, x2, x3), (y1, y2, y3) = ([axis * each for each in above_by] for axis in (x, y))
-    by_parameters = matrices(
-        (x1, x2, xy2, r2 + 2 * x**2, x3, -radial * x1, -radial * x2, -radial * x3, r2, r4, zero, zero),
-        (y1, y2, r2 + 2 * y**2, xy2, y3, -radial * y1, -radial * y2, -radial * y3, zero, zero, r2, r4),
+    others = ((r2, zero), (r4, zero), (zero, r2), (zero, r4))
+    by_parameters = (
+        *by_k[:2],
+        vectors(xy2, r2 + 2 * y**2),
+        vectors(r2 + 2 * x**2, xy2),
+        by_k[2],
+        *(each * -radial[:, None] for each in by_k),
+        *(vectors(*pair) for pair in others),
     )
     return Imaged(vectors(xd, yd), by_ray, by_parameters)
 
@@ -88,14 +91,15 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> Imaged:
     by_point = [
         [size * (row[i] - at * rotation[2, i]) for i in (0, 1)] for row, at in zip(rotation, over, strict=False)
     ]
-    by_angles: list[list[Array]] = [[], []]
+    by_angles = []
     for change in moved:
         *shift, deeper = _turned(change, point)
-        for axis, at in enumerate(over):
-            by_angle = size * (shift[axis] - at * deeper) + change[2, 2] * at - change[axis, 2]
-            by_angles[axis].append(by_angle)
+        by_angle = [
+            size * (shift[axis] - at * deeper) + change[2, 2] * at - change[axis, 2] for axis, at in enumerate(over)
+        ]
+        by_angles.append(vectors(*by_angle))
     value = [rotation[2, 2] * at - rotation[axis, 2] for axis, at in enumerate(over)]
-    return Imaged(vectors(*value), matrices(*by_point), matrices(*by_angles))
+    return Imaged(vectors(*value), matrices(*by_point), tuple(by_angles))
 
 
 def _turned(matrix: Array, point: Array) -> list[Array]:

@@ -9,8 +9,8 @@ from scipy.linalg import qr
 
 from adjust.adjustment import Options, adjust_problem, with_datum
 from adjust.cofactor import free_cofactor
-from adjust.elimination import Factor
 from adjust.errors import AdjustmentError
+from adjust.factor import Factor
 from adjust.functions import blind_mark, computed_observations
 from adjust.further_observations import at_computed
 from adjust.iteration import factorise, linearise

@@ -17,6 +17,7 @@ from adjust.unknowns import Unknowns, list_unknowns
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+_NOWHERE = np.full(3, -1, dtype=np.intp)
 ABSENT = -1  # stands for the unknown of a column that an observation does not have
 
 
@@ -25,9 +26,7 @@ def number(network: Network, approximations: Approximations, by_elements: bool =
 
     Raises AdjustmentError where a quantity has neither a value nor an approximation.
     """
-    cameras = {image.name: image.camera for image in network.images}
-    rows = zip(network.observations.image, network.observations.point, network.observations.kind, strict=True)
-    observed = frozenset((cameras[image] if kind == "fiducial" else "", point) for image, point, kind in rows)
+    observed = frozenset(network.observed_fiducials | {("", name) for name in network.observed_points})
     return Problem(network, list_unknowns(network, approximations, observed), approximations.mirrored, by_elements)
 
 
@@ -182,13 +181,12 @@ class Problem:
     @cached_property
     def image_numbers(self) -> Indices:
         """(n,) the image of every observation, by its number in the network."""
-        numbers = {image.name: i for i, image in enumerate(self.network.images)}
-        return np.array([numbers[name] for name in self.network.observations.image], dtype=np.intp)
+        return self.network.image_numbers
 
     @cached_property
     def is_fiducial(self) -> NDArray[np.bool_]:
         """(n,) whether it is a fiducial that is observed, and not an object point."""
-        return np.array([kind == "fiducial" for kind in self.network.observations.kind], dtype=bool)
+        return self.network.observations.is_fiducial
 
     @cached_property
     def rows_by_image(self) -> list[Indices]:
@@ -216,14 +214,13 @@ class Problem:
     @cached_property
     def places(self) -> Indices:
         """(n, 3) positions of the point's coordinates, or of the fiducial's two and ABSENT."""
-        cameras = {image.name: image.camera for image in self.network.images}
-        observations = self.network.observations
-        places = np.full((len(observations), 3), ABSENT, dtype=np.intp)
-        for row, (image, point) in enumerate(zip(observations.image, observations.point, strict=True)):
-            if self.is_fiducial[row]:
-                places[row, :2] = self.unknowns.fiducial[cameras[image], point]
-            else:
-                places[row] = self.unknowns.point[point]
+        images, observations = self.network.images, self.network.observations
+        names, of_name = observations.numbered_points
+        point = side_by_side([self.unknowns.point.get(name, _NOWHERE) for name in names])
+        places = point[of_name]
+        for row in np.flatnonzero(self.is_fiducial):
+            camera = images[self.image_numbers[row]].camera
+            places[row] = *self.unknowns.fiducial[camera, observations.point[row]], ABSENT
         return places
 
     @cached_property

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.elimination import Blocks, Factor
+from adjust.factor import Blocks, Factor
 from adjust.further_observations import FurtherObservation
 from adjust.iteration import Linearised
 from adjust.numbering import Numbering

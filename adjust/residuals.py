@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.elimination import Blocks, Factor
+from adjust.factor import Blocks, Factor
 from adjust.further_observations import square_sum
 from adjust.problem import ABSENT, Problem, State
 from adjust.reliability import UNCHECKED, Misfits, redundancies, statistics

@@ -7,7 +7,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.elimination import Blocks, Sums
+from adjust.elimination import Sums
+from adjust.factor import Blocks
 from adjust.functions import Derivatives
 from adjust.further_observations import FurtherObservation
 from adjust.numbering import ELEMENTS_AT_ONCE, Numbering, Touched
@@ -15,6 +16,7 @@ from adjust.problem import ABSENT, Problem, State
 from adjust.small_matrices import applied, lower_root, product, zeros
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
     by_column = np.zeros((count, width + 1, height, 2))  # what an operation on a column takes stands together
     if touched.columns.shape[:2] == (1, 1):
         for k, column in enumerate(touched.columns[0, 0]):
-            by_column[:, column] = matrix[..., k][touched.rows]
+            by_column[:, column] = _of_rows(matrix[..., k], touched.rows)
     elif len(touched.columns) == 1 and height <= count:
         for row, columns in enumerate(touched.columns[0]):
             by_column[:, columns, row] = matrix[touched.rows[:, row]].swapaxes(1, 2)
@@ -94,6 +96,14 @@ def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
         np.put_along_axis(by_column.transpose(0, 2, 3, 1), columns, matrix[touched.rows], axis=3)
     dense = by_column[:, :width].reshape(count, width, 2 * height).swapaxes(1, 2)
     return Blocks(touched.own, touched.shared, dense, right[touched.rows].reshape(count, 2 * height))
+
+
+def _of_rows(values: Array, rows: Indices) -> Array:
+    """Values (b, m, 2), of all (n, 2), of some rows (b, m); without a copy where they stand in order."""
+    first, count = int(rows[0, 0]), rows.size
+    if np.array_equal(rows.ravel(), np.arange(first, first + count)):
+        return values[first : first + count].reshape(*rows.shape, 2)
+    return np.asarray(values[rows])
 
 
 def _further_block(numbering: Numbering, further: FurtherObservation, values: Array) -> Blocks:

@@ -6,10 +6,10 @@ from functools import cached_property
 import numpy as np
 
 from adjust.diagnosis import singular_directions
-from adjust.elimination import Factor
 from adjust.errors import AdjustmentError
+from adjust.factor import Factor
 from adjust.functions import blind_mark
-from adjust.iteration import Linearised, Solution, factorise, iterate, linearise
+from adjust.iteration import Linearised, Solution, iterate, linearise
 from adjust.numbering import Numbering
 from adjust.options import Options
 from adjust.problem import Problem, State
@@ -153,13 +153,12 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
             f"approximate orientation of the image, and the sign of W: M rotates from object to camera, which looks "
             f"along its negative z axis."
         )
-    factor = factorise(numbering, start)
-    singular = singular_directions(weighted, state, numbering.free, factor)
+    singular = singular_directions(weighted, state, numbering.free, start.factor)
     if singular:
         solution = Solution(start, None, "singular", ())
-        return Run(problem, numbering, weighting, solution, singular, factor)
+        return Run(problem, numbering, weighting, solution, singular, start.factor)
     solution = iterate(numbering, covariance, start, limit)
-    factor = solution.factor or factorise(numbering, solution.end)
+    factor = solution.end.factor
     singular = singular_directions(weighted, solution.end.state, numbering.free, factor)
     if singular:
         ended: Termination = "singular" if solution.termination == "converged" else "diverged"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from adjust.elimination import Factor
+from adjust.factor import Factor
 from adjust.iteration import Linearised
 from adjust.numbering import Numbering
 from adjust.probabilities import Probabilities

@@ -22,16 +22,16 @@ def validate(network: Network) -> None:
     _check_unique("object point", (point.id for point in network.points))
     _check_cameras(network)
     _check_shapes(network.observations)
-    _check_distances(network)
     _check_names(network)
     _check_distances(network)
     _check_calibrations(network)
     _check_antennas(network)
-    _check_duplicate_observations(network.observations)
+    _check_duplicate_observations(network)
     _check_values(network.observations)
-    counts = _counts(network.observations)
-    for image in network.images:
-        _check_image(image, counts[image.name, False], counts[image.name, True])
+    fiducial, count = network.observations.is_fiducial, len(network.images)
+    targets, fiducials = (np.bincount(network.image_numbers[of], minlength=count) for of in (~fiducial, fiducial))
+    for image, *shown in zip(network.images, targets.tolist(), fiducials.tolist(), strict=True):
+        _check_image(image, *shown)
 
 
 def _check_not_empty(network: Network) -> None:
@@ -77,17 +77,12 @@ def _check_cameras(network: Network) -> None:
 
 
 def _check_distances(network: Network) -> None:
-    shown = {
-        point
-        for point, kind in zip(network.observations.point, network.observations.kind, strict=True)
-        if kind != "fiducial"
-    }
     for each in network.distances:
         what = f"the distance from {each.start} to {each.end}"
         for end in (each.start, each.end):
             if end not in network.point_by_id and end not in network.image_by_name:
                 raise AdjustmentError(f"{what}: {end} is neither an object point nor an image. Correct the name.")
-            if end in network.point_by_id and end not in shown:
+            if end in network.point_by_id and end not in network.observed_points:
                 raise AdjustmentError(f"{what}: no image shows the point {end}. Measure it, or leave the distance out.")
         if each.start == each.end:
             raise AdjustmentError(f"{what} has the same point at both ends. Correct one of them.")
@@ -167,31 +162,40 @@ def _check_shapes(observations: Observations) -> None:
 
 def _check_names(network: Network) -> None:
     observations = network.observations
-    for name, id_, kind in zip(observations.image, observations.point, observations.kind, strict=True):
-        image = network.image_by_name.get(name)
-        if image is None:
+    image, point, kind = observations.image, observations.point, observations.kind
+    strangers = set(image) - network.image_by_name.keys()
+    if strangers:
+        row = next(i for i, name in enumerate(image) if name in strangers)
+        raise AdjustmentError(
+            f"{kind[row]} {point[row]} is observed in image {image[row]}, which is not in the network. Add the image."
+        )
+    for camera, id_ in sorted(network.observed_fiducials):
+        if id_ not in network.camera_by_name[camera].fiducials:
+            rows = (i for i, name in enumerate(point) if name == id_ and kind[i] == "fiducial")
+            shown = next(image[i] for i in rows if network.image_by_name[image[i]].camera == camera)
             raise AdjustmentError(
-                f"{kind} {id_} is observed in image {name}, which is not in the network. Add the image."
-            )
-        if kind == "fiducial" and id_ not in network.camera_by_name[image.camera].fiducials:
-            raise AdjustmentError(
-                f"fiducial {id_} is observed in image {name}, but camera {image.camera} has no such mark. Give its "
+                f"fiducial {id_} is observed in image {shown}, but camera {camera} has no such mark. Give its "
                 f"coordinates in the camera file, or correct its id."
             )
-        if kind != "fiducial" and id_ not in network.point_by_id:
-            raise AdjustmentError(
-                f"{kind} {id_} is observed in image {name}, but there is no such object point. Add it to the points "
-                f"(coordinates may be left blank), or correct its id."
-            )
+    for id_ in sorted(network.observed_points - network.point_by_id.keys()):
+        row = next(i for i, name in enumerate(point) if name == id_ and kind[i] != "fiducial")
+        raise AdjustmentError(
+            f"{kind[row]} {id_} is observed in image {image[row]}, but there is no such object point. Add it to the "
+            f"points (coordinates may be left blank), or correct its id."
+        )
 
 
-def _check_duplicate_observations(observations: Observations) -> None:
-    fiducial = (kind == "fiducial" for kind in observations.kind)
-    rows = Counter(zip(observations.image, observations.point, fiducial, strict=True))
-    for (image, point, is_fiducial), count in rows.items():
-        if count > 1:
-            what = "fiducial" if is_fiducial else "point"
-            raise AdjustmentError(f"{what} {point} is observed {count} times in image {image}. Keep one of the rows.")
+def _check_duplicate_observations(network: Network) -> None:
+    observations = network.observations
+    names, of_name = observations.numbered_points
+    mark = (2 * network.image_numbers + observations.is_fiducial) * len(names) + of_name
+    _, first, counts = np.unique(mark, return_index=True, return_counts=True)
+    for row, count in zip(first[counts > 1], counts[counts > 1], strict=True):
+        what = "fiducial" if observations.is_fiducial[row] else "point"
+        raise AdjustmentError(
+            f"{what} {observations.point[row]} is observed {count} times in image {observations.image[row]}. Keep one "
+            f"of the rows."
+        )
 
 
 def _check_values(observations: Observations) -> None:
@@ -214,12 +218,6 @@ def _check_values(observations: Observations) -> None:
             raise AdjustmentError(
                 f"{observations.kind[row]} {observations.point[row]} in image {observations.image[row]} {what}."
             )
-
-
-def _counts(observations: Observations) -> Counter[tuple[str, bool]]:
-    """How many targets (False) and fiducials (True) every image shows."""
-    fiducial = (kind == "fiducial" for kind in observations.kind)
-    return Counter(zip(observations.image, fiducial, strict=True))
 
 
 def _check_image(image: Image, targets: int, fiducials: int) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from adjust.elimination import Factor
+from adjust.factor import Factor
 from adjust.iteration import Linearised
 from adjust.normal_equations import spread_squares
 from adjust.numbering import Numbering

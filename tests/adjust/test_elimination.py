@@ -11,7 +11,8 @@ from simulated import Truth, field_points, simulated
 
 from adjust import elimination, multifrontal, triangle
 from adjust.adjustment import adjust
-from adjust.elimination import Blocks, Factor, eliminate
+from adjust.elimination import eliminate
+from adjust.factor import Blocks, Factor
 from adjust.iteration import Linearised, factorise, linearise
 from adjust.network import Approximations, Network, Observations
 from adjust.numbering import Numbering
@@ -24,11 +25,12 @@ SHARED, OWN, IMAGES = 7, 4, 5
 COUNT = SHARED + OWN * IMAGES
 
 
-def random_blocks(rng: np.random.Generator) -> list[Blocks]:
+def random_blocks(rng: np.random.Generator, taller: int = 1) -> list[Blocks]:
     """Blocks of columns of very different size; one sees little of what is shared, one has fewer rows than columns."""
     own = SHARED + np.arange(OWN * IMAGES).reshape(IMAGES, OWN)
     blocks = []
-    for members, rows, width in (([0], 20, 2), ([1], 5, 5), ([2, 3, 4], 20, 5)):
+    for members, height, width in (([0], 20, 2), ([1], 5, 5), ([2, 3, 4], 20, 5)):
+        rows = taller * height
         shared = np.array([np.sort(rng.permutation(SHARED)[:width]) for _ in members])
         matrix = rng.normal(size=(len(members), rows, OWN + width))
         matrix *= 10.0 ** rng.integers(-4, 5, (len(members), 1, OWN + width))
@@ -59,10 +61,13 @@ def whole(factor: Factor) -> Array:
     return factor.cofactor_of(eye_array(len(factor.scale), format="csr"))
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.3])
-def test_it_is_the_dense_least_squares_solution(damping: float) -> None:
+@pytest.mark.parametrize(("damping", "taller"), [(0.0, 1), (0.3, 1), (0.0, 12)])
+def test_it_is_the_dense_least_squares_solution(damping: float, taller: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By reflections of low blocks, by the squares of tall ones."""
     rng = np.random.default_rng(1)
-    blocks = random_blocks(rng)
+    blocks = random_blocks(rng, taller)
+    if taller > 1:
+        monkeypatch.delattr(elimination, "triangle_of")
     weight = np.where(np.arange(COUNT) % 3 == 0, rng.uniform(0.1, 5.0, COUNT), 0.0)
     right = weight * rng.normal(size=COUNT)
     factor = eliminate(blocks, COUNT, weight, right, damping)

@@ -12,7 +12,8 @@ from simulated import Truth, simulated
 
 from adjust import elimination, fronts, triangle
 from adjust.adjustment import adjust
-from adjust.elimination import Blocks, Factor, eliminate
+from adjust.elimination import eliminate
+from adjust.factor import Blocks, Factor
 from adjust.fronts import Fronts, fronts_of
 from adjust.iteration import factorise, linearise
 from adjust.network import Approximations, Fiducial, Network, Observations, Prior

@@ -7,7 +7,7 @@ from simulated import field_points
 
 from adjust import null_space
 from adjust.adjustment import Options, adjust
-from adjust.elimination import BlockFactors, Factor
+from adjust.factor import BlockFactors, Factor
 from adjust.fronts import Fronts
 from adjust.triangle import Triangle
 
