@@ -97,12 +97,12 @@ def correlate(grey: NDArray[np.floating], template: Array, detail_px: float, fai
     clipped, so that a thin cross on a landscape answers as on an even ground. Contrasts of faint_dn or below count for
     less.
     """
-    image = _flattened(np.asarray(grey, np.float32), detail_px, faint_dn)
+    image = flattened(np.asarray(grey, np.float32), detail_px, faint_dn)
     chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), _COARSE * detail_px), np.float32)
     return np.asarray(cv2.matchTemplate(image, chip, cv2.TM_CCOEFF_NORMED), np.float32)
 
 
-def _flattened(image: Map, detail_px: float, faint_dn: float) -> Map:
+def flattened(image: Map, detail_px: float, faint_dn: float) -> Map:
     coarse_px = _COARSE * detail_px
     detail = image - cv2.GaussianBlur(image, (0, 0), coarse_px)
     contrast = np.sqrt(cv2.GaussianBlur(detail**2, (0, 0), 2 * coarse_px) + faint_dn**2)

@@ -9,11 +9,12 @@ from measure.candidates import Look, respond
 from measure.constellation import Bounds, Placement, PlacementSearch, same_picture, signs_of
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame, measure_frame
+from measure.learned import honest_covariance
 from measure.pose_decision import decide_pose
 from measure.poses import POSES, up_from_camera
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scan import Scan
-from measure.shapes import FiducialLayout, LayoutMark
+from measure.shapes import FiducialLayout, LayoutMark, MarkTemplate
 from measure.status import Status
 
 Array = NDArray[np.float64]
@@ -144,7 +145,7 @@ def _nothing(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasuremen
 def _measurement(
     scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, rivals: Sequence[str]
 ) -> FrameMeasurement:
-    marks = tuple(_row(mark, index, frame) for index, mark in enumerate(layout.marks))
+    marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
     problems = [f"{sentence}." for sentence in rivals]
     if rivals:
         pose = (
@@ -158,7 +159,7 @@ def _measurement(
     return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, tuple(problems))
 
 
-def _row(mark: LayoutMark, index: int, frame: Frame) -> MarkMeasurement:
+def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasurement:
     sighting = frame.sightings[index]
     fit = sighting.fit
     if not sighting.inside:
@@ -177,4 +178,9 @@ def _row(mark: LayoutMark, index: int, frame: Frame) -> MarkMeasurement:
         "neighbour_correlation": fit.neighbour_correlation,
     }
     status, reason = frame.verdict(index)
-    return MarkMeasurement(mark.id, "fiducial", fit.center_px, fit.covariance_px2, status, reason, quality)
+    covariance = fit.covariance_px2
+    if isinstance(mark.mark, MarkTemplate):
+        covariance = honest_covariance(mark.mark, scan, fit)
+        if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:
+            status, reason = Status.WEAK, "its template is its own picture: nothing checks its place"
+    return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)

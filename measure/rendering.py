@@ -29,7 +29,7 @@ class Rendering:
 def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Rendering:
     """The mark under a Gaussian of standard deviation blur_px, in a window of width x height px.
 
-    A drawn mark is 1 inside and 0 outside; a chip keeps its own grey values, to which the blur is added.
+    A drawn mark is 1 inside and 0 outside; a chip, to whose blur this one is added, spans 0 to 1.
     pixel_from_mark: (2, 3), from (x_mm, y_mm, 1) to (col, row) of the window.
     """
     sharp, cells = _sharp(mark, pixel_from_mark, width, height, blur_px)
@@ -81,10 +81,14 @@ def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
 
 
 def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> NDArray[np.bool_]:
-    """(height, width): which pixels lie on the chip."""
+    """(height, width): which pixels lie on the chip, where it is steady."""
     col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
     rows, cols = mark.image.shape
-    return np.asarray((col >= 1) & (col <= cols - 2) & (row >= 1) & (row <= rows - 2))
+    inside = (col >= 1) & (col <= cols - 2) & (row >= 1) & (row <= rows - 2)
+    if mark.steady is not None:
+        nearest = np.clip(np.rint(row), 0, rows - 1).astype(int), np.clip(np.rint(col), 0, cols - 1).astype(int)
+        inside &= mark.steady[nearest]
+    return np.asarray(inside)
 
 
 def _averages(blur_px: float, cells: int, pixels: int, padded: int) -> tuple[Single, Single, Single]:
@@ -104,14 +108,15 @@ def _averages(blur_px: float, cells: int, pixels: int, padded: int) -> tuple[Sin
 @lru_cache(maxsize=256)
 def _kernels(sigma: float) -> tuple[Array, Array, Array]:
     """A sampled Gaussian and its first and second derivative, normalised so that polynomials come out right."""
-    reach = int(np.ceil(4 * sigma)) + 1
+    reach = int(np.ceil(4 * sigma)) + 2
     place = np.arange(-reach, reach + 1, dtype=float)
     smooth = np.exp(-0.5 * (place / max(sigma, 1e-3)) ** 2)
     smooth /= smooth.sum()
     if sigma < 0.5:
         slope, bend = np.zeros_like(smooth), np.zeros_like(smooth)
-        slope[reach - 1 : reach + 2] = -0.5, 0.0, 0.5
-        bend[reach - 1 : reach + 2] = 1.0, -2.0, 1.0
+        # A chip's own detail is hardly coarser than its pixels: differences of the fourth order, over five of them.
+        slope[reach - 2 : reach + 3] = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12
+        bend[reach - 2 : reach + 3] = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / 12
         return smooth, slope, bend
     slope = place * smooth / (place**2 * smooth).sum()
     bend = (place**2 - sigma**2) * smooth
@@ -127,7 +132,8 @@ def _pixels_per_sample(mark: MarkTemplate, pixel_from_mark: Array) -> float:
 
 def _sampled(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int) -> Array:
     col, row = _chip_positions(mark, pixel_from_mark, width, height, cells)
-    return np.asarray(ndimage.map_coordinates(mark.image, [row, col], order=3, mode="nearest"), dtype=float)
+    sampled = ndimage.map_coordinates(mark.image, [row, col], order=3, mode="nearest")
+    return np.asarray((sampled - mark.image.min()) / max(np.ptp(mark.image), 1e-12), dtype=float)
 
 
 def _chip_positions(

@@ -3,8 +3,8 @@
 The kinds are shorthands that give parts; everything after them knows parts only.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -67,7 +67,10 @@ class MarkShape:
 class MarkTemplate:
     """A mark that is a chip cut from a scan.
 
-    image: (rows, columns), any scale of grey values; origin_px: (column, row) of the measured point in it.
+    image: (rows, columns), any scale of grey values; origin_px: (column, row) of the measured point in it. detail_mm:
+    its finest detail, 0 where that is not known: then two of its pixels. noise_dn: of one pixel of the scans that it is
+    made of, by whose names shares says how much of the chip is each one's own picture. steady: which of its pixels
+    look alike in all of them, None where all do.
     """
 
     image: Array
@@ -75,9 +78,21 @@ class MarkTemplate:
     origin_px: Point
     turn_deg: float = 0.0
     polarity: Polarity = "auto"
+    detail_mm: float = 0.0
+    noise_dn: float = 0.0
+    shares: Mapping[str, float] = field(default_factory=dict)
+    steady: NDArray[np.bool_] | None = None
 
 
 Mark = MarkShape | MarkTemplate
+
+
+@dataclass(frozen=True)
+class LearnedMark:
+    """A mark that nobody has drawn: a square of size_mm about it is averaged over the camera's scans, and that is its
+    template."""
+
+    size_mm: float
 
 
 @dataclass(frozen=True)
@@ -166,7 +181,7 @@ def turned_part(part: Part, angle_deg: float) -> Part:
 def thinnest_mm(mark: Mark) -> float:
     """The width of the mark's thinnest line, as far as its parts tell."""
     if isinstance(mark, MarkTemplate):
-        return mark.pitch_um / 1000 * 2
+        return mark.detail_mm or mark.pitch_um / 1000 * 2
     widths = []
     for part in mark.parts:
         if isinstance(part, Bar | Ring):

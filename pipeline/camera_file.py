@@ -1,7 +1,7 @@
 """camera.toml: the camera as it is given, for the measurement (its marks) and for the adjustment (its priors)."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -11,6 +11,7 @@ from adjust.families import FAMILY_NAMES, family, parameter_names
 from measure import shapes
 from pipeline.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.errors import InputError
+from pipeline.images_file import image_name
 from pipeline.mark_table import read_mark
 from pipeline.spelling import did_you_mean
 from pipeline.tables import Table, read_toml
@@ -26,7 +27,7 @@ class GivenFiducial:
     id: str
     xy_mm: shapes.Point
     sigma_mm: shapes.Point
-    mark: shapes.Mark | None
+    mark: shapes.Mark | shapes.LearnedMark | None
     passed_over: bool = False
 
 
@@ -39,11 +40,30 @@ class Source:
 
 
 @dataclass(frozen=True)
+class Clicks:
+    """Where somebody saw the marks in one scan: px by fiducial, column and row."""
+
+    scan: str
+    px: Mapping[str, shapes.Point]
+
+
+@dataclass(frozen=True)
+class LearnedFrom:
+    """The scan whose pictures the learned marks were first found by, the pose in which it lies, and whether clicks
+    show that."""
+
+    scan: str
+    pose: str
+    clicked: bool
+
+
+@dataclass(frozen=True)
 class CameraFile:
     """A camera file as read: mm, a standard deviation of 0 fixes, inf frees.
 
     principal_distance_mm and principal_point_mm are None where the file leaves them to the points. calibration: an
-    earlier one, which takes the place of the standard deviations of all that it gives.
+    earlier one, which takes the place of the standard deviations of all that it gives. clicks: None where nobody has
+    shown the learned marks; learned_from: None before they are learned.
     """
 
     path: Path
@@ -57,6 +77,13 @@ class CameraFile:
     fiducials: tuple[GivenFiducial, ...]
     calibration: EarlierCalibration | None = None
     source: Source | None = None
+    clicks: Clicks | None = None
+    learned_from: LearnedFrom | None = None
+
+    @property
+    def learned(self) -> tuple[GivenFiducial, ...]:
+        """The fiducials whose marks are yet to be learned from the scans."""
+        return tuple(one for one in self.fiducials if isinstance(one.mark, shapes.LearnedMark))
 
     @property
     def drawn(self) -> tuple[shapes.LayoutMark, ...]:
@@ -64,12 +91,12 @@ class CameraFile:
         return tuple(
             shapes.LayoutMark(one.id, one.xy_mm, one.sigma_mm, one.mark)
             for one in self.fiducials
-            if one.mark is not None
+            if isinstance(one.mark, shapes.Mark)
         )
 
     def layout(self) -> shapes.FiducialLayout:
-        """The marks to be measured. Raises InputError where one has no drawing, and is not to be passed over, or the
-        frame's size is missing."""
+        """The marks to be measured, those yet to be learned left out. Raises InputError where one has no drawing, and
+        is not to be passed over, or the frame's size is missing."""
         if self.frame_mm is None:
             raise InputError(f"{self.path}: frame_mm is missing: the size of the exposed frame, [width, height] in mm.")
         for fiducial in self.fiducials:
@@ -133,6 +160,7 @@ def parse_camera(table: Table) -> CameraFile:
         distortion=_distortion(table.table("distortion"), frame),
         fiducials=fiducials,
         source=_source(table.table("source")) if "source" in table else None,
+        clicks=_clicks(table.table("clicks"), fiducials) if "clicks" in table else None,
     )
     camera = replace(camera, calibration=read_calibration(sigma, camera.camera()))
     sigma.done()
@@ -143,6 +171,21 @@ def _source(table: Table) -> Source:
     source = Source(table.text("text"), int(table.number("reports", 0.0, least=0.0)))
     table.done()
     return source
+
+
+def _clicks(table: Table, fiducials: Sequence[GivenFiducial]) -> Clicks:
+    clicks = Clicks(image_name(table.text("scan")), {})
+    places = table.table("px")
+    learned = [one.id for one in fiducials if isinstance(one.mark, shapes.LearnedMark)]
+    px = {id: places.pair(id) for id in learned if id in places}
+    places.done()
+    table.done()
+    missing = [id for id in learned if id not in px]
+    if missing or not px:
+        raise table.error(
+            "px", f"says nothing of {', '.join(missing) or 'any mark'}. Click all learned marks, or none."
+        )
+    return replace(clicks, px=px)
 
 
 def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
@@ -161,7 +204,7 @@ def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
     return tuple(fiducials.values())
 
 
-def _marks(table: Table) -> Mapping[str, tuple[shapes.Mark, bool]]:
+def _marks(table: Table) -> Mapping[str, tuple[shapes.Mark | shapes.LearnedMark, bool]]:
     """Every drawn mark by name, and whether it is turned with its place."""
     marks = {}
     for name in table.names():
@@ -173,8 +216,13 @@ def _marks(table: Table) -> Mapping[str, tuple[shapes.Mark, bool]]:
     return marks
 
 
-def _placed(mark: shapes.Mark, radial: bool, xy_mm: shapes.Point) -> shapes.Mark:
-    """A radial mark is drawn as on the positive x' axis; elsewhere its own x axis points away from the centre."""
+def _placed(
+    mark: shapes.Mark | shapes.LearnedMark, radial: bool, xy_mm: shapes.Point
+) -> shapes.Mark | shapes.LearnedMark:
+    """A radial mark is drawn as on the positive x' axis; elsewhere its own x axis points away from the centre. What is
+    learned is learned at each place by itself."""
+    if isinstance(mark, shapes.LearnedMark):
+        return mark
     return shapes.turned(mark, math.degrees(math.atan2(xy_mm[1], xy_mm[0]))) if radial else mark
 
 

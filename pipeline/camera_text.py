@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from adjust.families import family
 from adjust.network import Prior
 from measure import shapes
-from pipeline.camera_file import CameraFile, GivenFiducial
+from pipeline.camera_file import NO_MARK, CameraFile, GivenFiducial
 
 SaveChip = Callable[[str, shapes.MarkTemplate], str]
 
@@ -30,12 +30,14 @@ def camera_text(camera: CameraFile, save_chip: SaveChip) -> str:
         lines.append(f"sigma_mm = {_sigmas(fiducial.sigma_mm)}")
         if fiducial.mark is not None:
             lines.append(f"mark = {_quoted(marks[fiducial.mark])}")
+        elif fiducial.passed_over:
+            lines.append(f"mark = {_quoted(NO_MARK)}")
     for mark, name in marks.items():
         lines += _mark_lines(mark, name, save_chip)
     return "\n".join(lines) + "\n"
 
 
-def _mark_names(fiducials: tuple[GivenFiducial, ...]) -> Mapping[shapes.Mark, str]:
+def _mark_names(fiducials: tuple[GivenFiducial, ...]) -> Mapping[shapes.Mark | shapes.LearnedMark, str]:
     """A name for every different mark."""
     marks = dict.fromkeys(fiducial.mark for fiducial in fiducials if fiducial.mark is not None)
     return {mark: f"mark-{number}" for number, mark in enumerate(marks, 1)}
@@ -57,11 +59,14 @@ def _prior_lines(parameters: Mapping[str, Prior], text: Callable[[Prior], str]) 
     return [f"{name} = {text(prior)}" for name, prior in parameters.items()]
 
 
-def _mark_lines(mark: shapes.Mark, name: str, save_chip: SaveChip) -> list[str]:
+def _mark_lines(mark: shapes.Mark | shapes.LearnedMark, name: str, save_chip: SaveChip) -> list[str]:
     lines = ["", f"[mark.{name}]"]
+    if isinstance(mark, shapes.LearnedMark):
+        return [*lines, 'kind = "learned"', f"size_mm = {mark.size_mm!r}"]
     if isinstance(mark, shapes.MarkTemplate):
         lines += ['kind = "template"', f"image = {_quoted(save_chip(name, mark))}", f"pitch_um = {mark.pitch_um!r}"]
-        return [*lines, f"origin_px = {_list(mark.origin_px)}", f"polarity = {_quoted(mark.polarity)}"]
+        lines += [f"origin_px = {_list(mark.origin_px)}", f"polarity = {_quoted(mark.polarity)}"]
+        return [*lines, f"detail_mm = {mark.detail_mm!r}"]
     lines += ['kind = "parts"', f"polarity = {_quoted(mark.polarity)}"]
     for part in mark.parts:
         lines += [f"[[mark.{name}.part]]", *_part_lines(part)]

@@ -11,12 +11,14 @@ from measure.errors import MeasurementError
 from measure.scan import open_scan
 from pipeline.tables import Table
 
-KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template")
+KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template", "learned")
 
 
-def read_mark(table: Table, folder: Path) -> shapes.Mark:
+def read_mark(table: Table, folder: Path) -> shapes.Mark | shapes.LearnedMark:
     """One mark. Raises InputError naming the key that is wrong."""
     kind = table.text("kind", choices=KINDS)
+    if kind == "learned":
+        return shapes.LearnedMark(table.number("size_mm", above=0.0))
     polarity = cast(shapes.Polarity, table.text("polarity", "auto", ("auto", "light", "dark")))
     if kind == "template":
         return replace(_template(table, folder), polarity=polarity)
@@ -83,4 +85,9 @@ def _template(table: Table, folder: Path) -> shapes.MarkTemplate:
             image = chip.window(0, 0, chip.width_px, chip.height_px).astype(np.float64)
     except MeasurementError as error:
         raise table.error("image", str(error)) from error
-    return shapes.MarkTemplate(image, table.number("pitch_um", above=0.0), table.pair("origin_px"))
+    return shapes.MarkTemplate(
+        image,
+        table.number("pitch_um", above=0.0),
+        table.pair("origin_px"),
+        detail_mm=table.number("detail_mm", 0.0, least=0.0),
+    )

@@ -15,11 +15,12 @@ from measure.errors import MeasurementError
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.rendering import extent_px
-from measure.results import FrameMeasurement, MarkMeasurement
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scan import Scan, open_scan
-from pipeline.camera_file import CameraFile
+from pipeline.camera_file import CameraFile, LearnedFrom
 from pipeline.coded_sheet import CodedSheet
 from pipeline.errors import InputError
+from pipeline.learn_stage import learn_marks, pose_of
 from pipeline.measurement_file import MeasuredScan
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
@@ -37,12 +38,19 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     if project.targets is not None and project.targets.code is not None:
         CodedSheet.of(project, project.targets)
     _check_readable(list(project.scans.values()))
-    with reporter.stage("measured") as count, _workers(len(project.scans)) as workers:
+    with _workers(len(project.scans)) as workers:
+        learned = learn_marks(project, reporter, workers)
+        scans = _measured_scans(learned, reporter, workers)
+    return _one_definition(project, scans)
+
+
+def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> list[MeasuredScan]:
+    with reporter.stage("measured") as count:
         futures = {workers.submit(measure_scan, project, name): name for name in project.scans}
         for done, future in enumerate(as_completed(futures), 1):
             future.result()
             count(futures[future], done, len(futures))
-    return _one_definition(project, [future.result() for future in futures])
+    return [future.result() for future in futures]
 
 
 def _one_definition(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
@@ -94,8 +102,17 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
     if all(fiducial.passed_over for fiducial in camera.fiducials):
         return FrameMeasurement(name, ())
     pitch = project.pitch_um or scan.pitch_um
-    measured = measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=project.pose))
+    measured = measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=pose_of(project, camera)))
+    if camera.learned_from is not None and project.pose == "auto" and measured.pose is not None:
+        measured = replace(measured, pose=_as_learned(camera.learned_from, scan))
     return replace(measured, image=name, marks=_with_sizes(measured, camera, scan, pitch))
+
+
+def _as_learned(learned: LearnedFrom, scan: Scan) -> Pose:
+    if learned.clicked and learned.scan == scan.name:
+        return Pose(learned.pose, True, ("the clicks in it say so.",))
+    like = f"it is taken to lie as {learned.scan}, from which its marks were learned: {learned.pose} is assumed."
+    return Pose(learned.pose, False, (like,))
 
 
 def _with_sizes(

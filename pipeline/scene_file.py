@@ -114,7 +114,7 @@ def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
             camera.distortion.decentering,
         ),
         fiducials=tuple(
-            scene.SceneFiducial(one.id, one.xy_mm, None if one.mark is None else _scene_mark(one.mark))
+            scene.SceneFiducial(one.id, one.xy_mm, _scene_mark(one.mark) if isinstance(one.mark, shapes.Mark) else None)
             for one in camera.fiducials
         ),
     )

@@ -66,10 +66,10 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
     generator = np.random.default_rng([scene_file.scene.seed, 20])
     camera = _given_camera(scene_file, generator)
 
-    def save_chip(name: str, template: shapes.MarkTemplate) -> str:
-        return _save_chip(out_dir, name, template)
+    def save(name: str, template: shapes.MarkTemplate) -> str:
+        return save_chip(out_dir, name, template)
 
-    write_atomically(out_dir / "camera.toml", camera_text(camera, save_chip))
+    write_atomically(out_dir / "camera.toml", camera_text(camera, save))
     targets = field_targets(scene_file.scene.field)
     write_atomically(out_dir / "points.csv", _points_csv(scene_file, targets, generator))
     middle = np.mean([target.center for target in targets], axis=0)
@@ -105,7 +105,7 @@ def _given_parameter(prior: Prior, generator: np.random.Generator) -> Prior:
 def _given_fiducial(fiducial: GivenFiducial, scene_file: SceneFile, generator: np.random.Generator) -> GivenFiducial:
     xy_mm = np.asarray(fiducial.xy_mm) + generator.normal(0.0, scene_file.given.fiducial_mm, 2)
     mark = fiducial.mark
-    if mark is not None and scene_file.scene.scanner.negative:
+    if isinstance(mark, shapes.Mark) and scene_file.scene.scanner.negative:
         # The scene tells what the positive shows, the project what its scans show.
         mark = replace(mark, polarity=NEGATIVE[mark.polarity])
     return replace(fiducial, xy_mm=_pair(xy_mm), mark=mark)
@@ -116,7 +116,8 @@ def _pair(values: Array) -> tuple[float, float]:
     return (round(float(values[0]), 4), round(float(values[1]), 4))
 
 
-def _save_chip(out_dir: Path, name: str, template: shapes.MarkTemplate) -> str:
+def save_chip(out_dir: Path, name: str, template: shapes.MarkTemplate) -> str:
+    """Write a template's picture and return its file's name."""
     low, high = float(template.image.min()), float(template.image.max())
     grey = np.rint((template.image - low) * (65535 / (high - low if high > low else 1.0))).astype(np.uint16)
     with atomic_path(out_dir / f"{name}.tif") as temporary:

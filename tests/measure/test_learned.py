@@ -1,0 +1,91 @@
+"""Marks that nobody has drawn: the template of many noisy pictures, and what is claimed of places measured with it."""
+
+import numpy as np
+import pytest
+from brute_marks import brute_picture
+from numpy.typing import NDArray
+
+from measure.learned import Chip, honest_covariance, template_of
+from measure.matching import MatchOptions, match
+from measure.recurring import recurrence
+from measure.shapes import MarkShape, polygon
+
+Array = NDArray[np.float64]
+
+WEDGE = MarkShape(polygon([(0.0, 0.0), (0.9, 1.2), (0.9, -1.2)]))
+PX_PER_MM, SIDE, NOISE_DN, SIZE_MM = 12.0, 61, 20.0, 2.8
+SHIFT = MatchOptions(freedom="shift", estimate_blur=False)
+
+
+def pictures(count: int, seed: int, dust: bool = False) -> tuple[list[Chip], Array]:
+    """Chips of the wedge, each with a gain of its own and placed half a pixel wrong, and the true places (n, 2)."""
+    rng = np.random.default_rng(seed)
+    true = 30 + rng.uniform(-0.5, 0.5, (count, 2))
+    chips = []
+    for index, place in enumerate(true):
+        linear = PX_PER_MM * np.array([[1.0, 0.004], [0.003, -1.0]])
+        shown = brute_picture(WEDGE, np.column_stack([linear, place]), SIDE, SIDE, 0.8)
+        grey = rng.uniform(1500, 2500) + rng.uniform(700, 1300) * shown + rng.normal(0, NOISE_DN, shown.shape)
+        if dust and index == 0:
+            grey[26:32, 34:40] += 4000.0
+        taken = np.column_stack([linear, place + rng.normal(0, 0.4, 2)])
+        chips.append(Chip(f"frame{index}", grey, (0, 0), taken))
+    return chips, true
+
+
+def measured(chips: list[Chip]) -> tuple[Array, Array]:
+    """Places (n, 2) and standard deviations (n, 2) with the template that the chips give."""
+    template = template_of(chips, SIZE_MM)
+    fits = [match(chip.grey, (0, 0), template, chip.pixel_from_mark, SHIFT) for chip in chips]
+    covariances = [honest_covariance(template, chip.scan, fit) for chip, fit in zip(chips, fits, strict=True)]
+    return np.array([fit.center_px for fit in fits]), np.sqrt(np.array(covariances)[:, [0, 1], [0, 1]])
+
+
+def test_a_learned_template_measures_as_its_standard_deviations_say() -> None:
+    """Places differ from the true ones by one common offset, and by no more than is claimed: 2 x 6 x 2 coordinates."""
+    scores = []
+    for seed in (1, 2):
+        chips, true = pictures(6, seed)
+        places, sigma = measured(chips)
+        off = places - true
+        scores.append((off - off.mean(axis=0)) / sigma / np.sqrt(1 - 1 / 6))
+        assert sigma.max() < 0.04
+    assert 0.7 < float(np.sqrt(np.mean(np.square(scores)))) < 1.35
+
+
+def test_dust_on_one_picture_stays_out_of_the_template() -> None:
+    clean, _ = pictures(5, 3)
+    dusty, _ = pictures(5, 3, dust=True)
+    with_dust, without = (template_of(chips, SIZE_MM).image.ravel() for chips in (dusty, clean))
+    gain, offset = np.polyfit(with_dust, without, 1)  # of a template they do not matter
+    assert np.abs(gain * with_dust + offset - without).max() < 4 * NOISE_DN
+
+
+def test_one_picture_alone_is_its_own_template_and_keeps_an_honest_sigma() -> None:
+    chips, _ = pictures(1, 4)
+    template = template_of(chips, SIZE_MM)
+    assert dict(template.shares) == {"frame0": 1.0}
+    fit = match(chips[0].grey, (0, 0), template, chips[0].pixel_from_mark, SHIFT)
+    np.testing.assert_allclose(fit.center_px, chips[0].pixel_from_mark[:, 2], atol=0.02)
+    sigma = np.sqrt(np.diag(honest_covariance(template, "frame0", fit)))
+    assert 0.005 < sigma.min() < sigma.max() < 0.2  # the residuals, which are nothing, would say nothing
+
+
+def test_no_picture_gives_no_template() -> None:
+    with pytest.raises(ValueError, match="needs a picture"):
+        template_of([], 3.0)
+
+
+def test_what_recurs_is_found_among_what_changes() -> None:
+    rng = np.random.default_rng(5)
+    mark = np.zeros((24, 24), np.float32)
+    mark[8:16, 11:13] = mark[11:13, 8:16] = 4.0
+    windows = []
+    for right, down in ((0, 0), (3, -2), (-2, 4), (1, 1)):
+        window = rng.normal(0, 1, (73, 73)).astype(np.float32)
+        window[18 + down : 42 + down, 30 + right : 54 + right] += mark
+        windows.append(window)
+    found = recurrence(windows[0], windows[1:], size_mm=2.4)
+    assert found.excess > 0.3
+    np.testing.assert_allclose(found.offset_mm, (0.55, 0.65), atol=0.11)  # its middle, (41.5, 29.5), from (36, 36)
+    assert recurrence(windows[0], [rng.normal(0, 1, (73, 73)).astype(np.float32)] * 3, 2.4).excess < 0.15

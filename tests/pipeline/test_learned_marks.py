@@ -1,0 +1,134 @@
+"""Marks that nobody has drawn, from rendered scans to comparator coordinates: shown by clicks, or by what recurs."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rich.console import Console
+
+from measure.results import FrameMeasurement
+from pipeline.camera_file import read_camera
+from pipeline.errors import InputError
+from pipeline.learn_stage import learn_marks
+from pipeline.measure_stage import measure_scan
+from pipeline.progress import Reporter
+from pipeline.project_file import Project, read_project
+from synthetic_images import areas, scene
+from synthetic_images.render import render_scene
+
+Array = NDArray[np.float64]
+
+CORNERS = {"1": (9.0, -9.0), "2": (-9.0, -9.0), "3": (-9.0, 9.0), "4": (9.0, 9.0)}
+ARROW = areas.polygon(((0.0, 0.0), (0.9, 0.3), (0.5, 0.5), (0.3, 0.9)))
+LEARNED = """
+name = "small"
+frame_mm = [22.0, 22.0]
+[mark.m]
+kind = "learned"
+size_mm = 2.4
+"""
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames of a landscape with an arrow at each corner of a dark pad."""
+    folder = tmp_path_factory.mktemp("learned")
+    images = tuple(
+        scene.SceneImage(f"f{k}", (40.0 * k, 10.0 * k, 100.0, 0.0, 0.0, 0.5 * k), turn_rad=0.004 * k) for k in range(3)
+    )
+    camera = scene.SceneCamera(
+        "small",
+        (22.0, 22.0),
+        30.0,
+        fiducials=tuple(scene.SceneFiducial(id, place, scene.DrawnMark((ARROW,))) for id, place in CORNERS.items()),
+    )
+    made = scene.Scene(
+        "learned",
+        3,
+        camera,
+        scene.DiskField((), 1.0),
+        images,
+        scene.Scanner((50.0, 50.0), margin_mm=2.0, noise=0.004),
+        background="terrain",
+        pad_mm=1.6,
+    )
+    render_scene(made, folder)
+    return folder
+
+
+def project_of(folder: Path, camera: str, scans: str = '"scans/*.tif"') -> Project:
+    given = "".join(
+        f'[[fiducial]]\nid = "{id}"\nxy_mm = [{x + 0.2}, {y - 0.3}]\nmark = "m"\n' for id, (x, y) in CORNERS.items()
+    )
+    (folder / "camera.toml").write_text(camera + given)
+    (folder / "project.toml").write_text(
+        f'camera = "camera.toml"\nscans = [{scans}]\npitch_um = 50.0\n[measure]\npose = "0"\n'
+    )
+    return read_project(folder / "project.toml")
+
+
+def truth(folder: Path) -> dict[str, Array]:
+    images = json.loads((folder / "truth.json").read_text())["images"]
+    return {
+        name: np.array([[image["fiducials"][id]["col_px"], image["fiducials"][id]["row_px"]] for id in CORNERS])
+        for name, image in images.items()
+    }
+
+
+def clicks(folder: Path) -> str:
+    px = truth(folder)["f1"] + (1.7, -2.2)
+    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, px.tolist(), strict=True))
+    return f'[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}'
+
+
+def measured(project: Project) -> list[FrameMeasurement]:
+    with ThreadPoolExecutor(1) as workers:
+        learned = learn_marks(project, Reporter(Console(quiet=True)), workers)
+    return [measure_scan(learned, name).frame for name in project.scans]
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_learned_marks_lie_off_the_true_ones_alike_in_all_frames(rendered: Path, shown: bool) -> None:
+    project = project_of(rendered, LEARNED + (clicks(rendered) if shown else ""))
+    frames = measured(project)
+    true = truth(rendered)
+    off = np.array(
+        [
+            [np.asarray(mark.center_px) - place for mark, place in zip(frame.marks, true[frame.image], strict=True)]
+            for frame in frames
+        ]
+    )
+    assert all(mark.status.is_observation for frame in frames for mark in frame.marks)
+    scatter = off - off.mean(axis=0)  # the offset turns with the frames by 0.008 rad at most
+    assert np.abs(scatter).max() < 0.03 + 0.008 * np.abs(off).max()
+    assert np.abs(off).max() < 24.0  # half of size_mm
+    # What was learned is a camera file that can be used instead.
+    again = read_camera(project.output / "learned" / "camera.toml")
+    assert [one.id for one in again.drawn] == list(CORNERS)
+
+
+def test_one_scan_must_be_clicked_and_says_what_it_can_tell(rendered: Path) -> None:
+    project = project_of(rendered, LEARNED, '"scans/f1.tif"')
+    with pytest.raises(InputError, match="with one scan nothing says what is a mark"):
+        measured(project)
+    (frame,) = measured(project_of(rendered, LEARNED + clicks(rendered), '"scans/f1.tif"'))
+    assert {str(mark.status) for mark in frame.marks} == {"weak"}
+    assert "its template is its own picture" in frame.marks[0].reason
+    assert all(0 < np.trace(np.asarray(mark.covariance_px2)) < 0.01 for mark in frame.marks)
+
+
+def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
+    with pytest.raises(InputError, match="says nothing of 4"):
+        project_of(rendered, LEARNED + clicks(rendered).rsplit("4 =", 1)[0])
+    project = project_of(rendered, LEARNED + clicks(rendered).replace("f1.tif", "g1.tif"))
+    with pytest.raises(InputError, match="'g1', which is none of the project's scans"):
+        measured(project)
+    camera = project.default_camera
+    assert camera.clicks is not None
+    outside = replace(camera, clicks=replace(camera.clicks, scan="f1", px={**camera.clicks.px, "2": (9999.0, 3.0)}))
+    with pytest.raises(InputError, match=r"click of fiducial '2', \[9999.0, 3.0\], lies outside"):
+        measured(replace(project, cameras={"camera.toml": outside}))
