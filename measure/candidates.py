@@ -20,6 +20,7 @@ Map = NDArray[np.float32]
 _EXTENT_PX = 14.0  # of the reduced mark
 _THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns
 _LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
+_SHARED_PX = 16  # of the reduced scan: places so near to one another share a window
 _ALIKE = 0.8  # correlation above which two pictures of marks share one response
 _COARSE = 4.0  # times the finest detail: coarser structure is background
 _CLIP = 2.0  # times the local contrast
@@ -31,18 +32,24 @@ class Responses:
     """Correlations with the looks of the marks, over the reduced scan.
 
     maps: by the kind of look and +1 or -1, (rows, columns) of how much the place looks like the mark lighter or darker
-    than its surroundings. reduction: by which the scan was reduced.
+    than its surroundings. reduction: by which the scan was reduced. origins: (kinds, 2) column and row of the reduced
+    scan where the maps of each kind begin; None: they hold all of it.
     """
 
     maps: Mapping[tuple[int, int], Map]
     reduction: int
+    origins: NDArray[np.int_] | None = None
+
+    def origin(self, kind: int) -> NDArray[np.int_]:
+        """(2,) pixel of the reduced scan where the maps of a kind begin."""
+        return np.zeros(2, dtype=int) if self.origins is None else self.origins[kind]
 
     def reduced_px(self, scan_px: Array) -> Array:
-        """Scan pixels (..., 2) in pixels of the maps."""
+        """Scan pixels (..., 2) in pixels of the reduced scan."""
         return (scan_px - (self.reduction - 1) / 2) / self.reduction
 
     def scan_px(self, reduced_px: Array) -> Array:
-        """Pixels of the maps (..., 2) in scan pixels."""
+        """Pixels of the reduced scan (..., 2) in scan pixels."""
         return reduced_px * self.reduction + (self.reduction - 1) / 2
 
 
@@ -69,11 +76,47 @@ def respond(scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1))
         grey = scan.reduced(reduction, weights)
         for kind, template in enumerate(kinds):
             response = _correlation(grey, template, max(details[kind], 1.0), scan.full_scale_dn * FAINT)
-            for sign in signs:
-                signed = response if sign > 0 else -response
-                known = maps.setdefault((kind, sign), signed)
-                np.maximum(known, signed, out=known)
+            _strongest(maps, kind, signs, response)
     return Responses(maps, reduction), index
+
+
+def respond_about(
+    scan: Scan, looks: Sequence[Look], places_px: Array, reach_px: float, signs: Collection[int] = (1, -1)
+) -> tuple[Responses, tuple[int, ...]]:
+    """The same, of each look only about its place (n, 2) in the scan, as far as reach_px and a little farther: of the
+    file only these windows are read. A kind is a look at one place."""
+    reduction = _reduction(scan, looks)
+    templates = [_template(look, reduction) for look in looks]
+    shapes, shape_of = _distinct(templates)
+    detail = max(detail_px(looks[0].mark, looks[0].linear) / reduction, 1.0)
+    reach, half = int(np.ceil(reach_px / reduction)), max(template.shape[0] for template in shapes) // 2
+    corners, corner_of = np.unique(np.floor(places_px / reduction / _SHARED_PX), axis=0, return_inverse=True)
+    origins = corners.astype(int) * _SHARED_PX - reach
+    size = _SHARED_PX + 2 * reach
+    kinds = sorted(set(zip(corner_of.tolist(), shape_of, strict=True)))
+
+    def at_corner(corner: int) -> dict[tuple[int, int], Map]:
+        col0, row0 = (origins[corner] - half).tolist()
+        maps: dict[tuple[int, int], Map] = {}
+        for weights in _channel_weights(scan):
+            grey = scan.reduced_window(reduction, col0, row0, size + 2 * half, size + 2 * half, weights)
+            for kind, shape in ((kind, shape) for kind, (own, shape) in enumerate(kinds) if own == corner):
+                response = correlate(grey, shapes[shape], detail, scan.full_scale_dn * FAINT)
+                spare = half - shapes[shape].shape[0] // 2
+                _strongest(maps, kind, signs, response[spare : spare + size, spare : spare + size])
+        return maps
+
+    every = {key: map_ for maps in scan.each(at_corner, range(len(corners))) for key, map_ in maps.items()}
+    index = tuple(kinds.index(pair) for pair in zip(corner_of.tolist(), shape_of, strict=True))
+    return Responses(every, reduction, origins[[corner for corner, _ in kinds]]), index
+
+
+def _strongest(maps: dict[tuple[int, int], Map], kind: int, signs: Collection[int], response: Map) -> None:
+    """Keep at every place the strongest response of all channels."""
+    for sign in signs:
+        signed = response if sign > 0 else -response
+        known = maps.setdefault((kind, sign), signed)
+        np.maximum(known, signed, out=known)
 
 
 def peaks(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[Array, Array]:

@@ -113,7 +113,9 @@ class PlacementSearch:
         self.marks, self.responses, self.bounds = marks, responses, bounds
         self.pitch = np.asarray(pitch_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, 1.5)
-        self.layers = {key: _Layer(map_, self.tolerance_px) for key, map_ in responses.maps.items()}
+        self.layers = {
+            key: _Layer(map_, responses.origin(key[0]), self.tolerance_px) for key, map_ in responses.maps.items()
+        }
 
     def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:
         """The best placements of a pose that differ from one another, best first; none where no two marks respond.
@@ -133,37 +135,44 @@ class PlacementSearch:
 class _Layer:
     """The responses to one look, and what is asked of them in every pose."""
 
-    def __init__(self, map_: Map, tolerance_px: float) -> None:
-        self.map, self.tolerance_px = map_, tolerance_px
+    def __init__(self, map_: Map, origin: NDArray[np.int_], tolerance_px: float) -> None:
+        self.map, self.origin, self.tolerance_px = map_, origin, tolerance_px
 
     @cached_property
     def candidates(self) -> Array:
-        """(n, 2) px of the map."""
-        return peaks(self.map, _CANDIDATES, _LEAST_RESPONSE)[0]
+        """(n, 2) px of the reduced scan."""
+        return peaks(self.map, _CANDIDATES, _LEAST_RESPONSE)[0] + self.origin
 
     @cached_property
     def wide(self) -> "_Reach":
-        return _Reach(self.map, self.tolerance_px)
+        return _Reach(self.map, self.origin, self.tolerance_px)
 
     @cached_property
     def near(self) -> "_Reach":
-        return _Reach(self.map, max(_NARROWED * self.tolerance_px, 1.5))
+        return _Reach(self.map, self.origin, max(_NARROWED * self.tolerance_px, 1.5))
+
+    def highest(self, place: Array, radius_px: float) -> tuple[Array, float]:
+        """The highest response about a place (2,) of the reduced scan, and how high; 0 outside of the map."""
+        top, height = _highest(self.map, place - self.origin, radius_px)
+        return top + self.origin, height
 
 
 class _Reach:
     """The highest response within a radius of every place, and what chance places answer: nineteen in twenty of them
     stay below it."""
 
-    def __init__(self, map_: Map, radius_px: float) -> None:
-        self.map = _dilated(map_, radius_px)
+    def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float) -> None:
+        self.map, self.origin = _dilated(map_, radius_px), origin
         self.chance = max(float(np.percentile(self.map[::3, ::3], 95)), 0.0)
 
-    def strength(self, col: NDArray[np.intp], row: NDArray[np.intp]) -> Array:
-        """How much the places (n,) answer beyond chance; places outside of the map do not."""
+    def strength(self, places: NDArray[np.int_]) -> tuple[Array, NDArray[np.bool_]]:
+        """How much the places (n, 2) of the reduced scan answer beyond chance, and which of them lie in the map; those
+        that do not have no answer."""
         rows, cols = self.map.shape
+        col, row = (places - self.origin).T
         inside = (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
         response = np.where(inside, self.map[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0.0).astype(float)
-        return np.asarray(np.maximum(np.maximum(response, 0.0) ** 2 - self.chance**2, 0.0))
+        return np.maximum(np.maximum(response, 0.0) ** 2 - self.chance**2, 0.0), inside
 
 
 class _Constellation:
@@ -233,9 +242,8 @@ class _Constellation:
         """Scores and numbers of supporting marks of many placements at once."""
         places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
         nearest = np.rint(places).astype(int)
-        rows, cols = reached[0].map.shape
-        inside = (nearest >= 0).all(axis=-1) & (nearest[..., 0] < cols) & (nearest[..., 1] < rows)
-        strength = np.stack([reach.strength(*nearest[:, k].T) for k, reach in enumerate(reached)], axis=1)
+        answers = [reach.strength(nearest[:, k]) for k, reach in enumerate(reached)]
+        strength, inside = (np.stack(each, axis=1) for each in zip(*answers, strict=True))
         score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
         return score, (strength > 0).sum(axis=1)
 
@@ -244,9 +252,7 @@ class _Constellation:
         widest = self.search.tolerance_px
         for tolerance_px in (widest, max(_NARROWED * widest, 1.5)):
             predicted = self.responses.reduced_px(self._scan_px(scale * self.camera + offset))
-            found = [
-                _highest(layer.map, place, tolerance_px) for layer, place in zip(self.layers, predicted, strict=True)
-            ]
+            found = [layer.highest(place, tolerance_px) for layer, place in zip(self.layers, predicted, strict=True)]
             weight = np.array([max(height - _LEAST_WEIGHED, 0.0) for _, height in found])
             if (weight > 0).sum() < 2:
                 break

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.candidates import Look, respond
+from measure.candidates import Look, respond, respond_about
+from measure.centred_frame import centred_places_px, is_complete, is_worth_a_look, reach_mm
 from measure.constellation import Bounds, Placement, PlacementSearch, same_picture, signs_of
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame, measure_frame
@@ -39,25 +40,50 @@ def measure_fiducials(
     picture shows: statuses, reasons and problems say it.
     """
     options = options or FiducialOptions()
-    found = _found(scan, layout, pitch_um, options)
-    if not found:
+    found, frame = _in_the_middle(scan, layout, pitch_um, options)
+    if frame is None or not is_complete(frame):
+        found, frame = _anywhere(scan, layout, pitch_um, options)
+    if frame is None:
         return _nothing(scan, layout, "nothing in the scan looks like two or more of the camera's marks")
-    frames = [measure_frame(scan, layout, found[0], options)]
-    for placement in _others(found):
-        if frames[-1].accepted:
-            break
-        frames.append(measure_frame(scan, layout, placement, options))
-    frame = max(frames, key=lambda frame: (frame.accepted, frame.belongs.sum()))
     if not frame.accepted:
         return _nothing(scan, layout, frame.misfit())
-    found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
-    found.sort(key=lambda placement: not placement.same_place(frame.placement))
+    place = frame.placement
+    found = [placement for placement in found if placement.pitch_mm == place.pitch_mm]
+    found.sort(key=lambda placement: not placement.same_place(place))
     pose = Pose(options.pose, True, _SET)
     if options.pose == "auto":
         pose = decide_pose(scan, layout, found, frame.fits, frame.weights, options)
         if pose.name != frame.placement.pose:
             frame = measure_frame(scan, layout, _best(found, pose.name), options)
     return _measurement(scan, layout, frame, pose, _rivals(found, pose.name))
+
+
+def _in_the_middle(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> tuple[list[Placement], Frame | None]:
+    """The placements, best first, of a frame in the middle of a large scan, and the frame in the best of them; none
+    where they are not worth a look or there is none."""
+    if pitch_um is None or not is_worth_a_look(scan, layout, pitch_mm := (pitch_um[0] / 1000, pitch_um[1] / 1000)):
+        return [], None
+    found = _placements(scan, layout, pitch_mm, options.scale_tolerance, options, reach_mm(layout))
+    found.sort(key=lambda placement: -round(placement.score, 2))
+    return found, measure_frame(scan, layout, found[0], options) if found else None
+
+
+def _anywhere(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> tuple[list[Placement], Frame | None]:
+    """The placements, best first, in the whole scan, and the frame in the first of the best ones that is accepted, or
+    else that of most marks; None where nothing looks like the marks."""
+    found = _found(scan, layout, pitch_um, options)
+    if not found:
+        return [], None
+    frames = [measure_frame(scan, layout, found[0], options)]
+    for placement in _others(found):
+        if frames[-1].accepted:
+            break
+        frames.append(measure_frame(scan, layout, placement, options))
+    return found, max(frames, key=lambda frame: (frame.accepted, frame.belongs.sum()))
 
 
 def _found(
@@ -95,12 +121,24 @@ def _pitches(
 
 
 def _placements(
-    scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float], tolerance: float, options: FiducialOptions
+    scan: Scan,
+    layout: FiducialLayout,
+    pitch_mm: tuple[float, float],
+    tolerance: float,
+    options: FiducialOptions,
+    centred_mm: float | None = None,
 ) -> list[Placement]:
+    """Of all poses asked for. centred_mm: how far about their places in a centred frame marks are looked for; None:
+    everywhere."""
     poses = POSES if options.pose == "auto" else (options.pose,)
     flip = np.diag([1 / pitch_mm[0], -1 / pitch_mm[1]])
     looks = [Look(mark.mark, flip @ up_from_camera(pose)) for pose in poses for mark in layout.marks]
-    responses, index = respond(scan, looks, signs_of(layout.marks))
+    signs = signs_of(layout.marks)
+    if centred_mm is None:
+        responses, index = respond(scan, looks, signs)
+    else:
+        places = [centred_places_px(scan, layout, flip @ up_from_camera(pose)) for pose in poses]
+        responses, index = respond_about(scan, looks, np.concatenate(places), centred_mm / max(pitch_mm), signs)
     bounds = Bounds(tolerance, float(np.deg2rad(options.rotation_deg)), options.search_mm(layout))
     search = PlacementSearch(layout.marks, responses, pitch_mm, bounds)
     count = len(layout.marks)

@@ -63,6 +63,11 @@ class Frame:
         return [s.fit if ok else None for s, ok in zip(self.sightings, self.belongs, strict=True)]
 
     @property
+    def all_clear(self) -> bool:
+        """Whether every mark that belongs is plainly there."""
+        return all(fit is None or fit.likeness >= _CLEAR_LIKENESS for fit in self.fits)
+
+    @property
     def accepted(self) -> bool:
         """Whether enough marks agree for the frame not to be chance: three, and three in ten of those in the scan, and
         three of them clear ones."""
