@@ -6,15 +6,16 @@ believed only if chance would hardly do as well (a contrario: Desolneux, Moisan 
 whether the same marks could bear other names: a field that looks the same from another side has none, and that is said.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.naming_growth import Grown, View, grow
+from adjust.naming_growth import OF_POSE, Grown, View, grow, log10_of_chance
 from adjust.naming_hypotheses import Cluster, Poses, clusters, mark_triples, point_triples, promising
-from adjust.resection import Pose
+from adjust.resection import Pose, resect
 from adjust.unnamed_marks import Marks
 
 Array = NDArray[np.float64]
@@ -24,6 +25,8 @@ MOST_LOG10_CHANCE = -6.0
 LEAST_SHARE = 0.4  # of the points that the image should show
 ALIKE_SHARE = 0.7  # of the named marks, from which on other names explain the image as well
 MOST_POSES = 1_000_000  # that are tried: they bound the time
+MOST_LOG10_CHANCE_OF_CODES = -3.0  # of codes that agree: they were not chosen among many
+LEAST_CODES = 4  # three always give a pose
 OTHER_CLUSTERS = 8  # named clusters that are tried as other points: with half of them seen, one case in 256 escapes
 
 
@@ -60,9 +63,10 @@ def name_marks(
     n, m = len(xyz), len(xy_mm)
     if min(n, m) < LEAST_POINTS:
         return f"{m} marks and {n} points are too few: {LEAST_POINTS} that agree are needed"
-    origin, size = xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0)))
+    unit = _Unit.of(xyz)
     marks = Marks.of(xy_mm, *frame_mm, sigma_mm, principal_distance_mm)
-    search = _Search((xyz - origin) / size, normals, marks, clusters((xyz - origin) / size, normals, m / n))
+    own = unit.of_points(xyz)
+    search = _Search(own, normals, marks, clusters(own, normals, m / n))
     found = search.first()
     if found is None:
         return f"the {m} marks found do not make the pattern that the {n} points would from any side"
@@ -72,10 +76,66 @@ def name_marks(
             f"the points look the same from another side, or moved on, as a regular grid does: {len(found.mark)} marks "
             f"agree with one naming, {len(other.mark)} with another one"
         )
-    pose = Pose(found.view.rotation, origin - size * found.view.rotation.T @ found.view.shift)
-    c = principal_distance_mm * (1.0 + found.view.scale)
-    gate_mm = found.gate * principal_distance_mm
-    return Names(found.mark, pose, c, found.view.radial, found.expected, found.log10_chance, gate_mm)
+    return unit.names(found, principal_distance_mm)
+
+
+def name_coded(
+    xyz: Array,
+    normals: Array,
+    xy_mm: Array,
+    frame_mm: tuple[Array, Array],
+    principal_distance_mm: float,
+    sigma_mm: float,
+    codes: Mapping[int, int],
+) -> Names | str:
+    """The same where codes say which points (by index) some of the marks (by index) are; not all of them need be right.
+
+    The pose that most codes agree with names the other marks. A mark whose code says another point has no name.
+    """
+    if len(codes) < LEAST_CODES:
+        return f"{len(codes)} coded targets were recognised, and {LEAST_CODES} are needed"
+    coded, points = np.array(list(codes)), np.array(list(codes.values()))
+    resection = resect(xyz[points], xy_mm[coded], principal_distance_mm, np.random.default_rng(1), sigma_mm)
+    if resection is None:
+        return f"the {len(codes)} coded targets recognised lie on one line and do not orient the image"
+    unit, agree = _Unit.of(xyz), resection.inliers
+    shift = -resection.pose.rotation @ ((resection.pose.center - unit.origin) / unit.size)
+    marks = Marks.of(xy_mm, *frame_mm, sigma_mm, principal_distance_mm)
+    view = View(resection.pose.rotation, shift)
+    grown = grow(view, points[agree], coded[agree], unit.of_points(xyz), normals, marks)
+    right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
+    area = float(np.prod(marks.greatest - marks.least))
+    chance = min(np.pi * (2.0 * grown.gate) ** 2 / area, 1.0)
+    log10_chance = log10_of_chance(right, len(codes), chance, float(comb(len(codes), OF_POSE)))
+    if log10_chance > MOST_LOG10_CHANCE_OF_CODES:
+        return f"{right} of the {len(codes)} coded targets recognised lie as their points would, which may be chance"
+    numbers = set(codes.values())
+    named = {
+        point: mark
+        for point, mark in grown.mark.items()
+        if codes.get(mark, point) == point and (mark in codes or point not in numbers)
+    }
+    return unit.names(replace(grown, mark=named, log10_chance=log10_chance), principal_distance_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class _Unit:
+    """The field's middle and its size, in which the search reckons."""
+
+    origin: Array
+    size: float
+
+    @classmethod
+    def of(cls, xyz: Array) -> "_Unit":
+        return cls(xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0))))
+
+    def of_points(self, xyz: Array) -> Array:
+        return np.asarray((xyz - self.origin) / self.size)
+
+    def names(self, found: Grown, c: float) -> Names:
+        pose = Pose(found.view.rotation, self.origin - self.size * found.view.rotation.T @ found.view.shift)
+        scaled = c * (1.0 + found.view.scale)
+        return Names(found.mark, pose, scaled, found.view.radial, found.expected, found.log10_chance, found.gate * c)
 
 
 @dataclass(frozen=True, eq=False)

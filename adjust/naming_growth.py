@@ -19,7 +19,7 @@ _PRIOR_SCALE = 0.05  # standard deviation of the principal distance, relative...
 _PRIOR_RADIAL = 0.1  # ...and of k1: a tenth of the distance where rays are 45 degrees oblique
 _ROBUST = 2.0  # sigmas, from which on a residual counts less (Huber)
 _BEFORE = -1e-6
-_OF_POSE = 3  # points whose agreement a pose can always have
+OF_POSE = 3  # points whose agreement a pose can always have
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array
     """
     sigma = marks.sigma
     for _ in range(_ROUNDS):
-        if len(points) <= _OF_POSE:
+        if len(points) <= OF_POSE:
             return Grown(view)
         view, sigma, covariance = _fitted(view, xyz[points], marks.places[named], marks.sigma)
         before = points, named
@@ -159,10 +159,16 @@ def _judged(view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, 
     shown = np.flatnonzero(_shown(view, xyz, normals, marks))
     expected = len(shown)
     agreeing = min(len(mark), expected)
-    if agreeing <= _OF_POSE:
+    if agreeing <= OF_POSE:
         return Grown(view)
     # A pose that is fitted to all may lie as far off as the gate from the one that three of the points give.
     chance = float(marks.chance(view.images(xyz[shown]), np.full(expected, 2.0 * gate)).mean())
-    tail = float(binom.logsf(agreeing - _OF_POSE - 1, expected - _OF_POSE, chance)) / np.log(10.0)
-    tests = _OF_POSE * np.log10(float(len(xyz)) * len(marks.places)) + np.log10(4.0)
-    return Grown(view, mark, gate, expected, tail + tests)
+    tests = (float(len(xyz)) * len(marks.places)) ** OF_POSE
+    return Grown(view, mark, gate, expected, log10_of_chance(agreeing, expected, chance, tests))
+
+
+def log10_of_chance(agreeing: int, expected: int, chance: float, tests: float) -> float:
+    """The logarithm of the expected number of poses with so many points that agree, if each agreed by chance; three of
+    them always do, with up to four poses for each of the tests that are possible."""
+    tail = float(binom.logsf(agreeing - OF_POSE - 1, expected - OF_POSE, chance)) / np.log(10.0)
+    return float(tail + np.log10(4.0 * tests))

@@ -84,7 +84,7 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
     for factor, radii in octaves(search.diameter_px):
         margin = int(np.ceil(4 * radii[-1])) * factor
         for col0, row0 in blocks(scan, factor):
-            size = (BLOCK_PX // factor) * factor + 2 * margin
+            size = block_px(factor) + 2 * margin
             window = scan.window(col0 - margin, row0 - margin, size, size)
             small = np.asarray(
                 cv2.resize(window, (size // factor, size // factor), interpolation=cv2.INTER_AREA), np.float32
@@ -111,9 +111,14 @@ def octaves(diameter_px: tuple[float, float]) -> Iterator[tuple[int, list[float]
     yield from by_factor.items()
 
 
+def block_px(factor: int) -> int:
+    """The side of a block: a whole number of reduced pixels."""
+    return (BLOCK_PX // factor) * factor
+
+
 def blocks(scan: Scan, factor: int) -> Iterator[tuple[int, int]]:
-    """Upper left corners of the blocks, a whole number of reduced pixels apart."""
-    step = (BLOCK_PX // factor) * factor
+    """Upper left corners of the blocks."""
+    step = block_px(factor)
     for row0 in range(0, scan.height_px, step):
         for col0 in range(0, scan.width_px, step):
             yield col0, row0

@@ -24,7 +24,8 @@ SURE = 0.3  # how near to ground or dot a bit must be, in units of the dot's con
 class RingCode:
     """bits: the segments of the ring; ring: its inner and outer radius in units of the dot's radius.
 
-    The default is the common 12-bit code, whose ring is as wide as the gap and as the dot's radius.
+    The default is the common 12-bit code (Schneider, IDENT/VISION 1991), whose ring is as wide as the gap and as the
+    dot's radius. A code's number is the smallest that its segments give.
     """
 
     bits: int = 12
@@ -40,6 +41,24 @@ class RingCode:
         """The smallest number that the segments (bits,), in clockwise order, give from any start, first bit highest."""
         weights = 1 << np.arange(self.bits)[::-1]
         return min(int(weights @ np.roll(segments, turn)) for turn in range(self.bits))
+
+    def mirrored(self, number: int) -> int:
+        """The number whose ring, seen from behind, reads as this one."""
+        return self.least_turn(int(f"{number:0{self.bits}b}"[::-1], 2))
+
+    def published_numbers(self) -> tuple[int, ...]:
+        """The numbers of DE 197 33 466 A1, in rising order: an even number of set bits, two of them opposite one
+        another. Any other number is read too."""
+        odd = range(1, 2**self.bits - 1, 2)
+        return tuple(number for number in odd if self._is_published(number) and self._is_least(number))
+
+    def _is_published(self, number: int) -> bool:
+        half = self.bits // 2
+        return number.bit_count() % 2 == 0 and bool(number & number >> half & 2**half - 1)
+
+    def _is_least(self, number: int) -> bool:
+        whole = 2**self.bits - 1
+        return all(number <= (number << turn & whole | number >> self.bits - turn) for turn in range(1, self.bits))
 
     def least_turn(self, number: int) -> int:
         """The number in the form in which it is read."""

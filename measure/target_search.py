@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from measure.disks import FittedDisk, fit_disk
 from measure.rendering import extent_px, picture
 from measure.scan import Scan
-from measure.shapes import MarkShape
+from measure.shapes import MarkShape, thinnest_mm
 
 Array = NDArray[np.float64]
 
-SEARCHED_RADIUS_PX = 4.0  # windows are reduced until the shorter half axis has about this length
+SEARCHED_RADIUS_PX = 4.0  # windows are reduced until the shorter half axis has about this length...
+THINNEST_PX = 1.5  # ...or the thinnest line this width
 LEAST_CORRELATION = 0.55
 MOST_SPOTS = 6  # fitted near one prediction
 EXPECTED_BLUR_PX = 1.0
@@ -66,7 +67,8 @@ def search_targets(
 
 def spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -> list[Array]:
     """(2,) places within the search distance where the predicted picture correlates best, the best first."""
-    factor = max(1, int(np.linalg.svd(prediction.pixel_from_disk, compute_uv=False)[1] / SEARCHED_RADIUS_PX))
+    shorter = float(np.linalg.svd(prediction.pixel_from_disk, compute_uv=False)[1])
+    factor = max(1, int(shorter * min(1.0 / SEARCHED_RADIUS_PX, thinnest_mm(shape) / THINNEST_PX)))
     template = predicted_picture(prediction.pixel_from_disk / factor, shape)
     half = np.array(template.shape[::-1]) // 2
     reach = int(np.ceil(prediction.search_px / factor)) + 1

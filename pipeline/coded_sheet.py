@@ -1,4 +1,4 @@
-"""A flat sheet of dots, some of them ring-coded: found in the whole picture, named without any orientation."""
+"""A flat sheet of dots, some of them ring-coded: found in the whole picture, named without any camera."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -30,10 +30,13 @@ _FOUND_WITHIN_PX = 2.0  # how far the fit may move from where the search has a d
 
 @dataclass(frozen=True, eq=False)
 class CodedSheet:
-    """ids and places (n, 2) of its points on the plane that holds them; settings: the kind of the targets."""
+    """ids and coordinates xyz (n, 3) of its points; places (n, 2): on the plane that holds them best; is_flat: whether
+    it does; settings: the kind of the targets."""
 
     ids: tuple[str, ...]
+    xyz: Array
     places: Array
+    is_flat: bool
     settings: TargetSettings
 
     @classmethod
@@ -55,25 +58,21 @@ class CodedSheet:
         places = np.array(list(xyz.values())).reshape(-1, 3)
         if len(places) < 4:
             raise InputError(
-                f"{project.path}: [object] points: {len(places)} points with X, Y and Z are no sheet; give 4."
+                f"{project.path}: [object] points: {len(places)} points with X, Y and Z name no coded targets; give 4."
             )
         spread = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
         height = np.ptp((places - places.mean(axis=0)) @ spread.Vh[2])
-        if height > _FLAT * np.ptp((places - places.mean(axis=0)) @ spread.Vh[0]):
-            raise InputError(
-                f"{project.path}: [object] points: coded targets are named on flat sheets only, and these points leave "
-                f"their plane by {height:.3g}. Measure such a field as disks, with orientations in images.csv."
-            )
-        return cls(tuple(xyz), (places - places.mean(axis=0)) @ spread.Vh[:2].T, settings)
+        is_flat = bool(height <= _FLAT * np.ptp((places - places.mean(axis=0)) @ spread.Vh[0]))
+        return cls(tuple(xyz), places, (places - places.mean(axis=0)) @ spread.Vh[:2].T, is_flat, settings)
 
 
 def measure_sheet(scan: Scan, sheet: CodedSheet) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """A mark for every point of the sheet, and what is to be said of the whole."""
     scan = scan.green()
-    found = _candidates(scan, sheet)
-    numbers = _numbers(scan, found, sheet)
-    coded, notes = _coded(numbers, sheet)
-    naming: Naming | str = _none_coded(found, numbers, sheet)
+    found = coded_candidates(scan, sheet)
+    numbers = read_numbers(scan, found, sheet)
+    coded, notes = coded_points(numbers, sheet)
+    naming: Naming | str = none_coded(found, numbers, sheet)
     if coded:
         alike = [i for i, dot in enumerate(found) if dot.contrast_dn * _sign(found, coded) > 0.0]
         found, coded = [found[i] for i in alike], {new: coded[i] for new, i in enumerate(alike) if i in coded}
@@ -92,20 +91,24 @@ def measure_sheet(scan: Scan, sheet: CodedSheet) -> tuple[tuple[MarkMeasurement,
     return tuple((absent | measured).values()), notes
 
 
-def _candidates(scan: Scan, sheet: CodedSheet) -> list[Candidate]:
+def coded_candidates(scan: Scan, sheet: CodedSheet) -> list[Candidate]:
     greatest = max(_GREATEST_SHARE * float(np.hypot(scan.width_px, scan.height_px)), _LEAST_DIAMETER_PX)
     search = DiskSearch((_LEAST_DIAMETER_PX, greatest), sheet.settings.polarity, _LEAST_CONTRAST)
     return disk_candidates(scan, search)
 
 
-def _numbers(scan: Scan, found: Sequence[Candidate], sheet: CodedSheet) -> dict[int, int]:
-    """The number about each dot that has one."""
+def read_numbers(scan: Scan, found: Sequence[Candidate], sheet: CodedSheet, mirrored: bool = False) -> dict[int, int]:
+    """The number about each dot that has one; mirrored: as the other side of the film shows it."""
     code = sheet.settings.code
     read = {index: read_code(scan, dot, code) for index, dot in enumerate(found)} if code else {}
-    return {index: number for index, number in read.items() if number is not None}
+    return {
+        index: code.mirrored(number) if mirrored else number
+        for index, number in read.items()
+        if number is not None and code is not None
+    }
 
 
-def _coded(numbers: dict[int, int], sheet: CodedSheet) -> tuple[dict[int, int], tuple[str, ...]]:
+def coded_points(numbers: dict[int, int], sheet: CodedSheet) -> tuple[dict[int, int], tuple[str, ...]]:
     """The point (by index) of each coded dot; a code that is read twice says nothing."""
     row = {id: i for i, id in enumerate(sheet.ids)}
     points = {dot: sheet.settings.numbers.get(number, str(number)) for dot, number in numbers.items()}
@@ -115,7 +118,7 @@ def _coded(numbers: dict[int, int], sheet: CodedSheet) -> tuple[dict[int, int], 
     return {dot: row[point] for dot, point in points.items() if point in row and count[point] == 1}, notes
 
 
-def _none_coded(found: Sequence[Candidate], numbers: dict[int, int], sheet: CodedSheet) -> str:
+def none_coded(found: Sequence[Candidate], numbers: dict[int, int], sheet: CodedSheet) -> str:
     bits = sheet.settings.code.bits if sheet.settings.code else 0
     if not found:
         return "no dot was found"

@@ -10,6 +10,8 @@ from pipeline.comparator_file import pixel_from_comparator
 
 Array = NDArray[np.float64]
 
+_ANGLES = np.arange(8) * np.pi / 4.0
+_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # enough for what a lens does within a target
 _FLAT = 1e-6  # of the field's size: points this near a plane lie on a board
 
 
@@ -19,22 +21,41 @@ def eccentricity_mm(model: ImageModel, centers: Array, normals: Array, radius: f
     centers (n, 3) and radius in object units, normals (n, 3) of unit length. With c the centre and n the normal in the
     camera frame, z forward, the centre of the perspective ellipse is off by
     `f r² [n_xy n_z + (c_xy / c_z) (1 - n_z²)] / (c_z² - r² (1 - n_z²))`: the pole of the disk's plane section, as from
-    the dual conic of its circle.
+    the dual conic of its circle. The lens bends this ellipse; its centre of gravity, which a fitted ellipse finds, is
+    that of its outline as distortion and film image it.
     """
     forward = np.array([1.0, 1.0, -1.0])
     c = ((centers - model.station) @ model.rotation.T) * forward
     n = (normals @ model.rotation.T) * forward
     tilt = 1.0 - n[:, 2] ** 2
     reach = c[:, 2] ** 2 - radius**2 * tilt
-    across = n[:, :2] * n[:, 2:] + c[:, :2] / c[:, 2:] * tilt[:, None]
-    ideal = radius**2 * across / reach[:, None]
-    # The same small step of the ray, through distortion and film: the image point of a ray that is shifted by it.
-    shifted = c.copy()
-    shifted[:, :2] += ideal * c[:, 2:]
-    places, _ = model.comparator_from_object(centers)
-    off, _ = model.comparator_from_object((shifted * forward) @ model.rotation + model.station)
-    difference: Array = off - places
-    return difference
+    off_axis = n[:, :2] * n[:, 2:] + c[:, :2] / c[:, 2:] * tilt[:, None]
+    middle = c[:, :2] / c[:, 2:] + radius**2 * off_axis / reach[:, None]
+    axes = np.stack(
+        [radius * (v[:, :2] - c[:, :2] / c[:, 2:] * v[:, 2:]) / c[:, 2:] for v in across(n)], axis=-1
+    )  # fmt: skip
+
+    def imaged(places: Array) -> Array:
+        rays = np.column_stack([places, np.ones(len(places))]) * c[:, 2:]
+        image, _ = model.comparator_from_object((rays * forward) @ model.rotation + model.station)
+        return image
+
+    outline = np.stack([imaged(middle + axes @ u) for u in _CIRCLE], axis=1)
+    return _centre_of_gravity(outline) - imaged(c[:, :2] / c[:, 2:])
+
+
+def _centre_of_gravity(outline: Array) -> Array:
+    """(n, 2) of the areas within outlines (n, k, 2) that are, but for a little, affine images of _CIRCLE.
+
+    In the affine frame, a displacement of the unit circle moves its centre of gravity by twice the mean of its part
+    along the radius, times the radius vector.
+    """
+    mean = outline.mean(axis=1)
+    linear = 2.0 * np.einsum("nki,kj->nij", outline - mean[:, None], _CIRCLE) / len(_CIRCLE)
+    flat = np.einsum("nij,nkj->nki", np.linalg.inv(linear), outline - mean[:, None])
+    outward = np.einsum("nki,ki->nk", flat, _CIRCLE) - 1.0
+    shift = 2.0 * np.einsum("nk,ki->ni", outward, _CIRCLE) / len(_CIRCLE)
+    return np.asarray(mean + np.einsum("nij,nj->ni", linear, shift))
 
 
 def disk_images(

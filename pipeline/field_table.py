@@ -1,17 +1,19 @@
-"""The table [field] of a scene file: disks on grids anywhere in space, disks one by one, or a planar board."""
+"""The table [field] of a scene file: disks, crosses or ring-coded disks, on grids anywhere in space or one by one, or a
+planar board."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.ring_codes import RingCode
 from pipeline.tables import Table
-from synthetic_images.scene import BoardField, DiskField, DiskTarget
+from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarget, RingFigure
 
 Array = NDArray[np.float64]
 
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
-KINDS = ("disks", "chessboard", "circle-grid")
+KINDS = ("disks", "crosses", "coded-rings", "chessboard", "circle-grid")
 
 
 def read_field(table: Table, unit: str, seed: int) -> DiskField | BoardField:
@@ -21,7 +23,12 @@ def read_field(table: Table, unit: str, seed: int) -> DiskField | BoardField:
     if kind == "chessboard":
         square = table.number("square_mm", above=0.0) * mm
         return BoardField("chessboard", table.whole("columns", least=2), table.whole("rows", least=2), square)
+    if kind == "crosses":
+        arm, line = table.number("arm_mm", above=0.0), table.number("line_mm", above=0.0)
+        return _field(table, seed, 2.0 * arm * mm, CrossFigure(line / arm))
     diameter = table.number("diameter_mm", above=0.0) * mm
+    if kind == "coded-rings":
+        return _coded_field(table, seed, diameter)
     if kind == "circle-grid":
         return BoardField(
             "circle-grid",
@@ -31,13 +38,33 @@ def read_field(table: Table, unit: str, seed: int) -> DiskField | BoardField:
             diameter,
             table.flag("asymmetric", False),
         )
+    return _field(table, seed, diameter)
+
+
+def _field(table: Table, seed: int, diameter: float, figure: CrossFigure | None = None) -> DiskField:
     generator = np.random.default_rng([seed, 10])
     targets = [target for grid in table.tables("grid") for target in _grid_targets(grid, generator)]
     targets += [target for scatter in table.tables("scatter") for target in _scattered_targets(scatter, generator)]
     targets += [_target(entry) for entry in table.tables("target")]
     if not targets:
         raise table.error("grid", "the field has no target. Add [[field.grid]], [[field.scatter]] or [[field.target]].")
-    return DiskField(tuple(targets), diameter, table.number("surround", 2.0, least=0.0))
+    return DiskField(tuple(targets), diameter, table.number("surround", 2.0, least=0.0), figure)
+
+
+def _coded_field(table: Table, seed: int, diameter: float) -> DiskField:
+    """Every so many disks have rings, and the numbers of these for names."""
+    default = RingCode()
+    code = RingCode(table.whole("bits", default.bits), table.pair("ring", default.ring))
+    every = table.whole("every", 1, least=1)
+    field = _field(table, seed, diameter)
+    numbers = code.published_numbers()
+    coded = range(0, len(field.targets), every)
+    if len(coded) > len(numbers):
+        raise table.error("bits", f"{code.bits} bits have {len(numbers)} codes, and {len(coded)} targets need one.")
+    name = {index: str(number) for index, number in zip(coded, numbers, strict=False)}
+    targets = tuple(replace(target, id=name.get(index, target.id)) for index, target in enumerate(field.targets))
+    figure = RingFigure(code.bits, *code.ring, {id: int(id) for id in name.values()})
+    return replace(field, targets=targets, figure=figure)
 
 
 def _grid_targets(table: Table, generator: np.random.Generator) -> list[DiskTarget]:

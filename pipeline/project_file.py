@@ -99,6 +99,12 @@ class Project:
         diameter = self.targets.diameter_mm if self.targets else None
         return 0.0 if diameter is None else diameter / 2.0 / self.unit_mm
 
+    @property
+    def target_radius(self) -> float:
+        """That of the disks, or half the length of the crosses, in the unit of the object coordinates."""
+        arm = self.targets.arm_mm if self.targets else None
+        return self.disk_radius if arm is None else arm / self.unit_mm
+
     @cached_property
     def default_camera(self) -> CameraFile:
         return next(iter(self.cameras.values()))

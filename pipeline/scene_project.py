@@ -19,7 +19,7 @@ from pipeline.camera_file import CameraFile, GivenFiducial
 from pipeline.camera_text import camera_text
 from pipeline.design.settings import DesignSettings
 from pipeline.field_table import UNITS_MM
-from synthetic_images.scene import BoardField, FilmKind, Scene, SceneImage
+from synthetic_images.scene import BoardField, CrossFigure, DiskField, FilmKind, RingFigure, Scene, SceneImage
 from synthetic_images.targets import Target, field_targets
 
 Array = NDArray[np.float64]
@@ -191,6 +191,15 @@ transformation = "{film_transformation(scene_file)}"
 
 def _targets_text(scene_file: SceneFile) -> str:
     field, mm = scene_file.scene.field, UNITS_MM[scene_file.unit]
+    if isinstance(field, DiskField) and isinstance(field.figure, CrossFigure):
+        arm = field.diameter / 2.0 * mm
+        return f'[targets]\nkind = "cross"\narm_mm = {arm:.6g}\nline_mm = {field.figure.line * arm:.6g}\n'
+    if isinstance(field, DiskField) and isinstance(field.figure, RingFigure):
+        ring = f"[{field.figure.inner:g}, {field.figure.outer:g}]"
+        return (
+            f'[targets]\nkind = "coded-ring"\nbits = {field.figure.bits}\nring = {ring}\n'
+            f"diameter_mm = {field.diameter * mm:.6g}\n"
+        )
     if not isinstance(field, BoardField):
         return f'[targets]\nkind = "disk"\ndiameter_mm = {field.diameter * mm:.6g}\n'
     text = f'[targets]\nkind = "{field.kind}"\ncolumns = {field.columns}\nrows = {field.rows}\n'

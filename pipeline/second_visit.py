@@ -9,11 +9,12 @@ from adjust.projection import adjusted_image
 from adjust.result import Adjustment
 from measure.results import MarkMeasurement
 from measure.scan import open_scan
-from measure.targets import TargetOptions, measure_disks
+from measure.status import Status
 from pipeline.measurement_file import MeasuredScan
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
-from pipeline.target_stage import Field, target_field, with_targets
+from pipeline.target_field import Field, measure_single_targets, target_field
+from pipeline.target_stage import with_targets
 from pipeline.target_table import TargetSettings
 
 _SEARCH_PX = 2.0  # an adjusted orientation predicts to far less than that
@@ -57,18 +58,24 @@ def _visit(field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: T
     missed = [
         prediction
         for prediction in field.predictions(model, scan, _SEARCH_PX)
-        if _is_inside(scan, prediction.center_px)
-        and (prediction.point not in targets or not targets[prediction.point].status.is_observation)
+        if _is_inside(scan, prediction.center_px) and _is_missed(targets.get(prediction.point), settings)
     ]
     if not missed:
         return scan
     with open_scan(scan.scan) as opened:
         grey = opened if settings.code is None else opened.green()
-        marks = measure_disks(grey, missed, TargetOptions(settings.polarity))
+        marks = measure_single_targets(grey, missed, settings)
     found = {mark.point: mark for mark in marks if mark.status.is_observation}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
     fresh = {point: mark for point, mark in found.items() if _is_free(mark, np.array(taken).reshape(-1, 2))}
     return with_targets(scan, tuple((targets | fresh).values())) if fresh else scan
+
+
+def _is_missed(mark: MarkMeasurement | None, settings: TargetSettings) -> bool:
+    """A coded target that was rejected has another one's ring at its place, and stays rejected."""
+    if mark is None:
+        return True
+    return not mark.status.is_observation and not (settings.code is not None and mark.status is Status.REJECTED)
 
 
 def _is_inside(scan: MeasuredScan, center_px: np.ndarray) -> bool:

@@ -1,32 +1,29 @@
 """The targets of one scan: boards name their own points; single disks and crosses get their names by prediction."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.families import parameter_names
-from adjust.network import Exterior
 from adjust.projection import ImageModel
 from adjust.resection import resect
 from adjust.rotation import rotation_from_angles
-from adjust.transformation import Film
 from measure.boards import measure_board
-from measure.disk_search import DiskSearch, disk_candidates
 from measure.results import MarkMeasurement
 from measure.scan import Scan
-from measure.shapes import Polarity
 from measure.status import Status
-from measure.targets import TargetOptions, TargetPrediction, measure_disks
-from pipeline.camera_file import CameraFile
+from measure.targets import TargetPrediction
+from pipeline.camera_model import camera_model, frame_mm
+from pipeline.coded_field import measure_coded_field
 from pipeline.coded_sheet import CodedSheet, measure_sheet
-from pipeline.comparator_file import comparator_from_pixel, pixel_from_comparator
-from pipeline.disks import disk_images, disk_normals, plane_normal
+from pipeline.comparator_file import comparator_from_pixel
 from pipeline.identification import PatternOptions, assign, recognise
 from pipeline.measurement_file import MeasuredScan
-from pipeline.network import given_points
 from pipeline.project_file import Project
+from pipeline.target_field import Field, measure_single_targets, target_candidates, target_field
+from pipeline.target_table import TargetSettings
+from pipeline.unoriented import likely_diameters_px, name_field
 
 Array = NDArray[np.float64]
 
@@ -41,31 +38,16 @@ _LEAST_DIAMETER_PX = 2.5
 _SIZE_SLACK = 1.5  # how wrong the approximate distance may make a target's size
 
 
-@dataclass(frozen=True)
-class Field:
-    """The targets that a prediction can name: ids, coordinates (n, 3), normals by id, the radius of the disks."""
-
-    ids: tuple[str, ...]
-    xyz: Array
-    normals: dict[str, Array]
-    radius: float
-
-    def predictions(self, model: ImageModel, scan: MeasuredScan, search_px: float) -> tuple[TargetPrediction, ...]:
-        """Where and how every target before the camera should be seen."""
-        normals, _ = disk_normals(self.ids, self.xyz, self.normals, plane_normal(self.xyz), model.station)
-        centers, maps, visible = disk_images(model, scan.pitch_um, self.xyz, normals, self.radius)
-        return tuple(
-            TargetPrediction(self.ids[i], centers[i], maps[i], search_px) for i in np.flatnonzero(visible)
-        )  # fmt: skip
-
-
 def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
     """The scan with its targets beside its fiducials: a mark for each target that could be in it."""
     settings = project.targets
     if settings is None:
         return measured
     if settings.code is not None:
-        return with_targets(measured, *measure_sheet(scan, CodedSheet.of(project, settings)))
+        coded = CodedSheet.of(project, settings)
+        if coded.is_flat:
+            return with_targets(measured, *measure_sheet(scan, coded))
+        return with_targets(measured, *measure_coded_field(scan, coded, project, measured))
     if settings.board is not None:
         board = measure_board(scan, settings.board)
         problems = (f"The board was not found: {board.reason}.",) if board.reason else ()
@@ -73,15 +55,11 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
         notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
         return with_targets(measured, board.marks, (*problems, *notes))
     field = target_field(project)
-    model, why = approximate_model(project, measured)
-    if model is not None:
-        model, why = _oriented(model, field, scan, measured, settings.polarity)
-    if model is None:
-        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, why) for id in field.ids)
-        return with_targets(measured, marks, (f"No target has a name: {why}.",))
-    return with_targets(
-        measured, measure_disks(scan, field.predictions(model, measured, _SLACK_PX), TargetOptions(settings.polarity))
-    )
+    predictions = _predictions(project, settings, field, scan, measured)
+    if isinstance(predictions, str):
+        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, predictions) for id in field.ids)
+        return with_targets(measured, marks, (f"No target has a name: {predictions}.",))
+    return with_targets(measured, measure_single_targets(scan, predictions, settings))
 
 
 def with_targets(
@@ -95,82 +73,50 @@ def with_targets(
     )  # fmt: skip
 
 
-def target_field(project: Project) -> Field:
-    """The targets whose coordinates are known at least roughly."""
-    places = {id: (point.X, point.Y, point.Z) for id, point in given_points(project).items()}
-    known = {id: [p.value for p in priors if p is not None] for id, priors in places.items()}
-    complete = {id: xyz for id, xyz in known.items() if len(xyz) == 3}
-    normals = dict(project.given_points.normals) if project.given_points else {}
-    return Field(tuple(complete), np.array(list(complete.values())).reshape(-1, 3), normals, project.disk_radius)
-
-
-def approximate_model(project: Project, measured: MeasuredScan) -> tuple[ImageModel | None, str]:
-    """The image as the files and its fiducials say it is; or why that is not enough to predict anything."""
+def _predictions(
+    project: Project, settings: TargetSettings, field: Field, scan: Scan, measured: MeasuredScan
+) -> Sequence[TargetPrediction] | str:
+    """Where each target should be, by the approximate orientation or, without one, by the pattern alone; or why not."""
     image = measured.frame.image
     camera = project.camera_of(image)
+    model = camera_model(camera, measured)
+    if isinstance(model, str):
+        return model
     exterior = project.given_images.exterior.get(image) if project.given_images else None
     if exterior is None:
-        return None, "the image has no approximate orientation in images.csv"
-    if camera.principal_distance_mm is None:
-        return None, f"{camera.path.name} gives no principal_distance_mm to predict the targets with"
-    film = _camera_from_comparator(camera, measured)
-    if film is None:
-        return None, "too few fiducials were measured to know where the camera's frame lies in the scan"
-    return _model(camera, exterior, film, measured), ""
+        found = target_candidates(scan, settings, likely_diameters_px(field, measured))
+        named = name_field(field, model, measured, found, frame_mm(camera, model, measured))
+        return named if isinstance(named, str) else named.predictions(field, measured)
+    approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
+    oriented, why = _oriented(approximate, field, scan, measured, settings)
+    return why if oriented is None else field.predictions(oriented, measured, _SLACK_PX)
 
 
-def _camera_from_comparator(camera: CameraFile, measured: MeasuredScan) -> Film | None:
-    """The film as the measurement of the fiducials took it to be; none for a camera that has none."""
-    if not camera.fiducials:
-        return Film("none", np.zeros(0), np.zeros(2))
-    if measured.frame.pixel_from_camera is None:
-        return None
-    places = np.linalg.inv(np.vstack([measured.frame.pixel_from_camera, [0.0, 0.0, 1.0]]))[:2]
-    linear = places[:, :2] @ np.diag(pixel_from_comparator(np.ones(2), measured.pitch_um))
-    return Film("affine", np.array([places[0, 2], *linear[0], places[1, 2], *linear[1]]), np.zeros(2))
-
-
-def _model(camera: CameraFile, exterior: Exterior, film: Film, measured: MeasuredScan) -> ImageModel:
-    middle = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0, measured.pitch_um)
-    x0, y0 = middle if camera.principal_point_mm is None else camera.principal_point_mm
-    distortion = camera.distortion
-    given = [distortion.parameters.get(name) for name in parameter_names(distortion.family)]
-    return ImageModel(
-        distortion,
-        np.array([camera.principal_distance_mm, x0, y0], dtype=np.float64),
-        np.array([0.0 if prior is None else prior.value for prior in given]),
-        rotation_from_angles(exterior.values[3:]),
-        exterior.center,
-        film,
-    )
-
-
-def _search(predictions: Sequence[TargetPrediction], measured: MeasuredScan, polarity: Polarity) -> DiskSearch | None:
-    """Disks of the sizes that the targets in or near the scan should have; None where none is large enough."""
+def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredScan) -> tuple[float, float] | None:
+    """The sizes that the targets in or near the scan should have; None where none is large enough."""
     size = np.array([measured.width_px, measured.height_px])
     near = [p for p in predictions if np.all(np.abs(p.center_px - size / 2.0) < _NEAR * size)]
-    axes = np.array([np.linalg.svd(p.pixel_from_disk, compute_uv=False) for p in near]).reshape(-1, 2)
+    axes = np.array([p.half_axes_px for p in near]).reshape(-1, 2)
     if not len(axes) or 2.0 * float(axes.max()) < _LEAST_DIAMETER_PX:
         return None
-    smallest = max(2.0 * float(axes.min()) / _SIZE_SLACK, _LEAST_DIAMETER_PX)
-    return DiskSearch((smallest, max(2.0 * float(axes.max()) * _SIZE_SLACK, smallest)), polarity)
+    return 2.0 * float(axes.min()) / _SIZE_SLACK, 2.0 * float(axes.max()) * _SIZE_SLACK
 
 
 def _oriented(
-    model: ImageModel, field: Field, scan: Scan, measured: MeasuredScan, polarity: Polarity
+    model: ImageModel, field: Field, scan: Scan, measured: MeasuredScan, settings: TargetSettings
 ) -> tuple[ImageModel | None, str]:
     """The image with an orientation good to a pixel or two, from the disks found and the pattern they make."""
     size = float(np.hypot(measured.width_px, measured.height_px))
     predictions = field.predictions(model, measured, _SLACK_PX)
     predicted = np.array([prediction.center_px for prediction in predictions]).reshape(-1, 2)
-    search = _search(predictions, measured, polarity)
-    if search is None:
+    diameters = _diameters_px(predictions, measured)
+    if diameters is None:
         return None, "the approximate orientation puts no target of two pixels or more into the scan"
-    strongest = disk_candidates(scan, search)[: _STRONGEST * len(predicted)]
+    strongest = target_candidates(scan, settings, diameters)[: _STRONGEST * len(predicted)]
     found = np.array([patch.center_px for patch in strongest]).reshape(-1, 2)
     placement = recognise(predicted, found, PatternOptions(shift_px=size / 2.0))
     if placement is None:
-        return None, f"the {len(found)} disks found do not make the pattern of the {len(predicted)} targets predicted"
+        return None, f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted"
     gate_px = _GATE_SHARE * size
     places = predicted @ placement[:, :2].T + placement[:, 2]
     ids = [prediction.point for prediction in predictions]

@@ -9,21 +9,23 @@ from measure.ring_codes import RingCode
 from measure.shapes import Polarity
 from pipeline.tables import Table
 
-KINDS = ("disk", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco")
-NOT_YET = ("cross",)
+KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco")
 
 
 @dataclass(frozen=True)
 class TargetSettings:
-    """What the targets are: single disks, or a board whose corners or dots have their places on it.
+    """What the targets are: single disks or crosses, or a board whose corners or dots have their places on it.
 
     diameter_mm: of the disks, also those of a board, in object space; None for corners, and where nothing is to be
-    corrected. code: the ring about some of the disks; numbers: the point that each number of that code is, those of
-    numbers that are not named here having the number as their name.
+    corrected. arm_mm: half the length of a cross in object space; cross_line: the width of its bars in that unit, None
+    where the targets are no crosses. code: the ring about some of the disks; numbers: the point that each number of
+    that code is, those of numbers that are not named here having the number as their name.
     """
 
     kind: str
     diameter_mm: float | None = None
+    arm_mm: float | None = None
+    cross_line: float | None = None
     polarity: Polarity = "auto"
     board: BoardSpec | None = None
     code: RingCode | None = None
@@ -32,12 +34,11 @@ class TargetSettings:
 
 def read_targets(table: Table) -> TargetSettings:
     """Read the table. Raises InputError naming the key that is wrong."""
-    kind = table.text("kind")
-    if kind in NOT_YET:
-        raise table.error("kind", f"{kind} targets cannot be measured yet. Give their comparator.csv instead.")
     kind = table.text("kind", choices=KINDS)
     if kind == "disk":
-        settings = TargetSettings(kind, table.number("diameter_mm", above=0.0), _polarity(table))
+        settings = TargetSettings(kind, table.number("diameter_mm", above=0.0), polarity=_polarity(table))
+    elif kind == "cross":
+        settings = _crosses(table)
     elif kind == "coded-ring":
         settings = _coded(table)
     else:
@@ -51,6 +52,13 @@ def read_targets(table: Table) -> TargetSettings:
     return settings
 
 
+def _crosses(table: Table) -> TargetSettings:
+    arm, line = table.number("arm_mm", above=0.0), table.number("line_mm", above=0.0)
+    if line >= arm:
+        raise table.error("line_mm", f"a line of {line:g} mm is no line for arms of {arm:g} mm. Give its width.")
+    return TargetSettings("cross", arm_mm=arm, cross_line=line / arm, polarity=_polarity(table))
+
+
 def _coded(table: Table) -> TargetSettings:
     default = RingCode()
     diameter = table.number("diameter_mm", above=0.0) if "diameter_mm" in table else None
@@ -59,7 +67,7 @@ def _coded(table: Table) -> TargetSettings:
         code = RingCode(bits, table.pair("ring", default.ring))
     except ValueError as error:
         raise table.error("kind", f"this coded-ring is impossible: {error}.") from None
-    return TargetSettings("coded-ring", diameter, _polarity(table), code=code, numbers=_numbers(table, code))
+    return TargetSettings("coded-ring", diameter, polarity=_polarity(table), code=code, numbers=_numbers(table, code))
 
 
 def _numbers(table: Table, code: RingCode) -> dict[int, str]:

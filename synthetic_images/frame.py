@@ -10,8 +10,16 @@ from synthetic_images.areas import Area, bounds, centroid, disk, polygon, subdiv
 from synthetic_images.damage import damage
 from synthetic_images.film import FrameGeometry, frame_geometry
 from synthetic_images.paint import AreaPaint, ChipPaint, Paint, chip_paint
-from synthetic_images.scene import BoardField, ChipMark, DiskField, DrawnMark, Scene, SceneFiducial
-from synthetic_images.targets import Target, board_sheet, chessboard_squares, disk_outline, field_targets
+from synthetic_images.scene import BoardField, ChipMark, CrossFigure, DiskField, DrawnMark, Scene, SceneFiducial
+from synthetic_images.targets import (
+    Target,
+    board_sheet,
+    chessboard_squares,
+    disk_outline,
+    field_targets,
+    figure_outlines,
+    figure_reach,
+)
 from synthetic_images.truth import FrameTruth, Position
 
 Array = NDArray[np.float64]
@@ -94,12 +102,12 @@ def _target_positions(geometry: FrameGeometry) -> dict[str, Position]:
     positions: dict[str, Position] = {}
     centers, reaches = np.empty((0, 2)), np.empty(0)  # of the nearer targets, with their surrounds
     for target in reversed(_far_to_near(geometry)):
-        outline = target.center[None] if target.radius == 0.0 else disk_outline(target, target.radius)
+        outline = target.center[None] if target.radius == 0.0 else disk_outline(target, figure_reach(field, target))
         pixels = geometry.pixel_from_object(np.vstack([target.center, outline]))
         if not np.isfinite(pixels).all():
             continue
         center, outline_px = pixels[0], pixels[1:]
-        figure = center if target.radius == 0.0 else centroid((outline_px,))
+        figure = _figure_center(geometry, target, center)
         reach = float(np.linalg.norm(outline_px - center, axis=1).max())
         hidden = _hidden(geometry, target, outline_px)
         if not hidden and (np.linalg.norm(centers - center, axis=1) < reaches + reach).any():
@@ -108,6 +116,14 @@ def _target_positions(geometry: FrameGeometry) -> dict[str, Position]:
             centers, reaches = np.vstack([centers, center]), np.append(reaches, reach * surround)
         positions[target.id] = Position(center, figure, hidden)
     return {target.id: positions[target.id] for target in field_targets(field) if target.id in positions}
+
+
+def _figure_center(geometry: FrameGeometry, target: Target, center: Array) -> Array:
+    """(2,) where the figure that is measured has its centre: a disk's ellipse beside the image of the disk's own."""
+    field = geometry.scene.field
+    if target.radius == 0.0 or (isinstance(field, DiskField) and isinstance(field.figure, CrossFigure)):
+        return center
+    return centroid((geometry.pixel_from_object(disk_outline(target, target.radius)),))
 
 
 def _hidden(geometry: FrameGeometry, target: Target, outline_px: Array) -> str:
@@ -159,8 +175,9 @@ def _field_paints(geometry: FrameGeometry, positions: dict[str, Position]) -> It
         if target.id not in positions or positions[target.id].hidden in ("faces away", "off the scan"):
             continue
         if field.surround:
-            yield from _object_paint(geometry, (disk_outline(target, target.radius * field.surround),), tones.surround)
-        yield from _object_paint(geometry, (disk_outline(target, target.radius),), tones.target)
+            around = disk_outline(target, figure_reach(field, target) * field.surround)
+            yield from _object_paint(geometry, ((around,),), tones.surround)
+        yield from _object_paint(geometry, figure_outlines(field, target), tones.target)
 
 
 def _far_to_near(geometry: FrameGeometry) -> list[Target]:
@@ -169,20 +186,20 @@ def _far_to_near(geometry: FrameGeometry) -> list[Target]:
 
 
 def _board_paints(geometry: FrameGeometry, field: BoardField) -> Iterator[Paint]:
-    yield from _object_paint(geometry, (board_sheet(field),), BOARD_WHITE)
+    yield from _object_paint(geometry, ((board_sheet(field),),), BOARD_WHITE)
     if field.kind == "chessboard":
-        yield from _object_paint(geometry, chessboard_squares(field), BOARD_BLACK)
+        yield from _object_paint(geometry, (chessboard_squares(field),), BOARD_BLACK)
         return
     for target in field_targets(field):
-        yield from _object_paint(geometry, (disk_outline(target, target.radius),), BOARD_BLACK)
+        yield from _object_paint(geometry, ((disk_outline(target, target.radius),),), BOARD_BLACK)
 
 
-def _object_paint(geometry: FrameGeometry, outlines: tuple[Array, ...], tone: float) -> Iterator[Paint]:
-    """One area of outlines (n, 3) in object space; those that reach behind the camera are not seen."""
-    pixels = tuple(geometry.pixel_from_object(outline) for outline in outlines)
-    area = tuple(outline for outline in pixels if np.isfinite(outline).all())
-    if area:
-        yield AreaPaint((area,), tone, inside_frame=True)
+def _object_paint(geometry: FrameGeometry, areas: tuple[tuple[Array, ...], ...], tone: float) -> Iterator[Paint]:
+    """Areas of outlines (n, 3) in object space, in one paint; outlines that reach behind the camera are not seen."""
+    pixels = [[geometry.pixel_from_object(outline) for outline in area] for area in areas]
+    seen = [tuple(outline for outline in area if np.isfinite(outline).all()) for area in pixels]
+    if any(seen):
+        yield AreaPaint(tuple(area for area in seen if area), tone, inside_frame=True)
 
 
 def _fiducial_paints(geometry: FrameGeometry) -> Iterator[Paint]:

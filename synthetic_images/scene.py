@@ -107,12 +107,40 @@ class DiskTarget:
 
 
 @dataclass(frozen=True)
+class CrossFigure:
+    """A cross in the place of a disk, as long as the disk is wide: one bar along the horizontal (along X where the
+    target faces up), one at right angles. line: the bars' width in halves of their length."""
+
+    line: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.line < 1.0:
+            raise ValueError(f"the line of a cross is narrower than half its length, not {self.line} of it")
+
+
+@dataclass(frozen=True)
+class RingFigure:
+    """Segments of a ring about some disks. numbers: by target, whose bits, the highest first and clockwise as seen, are
+    the segments that are drawn; inner, outer: the ring's radii in those of the disk."""
+
+    bits: int
+    inner: float
+    outer: float
+    numbers: Mapping[str, int]
+
+    def __post_init__(self) -> None:
+        if not 1.0 < self.inner < self.outer:
+            raise ValueError(f"a ring lies about its disk: from {self.inner} to {self.outer} of its radius is no ring")
+
+
+@dataclass(frozen=True)
 class DiskField:
-    """Disks of one diameter (object units), each on a surround so many times as wide (0: none)."""
+    """Disks of one diameter (object units), or other figures, each on a surround so many times as wide (0: none)."""
 
     targets: tuple[DiskTarget, ...]
     diameter: float
     surround: float = 2.0
+    figure: CrossFigure | RingFigure | None = None
 
     def __post_init__(self) -> None:
         positive("diameter of the targets", self.diameter)

@@ -5,17 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetic_images.areas import disk, subdivided
-from synthetic_images.scene import BoardField, DiskField, DiskTarget
+from synthetic_images.areas import Area, bar, disk, subdivided
+from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarget, RingFigure
 
 Array = NDArray[np.float64]
 
 EDGE_PIECES = 16  # of a board's edges, which the distortion bends
+ARC_PIECES = 24  # of a segment of a ring
+FACES_UP = 0.9  # cosine of the angle to Z, above which a target's own X is the object's
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """One point of the field. center, normal: (3,); radius: of its disk, 0 for the corner of a chessboard."""
+    """One point of the field. center, normal: (3,); radius: of its disk or half its cross, 0 for the corner of a
+    chessboard."""
 
     id: str
     center: Array
@@ -49,6 +52,54 @@ def disk_outline(target: Target, radius: float) -> Array:
     u /= np.linalg.norm(u)
     circle = disk((0.0, 0.0), radius)[0]
     return np.asarray(target.center + circle[:, :1] * u + circle[:, 1:] * np.cross(target.normal, u))
+
+
+def figure_reach(field: DiskField | BoardField, target: Target) -> float:
+    """The radius of the circle that holds all that is drawn of a target."""
+    if isinstance(field, DiskField) and isinstance(field.figure, RingFigure) and target.id in field.figure.numbers:
+        return target.radius * field.figure.outer
+    return target.radius
+
+
+def figure_outlines(field: DiskField, target: Target) -> tuple[tuple[Array, ...], ...]:
+    """The areas that are drawn of a target, each of outlines (n, 3)."""
+    if isinstance(field.figure, CrossFigure):
+        r, line = target.radius, target.radius * field.figure.line
+        areas: tuple[Area, ...] = (bar((-r, 0.0), (r, 0.0), line), bar((0.0, -r), (0.0, r), line))
+    elif field.figure is not None and target.id in field.figure.numbers:
+        areas = (disk((0.0, 0.0), target.radius), *_segments(field.figure, target))
+    else:
+        return ((disk_outline(target, target.radius),),)
+    u, v = _own_axes(target.normal)
+    return tuple(
+        tuple(
+            target.center + xy[:, :1] * u + xy[:, 1:] * v
+            for xy in (subdivided(outline, EDGE_PIECES) for outline in area)
+        )
+        for area in areas
+    )
+
+
+def _segments(figure: RingFigure, target: Target) -> tuple[Area, ...]:
+    """The segments of a target's ring that are set, clockwise from the top; neighbours in one piece."""
+    number, step = figure.numbers[target.id], 2.0 * np.pi / figure.bits
+    areas: list[Area] = []
+    for bit in range(figure.bits):
+        if number >> (figure.bits - 1 - bit) & 1:
+            angle = np.pi / 2.0 - step * (bit + np.linspace(0.0, 1.0, ARC_PIECES))
+            arc = target.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            areas.append((np.concatenate([figure.inner * arc, figure.outer * arc[::-1]]),))
+    return tuple(areas)
+
+
+def _own_axes(normal: Array) -> tuple[Array, Array]:
+    """A target's right and up, as seen from where it faces."""
+    if abs(normal[2]) < FACES_UP:
+        right = np.cross([0.0, 0.0, 1.0], normal)
+    else:
+        right = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    right = right / np.linalg.norm(right)
+    return right, np.cross(normal, right)
 
 
 def board_sheet(field: BoardField) -> Array:

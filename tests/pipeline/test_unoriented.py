@@ -1,0 +1,103 @@
+"""Crosses and ring-coded disks in space, rendered: named with no orientation, measured to their standard deviations."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from measure.results import MarkMeasurement
+from pipeline.errors import InputError
+from pipeline.measure_stage import measure_scan
+from pipeline.measurement_file import MeasuredScan
+from pipeline.project_file import read_project
+from pipeline.scene_file import render_project
+from pipeline.tables import read_toml
+from pipeline.target_table import read_targets
+
+Array = NDArray[np.float64]
+
+SCENE = """seed = 3
+[camera]
+name = "c"
+frame_mm = [24.0, 16.0]
+principal_distance_mm = 20.0
+[scan]
+pitch_um = 20.0
+margin_mm = 0.1
+noise = 0.01
+[[image]]
+name = "a"
+position = [0.9, -0.4, 2.3]
+angles_deg = [10.0, 22.0, 130.0]
+[field]
+surround = 1.5
+{field}
+[[field.scatter]]
+first = 5001
+points = 20
+right = [2.2, 0.0, 0.0]
+up = [0.0, 1.5, 0.0]
+relief = 0.35
+"""
+CROSSES = 'kind = "crosses"\narm_mm = 45.0\nline_mm = 12.0'
+RINGS = 'kind = "coded-rings"\ndiameter_mm = 36.0\nevery = 2'
+
+
+def rendered(folder: Path, field: str) -> tuple[Path, dict[str, Array]]:
+    """The project without its orientations, and the true places of the figures that are wholly seen."""
+    (folder / "scene.toml").write_text(SCENE.format(field=field), encoding="utf-8")
+    render_project(folder / "scene.toml", folder)
+    project = folder / "project.toml"
+    lines = project.read_text(encoding="utf-8").splitlines()
+    project.write_text("\n".join(line for line in lines if not line.startswith("images")), encoding="utf-8")
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["images"]["a"]["targets"]
+    places = {id: np.array([t["ellipse_col_px"], t["ellipse_row_px"]]) for id, t in truth.items() if t["visible"]}
+    return project, places
+
+
+def errors(scan: MeasuredScan, places: dict[str, Array]) -> dict[str, Array]:
+    marks = {mark.point: mark for mark in scan.frame.marks if mark.status.is_observation}
+    return {id: error(marks[id], place) for id, place in places.items() if id in marks}
+
+
+def error(mark: MarkMeasurement, place: Array) -> Array:
+    assert mark.center_px is not None
+    return mark.center_px - place
+
+
+def test_crosses_in_space(tmp_path: Path) -> None:
+    project, places = rendered(tmp_path, CROSSES)
+    scan = measure_scan(read_project(project), "a")
+    off = errors(scan, places)
+    assert len(off) == len(places) > 12
+    assert max(np.abs(one).max() for one in off.values()) < 0.03
+
+
+def test_ring_codes_in_space_and_two_that_are_confused(tmp_path: Path) -> None:
+    project, places = rendered(tmp_path, RINGS)
+    off = errors(measure_scan(read_project(project), "a"), places)
+    assert len(off) == len(places) > 12
+    assert max(np.abs(one).max() for one in off.values()) < 0.08
+    first, second = [id for id in places if int(id) < 4096][:2]
+    points = tmp_path / "points.csv"
+    swap = {first: second, second: first}
+    rows = [row.split(",", 1) for row in points.read_text(encoding="utf-8").splitlines()]
+    points.write_text("\n".join(f"{swap.get(id, id)},{rest}" for id, rest in rows), encoding="utf-8")
+    scan = measure_scan(read_project(project), "a")
+    assert any("lie where the field has another point" in problem for problem in scan.frame.problems)
+    confused = errors(scan, places)
+    assert set(confused) & {first, second} == set()
+    assert len(confused) >= len(places) - 4
+
+
+@pytest.mark.parametrize(
+    ("targets", "message"),
+    [('kind = "cross"\narm_mm = 5.0\nline_mm = 6.0', "a line of 6 mm is no line for arms of 5 mm"),
+     ('kind = "cross"\nline_mm = 6.0', "arm_mm")],
+)  # fmt: skip
+def test_what_a_cross_cannot_be(tmp_path: Path, targets: str, message: str) -> None:
+    (tmp_path / "t.toml").write_text(targets, encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        read_targets(read_toml(tmp_path / "t.toml"))
