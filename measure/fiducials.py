@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from measure.candidates import Look, respond, respond_about
 from measure.centred_frame import centred_places_px, is_complete, is_worth_a_look, reach_mm
 from measure.constellation import Bounds, Placement, PlacementSearch, same_picture, signs_of
+from measure.edge_place import EdgePlace
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame, measure_frame
 from measure.learned import honest_covariance
@@ -23,7 +24,7 @@ Array = NDArray[np.float64]
 _SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
 _STEP_TOLERANCE = 0.06
 _SET = ("set in the project.",)
-_TRIALS = 2  # placements tried at full resolution after the best one has failed
+_TRIALS = 4  # placements tried at full resolution after the best one has failed
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
 
@@ -47,15 +48,14 @@ def measure_fiducials(
         return _nothing(scan, layout, "nothing in the scan looks like two or more of the camera's marks")
     if not frame.accepted:
         return _nothing(scan, layout, frame.misfit())
-    place = frame.placement
-    found = [placement for placement in found if placement.pitch_mm == place.pitch_mm]
-    found.sort(key=lambda placement: not placement.same_place(place))
+    found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
     pose = Pose(options.pose, True, _SET)
     if options.pose == "auto":
-        pose = decide_pose(scan, layout, found, frame.fits, frame.weights, options)
+        posed = [_posed(found, frame.placement, pose) for pose in POSES]
+        pose = decide_pose(scan, layout, posed, frame, options)
         if pose.name != frame.placement.pose:
-            frame = measure_frame(scan, layout, _best(found, pose.name), options)
-    return _measurement(scan, layout, frame, pose, _rivals(found, pose.name))
+            frame = measure_frame(scan, layout, posed[POSES.index(pose.name)], options)
+    return _measurement(scan, layout, frame, pose, _rivals(found, frame.placement))
 
 
 def _in_the_middle(
@@ -98,9 +98,10 @@ def _found(
 
 
 def _others(found: Sequence[Placement]) -> list[Placement]:
-    """The placements next in score that put the frame elsewhere."""
+    """The placements that put the frame elsewhere, those first that many marks speak for: a few strong answers are
+    often false ones."""
     others: list[Placement] = []
-    for placement in found[1:]:
+    for placement in sorted(found[1:], key=lambda placement: -placement.score * placement.supported):
         if not any(placement.same_place(other) for other in (found[0], *others)):
             others.append(placement)
         if len(others) == _TRIALS:
@@ -151,16 +152,19 @@ def _placements(
     return [placement for _, _, found in searched for placement in found]
 
 
-def _best(found: Sequence[Placement], pose: str) -> Placement:
-    return next(placement for placement in found if placement.pose == pose)
+def _posed(found: Sequence[Placement], best: Placement, pose: str) -> Placement:
+    """The placement of a pose at the place of the best one: as it was found, or else the best one's, renamed."""
+    return next(
+        (placement for placement in found if placement.pose == pose and placement.same_place(best)), best.posed(pose)
+    )
 
 
-def _rivals(found: Sequence[Placement], pose: str) -> list[str]:
+def _rivals(found: Sequence[Placement], best: Placement) -> list[str]:
     """Sentences about other placements in the same pose that nearly as many marks speak for."""
-    same = [placement for placement in found if placement.pose == pose]
-    best = same[0]
     problems = []
-    for other in same[1:]:
+    for other in found:
+        if other.pose != best.pose or other.same_place(best):
+            continue
         if other.score >= _AMBIGUOUS * best.score and other.supported >= best.supported - 1:
             shift = np.linalg.solve(
                 best.pixel_from_camera[:, :2], other.pixel_from_camera[:, 2] - best.pixel_from_camera[:, 2]
@@ -214,6 +218,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
         "significance": fit.significance,
         "redundancy": float(fit.redundancy),
         "neighbour_correlation": fit.neighbour_correlation,
+        **_by_edges(fit.edges),
     }
     status, reason = frame.verdict(index)
     covariance = fit.covariance_px2
@@ -222,3 +227,15 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
         if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:
             status, reason = Status.WEAK, "its template is its own picture: nothing checks its place"
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
+
+
+def _by_edges(edges: EdgePlace | None) -> dict[str, float]:
+    """How far from the matched place the second method puts the mark, and in standard deviations of that."""
+    if edges is None:
+        return {}
+    col, row = edges.offset_px
+    return {
+        "second_method_col_px": float(col),
+        "second_method_row_px": float(row),
+        "second_method_sigmas": edges.sigmas,
+    }

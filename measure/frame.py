@@ -45,11 +45,12 @@ _EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey value
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """belongs: (n,) marks that were found and agree. misfit_mm: (n,) how far each mark found is from where the frame
-    puts it, nan without one; scatter_mm: the median of those that belong. pixel_from_camera: (2, 3), the placement's
-    own where fewer than two marks belong."""
+    """camera_mm: (n, 2) given. belongs: (n,) marks that were found and agree. misfit_mm: (n,) how far each mark found
+    is from where the frame puts it, nan without one; scatter_mm: the median of those that belong. pixel_from_camera:
+    (2, 3), the placement's own where fewer than two marks belong."""
 
     placement: Placement
+    camera_mm: Array
     sightings: tuple[Sighting, ...]
     belongs: Mask
     misfit_mm: Array
@@ -66,6 +67,13 @@ class Frame:
     def all_clear(self) -> bool:
         """Whether every mark that belongs is plainly there."""
         return all(fit is None or fit.likeness >= _CLEAR_LIKENESS for fit in self.fits)
+
+    @property
+    def missed_px(self) -> list[Array]:
+        """Where the frame puts the marks in the scan that were not found."""
+        places = [self.pixel_from_camera @ (*xy, 1.0) for xy in self.camera_mm]
+        missed = [s.inside and not ok for s, ok in zip(self.sightings, self.belongs, strict=True)]
+        return [np.asarray(place) for place, gone in zip(places, missed, strict=True) if gone]
 
     @property
     def accepted(self) -> bool:
@@ -255,6 +263,7 @@ class _Sighter:
         sightings = tuple(sighting for sighting in self.sightings if sighting is not None)
         return Frame(
             self.placement,
+            self.camera,
             sightings,
             self.belongs,
             self._misfit_mm(),

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.edge_place import EdgePlace, edge_place
 from measure.grain import grain_model
 from measure.match_options import MatchOptions
 from measure.noise import correlated, is_textured, noise_model
@@ -36,7 +37,7 @@ class Match:
     one pixel. damaged_fraction: share of the pixels about the mark that were cut out. redundancy: pixels used less
     unknowns. neighbour_correlation: of the residuals; they were taken as white where covariance_is_white. likeness:
     correlation of the fitted picture with the window, less its plane background: 1 for a perfect mark, 0 for none.
-    significance: the contrast over its own standard deviation.
+    significance: the contrast over its own standard deviation. edges: the mark's place by another method, to compare.
     """
 
     converged: bool
@@ -54,6 +55,7 @@ class Match:
     likeness: float
     significance: float
     residuals_dn: Array
+    edges: EdgePlace | None = None
 
     @property
     def snr(self) -> float:
@@ -121,6 +123,7 @@ def _result(fit: PictureFit) -> Match:
     model, used = fit.model, fit.used
     noise = noise_model(model.residuals, used, len(model.design))
     covariance, gain_sigma = np.full((2, 2), np.inf), np.inf
+    edges: EdgePlace | None = None
     if not fit.reason:
         masked = model.design * used
         if not noise.is_white:
@@ -133,6 +136,10 @@ def _result(fit: PictureFit) -> Match:
         full = inverse @ middle @ inverse
         covariance = (full[:2, :2] + full[:2, :2].T) / 2
         gain_sigma = float(np.sqrt(max(full[-GREY, -GREY], 1e-12)))
+        by_grey = np.tensordot(inverse, masked, axes=1)
+        edges = edge_place(
+            model.residuals, used, model.design, by_grey, noise, float(np.sqrt(model.state.variance_px2))
+        )
         if not np.all(np.linalg.eigvalsh(covariance) > 0):
             covariance = (inverse * noise.variance_dn2)[:2, :2]
     state = model.state
@@ -152,6 +159,7 @@ def _result(fit: PictureFit) -> Match:
         likeness=_likeness(fit),
         significance=fit.contrast_dn / gain_sigma,
         residuals_dn=np.where(fit.area, model.residuals, np.nan),
+        edges=edges,
     )
 
 

@@ -13,169 +13,169 @@ from numpy.typing import NDArray
 
 from measure.constellation import Placement
 from measure.fiducial_options import FiducialOptions
-from measure.frame_fit import fit_frame
+from measure.frame import Frame
+from measure.frame_fit import FrameFit, fit_frame
 from measure.matching import Match
-from measure.poses import POSES, up_from_camera
-from measure.rendering import extent_px, render
+from measure.pose_pictures import Shown, Site
+from measure.poses import up_from_camera
 from measure.results import Pose
 from measure.scan import Scan
-from measure.shapes import FiducialLayout, Mark
+from measure.shapes import Disk, FiducialLayout, Mark, MarkShape
 
 Array = NDArray[np.float64]
 
 _DECIDED = 7.0  # log-odds: a thousand to one
-_PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
-_OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
+_TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence
+_FILM_DEGREES = 4.0  # of freedom that the standard deviations of film and given places are known with: to a third
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Verdict:
-    """One pose's log-likelihoods, of the pictures and of the coordinates, and how many marks it names."""
+    """One pose's log-likelihoods, of the pictures (sites,) and of the coordinates; names: of each site's mark, -1 for
+    none; chi_square: of the coordinates."""
 
     pose: str
-    pictures: float
+    names: tuple[int, ...]
+    pictures: Array
+    coordinates: float
     chi_square: float
-    redundancy: int
-    named: int
+
+    @property
+    def total(self) -> float:
+        return float(self.pictures.sum()) + self.coordinates
 
 
 def decide_pose(
-    scan: Scan,
-    layout: FiducialLayout,
-    found: Sequence[Placement],
-    fits: Sequence[Match | None],
-    weights: Sequence[float] | None,
-    options: FiducialOptions,
+    scan: Scan, layout: FiducialLayout, placements: Sequence[Placement], frame: Frame, options: FiducialOptions
 ) -> Pose:
-    """The pose, from all poses' placements (the best first) and the fits of the best one's marks, None where a mark
-    was not found."""
-    seen = [fit for fit in fits if fit is not None]
-    judge = _Judge(scan, layout, seen, weights, found[0].pitch_mm, options)
-    best_of_pose: dict[str, Placement] = {}
-    for placement in found:
-        best_of_pose.setdefault(placement.pose, placement)
-    verdicts = [judge.verdict(best_of_pose[pose]) for pose in POSES if pose in best_of_pose]
-    return _decision([verdict for verdict in verdicts if verdict is not None], len(seen))
+    """The pose, from a placement for each (at the place of the frame that was measured in one of them)."""
+    seen = [fit for fit in frame.fits if fit is not None]
+    missed = frame.missed_px
+    named = [
+        each
+        for each in (_Named.of(placement, layout, seen, missed, options) for placement in placements)
+        if each is not None
+    ]
+    sites = [Site(scan, fit, fit.center_px, frame.weights) for fit in seen]
+    # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
+    usual = sorted(seen, key=lambda fit: abs(fit.contrast_dn))[len(seen) // 2]
+    sites += [Site(scan, usual, place, frame.weights) for place in missed]
+    pictures = np.array(
+        [site.likelihoods([each.shown(index, layout) for each in named]) for index, site in enumerate(sites)]
+    ).reshape(len(sites), len(named))
+    verdicts = [each.verdict(pictures[:, index]) for index, each in enumerate(named)]
+    return _decision(verdicts, layout)
 
 
-class _Judge:
-    """Gives verdicts on the marks that were found, whichever names a pose gives them."""
+@dataclass(frozen=True, eq=False)
+class _Named:
+    """The places of marks, found or missed, by the names that a pose gives them (-1: none), and the frame through those
+    found."""
 
-    def __init__(
-        self,
-        scan: Scan,
+    pose: str
+    names: tuple[int, ...]
+    fit: FrameFit
+    linear: Array
+
+    @classmethod
+    def of(
+        cls,
+        placement: Placement,
         layout: FiducialLayout,
         seen: Sequence[Match],
-        weights: Sequence[float] | None,
-        pitch_mm: tuple[float, float],
+        missed: Sequence[Array],
         options: FiducialOptions,
-    ) -> None:
-        self.layout, self.seen, self.options = layout, seen, options
-        self.pitch = np.asarray(pitch_mm)
-        self.camera = np.array([mark.xy_mm for mark in layout.marks])
-        self.sites = [_Site(scan, [mark.mark for mark in layout.marks], fit, weights) for fit in seen]
-
-    def verdict(self, placement: Placement) -> _Verdict | None:
-        """None where the pose names fewer than two of the marks found."""
-        matrix = placement.pixel_from_camera
-        predicted = self.camera @ matrix[:, :2].T + matrix[:, 2]
-        centers = np.array([fit.center_px for fit in self.seen])
-        distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * self.pitch, -1, 0))
-        names = [
-            int(index) if distance[index, j] < 4 * self.options.gate_mm else -1
-            for j, index in enumerate(distance.argmin(axis=0))
-        ]
-        named = [j for j, name in enumerate(names) if name >= 0]
-        if len(named) < 2 or len({names[j] for j in named}) < len(named):
+    ) -> "_Named | None":
+        """None where the pose names fewer than two of the marks found, or two alike."""
+        pitch, camera = np.asarray(placement.pitch_mm), np.array([mark.xy_mm for mark in layout.marks])
+        predicted = camera @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        centers = np.array([*(fit.center_px for fit in seen), *missed])
+        distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
+        nearest = distance.argmin(axis=0)
+        near = distance.min(axis=0) < 4 * options.gate_mm
+        names = np.where(near, nearest, -1)
+        if len(np.unique(names[near])) < near.sum():
             return None
-        camera = self.camera[[names[j] for j in named]]
-        up = centers[named] * self.pitch * (1.0, -1.0)
-        fit = fit_frame(camera, up, self._sigma([names[j] for j in named], named), up_from_camera(placement.pose))
-        linear = np.diag([1.0, -1.0]) @ fit.up_from_camera[:, :2] / self.pitch[:, None]
-        pictures = sum(
-            site.likelihood(self.layout.marks[name].mark if name >= 0 else None, linear)
-            for site, name in zip(self.sites, names, strict=True)
-        )
-        return _Verdict(placement.pose, pictures, fit.chi_square, fit.redundancy, len(named))
+        near, centers = near[: len(seen)], centers[: len(seen)]
+        if near.sum() < 2:
+            return None
+        own = names[: len(seen)][near]
+        given = np.array([min(max(layout.marks[name].sigma_mm), 1e3) for name in own])
+        measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in seen])[near] * pitch.mean()
+        sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
+        up = centers[near] * pitch * (1.0, -1.0)
+        fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose))
+        linear = np.diag([1.0, -1.0]) @ fit.up_from_camera[:, :2] / pitch[:, None]
+        return cls(placement.pose, tuple(int(name) for name in names), fit, linear)
 
-    def _sigma(self, names: Sequence[int], named: Sequence[int]) -> Array:
-        given = np.array([min(max(self.layout.marks[name].sigma_mm), 1e3) for name in names])
-        measured = np.array([np.sqrt(np.trace(self.seen[j].covariance_px2) / 2) for j in named]) * self.pitch.mean()
-        return np.asarray(np.sqrt(given**2 + measured**2 + self.options.film_sigma_mm**2))
+    def shown(self, site: int, layout: FiducialLayout) -> Shown:
+        return Shown(None if self.names[site] < 0 else layout.marks[self.names[site]].mark, self.linear)
 
-
-class _Site:
-    """A place where a mark was found, with the window that every pose's mark is compared with."""
-
-    def __init__(self, scan: Scan, marks: Sequence[Mark], fit: Match, weights: Sequence[float] | None) -> None:
-        self.fit = fit
-        reach = max(_reach_px(mark, fit.pixel_from_mark[:, :2]) for mark in marks)
-        col0, row0 = np.floor(fit.center_px - reach - 4).astype(int)
-        width = height = int(np.ceil(2 * reach)) + 10
-        self.window = scan.window(int(col0), int(row0), width, height, weights).astype(float)
-        self.center = fit.center_px - (col0, row0)
-        self.known: list[tuple[Array, float]] = []
-        self.noise_dn = fit.noise_dn
-
-    def likelihood(self, mark: Mark | None, linear: Array) -> float:
-        """The log-likelihood of the window under a mark (None: bare background), up to a constant."""
-        height, width = self.window.shape
-        row, col = np.mgrid[:height, :width].astype(float)
-        columns = [np.ones_like(row), col / width, row / height]
-        if mark is not None:
-            rendering = render(mark, np.column_stack([linear, self.center]), width, height, self.fit.blur_px)
-            shown = [rendering.value, rendering.by_col, rendering.by_row]
-            for other, known in self.known:
-                if np.abs(other - shown[0]).max() < 0.05:
-                    return known
-            columns += shown
-        design = np.stack([column.ravel() for column in columns], axis=1)
-        grey = self.window.ravel()
-        residuals = grey - design @ np.linalg.lstsq(design, grey, rcond=None)[0]
-        relative = np.minimum(np.abs(residuals) / max(self.noise_dn, 1e-9), _OUTLIER)
-        result = float(-np.sum(relative**2) / 2 / _PIXELS_PER_DEGREE)
-        if mark is not None:
-            self.known.append((shown[0], result))
-        return result
+    def verdict(self, pictures: Array) -> _Verdict:
+        """The coordinates' likelihood is Student's: nobody knows the film's standard deviation well."""
+        degrees = _FILM_DEGREES + max(self.fit.redundancy, 0)
+        coordinates = -degrees / 2 * float(np.log1p(self.fit.chi_square / _FILM_DEGREES))
+        return _Verdict(self.pose, self.names, pictures, coordinates, self.fit.chi_square)
 
 
-def _reach_px(mark: Mark, linear: Array) -> float:
-    """How far the mark reaches from its centre, along columns or rows, however it is turned by quarters."""
-    return float(np.abs(extent_px(mark, np.column_stack([linear, np.zeros(2)]))).max())
-
-
-def _decision(verdicts: Sequence[_Verdict], seen: int) -> Pose:
-    """Compare the poses, after scaling coordinate misfits by what the best pose itself leaves unexplained."""
+def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout) -> Pose:
+    """The likeliest pose, and what speaks for it."""
     if not verdicts:
-        return Pose("0", False, (f"no pose names the {seen} marks that were found.",))
-    first = max(verdicts, key=lambda verdict: verdict.pictures - verdict.chi_square / 2)
-    unexplained = max(1.0, first.chi_square / max(first.redundancy, 1))
-
-    def total(verdict: _Verdict) -> float:
-        return verdict.pictures - verdict.chi_square / 2 / unexplained
-
-    best = max(verdicts, key=total)
-    alike = [verdict.pose for verdict in verdicts if total(best) - total(verdict) < _DECIDED]
-    if len(alike) > 1:
-        return Pose(
-            alike[0],
-            False,
-            (
-                f"nothing in the {seen} marks found tells the poses {', '.join(alike)} apart: "
-                f"their pictures and given coordinates are alike; {alike[0]} is assumed.",
-            ),
-        )
-    others = [verdict for verdict in verdicts if verdict is not best]
-    if not others:
-        return Pose(best.pose, True, (f"no other pose explains the {seen} marks found.",))
-    rival = max(others, key=total)
-    pictures = best.pictures - rival.pictures
-    coordinates = (rival.chi_square - best.chi_square) / 2 / unexplained
+        return Pose("0", False, ("no pose names the marks that were found.",))
+    best = max(verdicts, key=lambda verdict: verdict.total)
+    alike = [verdict for verdict in verdicts if best.total - verdict.total < _DECIDED]
+    others = sorted((v for v in verdicts if v not in alike), key=lambda verdict: -verdict.total)
+    against = _against(best, others[0], layout) if others else ()
+    seen = sum(name >= 0 for name in best.names)
+    if len(alike) == 1:
+        return Pose(best.pose, True, against or (f"no other pose explains the {seen} marks found.",))
+    names = ", ".join(verdict.pose for verdict in alike)
     return Pose(
-        best.pose,
-        True,
+        alike[0].pose,
+        False,
         (
-            f"the marks' pictures speak for it against the next best pose {rival.pose} with log-odds {pictures:.1f}.",
-            f"their given coordinates with log-odds {coordinates:.1f}.",
+            f"nothing in the {seen} marks found tells the poses {names} apart: "
+            f"their pictures and given coordinates are alike; {alike[0].pose} is assumed.",
+            *against,
         ),
     )
+
+
+def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout) -> tuple[str, ...]:
+    """What speaks for the best pose against the likeliest of those that it rules out, a sentence each."""
+    sentences = []
+    by_site = best.pictures - rival.pictures
+    if by_site.sum() > _TOLD:
+        telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > _TOLD]
+        kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in telling})
+        sentences.append(
+            f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks speak against the next best pose "
+            f"{rival.pose} with log-odds {by_site.sum():.1f}."
+        )
+    asymmetry = float(np.sqrt(max(rival.chi_square - best.chi_square, 0.0)))
+    if abs(best.coordinates - rival.coordinates) > _TOLD:
+        word = "against" if best.coordinates > rival.coordinates else "for"
+        sentences.append(
+            f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, speaks {word} pose {rival.pose} "
+            f"with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
+        )
+    return tuple(sentences)
+
+
+def _difference(one: int, other: int, layout: FiducialLayout) -> str:
+    """What two marks of the camera are told apart by."""
+    if one < 0 or other < 0:
+        return "marks where the other pose has none"
+    (core, dots), (other_core, other_dots) = (_drawn(layout.marks[index].mark) for index in (one, other))
+    if core != other_core:
+        return "unlike marks"
+    return "identification dots" if dots != other_dots else "the marks' directions"
+
+
+def _drawn(mark: Mark) -> tuple[object, int]:
+    """A mark's figure, whichever way it is turned, and how many dots stand beside it."""
+    if not isinstance(mark, MarkShape):
+        return mark, 0
+    dots = [part for part in mark.parts if isinstance(part, Disk) and part.center_mm != (0.0, 0.0)]
+    rest = [part for part in mark.parts if part not in dots]
+    return sorted(type(part).__name__ for part in rest), len(dots)

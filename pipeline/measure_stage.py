@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 
 from measure.coma import one_definition
+from measure.cross_checks import cross_checked
 from measure.errors import MeasurementError
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
+from measure.pitch_check import pitch_problem
 from measure.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scan import Scan, open_scan
@@ -41,7 +43,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     with _workers(len(project.scans)) as workers:
         learned = learn_marks(project, reporter, workers)
         scans = _measured_scans(learned, reporter, workers)
-    return _one_definition(project, scans)
+    return _checked(learned, _one_definition(project, scans))
 
 
 def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> list[MeasuredScan]:
@@ -51,6 +53,17 @@ def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> 
             future.result()
             count(futures[future], done, len(futures))
     return [future.result() for future in futures]
+
+
+def _checked(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
+    """The fiducials of each camera's frames checked against one another."""
+    frames = {scan.scan: scan.frame for scan in measured}
+    for camera in project.cameras.values():
+        own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
+        if camera.drawn:
+            checked = cross_checked([scan.frame for scan in own], camera.layout())
+            frames |= {scan.scan: frame for scan, frame in zip(own, checked, strict=True)}
+    return tuple(replace(scan, frame=frames[scan.scan]) for scan in measured)
 
 
 def _one_definition(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
@@ -102,7 +115,16 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
     if all(fiducial.passed_over for fiducial in camera.fiducials):
         return FrameMeasurement(name, ())
     pitch = project.pitch_um or scan.pitch_um
-    measured = measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=pose_of(project, camera)))
+    layout, options = camera.layout(), FiducialOptions(pose=pose_of(project, camera))
+    measured = measure_fiducials(scan, layout, pitch, options)
+    if pitch is not None:
+        if measured.pixel_from_camera is None:
+            # A pitch that is far off hides all marks; the frame's size tells it well enough to find them.
+            other = measure_fiducials(scan, layout, None, options)
+            measured = measured if other.pixel_from_camera is None else other
+        source = "the project" if project.pitch_um is not None else "the scan's file"
+        wrong = pitch_problem(measured, layout, pitch, source)
+        measured = replace(measured, problems=(*measured.problems, wrong) if wrong else measured.problems)
     if camera.learned_from is not None and project.pose == "auto" and measured.pose is not None:
         measured = replace(measured, pose=_as_learned(camera.learned_from, scan))
     return replace(measured, image=name, marks=_with_sizes(measured, camera, scan, pitch))

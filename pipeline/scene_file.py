@@ -114,13 +114,13 @@ def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
             camera.distortion.decentering,
         ),
         fiducials=tuple(
-            scene.SceneFiducial(one.id, one.xy_mm, _scene_mark(one.mark) if isinstance(one.mark, shapes.Mark) else None)
+            scene.SceneFiducial(one.id, one.xy_mm, scene_mark(one.mark) if isinstance(one.mark, shapes.Mark) else None)
             for one in camera.fiducials
         ),
     )
 
 
-def _scene_mark(mark: shapes.Mark) -> scene.DrawnMark | scene.ChipMark:
+def scene_mark(mark: shapes.Mark) -> scene.DrawnMark | scene.ChipMark:
     """A mark of no polarity is light, as most are. In a scene polarities are those of the positive."""
     light = mark.polarity != "dark"
     if isinstance(mark, shapes.MarkShape):

@@ -1,0 +1,155 @@
+"""Search and pose in rendered frames, against their truth.
+
+PYTHONPATH=.:benchmarks python benchmarks/search.py OUT.jsonl [--frames 600] [--first 0] [--seed 1]
+
+One line a frame is added to OUT.jsonl, and frames that stand there already are left out, so that a run can be
+continued; then the tables of all its lines are printed. With --only INDEX one frame is told mark by mark, and its
+picture written beside OUT.jsonl.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from search_frames import KINDS, SYMMETRIES, Case, draw_case
+
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.results import FrameMeasurement, MarkMeasurement
+from measure.status import Status
+
+Json = dict[str, Any]
+
+WRONG_SIGMAS = 5.0
+WRONG_PX = 0.5  # what is farther off, and by so many standard deviations, is no measurement of this mark
+OUTCOMES = ("all marks", "some marks", "refused", "wrong, weak", "WRONG")
+
+
+def main() -> None:
+    """Run the frames that are missing, and print."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--frames", type=int, default=600)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", type=int)
+    given = parser.parse_args()
+    if given.only is not None:
+        tell(draw_case(given.seed, given.only), given.out.with_name(f"{given.only}.png"))
+        return
+    done = {line["frame"] for line in lines(given.out)}
+    for index in range(given.first, given.first + given.frames):
+        if index not in done:
+            with given.out.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"frame": index, **judged(draw_case(given.seed, index))}) + "\n")
+    print_tables(lines(given.out))
+
+
+def lines(path: Path) -> list[Json]:
+    """The frames that were done."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+
+
+def judged(case: Case) -> Json:
+    """Measure a frame, and compare it with its truth."""
+    begin = time.perf_counter()
+    result = measured(case)
+    seconds = time.perf_counter() - begin
+    marks = {mark.point: mark for mark in result.marks}
+    observed = {id for id, mark in marks.items() if mark.status.is_observation}
+    wrong = [id for id in observed if is_wrong(case, marks[id], result)]
+    return {
+        "kind": case.kind,
+        "symmetry": case.symmetry,
+        "picture": case.picture,
+        "marks": len(marks),
+        "visible": len(marks) - len(case.hidden),
+        "observed": len(observed),
+        "wrong": len(wrong),
+        "outcome": outcome(case, marks, observed, wrong),
+        "pose": pose_outcome(case, result) if observed else "none",
+        "weak": sum(mark.status is Status.WEAK for mark in marks.values()),
+        "seconds": round(seconds, 2),
+    }
+
+
+def measured(case: Case) -> FrameMeasurement:
+    pitch = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
+    return measure_fiducials(case.scan, case.layout, pitch, FiducialOptions())
+
+
+def is_wrong(case: Case, mark: MarkMeasurement, result: FrameMeasurement) -> bool:
+    """Whether a mark lies where none of that name is; where the pose is only assumed, where there is none at all."""
+    assert mark.center_px is not None
+    assert mark.covariance_px2 is not None
+    decided = result.pose is not None and result.pose.decided
+    names = {mark.point} if decided else set(case.centers_px)
+    errors = [mark.center_px - case.centers_px[id] for id in names - case.hidden]
+    if not errors:
+        return True
+    error = min(errors, key=lambda error: float(np.hypot(*error)))
+    sigmas = float(np.sqrt(error @ np.linalg.solve(mark.covariance_px2, error)))
+    return float(np.hypot(*error)) > WRONG_PX and sigmas > WRONG_SIGMAS
+
+
+def outcome(case: Case, marks: dict[str, MarkMeasurement], observed: set[str], wrong: Sequence[str]) -> str:
+    if any(marks[id].status is Status.MEASURED for id in wrong):
+        return "WRONG"
+    if wrong:
+        return "wrong, weak"
+    if not observed:
+        return "refused"
+    return "all marks" if len(observed) == len(marks) - len(case.hidden) else "some marks"
+
+
+def pose_outcome(case: Case, result: FrameMeasurement) -> str:
+    if result.pose is None or not result.pose.decided:
+        return "assumed"
+    return "right" if result.pose.name == case.pose else "WRONG"
+
+
+def print_tables(done: Sequence[Json]) -> None:
+    """Outcomes by the marks' kind, poses by what could tell them."""
+    print(f"{len(done)} frames, median {np.median([line['seconds'] for line in done]):.2f} s a frame\n")
+    _print_table("marks", "kind", KINDS, "outcome", OUTCOMES, done)
+    _print_table("picture", "picture", sorted({line["picture"] for line in done}), "outcome", OUTCOMES, done)
+    _print_table("pose", "symmetry", SYMMETRIES, "pose", ("right", "assumed", "WRONG", "none"), done)
+    for name, key in (("frames with a wrong mark", "wrong"),):
+        print(f"{name}: {[line['frame'] for line in done if line[key]]}")
+    print(f"frames with a wrong pose: {[line['frame'] for line in done if line['pose'] == 'WRONG']}")
+    print(f"frames refused: {[line['frame'] for line in done if line['outcome'] == 'refused']}")
+
+
+def _print_table(
+    title: str, row_key: str, rows: Sequence[str], column_key: str, columns: Sequence[str], done: Sequence[Json]
+) -> None:
+    print(f"{title:24}" + "".join(f"{column:>13}" for column in columns) + f"{'frames':>9}")
+    for row in rows:
+        own = [line[column_key] for line in done if line[row_key] == row]
+        print(f"{row:24}" + "".join(f"{own.count(column):13d}" for column in columns) + f"{len(own):9d}")
+    print()
+
+
+def tell(case: Case, picture: Path) -> None:
+    """One frame, mark by mark."""
+    result = measured(case)
+    print(f"{case.kind}, {case.symmetry}, {case.picture}; true pose {case.pose}; hidden {sorted(case.hidden)}")
+    print(f"pose {result.pose}\nproblems {result.problems}")
+    for mark in result.marks:
+        true = case.centers_px[mark.point]
+        place = "" if mark.center_px is None else f"{np.round(mark.center_px, 2)}"
+        wrong = mark.status.is_observation and is_wrong(case, mark, result)
+        print(
+            f"{mark.point:3} true {np.round(true, 2)} {place:20} {mark.status} {'WRONG' if wrong else ''} {mark.reason}"
+        )
+    grey = case.scan.window(0, 0, case.scan.width_px, case.scan.height_px)
+    cv2.imwrite(str(picture), (grey / case.scan.full_scale_dn * 255).astype(np.uint8))
+
+
+if __name__ == "__main__":
+    main()

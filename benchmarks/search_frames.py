@@ -1,0 +1,250 @@
+"""Small frames for the study of search and pose: every kind of mark, in all poses, among all that marks are confused
+with. Each is drawn by chance, from a seed of its own."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.picture_scan import WholePicture
+from measure.resolution import NO_TAGS
+from measure.scan import Scan
+from measure.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, Part, cross, dot, polygon, ring_cross, turned
+from pipeline.scene_file import scene_mark
+from synthetic_images.background import scene_background
+from synthetic_images.film import FrameGeometry
+from synthetic_images.frame import make_frame
+from synthetic_images.paint import AreaPaint, ChipPaint, Paint
+from synthetic_images.render import grey_strips
+from synthetic_images.scene import (
+    POSES,
+    Background,
+    DiskField,
+    Film,
+    FilmTransformation,
+    Scanner,
+    Scene,
+    SceneCamera,
+    SceneFiducial,
+    SceneImage,
+    Side,
+    Tones,
+)
+
+Array = NDArray[np.float64]
+Sheet = NDArray[np.uint8]
+Generator = np.random.Generator
+
+KINDS = ("cross", "ring-cross", "dot", "wing")
+SYMMETRIES = ("alike", "uneven", "numbered", "unlike")
+FRAME_MM = 24.0
+PITCH_UM = 28.0
+MARGIN_MM = 4.0
+GIVEN_SIGMA_MM = 0.005
+FILM_UM = 3.0
+APART_MM = 2.0  # of clutter from the marks: what covers a mark is damage, another study
+SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A frame and its truth. picture: what disturbs it, in words; centers_px: (2,) of each mark by id; hidden: the ids
+    of marks that cannot be seen. decidable: whether anything tells its pose."""
+
+    kind: str
+    symmetry: str
+    picture: str
+    layout: FiducialLayout
+    pose: str
+    pitch_um: float | None
+    scan: Scan
+    centers_px: dict[str, Array]
+    hidden: frozenset[str]
+
+
+def draw_case(seed: int, index: int) -> Case:
+    """The index-th frame of the study of that seed."""
+    rng = np.random.default_rng([seed, index])
+    kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
+    layout = _layout(rng, kind, symmetry)
+    tones, picture = _tones(rng)
+    scene = _scene(rng, layout, tones)
+    frame = make_frame(scene, 0)
+    frame = replace(frame, paints=(*frame.paints, *_clutter(rng, layout, frame.truth.geometry, tones)))
+    grey = np.concatenate(list(grey_strips(frame, 0, scene_background(scene))))
+    positions = frame.truth.fiducials
+    return Case(
+        kind=kind,
+        symmetry=symmetry,
+        picture=picture + (", negative" if scene.scanner.negative else ""),
+        layout=layout,
+        pose=scene.images[0].pose,
+        pitch_um=PITCH_UM * float(rng.uniform(0.99, 1.01)) if rng.random() < 0.9 else None,
+        scan=Scan(Path(f"{index}.tif"), WholePicture(grey[..., None]), NO_TAGS),
+        centers_px={id: position.center_px for id, position in positions.items()},
+        hidden=frozenset(id for id, position in positions.items() if position.hidden),
+    )
+
+
+def _layout(rng: Generator, kind: str, symmetry: str) -> FiducialLayout:
+    """Corners, or corners and sides; alike, or made different by a few um, by dots beside the marks, or by kind."""
+    at = float(rng.uniform(10.0, 11.2))
+    places = [(at, -at), (-at, -at), (-at, at), (at, at)]
+    if rng.random() < 0.6:
+        places += [(0.0, -at), (-at, 0.0), (0.0, at), (at, 0.0)]
+    drawings = [_drawing(kind)] * len(places)
+    if symmetry == "numbered":
+        drawings = [(*parts, *_dots(number)) for number, parts in enumerate(drawings)]
+    if symmetry == "unlike":
+        odd = _drawing(KINDS[(KINDS.index(kind) + 1) % len(KINDS)])
+        drawings[0] = odd
+        drawings[1] = odd if rng.random() < 0.3 else drawings[1]
+    offsets = np.zeros((len(places), 2))
+    if symmetry == "uneven":
+        offsets = rng.normal(0.0, rng.choice([0.005, 0.02, 0.1]), offsets.shape)
+    marks = []
+    for number, ((x, y), (dx, dy), parts) in enumerate(zip(places, offsets.tolist(), drawings, strict=True)):
+        shape = MarkShape(parts)
+        if kind == "wing":
+            shape = MarkShape(tuple(turned(shape, float(np.degrees(np.arctan2(y, x)))).parts))  # type: ignore[union-attr]
+        marks.append(LayoutMark(str(number + 1), (x + dx, y + dy), (GIVEN_SIGMA_MM, GIVEN_SIGMA_MM), shape))
+    return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
+
+
+def _drawing(kind: str) -> tuple[Part, ...]:
+    if kind == "cross":
+        return cross(0.5, 0.1)
+    if kind == "ring-cross":
+        return ring_cross(0.5, 0.1, 0.8, 0.1)
+    if kind == "dot":
+        return dot(0.15)
+    return polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35)))
+
+
+def _dots(number: int) -> tuple[Part, ...]:
+    return tuple(Disk((1.05, 0.35 * k - 0.35), 0.1) for k in range(number % 4))
+
+
+def _tones(rng: Generator) -> tuple[Tones, str]:
+    choice = rng.random()
+    if choice < 0.1:
+        return Tones(background=0.88, contrast=0.05, mark=0.97, dark_mark=0.6), "overexposed"
+    if choice < 0.2:
+        return Tones(border=0.02, background=0.06, contrast=0.02, mark=0.3, dark_mark=0.0), "dark"
+    return Tones(background=float(rng.uniform(0.25, 0.5)), contrast=float(rng.uniform(0.04, 0.12))), "normal"
+
+
+def _scene(rng: Generator, layout: FiducialLayout, tones: Tones) -> Scene:
+    fiducials = tuple(SceneFiducial(mark.id, _made(rng, mark), scene_mark(mark.mark)) for mark in layout.marks)
+    ids = [mark.id for mark in layout.marks]
+    covered = rng.choice(ids, int(rng.integers(1, len(ids) // 2)), replace=False) if rng.random() < 0.2 else ()
+    scale = 1.0 + rng.normal(0.0, 0.001, 2)
+    image = SceneImage(
+        name="frame",
+        exterior=(0.0, 0.0, 100.0, 0.0, 0.0, 0.0),
+        pose=str(rng.choice(POSES)),
+        turn_rad=float(np.radians(rng.normal(0.0, 1.0))),
+        offset_mm=(float(rng.normal(0.0, 0.4)), float(rng.normal(0.0, 0.4))),
+        film=FilmTransformation((float(scale[0]), float(scale[1])), float(rng.normal(0.0, 3e-4))),
+        covered=tuple(str(id) for id in covered),
+        neighbour=SIDES[rng.integers(4)] if rng.random() < 0.5 else None,
+        neighbour_gap_mm=float(rng.uniform(0.8, 2.5)),
+    )
+    backgrounds: tuple[Background, ...] = ("wall", "wall", "terrain", "plain")
+    return Scene(
+        name="search",
+        seed=int(rng.integers(2**31)),
+        camera=SceneCamera("search", (FRAME_MM, FRAME_MM), 25.0, fiducials=fiducials),
+        field=DiskField((), 1.0),
+        images=(image,),
+        scanner=Scanner(
+            (PITCH_UM, PITCH_UM),
+            margin_mm=MARGIN_MM,
+            blur_px=float(rng.uniform(0.6, 1.4)),
+            noise=0.01,
+            negative=bool(rng.random() < 0.3),
+        ),
+        film=Film(
+            deformation_um=FILM_UM, grain=float(rng.uniform(0.0, 0.02)), grain_px=1.0, dust=30, scratches=3, hairs=3
+        ),
+        tones=tones,
+        background=backgrounds[rng.integers(4)],
+        pad_mm=float(rng.choice([0.0, 1.4])),
+    )
+
+
+def _made(rng: Generator, mark: LayoutMark) -> tuple[float, float]:
+    """Where the camera has its mark: beside its given place by the given standard deviation."""
+    x, y = rng.normal(mark.xy_mm, mark.sigma_mm)
+    return float(x), float(y)
+
+
+def _clutter(rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, tones: Tones) -> list[Paint]:
+    """Writing, stamps, and figures as the camera's own and other marks, anywhere on the film but on the marks."""
+    if rng.random() < 0.15:
+        return []
+    draw: Sequence[Callable[[], Paint]] = (
+        lambda: _writing(rng, layout, geometry, tones),
+        lambda: _stamp(rng, layout, geometry, tones),
+        lambda: _figure(rng, layout, geometry, tones),
+        lambda: _figure(rng, layout, geometry, tones),
+    )
+    return [draw[int(rng.integers(len(draw)))]() for _ in range(rng.integers(2, 12))]
+
+
+def _free_place(rng: Generator, layout: FiducialLayout) -> Array:
+    """(2,) camera mm, inside of the frame or in the margin about it."""
+    marks = np.array([mark.xy_mm for mark in layout.marks])
+    while True:
+        place = rng.uniform(-1.0, 1.0, 2) * (FRAME_MM / 2 + MARGIN_MM - 1.0)
+        if np.hypot(*(marks - place).T).min() > APART_MM:
+            return np.asarray(place)
+
+
+def _figure(rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, tones: Tones) -> Paint:
+    kind = str(rng.choice(KINDS))
+    drawn = layout.marks[0].mark if rng.random() < 0.4 else MarkShape(_drawing(kind))
+    assert isinstance(drawn, MarkShape)
+    shown = turned(drawn, float(rng.uniform(0.0, 360.0)) if rng.random() < 0.3 else 0.0)
+    place, size = _free_place(rng, layout), 1.0 if rng.random() < 0.5 else float(rng.uniform(0.5, 2.0))
+    mark = scene_mark(shown)
+    areas = tuple(tuple(size * outline + place for outline in area) for area in mark.areas)  # type: ignore[union-attr]
+    tone = tones.mark if rng.random() < 0.7 else tones.dark_mark
+    return AreaPaint(tuple(geometry.pixel_area(area) for area in areas), tone)
+
+
+def _writing(rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, tones: Tones) -> Paint:
+    letters = "".join(rng.choice(list("ABCEFHKLMNTXYZ0123456789+xo.-"), int(rng.integers(2, 9))))
+    return _chip(rng, layout, geometry, tones, lambda cover: _write(cover, letters, float(rng.uniform(0.5, 1.2))))
+
+
+def _stamp(rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, tones: Tones) -> Paint:
+    def draw(cover: Sheet) -> None:
+        cv2.circle(cover, (cover.shape[1] // 2, cover.shape[0] // 2), cover.shape[0] // 2 - 3, 255, 3, cv2.LINE_AA)
+        _write(cover, "No 7", 0.5)
+
+    return _chip(rng, layout, geometry, tones, draw)
+
+
+def _write(cover: Sheet, letters: str, size: float) -> None:
+    cv2.putText(cover, letters, (6, cover.shape[0] * 2 // 3), cv2.FONT_HERSHEY_SIMPLEX, size, 255, 2, cv2.LINE_AA)
+
+
+def _chip(
+    rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, tones: Tones, draw: Callable[[Sheet], None]
+) -> ChipPaint:
+    """A drawing on a small sheet, turned by quarters, that covers no mark."""
+    sheet = np.zeros((44, 120), np.uint8)
+    draw(sheet)
+    cover = np.asarray(np.rot90(sheet / 255.0, int(rng.integers(4))), np.float32)
+    reach_mm = float(np.hypot(*cover.shape)) / 2 * PITCH_UM / 1000
+    marks = np.array([mark.xy_mm for mark in layout.marks])
+    place = _free_place(rng, layout)
+    while np.hypot(*(marks - place).T).min() < reach_mm + 1.0:
+        place = _free_place(rng, layout)
+    center = geometry.pixel_from_camera(place[None])[0]
+    col0, row0 = (round(c - n / 2) for c, n in zip(center, cover.shape[::-1], strict=True))
+    return ChipPaint(cover, col0, row0, tones.mark if rng.random() < 0.6 else tones.dark_mark)

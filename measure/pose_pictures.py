@@ -1,0 +1,113 @@
+"""What a found mark's picture says of which of the camera's marks it is, in whichever direction a pose shows it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.matching import Match
+from measure.noise import robust_scale
+from measure.rendering import extent_px, picture
+from measure.robust import tukey_weights
+from measure.scan import Scan
+from measure.shapes import Mark
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_ALIKE = 0.05  # of the contrast: pictures that differ nowhere by more are one
+_ABOUT_PX = 3.0  # how far about the drawings the ground tells of its grey value
+_PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
+_OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
+_ROUNDS = 4  # of robust weights
+_SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark feigns or hides what tells marks apart
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A mark as a pose shows it at a site: linear, the (2, 2) part of pixel_from_mark. None: bare ground."""
+
+    mark: Mark | None
+    linear: Array
+
+
+class Site:
+    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark."""
+
+    def __init__(self, scan: Scan, like: Match, center_px: Array, weights: Sequence[float] | None) -> None:
+        self.scan, self.like, self.center_px, self.weights = scan, like, center_px, weights
+
+    def likelihoods(self, shown: Sequence[Shown]) -> Array:
+        """The log-likelihood of the picture under what each pose shows here, up to a constant: 0 for the best, and no
+        less than the probability that something else spoils the picture."""
+        reach = max(_reach_px(each) for each in shown) + 2 * _ABOUT_PX
+        col0, row0 = np.floor(self.center_px - reach).astype(int)
+        size = int(np.ceil(2 * reach)) + 1
+        window = self.scan.window(int(col0), int(row0), size, size, self.weights).astype(float)
+        center = self.center_px - (col0, row0)
+        pictures, picture_of = _distinct([self._picture(each, center, size) for each in shown])
+        area = _area(pictures)
+        residuals = [self._residuals(window, each, area) for each in pictures]
+        # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
+        scale = max(self.like.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
+        misfits = np.array([np.sum(np.minimum(np.abs(each) / scale, _OUTLIER) ** 2) for each in residuals])
+        relative = np.exp(-(misfits - misfits.min()) / 2 / _PIXELS_PER_DEGREE)
+        return np.asarray(np.log((1 - _SPOILT) * relative + _SPOILT))[picture_of]
+
+    def _picture(self, shown: Shown, center: Array, size: int) -> Array:
+        if shown.mark is None:
+            return np.zeros((size, size))
+        return picture(shown.mark, np.column_stack([shown.linear, center]), size, size, self.like.blur_px)
+
+    def _residuals(self, window: Array, shown: Array, area: Mask) -> Array:
+        """What the picture on a plane ground leaves, the mark being light or dark as the one that was found; its place
+        may be off by a little, for it was fitted with another drawing."""
+        grey = window[area]
+        row, col = np.nonzero(area)
+        ground = [np.ones_like(grey), col / len(window), row / len(window)]
+        if shown.any():
+            by_row, by_col = (np.asarray(np.gradient(shown, axis=axis)) for axis in (0, 1))
+            columns = [*ground, shown[area], by_row[area], by_col[area]]
+            residuals, solution = _robust(columns, grey)
+            if solution[len(ground)] * self.like.contrast_dn > 0:
+                return residuals
+        return _robust(ground, grey)[0]
+
+
+def _distinct(pictures: Sequence[Array]) -> tuple[list[Array], list[int]]:
+    """The pictures that differ, and which of them each is."""
+    kinds: list[Array] = []
+    index = []
+    for each in pictures:
+        alike = [number for number, kind in enumerate(kinds) if np.abs(kind - each).max() < _ALIKE]
+        index.append(alike[0] if alike else len(kinds))
+        if not alike:
+            kinds.append(each)
+    return kinds, index
+
+
+def _area(pictures: Sequence[Array]) -> Mask:
+    """The pixels about all drawings: farther off lies what no mark explains."""
+    outside = (np.max(pictures, axis=0) - np.min(pictures, axis=0).clip(max=0.0) < _ALIKE).astype(np.uint8)
+    return np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= _ABOUT_PX)
+
+
+def _robust(columns: Sequence[Array], grey: Array) -> tuple[Array, Array]:
+    """Residuals and coefficients of a fit that holds against writing and dust in the window."""
+    design, weights = np.stack(columns, axis=1), np.ones_like(grey)
+    residuals, solution = grey, np.zeros(len(columns))
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weights)
+        solution = np.asarray(np.linalg.lstsq(design * root[:, None], grey * root, rcond=None)[0], dtype=float)
+        residuals = grey - design @ solution
+        weights = tukey_weights(residuals, max(robust_scale(residuals), 1e-9))
+    return residuals, solution
+
+
+def _reach_px(shown: Shown) -> float:
+    """How far the mark reaches from its centre, along columns or rows."""
+    if shown.mark is None:
+        return 0.0
+    return float(np.abs(extent_px(shown.mark, np.column_stack([shown.linear, np.zeros(2)]))).max())
