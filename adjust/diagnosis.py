@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from adjust.datum import free_coordinates, object_datum
 from adjust.directions import camera_leads, datum_sentence, field_of, following
 from adjust.factor import Factor
 from adjust.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
-from adjust.own_directions import own_sentence, unnamed_sentence
+from adjust.own_directions import many_sentence, own_sentence, unnamed_sentence
 from adjust.problem import Problem, State
 from adjust.result import NullDirection
 
@@ -32,7 +33,8 @@ def singular_directions(problem: Problem, state: State, free: Indices, factor: F
     """The null directions of the factor of a state, at its computed observations; none where it is regular."""
     blind = blind_blocks(factor)
     null, _ = null_space(factor, blind, SINGULAR)
-    return (*_within_blocks(problem, state, free, blind), *_named(problem, state, free, factor, blind, null, PURE))
+    found = _named(problem, state, free, factor, blind, null, PURE)
+    return (*_within_blocks(problem, state, free, blind), *found.named, *found.left)
 
 
 def weak_directions(
@@ -42,7 +44,8 @@ def weak_directions(
 
     The factor is to be that without the cameras' priors. Of all directions below WEAK those are told in which these
     priors weigh less than SETTLED times what the observations do. Directions that move fiducials with priors are no
-    cause for alarm: their priors are meant to place them. singular: the null directions, which are not told again.
+    cause for alarm: their priors are meant to place them. singular: the null directions, which are not told again. Many
+    directions without a name are told as one: the longer a strip is, the more ways there are in which it can bend.
     """
     blind = blind_blocks(factor)
     hardly, told = null_space(factor, blind, WEAK)
@@ -60,7 +63,14 @@ def weak_directions(
     unsettled = of_unit_weight @ right[weight < SETTLED].T
     found = _named(problem, state, free, factor, blind, np.linalg.qr(unsettled)[0], MIXED)
     again = {_motion(each) for each in singular}
-    return tuple(each for each in found if _motion(each) not in again)
+    named, left = (tuple(each for each in some if _motion(each) not in again) for some in (found.named, found.left))
+    return (*named, *(left if len(left) <= NAMES_SHOWN else (_together(left),)))
+
+
+def _together(directions: Sequence[NullDirection]) -> NullDirection:
+    """Many directions that have no name, as one."""
+    moved = tuple(dict.fromkeys(name for each in directions for name in each.parameters))
+    return NullDirection(collapsed(list(moved)), *many_sentence(len(directions), following(set(moved))))
 
 
 def _motion(direction: NullDirection) -> str:
@@ -98,8 +108,16 @@ def collapsed(names: list[str]) -> tuple[str, ...]:
         kinds.setdefault(kind, []).append(name)
     shown = []
     for kind, members in kinds.items():
-        shown += members if len(members) <= NAMES_SHOWN else [kind]
+        shown += [kind] if len(members) > NAMES_SHOWN or kind in members else members
     return tuple(shown)
+
+
+@dataclass(frozen=True)
+class _Directions:
+    """Directions that have a name, and those that are told after what moves most in them."""
+
+    named: tuple[NullDirection, ...]
+    left: tuple[NullDirection, ...]
 
 
 def _within_blocks(
@@ -120,10 +138,10 @@ def _named(
     blind: Sequence[BlindBlock],
     null: Array,
     part: float,
-) -> tuple[NullDirection, ...]:
+) -> "_Directions":
     """Sentences for the vectors (n, d) of a null space: the object datum first, then the camera, then what is left."""
     if null.shape[1] == 0:
-        return ()
+        return _Directions((), ())
     names = [problem.unknowns.names[i] for i in free]
     datum, sentences, rest = _datum_part(problem, state, free, factor, blind, null)
     still = _with_points_still(problem, free, datum, rest)
@@ -143,9 +161,8 @@ def _named(
     sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
     for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
         sentences.append(_left_sentence(problem, state, names[int(np.argmax(np.abs(vector)))], own))
-    return tuple(
-        NullDirection(collapsed(own), cause, remedy) for own, (cause, remedy) in zip(moved, sentences, strict=True)
-    )
+    told = tuple(NullDirection(collapsed(own), *sentence) for own, sentence in zip(moved, sentences, strict=True))
+    return _Directions(told[: len(told) - left.shape[1]], told[len(told) - left.shape[1] :])
 
 
 def _left_sentence(problem: Problem, state: State, most: str, moved: Sequence[str]) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from adjust.triangle import Triangle
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below which there is no solution
+SINGULAR = 1e-10  # singular values of the scaled rows, over the largest, below which there is no solution
 DENSE = 100  # shared unknowns up to which all singular values are computed
 FIRST_COUNT = 24  # vectors that are iterated at a time where there are more
 ITERATIONS = 50
@@ -95,7 +95,7 @@ def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:
         _, singular, right = np.linalg.svd(triangle.toarray())
         hardly = singular <= below * singular[0]
         return singular[hardly], right[hardly].T
-    largest = _largest_singular(triangle)
+    largest = triangle.largest_singular
     count = FIRST_COUNT
     while True:
         singular, vectors = _inverse_iteration(triangle.lifted(ROUNDING * largest), count, below * largest)
@@ -105,19 +105,11 @@ def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:
         count = min(2 * count, len(triangle))
 
 
-def _largest_singular(triangle: Triangle) -> float:
-    """By power iteration, to a few percent."""
-    vector = np.random.default_rng(0).normal(size=len(triangle))
-    for _ in range(20):
-        vector = triangle.transposed_times(triangle.times(vector))
-        vector /= np.linalg.norm(vector)
-    return float(np.linalg.norm(triangle.times(vector)))
-
-
 def _inverse_iteration(triangle: Triangle, count: int, limit: float) -> tuple[Array, Array]:
     """The smallest singular values (count,) and right vectors (s, count) by orthogonal iteration with the inverse.
 
-    Those above the limit need not have converged. Source: Golub and Van Loan, Matrix Computations, section 8.2.
+    Those above the limit need not have converged; nor any where all are below it, so that there are more. Source: Golub
+    and Van Loan, Matrix Computations, section 8.2.
     """
     vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(len(triangle), count)))[0]
     before = np.full(count, np.inf)
@@ -126,7 +118,8 @@ def _inverse_iteration(triangle: Triangle, count: int, limit: float) -> tuple[Ar
         vectors = np.linalg.qr(triangle.solve(half))[0]
         _, singular, right = np.linalg.svd(triangle.times(vectors), full_matrices=False)
         vectors, singular = vectors @ right[::-1].T, singular[::-1]
-        if (np.abs(before - singular)[singular <= limit] <= STANDSTILL * limit).all():
+        small = singular <= limit  # no singular value is larger than what is found for it in these vectors
+        if small.all() or (np.abs(before - singular)[small] <= STANDSTILL * limit).all():
             break
         before = singular
     return singular, vectors

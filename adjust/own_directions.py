@@ -98,3 +98,13 @@ def unnamed_sentence(name: str, followers: str) -> tuple[str, str]:
                 f"The quantity {quantity} of camera {owner} can change{followers}.",
                 f"Give {quantity} a standard deviation, or fix it.",
             )
+
+
+def many_sentence(count: int, followers: str) -> tuple[str, str]:
+    """Cause and remedy of many directions that no lead names."""
+    return (
+        f"The network can drift and bend in {count} ways{followers}: what is known of the object is too little for it, "
+        "or too far apart.",
+        "Measure known points all over the network, those of a long strip every few images, or give stations with "
+        "standard deviations in images.csv. The standard deviations tell how far it may have drifted.",
+    )

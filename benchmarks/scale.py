@@ -48,6 +48,8 @@ Figures = dict[str, Any]
 
 VIEWS, VIEWS_OF_RESEAU_ALONE = (50, 200, 1000), (4000,)
 NETWORKS = ((50, 2000), (200, 20000))  # images and unknown points
+STRIPS, STRIPS_OF_RESEAU_ALONE = (500, 1000), (2000, 4000)  # images
+POINTS_AN_IMAGE, CONTROL_EVERY = 50, 10  # of a strip: points that an image shows, images between known points
 PATIENCE_S = 300.0  # of CPU time, for SciPy
 SIGMA_MM = 0.005
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
@@ -160,6 +162,23 @@ def unknown(images: int, points: int) -> Scene:
     return _scene(rng, xyz, stations, angles, "unknown", sigma, 0.02)
 
 
+def strip(images: int, control: int = CONTROL_EVERY) -> Scene:
+    """A strip of 60 % overlap, fifty points an image, some known every ten images; 0: at the first two alone."""
+    rng = np.random.default_rng(images)
+    base, height = 0.4 * FRAME_MM, 1.0 * FOCAL_MM
+    stations = np.column_stack([base * np.arange(images), np.zeros(images), np.full(images, height)])
+    per_base = int(0.4 * POINTS_AN_IMAGE)
+    along = base * (np.arange(images * per_base) / per_base - 0.5)
+    across = rng.uniform(-0.4 * FRAME_MM, 0.4 * FRAME_MM, len(along))
+    xyz = np.column_stack([along, across, rng.uniform(-10.0, 10.0, len(along))])
+    turns = rng.integers(0, 4, images) * np.pi / 2
+    angles = 0.02 * rng.normal(size=(images, 3)) + np.outer(turns, (0.0, 0.0, 1.0))
+    every = per_base * control // 2
+    known = np.arange(len(along)) % every == 0 if control else along < 1.5 * base
+    sigma = np.where(known, 0.0, np.inf)
+    return _scene(rng, xyz, stations + rng.normal(size=(images, 3)), angles, "unknown", sigma, 0.02)
+
+
 def _scene(
     rng: np.random.Generator, points: Array, stations: Array, angles: Array, task: str, sigma: Array, error: float
 ) -> Scene:
@@ -169,9 +188,11 @@ def _scene(
     seen = []
     for station, rotation in zip(stations, FLIP @ rotation_from_angles(angles), strict=True):
         vector = cv2.Rodrigues(rotation)[0]
-        projected = cv2.projectPoints(points, vector, -rotation @ station, matrix, lens)[0].reshape(-1, 2)
-        inside = np.flatnonzero((np.abs(projected) < FRAME_MM / 2).all(axis=1))
-        places = projected[inside] * (1.0, -1.0) + SIGMA_MM * rng.normal(size=(len(inside), 2))
+        near = np.flatnonzero((np.abs(points - station) < 2.0 * FRAME_MM).all(axis=1))
+        projected = cv2.projectPoints(points[near], vector, -rotation @ station, matrix, lens)[0].reshape(-1, 2)
+        shown = (np.abs(projected) < FRAME_MM / 2).all(axis=1)
+        inside = near[shown]
+        places = projected[shown] * (1.0, -1.0) + SIGMA_MM * rng.normal(size=(len(inside), 2))
         seen.append((inside, places))
     rays = np.bincount(np.concatenate([inside for inside, _ in seen]), minlength=len(points))
     names = [f"i{i}" for i in range(len(seen))]
@@ -333,6 +354,9 @@ PROGRAMS: dict[tuple[str, str], Callable[..., Figures]] = {
     ("known", "opencv"): lambda views: opencv(known(views)),
     ("unknown", "reseau"): lambda images, points: reseau(unknown(images, points)),
     ("unknown", "scipy"): lambda images, points: scipy(unknown(images, points)),
+    ("strip", "reseau"): lambda images, control=CONTROL_EVERY: reseau(strip(images, control)),
+    ("strip", "scipy"): lambda images: scipy(strip(images)),
+    ("strip", "ceres"): lambda images: ceres(strip(images)),
     ("unknown", "ceres"): lambda images, points: ceres(unknown(images, points)),
 }
 

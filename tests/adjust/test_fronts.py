@@ -10,13 +10,13 @@ from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 from simulated import Truth, simulated
 
-from adjust import elimination, fronts, triangle
+from adjust import diagnosis, elimination, fronts, triangle
 from adjust.adjustment import adjust
 from adjust.elimination import eliminate
 from adjust.factor import Blocks, Factor
 from adjust.fronts import Fronts, fronts_of
 from adjust.iteration import factorise, linearise
-from adjust.network import Approximations, Fiducial, Network, Observations, Prior
+from adjust.network import Approximations, Fiducial, Network, ObjectPoint, Observations, Prior
 from adjust.numbering import Numbering
 from adjust.problem import number
 from adjust.rows import WhitenedRows, prior_root_weights
@@ -184,3 +184,19 @@ def test_fronts_hold_all_that_is_met_in_elimination() -> None:
     for front in of_ring:
         assert 499 in front.columns
         assert 502 in front.columns
+
+
+@pytest.mark.usefixtures("finely")
+def test_the_many_ways_in_which_a_strip_can_bend_are_told_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is known well stands at one end: the other end is weak in as many ways as one cares to count."""
+    monkeypatch.setattr(diagnosis, "WEAK", 0.02)
+    network, start = strip(50.0)
+    points = [
+        ObjectPoint(each.id, *(Prior(float(x)) for x in start.points[each.id])) if int(each.id) < 10 else each
+        for each in network.points
+    ]
+    result = adjust(replace(network, points=tuple(points)), start)
+    assert result.converged
+    (warning,) = [text for text in result.warnings if "bend" in text]
+    assert "ways" in warning
+    assert "EO.*.Z0" in warning
