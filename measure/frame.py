@@ -15,7 +15,7 @@ from measure.matching import Match
 from measure.poses import up_from_camera
 from measure.refinement import Sighting, sight, strongest
 from measure.scan import LUMINANCE, Scan
-from measure.shapes import FiducialLayout, Mark
+from measure.shapes import FiducialLayout, FrameCorner, Mark
 from measure.status import Status
 
 Array = NDArray[np.float64]
@@ -203,6 +203,7 @@ class _Sighter:
             (index, sighting)
             for index, sighting in enumerate(self.sightings)
             if sighting is not None and sighting.inside and not (self.clear(index) and self.belongs[index])
+            if not isinstance(self.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
         ]
         if not faint:
             return

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.candidates import FAINT, correlate, detail_px
+from measure.frame_corner import corner_of_edges
 from measure.matching import Match, MatchOptions, match, window_about
 from measure.rendering import extent_px, picture
 from measure.scan import Scan
-from measure.shapes import Mark, MarkShape, Polygon
+from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
 
 Array = NDArray[np.float64]
 
@@ -45,14 +46,9 @@ def sight(
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
         return Sighting(predicted, False, None, "its place is outside of the scan")
-    start = np.array(pixel_from_mark)
-    start[:, 2], height = strongest(scan, mark, pixel_from_mark, search_px, polarity, weights)
-    if height < _LEAST_RESPONSE:
+    fit = _fitted(scan, mark, pixel_from_mark, search_px, polarity, weights, options)
+    if fit is None:
         return Sighting(predicted, True, None, f"nothing within {search_px:.0f} px of its place looks like it")
-    col0, row0, width, tall = window_about(mark, start, options.margin_px + 4)
-    window = scan.window(col0, row0, width, tall, weights).astype(float)
-    valid = _inside_scan(scan, col0, row0, width, tall)
-    fit = match(window, (col0, row0), mark, start, _options_for(mark, options), valid)
     if not fit.converged:
         return Sighting(predicted, True, None, fit.reason)
     if abs(fit.contrast_dn) < FAINT * scan.full_scale_dn:
@@ -60,6 +56,28 @@ def sight(
     if fit.contrast_dn * polarity <= 0:
         return Sighting(predicted, True, None, "what lies there has the other polarity")
     return Sighting(predicted, True, fit)
+
+
+def _fitted(
+    scan: Scan,
+    mark: Mark,
+    pixel_from_mark: Array,
+    search_px: float,
+    polarity: int,
+    weights: Sequence[float] | None,
+    options: MatchOptions,
+) -> Match | None:
+    """The mark matched where it looks most like itself; None where nothing looks like it."""
+    if isinstance(mark, FrameCorner):
+        return corner_of_edges(scan, mark, pixel_from_mark, search_px, polarity, weights)
+    start = np.array(pixel_from_mark)
+    start[:, 2], height = strongest(scan, mark, pixel_from_mark, search_px, polarity, weights)
+    if height < _LEAST_RESPONSE:
+        return None
+    col0, row0, width, tall = window_about(mark, start, options.margin_px + 4)
+    window = scan.window(col0, row0, width, tall, weights).astype(float)
+    valid = _inside_scan(scan, col0, row0, width, tall)
+    return match(window, (col0, row0), mark, start, _options_for(mark, options), valid)
 
 
 def strongest(

@@ -14,6 +14,8 @@ Point = tuple[float, float]
 Polarity = Literal["light", "dark", "auto"]
 Array = NDArray[np.float64]
 
+_SEARCHED = 0.3  # of a frame corner's reach: the square that it is searched by
+
 
 @dataclass(frozen=True)
 class Disk:
@@ -61,6 +63,19 @@ class MarkShape:
     def __post_init__(self) -> None:
         if not self.parts:
             raise ValueError("a mark needs at least one part")
+
+
+@dataclass(frozen=True)
+class FrameCorner(MarkShape):
+    """Where two edges of the exposed frame meet; its parts, a square of the frame, serve the search alone.
+
+    toward: (±1, ±1), where from the corner the frame lies. reach_mm: how far along the edges they are measured, from
+    radius_mm on, that of a rounded corner.
+    """
+
+    toward: Point = (1.0, 1.0)
+    reach_mm: float = 1.0
+    radius_mm: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +166,18 @@ def ring_dot(ring_mm: float, ring_line_mm: float, radius_mm: float) -> tuple[Par
 def polygon(vertices_mm: Sequence[Point]) -> tuple[Part, ...]:
     """A wedge, a notch or a wing."""
     return (Polygon(tuple((float(x), float(y)) for x, y in vertices_mm)),)
+
+
+def frame_corner(xy_mm: Point, reach_mm: float, radius_mm: float = 0.0, polarity: Polarity = "auto") -> FrameCorner:
+    """The corner of the frame at a place in it, polarity that of the frame against the border."""
+    toward = (-1.0 if xy_mm[0] > 0 else 1.0, -1.0 if xy_mm[1] > 0 else 1.0)
+    size = max(_SEARCHED * reach_mm, 2 * radius_mm)
+    turn = np.linspace(0.0, np.pi / 2, 9)
+    arc = [(radius_mm * (1 - float(np.sin(t))), radius_mm * (1 - float(np.cos(t)))) for t in turn] if radius_mm else []
+    square = polygon(
+        [(x * toward[0], y * toward[1]) for x, y in (*(arc or [(0.0, 0.0)]), (size, 0.0), (size, size), (0.0, size))]
+    )
+    return FrameCorner(square, polarity, toward, reach_mm, radius_mm)
 
 
 def turned(mark: Mark, angle_deg: float) -> Mark:

@@ -17,6 +17,7 @@ from pipeline.spelling import did_you_mean
 from pipeline.tables import Table, read_toml
 
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
+CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
 
 
@@ -220,9 +221,12 @@ def _placed(
     mark: shapes.Mark | shapes.LearnedMark, radial: bool, xy_mm: shapes.Point
 ) -> shapes.Mark | shapes.LearnedMark:
     """A radial mark is drawn as on the positive x' axis; elsewhere its own x axis points away from the centre. What is
-    learned is learned at each place by itself."""
+    learned is learned at each place by itself; a frame's corner lies as its quadrant says."""
     if isinstance(mark, shapes.LearnedMark):
         return mark
+    if isinstance(mark, shapes.FrameCorner):
+        reach = mark.reach_mm or max(min(abs(xy_mm[0]), abs(xy_mm[1])) * CORNER_REACH, 2 * mark.radius_mm)
+        return shapes.frame_corner(xy_mm, reach, mark.radius_mm, mark.polarity)
     return shapes.turned(mark, math.degrees(math.atan2(xy_mm[1], xy_mm[0]))) if radial else mark
 
 

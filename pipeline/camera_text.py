@@ -67,6 +67,9 @@ def _mark_lines(mark: shapes.Mark | shapes.LearnedMark, name: str, save_chip: Sa
         lines += ['kind = "template"', f"image = {_quoted(save_chip(name, mark))}", f"pitch_um = {mark.pitch_um!r}"]
         lines += [f"origin_px = {_list(mark.origin_px)}", f"polarity = {_quoted(mark.polarity)}"]
         return [*lines, f"detail_mm = {mark.detail_mm!r}"]
+    if isinstance(mark, shapes.FrameCorner):
+        lines += ['kind = "frame-corner"', f"reach_mm = {mark.reach_mm!r}", f"radius_mm = {mark.radius_mm!r}"]
+        return [*lines, f"polarity = {_quoted(mark.polarity)}"]
     lines += ['kind = "parts"', f"polarity = {_quoted(mark.polarity)}"]
     for part in mark.parts:
         lines += [f"[[mark.{name}.part]]", *_part_lines(part)]

@@ -11,7 +11,10 @@ from measure.errors import MeasurementError
 from measure.scan import open_scan
 from pipeline.tables import Table
 
-KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template", "learned")
+KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template", "learned", "frame-corner")
+
+
+_ANY_CORNER = (-1.0, -1.0)  # which one it is says the fiducial's place
 
 
 def read_mark(table: Table, folder: Path) -> shapes.Mark | shapes.LearnedMark:
@@ -20,6 +23,11 @@ def read_mark(table: Table, folder: Path) -> shapes.Mark | shapes.LearnedMark:
     if kind == "learned":
         return shapes.LearnedMark(table.number("size_mm", above=0.0))
     polarity = cast(shapes.Polarity, table.text("polarity", "auto", ("auto", "light", "dark")))
+    if kind == "frame-corner":
+        reach, radius = table.number("reach_mm", 0.0, least=0.0), table.number("radius_mm", 0.0, least=0.0)
+        if radius and reach and radius >= reach:
+            raise table.error("radius_mm", f"must be smaller than reach_mm ({reach:g}), not {radius:g}.")
+        return shapes.frame_corner(_ANY_CORNER, reach, radius, polarity)
     if kind == "template":
         return replace(_template(table, folder), polarity=polarity)
     return shapes.MarkShape(_parts(kind, table), polarity)

@@ -71,6 +71,7 @@ def parse_scene(table: Table) -> SceneFile:
             background=cast(scene.Background, picture.text("background", "plain", get_args(scene.Background))),
             ground=picture.number("ground", 0.0),
             pad_mm=picture.number("pad_mm", 0.0, least=0.0),
+            corner_radius_mm=picture.number("corner_radius_mm", 0.0, least=0.0),
         ),
     )
     given = _given(table.table("given"))
@@ -113,11 +114,13 @@ def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
             camera.distortion.r0_mm,
             camera.distortion.decentering,
         ),
-        fiducials=tuple(
-            scene.SceneFiducial(one.id, one.xy_mm, scene_mark(one.mark) if isinstance(one.mark, shapes.Mark) else None)
-            for one in camera.fiducials
-        ),
+        fiducials=tuple(scene.SceneFiducial(one.id, one.xy_mm, _painted(one.mark)) for one in camera.fiducials),
     )
+
+
+def _painted(mark: shapes.Mark | shapes.LearnedMark | None) -> scene.DrawnMark | scene.ChipMark | None:
+    """Nothing is painted at a corner of the frame, which is there already, nor where nobody has drawn the mark."""
+    return None if mark is None or isinstance(mark, shapes.LearnedMark | shapes.FrameCorner) else scene_mark(mark)
 
 
 def scene_mark(mark: shapes.Mark) -> scene.DrawnMark | scene.ChipMark:

@@ -77,6 +77,19 @@ def polygon(vertices: tuple[Point, ...]) -> Area:
     return (np.asarray(vertices, float),)
 
 
+def rounded_rectangle(half: Array, radius: float) -> Array:
+    """The outline of a rectangle of half sizes (2,) about the origin, its corners rounded."""
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
+    if radius == 0.0:
+        return corners
+    turn = np.linspace(0.0, np.pi / 2, CIRCLE_VERTICES // 4)
+    arcs = [
+        corner * (1 - radius / half) + radius * np.stack([np.cos(turn + start), np.sin(turn + start)], axis=1)
+        for corner, start in zip(corners, np.arange(4) * np.pi / 2, strict=True)
+    ]
+    return np.concatenate(arcs)
+
+
 def stroke(path: Array, line: float) -> Area:
     """A curved line of constant width along an (n, 2) path."""
     along = np.gradient(path, axis=0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetic_images.areas import Area, bounds, centroid, disk, polygon, subdivided
+from synthetic_images.areas import Area, bounds, centroid, disk, polygon, rounded_rectangle, subdivided
 from synthetic_images.damage import damage
 from synthetic_images.film import FrameGeometry, frame_geometry
 from synthetic_images.paint import AreaPaint, ChipPaint, Paint, chip_paint
@@ -54,7 +54,7 @@ def make_frame(scene: Scene, index: int) -> Frame:
 def _exposed_areas(geometry: FrameGeometry) -> list[Area]:
     """The exposed frame and the neighbour's, mm in this camera's frame."""
     half = np.asarray(geometry.scene.camera.frame_mm) / 2
-    outline = subdivided(np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half, EDGE_PIECES)
+    outline = subdivided(rounded_rectangle(half, geometry.scene.corner_radius_mm), EDGE_PIECES)
     return [(outline + shift,) for shift in _advances(geometry)]
 
 

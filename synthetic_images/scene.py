@@ -294,7 +294,8 @@ class Tones:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A series of photographs. pad_mm: radius of the unexposed disk behind every fiducial (0: none).
+    """A series of photographs. pad_mm: radius of the unexposed disk behind every fiducial (0: none); corner_radius_mm:
+    of the rounded corners of the exposed frame (0: sharp).
 
     ground: height of the plane that carries the texture of a "terrain" background.
     """
@@ -310,10 +311,14 @@ class Scene:
     background: Background = "plain"
     ground: float = 0.0
     pad_mm: float = 0.0
+    corner_radius_mm: float = 0.0
 
     def __post_init__(self) -> None:
         one_of("background", self.background, get_args(Background))
         not_negative("pad_mm", self.pad_mm)
+        not_negative("corner_radius_mm", self.corner_radius_mm)
+        if 2 * self.corner_radius_mm > min(self.camera.frame_mm):
+            raise ValueError(f"corner_radius_mm is {self.corner_radius_mm}: the frame's sides are not that long")
         if not self.images:
             raise ValueError("a scene needs at least one image")
         unique("image", [image.name for image in self.images])
