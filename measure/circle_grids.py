@@ -5,7 +5,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.board_specs import CircleGridSpec
-from measure.disk_search import Candidate, DiskSearch, disk_candidates
+from measure.disk_patches import Candidate, DiskSearch
+from measure.disk_search import disk_candidates
 from measure.disks import FittedDisk, fit_disk
 from measure.lattices import Place, grid_places
 from measure.results import MarkMeasurement

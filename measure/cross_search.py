@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.disk_search import Candidate, DiskSearch, block_px, blocks, is_own, separate
+from measure.block_search import search_blocks
+from measure.disk_patches import Candidate, DiskSearch
 from measure.noise import robust_scale
 from measure.scan import Scan
 
@@ -45,37 +46,40 @@ class CrossSearch:
 
 def cross_candidates(scan: Scan, search: CrossSearch) -> list[Candidate]:
     """Patches of a cross's shape, the strongest first; the columns of pixel_from_disk are its half bars."""
-    found: list[Candidate] = []
+    return search_blocks(scan, _octaves(search, scan.full_scale_dn))
+
+
+def _octaves(search: CrossSearch, full_scale_dn: float) -> list["CrossOctave"]:
+    octaves = []
     shortest, longest = search.half_px
     while True:
-        factor = _reduction(shortest, search.line)
         upper = min(shortest * OCTAVE, longest)
-        margin = int(np.ceil(2.0 * upper / factor + 4)) * factor
-        for col0, row0 in blocks(scan, factor):
-            small, size = _reduced(scan, col0, row0, factor, margin)
-            origin = np.array([col0 - margin, row0 - margin]) + (factor - 1) / 2
-            for patch in _patches(small, (shortest / factor, upper / factor), search, scan.full_scale_dn):
-                center = patch.center_px * factor + origin
-                if is_own(center, col0, row0, size, scan):
-                    found.append(Candidate(center, patch.pixel_from_disk * factor, patch.contrast_dn))
+        factor = _reduction(shortest, search.line)
+        octaves.append(CrossOctave(factor, (shortest / factor, upper / factor), search, full_scale_dn))
         if upper >= longest:
-            break
+            return octaves
         shortest = upper
-    found.sort(key=lambda patch: (-abs(patch.contrast_dn), *patch.center_px))
-    return separate(found)
 
 
 def _reduction(half_px: float, line: float) -> int:
     return max(1, int(min(half_px / SEARCHED_ARM_PX, line * half_px / THINNEST_PX)))
 
 
-def _reduced(scan: Scan, col0: int, row0: int, factor: int, margin: int) -> tuple[Image, int]:
-    """A block with its margin, reduced, and the size of the block alone."""
-    size = block_px(factor)
-    whole = size + 2 * margin
-    window = scan.window(col0 - margin, row0 - margin, whole, whole)
-    small = cv2.resize(window, (whole // factor, whole // factor), interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.float32), size
+@dataclass(frozen=True)
+class CrossOctave:
+    """A reduction of the scan and the shortest and longest half of a cross, reduced px, in it."""
+
+    factor: int
+    half: tuple[float, float]
+    search: CrossSearch
+    full_scale_dn: float
+
+    @property
+    def margin_px(self) -> int:
+        return int(np.ceil(2.0 * self.half[1] + 4)) * self.factor
+
+    def patches(self, small: Image) -> list[Candidate]:
+        return _patches(small, self.half, self.search, self.full_scale_dn)
 
 
 def _patches(small: Image, half: tuple[float, float], search: CrossSearch, full_scale_dn: float) -> list[Candidate]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.disk_search import Candidate
+from measure.disk_patches import Candidate
 from measure.scan import Scan
 
 Array = NDArray[np.float64]

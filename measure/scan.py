@@ -53,6 +53,11 @@ class Scan:
         self._reduced: dict[int, Array] = {}
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
+    @property
+    def rows_kept(self) -> int:
+        """How many rows of the scan stay decoded for the next windows, however they lie to its segments."""
+        return self._cache.rows_kept
+
     def green(self) -> "Scan":
         """The same scan with its green for grey value, if it has colours. A lens draws red and blue at scales of their
         own, some 1e-4 off; a mark in a mixture of all has no one place."""

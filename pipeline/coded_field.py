@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.disk_search import Candidate
+from measure.disk_patches import Candidate
 from measure.results import MarkMeasurement
 from measure.scan import Scan
 from measure.status import Status

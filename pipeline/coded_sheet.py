@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.disk_search import Candidate, DiskSearch, disk_candidates
+from measure.disk_patches import Candidate, DiskSearch
+from measure.disk_search import disk_candidates
 from measure.results import MarkMeasurement
 from measure.ring_codes import read_code
 from measure.scan import Scan

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from adjust.projection import ImageModel
 from measure.cross_search import CrossSearch, cross_candidates
-from measure.disk_search import Candidate, DiskSearch, disk_candidates
+from measure.disk_patches import Candidate, DiskSearch
+from measure.disk_search import disk_candidates
 from measure.results import MarkMeasurement
 from measure.scan import Scan
 from measure.targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks

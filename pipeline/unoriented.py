@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from adjust.naming import Names, name_coded, name_marks
 from adjust.projection import ImageModel
-from measure.disk_search import Candidate
+from measure.disk_patches import Candidate
 from measure.targets import TargetPrediction
 from pipeline.comparator_file import comparator_from_pixel
 from pipeline.measurement_file import MeasuredScan

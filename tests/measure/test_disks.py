@@ -6,7 +6,8 @@ from drawn import drawn, ellipse, scan_of, whitened
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from measure.disk_search import DiskSearch, disk_candidates, find_disks
+from measure.disk_patches import DiskSearch
+from measure.disk_search import disk_candidates, find_disks
 from measure.disks import fit_disk
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ import pytest
 from drawn import drawn, scan_of
 from numpy.typing import NDArray
 
-from measure.disk_search import Candidate
+from measure.disk_patches import Candidate
 from measure.picture_scan import WholePicture
 from measure.resolution import NO_TAGS
 from measure.ring_codes import RingCode, read_code

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.disk_search import DiskSearch, disk_candidates
+from measure.disk_patches import DiskSearch
+from measure.disk_search import disk_candidates
 from measure.ring_codes import RingCode, read_code
 from measure.scan import open_scan
 from measure.sheet_naming import Dots, Naming, name_dots
