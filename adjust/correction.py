@@ -1,5 +1,6 @@
 """What every distortion family gives: a correction of the observed point or the image of a ray, with derivatives."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -39,12 +40,12 @@ class Correction:
 class Imaged:
     """h (n, 2), the image of the ray at c = 1, and its derivatives.
 
-    by_ray (n, 2, 2); by_parameters: (n, 2) by each of k parameters, none where these do nothing to the ray.
+    by_ray (n, 2, 2); by_parameter: gives that by one of the parameters (n, 2), for many of them are never asked for.
     """
 
     value: Array
     by_ray: Array
-    by_parameters: tuple[Array, ...] = ()
+    by_parameter: Callable[[int], Array]
 
 
 def no_correction(_: Settings, xy: Array, __: Array, parameters: Array) -> Correction:
@@ -56,4 +57,4 @@ def no_correction(_: Settings, xy: Array, __: Array, parameters: Array) -> Corre
 
 def undistorted(ray: Array, _: Array) -> Imaged:
     """Of the families that correct the observed point, and of none."""
-    return Imaged(ray, np.broadcast_to(np.eye(2), (len(ray), 2, 2)))
+    return Imaged(ray, np.broadcast_to(np.eye(2), (len(ray), 2, 2)), lambda _: np.broadcast_to(0.0, ray.shape))

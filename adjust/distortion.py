@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from adjust.correction import Correction, Imaged
 from adjust.families import family
 from adjust.network import Distortion
-from adjust.small_matrices import zeros
+from adjust.small_matrices import columns, zeros
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class ImageEquations:
     """F (n, 2) in mm of points with the image of their ray and their correction, at a principal distance.
 
     Its derivatives are those by the observed point xy (n, 2, 2), the ray (n, 2, 2), the interior orientation c, x0',
-    y0' (n, 2, 3) and the family's parameters (n, 2, k), or by a single one of these (n, 2).
+    y0' (n, 2, 3) and the family's parameters (n, 2, k).
     """
 
     value: Array
@@ -44,22 +44,20 @@ class ImageEquations:
 
     @property
     def by_interior(self) -> Array:
-        by_principal_point = -np.eye(2) - self.correction.by_principal_point
-        by_interior = zeros(len(self.value), 2, 3, dtype=self.value.dtype)
-        by_interior[..., 0] = -self.imaged.value
-        by_interior[..., 1:] = by_principal_point
-        return by_interior
+        return columns([self.by_quantity(k) for k in range(3)])
 
     @property
     def by_parameters(self) -> Array:
-        by_parameters = zeros(*self.correction.by_parameters.shape, dtype=self.value.dtype)
-        for k in range(by_parameters.shape[2]):
-            by_parameters[..., k] = self.by_parameter(k)
-        return by_parameters
+        count = self.correction.by_parameters.shape[2]
+        return columns([self.by_quantity(3 + k) for k in range(count)]) if count else zeros(len(self.value), 2, 0)
 
-    def by_parameter(self, k: int) -> Array:
-        by_correction = self.correction.by_parameters[..., k]
-        return -self.c * self.imaged.by_parameters[k] - by_correction if self.imaged.by_parameters else -by_correction
+    def by_quantity(self, k: int) -> Array:
+        """Derivative (n, 2) by c, x0', y0' or a parameter of the family, in this order."""
+        if k == 0:
+            return -self.imaged.value
+        if k < 3:
+            return np.asarray(-np.eye(2)[:, k - 1] - self.correction.by_principal_point[..., k - 1])
+        return np.asarray(-self.c * self.imaged.by_parameter(k - 3) - self.correction.by_parameters[..., k - 3])
 
 
 def image_equations(

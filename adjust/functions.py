@@ -16,9 +16,9 @@ from adjust.correction import Imaged
 from adjust.distortion import equations_of
 from adjust.line_of_sight import SightVectors, sight_vectors
 from adjust.network import Distortion
-from adjust.problem import Part, Problem, State
+from adjust.problem import Films, Part, Problem, State
 from adjust.projection import camera_from_image, imaged_ray, rays
-from adjust.small_matrices import applied, cross, laid_out, of_each, product, zeros
+from adjust.small_matrices import applied, columns, cross, laid_out, of_each, product, zeros
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -94,7 +94,7 @@ def _computed_in_camera(problem: Problem, state: State, targets: Iterable[SeenTa
 
 def _seen(problem: Problem, state: State, camera: str, targets: Indices) -> SeenTargets:
     """Some targets as they appear from their stations."""
-    rows = _all_of(targets, len(problem.image_numbers))
+    rows = _in_order(targets)
     images = problem.image_numbers[rows]
     stations = state.values[problem.exterior[:, :3].T[:, images]].T
     points = state.values[problem.places.T[:, rows]].T
@@ -124,7 +124,7 @@ def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) ->
     xy_mm = np.empty_like(camera_xy)
     found = np.empty(len(camera_xy), dtype=bool)
     for films in problem.films:
-        parameters, rows = state.values[films.positions][films.of], _all_of(films.rows, len(camera_xy))
+        parameters, rows = state.values[films.positions][films.of], _in_order(films.rows)
         xy_mm[rows], found[rows] = films.kind.inverse(parameters, camera_xy[rows], films.centers_mm)
     return xy_mm, found
 
@@ -136,9 +136,10 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     film = _film_derivatives(problem, state, xy_mm)
     at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
     by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
-    by_unknowns = zeros(len(xy_mm), 2, parts.camera.columns.stop)
+    by_unknowns = np.zeros((parts.camera.columns.stop, len(xy_mm), 2)).transpose(
+        1, 2, 0
+    )  # columns, as blocks have them
     by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
-    attitude = problem.attitude_by_unknowns(state)
     straight = problem.network.line_of_sight.is_straight
     for seen in computed.targets:
         interior, parameters, distortion = _camera(problem, state, seen.camera)
@@ -148,15 +149,14 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         by_vector = product(by_in_camera, of_each(state.rotations, images))
         by_attitude = cross(seen.in_camera[:, None, :], by_in_camera)
         if problem.keeps_angles.any():
-            by_attitude = product(by_attitude, of_each(attitude, images))
+            by_attitude = product(by_attitude, of_each(problem.attitude_by_unknowns(state), images))
         by_station = -by_vector if straight else product(by_vector, seen.sight.by_station)
         by_point = by_vector if straight else product(by_vector, seen.sight.by_point)
         by_camera_xy[rows] = at.by_xy
-        by_exterior, by_interior = (by_station, by_attitude), at.by_interior
-        of_camera = [by_interior[..., k] if k < 3 else at.by_parameter(k - 3) for k in parts.camera.members]
+        by_exterior = by_station, by_attitude
         _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
         _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
-        _fill(by_unknowns, rows, parts.camera, of_camera)
+        _fill(by_unknowns, rows, parts.camera, [at.by_quantity(k) for k in parts.camera.members])
     by_film = film.by_parameters + product(by_camera_xy - np.eye(2), at_distorted.by_parameters)
     _fill(by_unknowns, slice(None), parts.film, [by_film[..., k] for k in parts.film.members])
     return Derivatives(film.by_xy if problem.by_elements else product(by_camera_xy, film.by_xy), by_unknowns)
@@ -170,10 +170,8 @@ def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Arra
 
 def _by_in_camera(by_ray: Array, seen: SeenTargets) -> Array:
     """Derivative (n, 2, 3) by U, V, W of what has a derivative (n, 2, 2) by the ray -U/W, -V/W."""
-    by_in_camera = zeros(len(by_ray), 2, 3)
-    by_in_camera[..., :2] = by_ray
-    by_in_camera[..., 2] = applied(by_ray, seen.ray)
-    return np.asarray(by_in_camera / -seen.in_camera[:, 2, None, None])
+    by_in_plane = by_ray / -seen.in_camera[:, 2, None, None]
+    return columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, seen.ray)])
 
 
 @dataclass(frozen=True)
@@ -186,22 +184,28 @@ class _FilmDerivatives:
 
 
 def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
-    count, width = len(xy_mm), max(films.positions.shape[1] for films in problem.films)
+    of_films = [_of_films(films, state, xy_mm) for films in problem.films]
+    if len(of_films) == 1:
+        return of_films[0]
+    count, width = len(xy_mm), max(each.by_parameters.shape[2] for each in of_films)
     result = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), zeros(count, 2, width))
-    for films in problem.films:
-        rows = _all_of(films.rows, count)
-        xy = xy_mm[rows]
-        parameters = state.values[films.positions][films.of]
-        design = films.kind.design(parameters, xy, films.centers_mm, films.halves_mm)
-        result.camera_xy[rows] = films.kind.apply(parameters, xy)
-        result.by_xy[rows] = films.kind.gradient(parameters, xy)
-        result.by_parameters[rows, :, : films.positions.shape[1]] = design
+    for films, each in zip(problem.films, of_films, strict=True):
+        result.camera_xy[films.rows], result.by_xy[films.rows] = each.camera_xy, each.by_xy
+        result.by_parameters[films.rows, :, : each.by_parameters.shape[2]] = each.by_parameters
     return result
 
 
-def _all_of(rows: Indices, count: int) -> Rows:
-    """Rows, in order, of so many in all: where they are all, as a slice, which takes no copy."""
-    return slice(None) if len(rows) == count else rows
+def _of_films(films: Films, state: State, xy_mm: Array) -> _FilmDerivatives:
+    """The derivatives of the films of one kind alone."""
+    parameters, xy = state.values[films.positions][films.of], xy_mm[_in_order(films.rows)]
+    design = films.kind.design(parameters, xy, films.centers_mm, films.halves_mm)
+    return _FilmDerivatives(films.kind.apply(parameters, xy), films.kind.gradient(parameters, xy), design)
+
+
+def _in_order(rows: Indices) -> Rows:
+    """Ascending rows, as a slice, which takes no copy, where none is left out."""
+    whole = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
+    return slice(int(rows[0]), int(rows[-1]) + 1) if whole else rows
 
 
 def blind_mark(problem: Problem, state: State) -> str:

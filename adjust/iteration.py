@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.elimination import eliminate
 from adjust.factor import Factor
-from adjust.functions import Derivatives, compute, computed_observations, derivatives
+from adjust.functions import compute, computed_observations, derivatives
 from adjust.further_observations import square_sum
 from adjust.numbering import Numbering
 from adjust.problem import Problem, State
@@ -18,6 +18,7 @@ from adjust.rows import WhitenedRows, of_cameras, prior_differences, prior_root_
 Array = NDArray[np.float64]
 
 STANDSTILL_SIGMAS = 1e-8  # a step below this, in standard deviations, is none
+FORESEEN = 0.1  # of that: a next step that would be smaller if it shrank as the last two did need not be taken
 ROUNDING_SIGMAS = 1e-5  # steps below this that no longer shrink are rounding
 VPV_ROUNDING = 1e-9  # relative increase of v'Pv that is not an increase
 FIRST_DAMPING = 1e-4
@@ -31,12 +32,15 @@ LARGEST_TURN = 0.75  # of a step's length that its second-order part may have
 
 @dataclass(frozen=True)
 class Linearised:
-    """The equations at a state: computed observations and residuals (n, 2) in mm, derivatives, whitened rows, v'Pv."""
+    """The equations at a state: computed observations and residuals (n, 2) in mm, whitened rows, v'Pv.
+
+    by_observation (n, 2, 2): A, the derivatives of the functions by the observations.
+    """
 
     state: State
     computed_mm: Array
     v_mm: Array
-    at: Derivatives
+    by_observation: Array
     rows: WhitenedRows
     vpv: float
 
@@ -65,7 +69,7 @@ def linearise(numbering: Numbering, covariance_mm2: Array, state: State) -> Line
     v = computed.xy_mm - problem.network.observations.xy_mm
     at = derivatives(problem, state, computed)
     rows = whitened_rows(numbering, state.values, at, covariance_mm2, v)
-    return Linearised(state, computed.xy_mm, v, at, rows, _square_sum(problem, state, rows))
+    return Linearised(state, computed.xy_mm, v, at.by_observation, rows, _square_sum(problem, state, rows))
 
 
 def _square_sum(problem: Problem, state: State, rows: WhitenedRows) -> float:
@@ -110,10 +114,14 @@ def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limi
 
 
 def _stands_still(history: list[Iteration]) -> bool:
-    steps = [each.largest_step_sigmas for each in history[-2:]]
+    """Whether the last step was none, or rounding, or so much smaller than those before that the next will be none."""
+    steps = [each.largest_step_sigmas for each in history[-3:]]
     if steps[-1] < STANDSTILL_SIGMAS:
         return True
-    return len(steps) == 2 and max(steps) < ROUNDING_SIGMAS and steps[1] > 0.5 * steps[0]
+    if len(steps) > 1 and max(steps[-2:]) < ROUNDING_SIGMAS and steps[-1] > 0.5 * steps[-2]:
+        return True
+    undamped = len(steps) == 3 and not any(each.damping for each in history[-3:])
+    return undamped and steps[2] * max(steps[1] / steps[0], steps[2] / steps[1]) < FORESEEN * STANDSTILL_SIGMAS
 
 
 def _eased(damping: float, gain: float) -> float:
@@ -154,7 +162,7 @@ def _step(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: 
         if np.isfinite(step).all():
             # The damping's rows, which hold the scaled unknowns where they are, take their part of the decrease.
             promised = factor.length() ** 2 + damping * float(((factor.scale * solution) ** 2).sum())
-            bent = step if damping == 0.0 else _bent(numbering, covariance_mm2, at, damping, step)
+            bent = step if damping == 0.0 else _bent(numbering, at, damping, step)
             moved = None if bent is None else linearise(numbering, covariance_mm2, problem.moved(at.state, bent))
             if moved is not None and moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv):
                 gain = (at.vpv - moved.vpv) / promised if promised > VPV_ROUNDING * (1.0 + at.vpv) else 1.0
@@ -163,14 +171,7 @@ def _step(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: 
     return None
 
 
-def _linear_change(problem: Problem, at: Linearised, step: Array) -> Array:
-    """How the computed observations (n, 2) in mm change with a step of the unknowns, to the first order: -A^-1 B dx."""
-    by_column = np.append(step, 0.0)[problem.columns]  # the last stands for ABSENT
-    along = np.einsum("nij,nj->ni", at.at.by_unknowns, by_column)
-    return np.asarray(-np.linalg.solve(at.at.by_observation, along[..., None])[..., 0])
-
-
-def _bent(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: float, step: Array) -> Array | None:
+def _bent(numbering: Numbering, at: Linearised, damping: float, step: Array) -> Array | None:
     """A damped step with its second-order part; None where that is too large to be trusted, or cannot be found.
 
     The second derivative of the observations along the step, by a difference, takes the place of an observation:
@@ -180,8 +181,9 @@ def _bent(numbering: Numbering, covariance_mm2: Array, at: Linearised, damping: 
     ahead = computed_observations(problem, problem.moved(at.state, PROBE * step))
     if ahead is None:
         return None
-    half_curvature_mm = ((ahead - at.computed_mm) / PROBE - _linear_change(problem, at, step)) / PROBE
-    rows = whitened_rows(numbering, at.state.values, at.at, covariance_mm2, at.v_mm + half_curvature_mm)
+    change_mm = at.rows.change_mm(at.by_observation, step)
+    half_curvature_mm = ((ahead - at.computed_mm) / PROBE - change_mm) / PROBE
+    rows = at.rows.of_discrepancies(at.by_observation, at.v_mm + half_curvature_mm)
     factor = factorise(numbering, replace(at, rows=rows), damping)
     bent = np.zeros_like(step)
     bent[numbering.free] = factor.solution()

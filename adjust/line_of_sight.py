@@ -39,8 +39,8 @@ def sight_vectors(setting: LineOfSight, station: Array, xyz: Array) -> SightVect
 
 
 def _straight(stations: Array, xyz: Array) -> SightVectors:
-    eye = np.broadcast_to(np.eye(3), (*xyz.shape, 3))
-    return SightVectors(xyz - stations, -eye, eye)
+    shape = (*xyz.shape, 3)
+    return SightVectors(xyz - stations, np.broadcast_to(-np.eye(3), shape), np.broadcast_to(np.eye(3), shape))
 
 
 def _over_the_sphere(unit_m: float, stations: Array, xyz: Array) -> SightVectors:

@@ -211,13 +211,17 @@ def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterat
     owned = numbers[blocks.owned]
     count, owns = int(numbers.max(initial=ABSENT)) + 1, owned != ABSENT
     first_own = count - int(owns.sum())
+    rank = (np.arange(count + 1) - first_own) % max(count, 1)  # own unknowns first; the last stands for ABSENT
     order = np.argsort(blocks.of, kind="stable")
-    of, unknown = blocks.of[order], derivatives[order].T
+    # Most observations of a block touch what the one before touched: such runs are looked at once.
+    of, unknown = blocks.of[order], derivatives[order]
+    begins = np.append(True, (of[1:] != of[:-1]) | (unknown[1:] != unknown[:-1]).any(axis=1))[: len(of)]
+    run, of, unknown = np.cumsum(begins) - 1, of[begins], unknown[begins].T
     # Every pair of a block and an unknown that it touches or owns: block by block, its own unknowns first.
-    pair = np.where(unknown == ABSENT, ABSENT, of * count + (unknown - first_own) % count)
-    new = pair != ABSENT  # most observations of a block touch what the one before touched
+    pair = np.where(unknown == ABSENT, ABSENT, of * count + rank[unknown])
+    new = pair != ABSENT
     new[:, 1:] &= pair[:, 1:] != pair[:, :-1]
-    owned_pairs = np.nonzero(owns)[0] * count + (owned[owns] - first_own) % count
+    owned_pairs = np.nonzero(owns)[0] * count + rank[owned[owns]]
     pairs, place = np.unique(np.concatenate([pair[new], owned_pairs]), return_inverse=True)
     first = np.searchsorted(pairs, np.arange(len(owned)) * count)
     widths = np.diff(first, append=len(pairs))
@@ -238,12 +242,16 @@ def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterat
             ordered = first_row[some][:, None] + np.arange(height)
             own_and_shared = unknown[first[some][:, None] + np.arange(width)]
             own, shared = own_and_shared[:, :own_count], own_and_shared[:, own_count:]
-            yield Touched(order[ordered], own, shared, _agreed(columns[ordered]))
+            yield Touched(order[ordered], own, shared, _agreed(columns, run[ordered]))
 
 
-def _agreed(columns: Indices) -> Indices:
+def _agreed(columns: Indices, run: Indices) -> Indices:
+    """The columns (b, m, k) of the runs (b, m) of observations, b or m 1 where all agree."""
+    if (run == run[:, :1]).all():
+        run = run[:, :1]
+    of_rows = columns[run]
     for axis in (0, 1):
-        first = columns.take(range(min(1, columns.shape[axis])), axis=axis)
-        if (columns == first).all():
-            columns = first
-    return columns
+        first = of_rows.take(range(min(1, of_rows.shape[axis])), axis=axis)
+        if (of_rows == first).all():
+            of_rows = first
+    return of_rows

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.correction import Imaged
+from adjust.correction import Imaged, undistorted
 from adjust.small_matrices import applied, matrices, product, vectors
 
 Array = NDArray[np.float64]
@@ -28,14 +28,22 @@ def opencv(ray: Array, parameters: Array) -> Imaged:
     # From OpenCV's axes to the camera's: the image's y, and the ray's, turn their signs.
     scale, mirror = np.array([1 + b1, -1.0]), np.array([1.0, -1.0])
     straight = _lens(ray * mirror, parameters[:12])
-    tilted = _tilt(straight.value, tau_x, tau_y)
-    by_b1 = tilted.value * np.array([1.0, 0.0])
-    by_lens, by_ray = straight.by_parameters, straight.by_ray
-    if tau_x or tau_y:
-        by_lens = tuple(applied(tilted.by_ray, column) for column in by_lens)
-        by_ray = product(tilted.by_ray, by_ray)
-    by_parameters = *(column * scale for column in (*by_lens, *tilted.by_parameters)), by_b1
-    return Imaged(tilted.value * scale, by_ray * scale[:, None] * mirror, by_parameters)
+    is_tilted = tau_x != 0.0 or tau_y != 0.0
+    tilted = _tilt(straight.value, tau_x, tau_y) if is_tilted else undistorted(straight.value, parameters)
+
+    def by_parameter(k: int) -> Array:
+        match OPENCV_NAMES[k]:
+            case "b1":
+                return vectors(tilted.value[:, 0], np.zeros_like(tilted.value[:, 0]))
+            case "tau_x" | "tau_y" as name:
+                column = _tilt(straight.value, tau_x, tau_y).by_parameter(name == "tau_y")
+            case _:
+                column = straight.by_parameter(k)
+                column = applied(tilted.by_ray, column) if is_tilted else column
+        return np.asarray(column * scale)
+
+    by_ray = product(tilted.by_ray, straight.by_ray) if is_tilted else straight.by_ray
+    return Imaged(tilted.value * scale, by_ray * scale[:, None] * mirror, by_parameter)
 
 
 def _lens(ray: Array, parameters: Array) -> Imaged:
@@ -57,20 +65,25 @@ def _lens(ray: Array, parameters: Array) -> Imaged:
         (radial + 2 * p1 * y + 4 * p2 * x + 2 * x * xd_by_r2, 2 * p1 * x + 2 * y * xd_by_r2),
         (2 * p2 * y + 2 * x * yd_by_r2, radial + 4 * p1 * y + 2 * p2 * x + 2 * y * yd_by_r2),
     )
-    r4 = r2 * r2
-    above_by = [power / below for power in (r2, r4, r4 * r2)]  # by k1, k2, k3; those by k4, k5, k6 are -radial times it
-    by_k = [vectors(x * each, y * each) for each in above_by]
-    xy2, zero = 2 * x * y, np.zeros_like(x)
-    others = ((r2, zero), (r4, zero), (zero, r2), (zero, r4))
-    by_parameters = (
-        *by_k[:2],
-        vectors(xy2, r2 + 2 * y**2),
-        vectors(r2 + 2 * x**2, xy2),
-        by_k[2],
-        *(each * -radial[:, None] for each in by_k),
-        *(vectors(*pair) for pair in others),
-    )
-    return Imaged(vectors(xd, yd), by_ray, by_parameters)
+
+    def by_parameter(k: int) -> Array:
+        zero, powers = np.zeros_like(x), (r2, r2 * r2, r2 * r2 * r2)
+        match OPENCV_NAMES[k]:
+            case "p1":
+                return vectors(2 * x * y, r2 + 2 * y**2)
+            case "p2":
+                return vectors(r2 + 2 * x**2, 2 * x * y)
+            case "s1" | "s2" as name:
+                return vectors(powers[int(name[1]) - 1], zero)
+            case "s3" | "s4" as name:
+                return vectors(zero, powers[int(name[1]) - 3])
+            case "k1" | "k2" | "k3" as name:
+                factor = powers[int(name[1]) - 1] / below
+            case name:  # k4, k5, k6
+                factor = -radial * powers[int(name[1]) - 4] / below
+        return vectors(x * factor, y * factor)
+
+    return Imaged(vectors(xd, yd), by_ray, by_parameter)
 
 
 def _tilt(point: Array, tau_x: float, tau_y: float) -> Imaged:
@@ -91,15 +104,16 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> Imaged:
     by_point = [
         [size * (row[i] - at * rotation[2, i]) for i in (0, 1)] for row, at in zip(rotation, over, strict=False)
     ]
-    by_angles = []
-    for change in moved:
+
+    def by_angle(k: int) -> Array:
+        change = moved[k]
         *shift, deeper = _turned(change, point)
-        by_angle = [
-            size * (shift[axis] - at * deeper) + change[2, 2] * at - change[axis, 2] for axis, at in enumerate(over)
-        ]
-        by_angles.append(vectors(*by_angle))
+        return vectors(
+            *(size * (shift[i] - at * deeper) + change[2, 2] * at - change[i, 2] for i, at in enumerate(over))
+        )
+
     value = [rotation[2, 2] * at - rotation[axis, 2] for axis, at in enumerate(over)]
-    return Imaged(vectors(*value), matrices(*by_point), tuple(by_angles))
+    return Imaged(vectors(*value), matrices(*by_point), by_angle)
 
 
 def _turned(matrix: Array, point: Array) -> list[Array]:

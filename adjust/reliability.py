@@ -125,7 +125,7 @@ def _of_pairs(units: TestedUnits, values: Array) -> Array:
 
 def _transforms(problem: Problem, end: Linearised, units: TestedUnits) -> Array:
     transform = np.zeros((len(units), 2, 2))
-    transform[: len(end.v_mm)] = np.linalg.solve(end.rows.root, end.at.by_observation)
+    transform[: len(end.v_mm)] = np.linalg.solve(end.rows.root, end.by_observation)
     transform[len(end.v_mm) :, [0, 1], [0, 1]] = _of_pairs(units, _prior_root_weights(problem))
     return transform
 

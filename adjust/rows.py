@@ -1,8 +1,7 @@
 """The weighted rows of an adjustment: whitened pairs F1, F2 and F3, F4 in blocks, and the unknowns' priors."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +10,9 @@ from adjust.elimination import Sums
 from adjust.factor import Blocks
 from adjust.functions import Derivatives
 from adjust.further_observations import FurtherObservation
-from adjust.numbering import ELEMENTS_AT_ONCE, Numbering, Touched
+from adjust.numbering import Numbering, Touched
 from adjust.problem import ABSENT, Problem, State
-from adjust.small_matrices import applied, lower_root, product, zeros
+from adjust.small_matrices import applied, inverse, lower_root, product
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -21,7 +20,7 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class WhitenedRows:
-    """Rows of unit weight; in turn the blocks of `Numbering.touched`, of large networks put together as asked for.
+    """Rows of unit weight; in turn the blocks of `Numbering.touched`, put together as asked for.
 
     A block for each further observation follows. root (n, 2, 2): the factor L of A C A' = L L'; matrix (n, 2, k): by
     the unknowns at `Problem.columns`; right (n, 2).
@@ -34,16 +33,19 @@ class WhitenedRows:
     further: tuple[Blocks, ...]
 
     def __iter__(self) -> Iterator[Blocks]:
-        yield from self._at_hand if self.matrix.size <= ELEMENTS_AT_ONCE else self._put_together()
-
-    @cached_property
-    def _at_hand(self) -> list[Blocks]:
-        return list(self._put_together())
-
-    def _put_together(self) -> Iterator[Blocks]:
         for touched in self.numbering.touched:
             yield _blocks(touched, self.matrix, self.right)
         yield from self.further
+
+    def of_discrepancies(self, by_observation: Array, v_mm: Array) -> "WhitenedRows":
+        """The same rows with other v (n, 2) on the right side; by_observation: A (n, 2, 2)."""
+        return replace(self, right=_whitened(self.root, applied(by_observation, v_mm)[..., None])[..., 0])
+
+    def change_mm(self, by_observation: Array, step: Array) -> Array:
+        """How the computed observations (n, 2) change with a step of the unknowns, to the first order: -A^-1 B dx."""
+        by_column = np.append(step, 0.0)[self.numbering.problem.columns]  # the last stands for ABSENT
+        along = applied(self.root, np.einsum("nij,nj->ni", self.matrix, by_column))
+        return -applied(inverse(by_observation), along)
 
     @property
     def sums(self) -> Sums:
@@ -68,22 +70,31 @@ def whitened_rows(
 ) -> WhitenedRows:
     """The rows B dx = w of all blocks, every pair multiplied by L^-1, where A C A' = L L'.
 
-    At computed observations F is 0, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed less observed.
+    At computed observations F is 0, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed less observed. The
+    derivatives B are divided where they are, and are not these any more.
     """
     a = at.by_observation
     root = lower_root(product(product(a, covariance_mm2), a.transpose(0, 2, 1)))
-    first, below, second = root[:, 0, :1], root[:, 1, :1], root[:, 1, 1:]
-    rows = zeros(len(a), 2, at.by_unknowns.shape[2] + 1)
-    for into, of in ((rows[..., :-1], at.by_unknowns), (rows[..., -1:], applied(a, v_mm)[..., None])):
-        np.divide(of[:, 0], first, out=into[:, 0])
-        np.divide(of[:, 1] - below * into[:, 0], second, out=into[:, 1])
+    right = _whitened(root, applied(a, v_mm)[..., None])[..., 0]
     further = tuple(_further_block(numbering, each, values) for each in numbering.problem.further)
-    return WhitenedRows(numbering, root, rows[..., :-1], rows[..., -1], further)
+    return WhitenedRows(numbering, root, _whitened(root, at.by_unknowns), right, further)
+
+
+def _whitened(root: Array, rows: Array) -> Array:
+    """Rows (n, 2, k) divided by lower triangles (n, 2, 2), in their own memory: it is the largest array of a step."""
+    rows[:, 0] /= root[:, 0, :1]
+    rows[:, 1] -= root[:, 1, :1] * rows[:, 0]
+    rows[:, 1] /= root[:, 1, 1:]
+    return rows
 
 
 def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
     """The rows of blocks of equal shape, of all (n, 2, k), with every derivative in its unknown's column."""
     (count, height), width = touched.rows.shape, touched.own.shape[1] + touched.shared.shape[1]
+    of_blocks = _of_rows(right, touched.rows).reshape(count, 2 * height)
+    if touched.columns.shape[:2] == (1, 1) and np.array_equal(touched.columns[0, 0], np.arange(width)):
+        as_they_are = _of_rows(matrix, touched.rows).reshape(count, 2 * height, width)
+        return Blocks(touched.own, touched.shared, as_they_are, of_blocks)
     by_column = np.zeros((count, width + 1, height, 2))  # what an operation on a column takes stands together
     if touched.columns.shape[:2] == (1, 1):
         for k, column in enumerate(touched.columns[0, 0]):
@@ -95,14 +106,14 @@ def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
         columns = np.broadcast_to(touched.columns[:, :, None, :], (count, height, 2, matrix.shape[2]))
         np.put_along_axis(by_column.transpose(0, 2, 3, 1), columns, matrix[touched.rows], axis=3)
     dense = by_column[:, :width].reshape(count, width, 2 * height).swapaxes(1, 2)
-    return Blocks(touched.own, touched.shared, dense, right[touched.rows].reshape(count, 2 * height))
+    return Blocks(touched.own, touched.shared, dense, of_blocks)
 
 
 def _of_rows(values: Array, rows: Indices) -> Array:
-    """Values (b, m, 2), of all (n, 2), of some rows (b, m); without a copy where they stand in order."""
-    first, count = int(rows[0, 0]), rows.size
+    """Values (b, m, ...), of all (n, ...), of some rows (b, m); without a copy where they stand in order."""
+    first, count = int(rows[0, 0]) if rows.size else 0, rows.size
     if np.array_equal(rows.ravel(), np.arange(first, first + count)):
-        return values[first : first + count].reshape(*rows.shape, 2)
+        return values[first : first + count].reshape(*rows.shape, *values.shape[1:])
     return np.asarray(values[rows])
 
 

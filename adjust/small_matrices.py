@@ -31,6 +31,11 @@ def matrices(*rows: Sequence[Array]) -> Array:
     return np.asarray(np.moveaxis(stacked.reshape(len(rows), len(rows[0]), stacked.shape[1]), -1, 0))
 
 
+def columns(members: Sequence[Array]) -> Array:
+    """(n, i, k) of k columns (n, i)."""
+    return np.asarray(np.moveaxis(np.stack([member.T for member in members]), (0, 1, 2), (2, 1, 0)))
+
+
 def laid_out(array: Array) -> Array:
     """The same array (n, ...), in memory as it is described above."""
     return np.asarray(np.moveaxis(np.ascontiguousarray(np.moveaxis(array, 0, -1)), -1, 0))
@@ -45,7 +50,7 @@ def product(left: Array, right: Array) -> Array:
     """(..., i, k) of matrices (..., i, j) and (..., j, k)."""
     total = left[..., :, 0, None] * right[..., None, 0, :]
     for j in range(1, left.shape[-1]):
-        total = total + left[..., :, j, None] * right[..., None, j, :]
+        total += left[..., :, j, None] * right[..., None, j, :]
     return np.asarray(total)
 
 

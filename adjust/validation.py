@@ -189,6 +189,8 @@ def _check_duplicate_observations(network: Network) -> None:
     observations = network.observations
     names, of_name = observations.numbered_points
     mark = (2 * network.image_numbers + observations.is_fiducial) * len(names) + of_name
+    if len(np.unique(mark)) == len(mark):
+        return
     _, first, counts = np.unique(mark, return_index=True, return_counts=True)
     for row, count in zip(first[counts > 1], counts[counts > 1], strict=True):
         what = "fiducial" if observations.is_fiducial[row] else "point"

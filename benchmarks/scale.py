@@ -267,7 +267,7 @@ def scipy(scene: Scene) -> Figures:
         step[numbering.free] = x
         linear = linearise(numbering, covariance, problem.moved(first, step))
         assert linear is not None
-        by = -np.linalg.solve(linear.at.by_observation, linear.rows.root @ linear.rows.matrix) / SIGMA_MM
+        by = -np.linalg.solve(linear.by_observation, linear.rows.root @ linear.rows.matrix) / SIGMA_MM
         used = np.broadcast_to((numbers != ABSENT)[:, None, :], by.shape)
         rows = np.broadcast_to(np.arange(2 * len(by)).reshape(-1, 2, 1), by.shape)
         columns = np.broadcast_to(numbers[:, None, :], by.shape)
