@@ -27,6 +27,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from adjust.adjustment import adjust
+from adjust.approximations import approximate
 from adjust.iteration import linearise
 from adjust.network import (
     Approximations,
@@ -79,13 +80,16 @@ def main() -> None:
         print(json.dumps(PROGRAMS[task, program](*map(int, sizes))))
         return
     print("100 known points, full covariance of the camera; CPU seconds of one thread, peak MiB")
-    print(f"{'views':>7} {'reseau':>16} {'OpenCV':>16} {'ratio':>7}")
+    print("tests: all residuals' tests, reliability, suspects and warnings, where they are asked for besides")
+    print("start: approximations from the points alone, where none are given")
+    print(f"{'views':>7} {'reseau':>16} {'OpenCV':>16} {'ratio':>7} {'tests':>9} {'start':>9}")
     for views in VIEWS:
         ours, theirs = measured("known", "reseau", views), measured("known", "opencv", views)
         ratio = f"{theirs['seconds'] / ours['seconds']:7.1f}" if "seconds" in theirs else f"{'':>7}"
-        print(f"{views:7} {_figures(ours)} {_figures(theirs)} {ratio}")
+        print(f"{views:7} {_figures(ours)} {_figures(theirs)} {ratio} {_besides(ours, views)}")
     for views in VIEWS_OF_RESEAU_ALONE:
-        print(f"{views:7} {_figures(measured('known', 'reseau', views))}")
+        ours = measured("known", "reseau", views)
+        print(f"{views:7} {_figures(ours)} {'':24} {_besides(ours, views)}")
     print("\nUnknown points; the covariance that each gives in the time behind +")
     for images, points in NETWORKS:
         print(f"{images} images, {points} points")
@@ -121,6 +125,12 @@ def _figures(found: Figures) -> str:
         return f"{'-':>16}"
     covariance = f"+{found['covariance_seconds']:.1f}" if "covariance_seconds" in found else ""
     return f"{found['seconds']:.2f}{covariance} s {found['mib']:.0f}".rjust(16)
+
+
+def _besides(ours: Figures, views: int) -> str:
+    """Seconds of the tests, and of approximations."""
+    start = measured("known", "start", views)
+    return " ".join(f"{each['seconds']:7.2f} s" for each in ({"seconds": ours["tests_seconds"]}, start))
 
 
 def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -227,12 +237,20 @@ def _scene(
 
 
 def reseau(scene: Scene) -> Figures:
-    """With the standard deviations of everything."""
+    """With the standard deviations of everything; what the observations tell besides is measured by itself."""
     result, seconds = _timed(lambda: adjust(scene.network, scene.start))
     assert result.converged
     cameras = [name for name in result.names if name.startswith("IO.")]
     _, more = _timed(lambda: (result.cofactor.variances, result.cofactor_of(cameras)))
-    return {"seconds": seconds + more, "mib": _peak_mib(), "vpv": result.vpv, "says": "everything"}
+    figures = {"seconds": seconds + more, "mib": _peak_mib(), "vpv": result.vpv, "says": "everything"}
+    _, tests = _timed(lambda: (result.residuals, result.groups, result.reliability, result.suspects, result.warnings))
+    return figures | {"tests_seconds": tests, "mib_with_tests": _peak_mib()}
+
+
+def start(scene: Scene) -> Figures:
+    """Approximations from the known points alone, and that the adjustment from them leads to the same minimum."""
+    found, seconds = _timed(lambda: approximate(scene.network))
+    return {"seconds": seconds, "mib": _peak_mib(), "vpv": adjust(scene.network, found).vpv}
 
 
 def opencv(scene: Scene) -> Figures:
@@ -351,6 +369,7 @@ def ceres(scene: Scene) -> Figures:
 
 PROGRAMS: dict[tuple[str, str], Callable[..., Figures]] = {
     ("known", "reseau"): lambda views: reseau(known(views)),
+    ("known", "start"): lambda views: start(known(views)),
     ("known", "opencv"): lambda views: opencv(known(views)),
     ("unknown", "reseau"): lambda images, points: reseau(unknown(images, points)),
     ("unknown", "scipy"): lambda images, points: scipy(unknown(images, points)),
