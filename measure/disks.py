@@ -1,10 +1,12 @@
 """Round targets measured to the noise of the film: a blurred ellipse fitted by least-squares matching."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.blank_film import BESIDE_PX
+from measure.compression import with_loss
 from measure.matching import MatchOptions, match, window_about
 from measure.scan import Scan
 from measure.shapes import Disk, MarkShape
@@ -14,13 +16,14 @@ Array = NDArray[np.float64]
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
 SHORTEST_MARGIN_PX, LONGEST_MARGIN_PX = 2.5, 10.0
 MARGIN = 0.3  # of the radius: the ground is not plain for long, where the pad ends that a target is painted on, say
+PLAIN_MARGIN_PX = 7.0  # where it is plain, for a tenth less noise than with the shortest margin
 LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
 SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
 SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from the disk
 LEAST_SNR = 4.0
 WEAK_DAMAGE, MOST_DAMAGE = 0.1, 0.35
 MOST_BLUR = 0.7  # of the shorter half axis
-WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.2, 0.08  # residuals over contrast: texture and stains are no disks
+WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast: texture and stains are no disks
 SMOOTH = 0.5  # correlation of neighbouring residuals, from which on they are no noise
 
 
@@ -75,17 +78,24 @@ def fit_disk(
     """
     start = np.column_stack([pixel_from_disk, center_px])
     radius = float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
-    margin = max(MARGIN * radius, SHORTEST_MARGIN_PX, LEAST_REACH_PX - radius)
-    margin = max(min(margin, longest_margin_px, LONGEST_MARGIN_PX), 1.5)
+    sure = max(MARGIN * radius, SHORTEST_MARGIN_PX, LEAST_REACH_PX - radius)
+    sure = max(min(sure, longest_margin_px, LONGEST_MARGIN_PX), 1.5)
+    wide = max(sure, min(PLAIN_MARGIN_PX, longest_margin_px))
     options = MatchOptions(
-        freedom="ellipse" if shape is UNIT_DISK else "affine", margin_px=margin, max_shift_px=max(radius, 2.0)
+        freedom="ellipse" if shape is UNIT_DISK else "affine",
+        margin_px=wide,
+        margin_blurs=0.0,
+        plain_px=sure,
+        max_shift_px=max(radius, 2.0),
     )
-    col0, row0, width, height = window_about(shape, start, options.margin_px + 2)
-    window = scan.window(col0, row0, width, height)
-    fit = match(window, (col0, row0), shape, start, options, inside(scan, col0, row0, width, height))
+    col0, row0, width, height = window_about(shape, start, wide + BESIDE_PX)
+    window, valid = scan.window(col0, row0, width, height), inside(scan, col0, row0, width, height)
+    fit = match(window, (col0, row0), shape, start, options, valid, scan.is_lossy)
+    if not fit.converged and sure < wide:
+        fit = match(window, (col0, row0), shape, start, replace(options, margin_px=sure), valid, scan.is_lossy)
     disk = FittedDisk(
         center_px=fit.center_px,
-        covariance_px2=fit.covariance_px2,
+        covariance_px2=with_loss(fit.covariance_px2, scan),
         pixel_from_disk=fit.pixel_from_mark[:, :2],
         contrast_dn=fit.contrast_dn,
         noise_dn=fit.noise_dn,

@@ -17,7 +17,7 @@ class FiducialOptions:
     turned and scaled against its pose and the pitch. misfit_mm, affinity: how far a mark may lie from its given place
     when it is searched, plus what share of the constellation's span. gate_mm: how far a measured mark may lie from
     where the others put it. film_sigma_mm: scatter of marks by film and scanner. match: of the fit at full resolution;
-    a polygon is always matched by its shift alone.
+    a polygon is matched with the rotation and scale of the frame.
     """
 
     pose: str = "auto"

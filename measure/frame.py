@@ -1,7 +1,7 @@
 """One frame in one placement: its marks sighted at full resolution, and those told apart that do not belong."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from measure.frame_fit import fit_frame, strangers
 from measure.glimpse import Glimpse, glimpse
 from measure.matching import Match
 from measure.poses import up_from_camera
-from measure.refinement import Sighting, sight, strongest
+from measure.refinement import Sighting, leans_on_frame, sight, strongest
 from measure.scan import LUMINANCE, Scan
 from measure.shapes import FiducialLayout, FrameCorner, Mark
 from measure.status import Status
@@ -37,6 +37,7 @@ _FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, 
 _FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
 _LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
 _SAME_PX = 1.0
+_SETTLED_PX = 1.5  # about a mark that was matched already
 _ROUNDS = 2  # of looking for faint marks: the first ones tell where the others are
 _REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
@@ -130,6 +131,7 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
         if sighter.sure():
             sighter.glimpse_faint(sighter.reach_px())
             sighter.judge()
+    sighter.settle()
     return sighter.frame()
 
 
@@ -190,6 +192,29 @@ class _Sighter:
         self.belongs[index[out]] = False
         fit = fit_frame(self.camera[index[~out]], up[~out], sigma[~out], self.turn)
         self.pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / self.pitch[:, None]
+
+    def settle(self) -> None:
+        """Match marks that do not tell their own rotation and scale once more, with those of the frame."""
+        leaning = [
+            (index, mark.mark)
+            for index, mark in enumerate(self.layout.marks)
+            if self.belongs[index] and self.clear(index) and leans_on_frame(mark.mark)
+        ]
+        if not leaning or self.belongs.sum() < 2:
+            return
+        belonging = self.camera[self.belongs]
+        radius_mm = float(np.hypot(*(belonging - belonging.mean(axis=0)).T).mean())
+        frame_sigma = float(np.hypot(self.options.film_sigma_mm, self._scatter_mm())) / radius_mm
+        match, linear = self.options.match, self.pixel_from_camera[:, :2]
+        for index, mark in leaning:
+            before = self.sightings[index]
+            if before is None or before.fit is None:
+                continue
+            start, sign = np.column_stack([linear, before.fit.center_px]), self._sign(mark)
+            after = sight(self.scan, mark, start, _SETTLED_PX, sign, self.weights, match, frame_sigma)
+            if after.fit is not None:
+                self.sightings[index] = replace(before, fit=after.fit)
+        self.judge()
 
     def sure(self) -> bool:
         """Whether so many marks agree, some of them clear ones, that they tell where every other must be."""

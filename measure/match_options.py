@@ -1,6 +1,7 @@
 """How a mark is matched."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal, get_args
 
 Freedom = Literal["shift", "similarity", "affine", "ellipse"]
@@ -15,7 +16,8 @@ class MatchOptions:
     blur_px: standard deviation of the scan's blur; the start of its estimation, if it is estimated.
     linear_sigma: prior standard deviation of rotation (rad), scale and shear, as known from the other marks; the
     default holds only what the picture does not show at all.
-    margin_px: how far about the mark grey values are used.
+    margin_px: how far about the mark grey values are used; in a blurred scan so many standard deviations of the blur.
+    plain_px: where grey values farther from the mark vary much more than the nearer ones, the match fails.
     """
 
     freedom: Freedom = "similarity"
@@ -23,6 +25,8 @@ class MatchOptions:
     estimate_blur: bool = True
     linear_sigma: float = 0.3
     margin_px: float = 6.0
+    margin_blurs: float = 4.0
+    plain_px: float = inf
     damage_sigmas: float = 3.2
     damage_rounds: int = 3
     max_iterations: int = 15
@@ -36,6 +40,7 @@ class MatchOptions:
             "blur_px",
             "linear_sigma",
             "margin_px",
+            "plain_px",
             "damage_sigmas",
             "max_iterations",
             "max_shift_px",
@@ -43,5 +48,6 @@ class MatchOptions:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
-        if self.damage_rounds < 0:
-            raise ValueError(f"damage_rounds is {self.damage_rounds}; 0 or more is right")
+        for name in ("margin_blurs", "damage_rounds"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is right")

@@ -3,7 +3,8 @@
 The model of a window is `gain * picture(mark) + offset + slopes`; unknown are the mark's place, if wished its rotation,
 scale and shear, the blur, and four grey-value parameters, all in one Gauss-Newton adjustment. Dust and scratches
 are first weighted down (Tukey's biweight), then cut out where smoothed residuals stand out; the rest decides.
-The covariance comes from the residuals' own autocovariance where grain correlates them.
+Where grain correlates the noise, its autocovariance, from the residuals and from blank film beside the mark, weighs the
+last steps and gives the covariance (generalised least squares).
 """
 
 from dataclasses import dataclass, replace
@@ -11,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.blank_film import blank_patches, is_coloured
 from measure.edge_place import EdgePlace, edge_place
 from measure.grain import grain_model
 from measure.match_options import MatchOptions
-from measure.noise import correlated, is_textured, noise_model
+from measure.noise import is_textured, noise_model
 from measure.picture_fit import PictureFit
 from measure.picture_model import GREY, PictureModel, background_px
 from measure.rendering import extent_px
@@ -69,39 +71,57 @@ def match(
     pixel_from_mark: Array,
     options: MatchOptions | None = None,
     valid: Mask | None = None,
+    is_lossy: bool = False,
 ) -> Match:
     """Fit the mark to a window of the scan.
 
     window: (height, width) grey values whose top-left pixel's centre is at origin_px (col, row) of the scan; valid:
     which of its pixels are true ones. pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col,
-    row): its last column is the approximate centre, right to a pixel or two. Never raises for what the picture holds.
+    row): its last column is the approximate centre, right to a pixel or two. is_lossy: whether the grain in the
+    window was compressed, and tells nothing. Never raises for what the picture holds.
     """
     options = options or MatchOptions()
+    grey = np.asarray(window, dtype=float)
+    usable = np.isfinite(grey) if valid is None else np.isfinite(grey) & valid
+    blank = np.zeros_like(usable) if is_lossy else usable
     start = np.array(pixel_from_mark, dtype=float)
-    grey, usable, origin = _cropped(np.asarray(window, dtype=float), valid, origin_px, mark, start, options)
-    start[:, 2] -= origin
-    fit = _fitted(PictureModel(grey, mark, start, options), usable)
-    if fit.reason or is_textured(fit.model.residuals, fit.used):
-        detail = _fitted(PictureModel(grey, mark, start, options, background_px(mark, start)), usable)
-        fit = fit if detail.reason else detail
-    result = _result(fit)
+    start[:, 2] -= origin_px
+    result = _matched(np.where(usable, grey, 0.0), usable, blank, mark, start, options)
+    if result.converged and options.margin_blurs * result.blur_px > options.margin_px:
+        # The blur spreads the mark beyond its margin.
+        wide = replace(options, blur_px=result.blur_px, margin_px=options.margin_blurs * result.blur_px)
+        result = _matched(np.where(usable, grey, 0.0), usable, blank, mark, start, wide)
     moved = np.array(result.pixel_from_mark)
-    moved[:, 2] += origin
+    moved[:, 2] += origin_px
     return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
 
 
-def _cropped(
-    window: Array, valid: Mask | None, origin_px: tuple[float, float], mark: Mark, start: Array, options: MatchOptions
-) -> tuple[Array, Mask, Array]:
-    """The part of the window that the fit can use, which of it is usable, and its own origin."""
-    height, width = window.shape
-    usable = np.isfinite(window) if valid is None else np.isfinite(window) & valid
-    col0, row0, wide, tall = window_about(mark, start, options.margin_px + _SPARE_PX)
-    first_col, first_row = max(round(col0 - origin_px[0]), 0), max(round(row0 - origin_px[1]), 0)
-    rows = slice(min(first_row, height - 1), max(first_row + tall, 1))
-    cols = slice(min(first_col, width - 1), max(first_col + wide, 1))
-    origin = np.array([origin_px[0] + cols.start, origin_px[1] + rows.start])
-    return np.where(usable, window, 0.0)[rows, cols], usable[rows, cols], origin
+def _matched(window: Array, usable: Mask, blank: Mask, mark: Mark, start: Array, options: MatchOptions) -> Match:
+    """The match in the whole window's own pixels: fitted in the part about the mark, its noise told by the rest too,
+    where that may be blank film."""
+    rows, cols = _cropped(window.shape, mark, start, options)
+    grey, seen, near = window[rows, cols], usable[rows, cols], start.copy()
+    near[:, 2] -= cols.start, rows.start
+    fit = _fitted(PictureModel(grey, mark, near, options), seen)
+    if fit.reason or is_textured(fit.model.residuals, fit.used):
+        detail = _fitted(PictureModel(grey, mark, near, options, background_px(mark, near)), seen)
+        fit = fit if detail.reason else detail
+    free = blank.copy()
+    free[rows, cols] &= ~fit.area
+    result = _result(fit, window, free)
+    moved = np.array(result.pixel_from_mark)
+    moved[:, 2] += cols.start, rows.start
+    return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
+
+
+def _cropped(shape: tuple[int, ...], mark: Mark, start: Array, options: MatchOptions) -> tuple[slice, slice]:
+    """The rows and columns of a window that the fit can use."""
+    col0, row0, width, height = window_about(mark, start, options.margin_px + _SPARE_PX)
+    rows, cols = (
+        slice(min(max(first, 0), size - 1), max(first + count, 1))
+        for first, count, size in ((row0, height, shape[0]), (col0, width, shape[1]))
+    )
+    return rows, cols
 
 
 def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
@@ -118,30 +138,22 @@ def _fitted(model: PictureModel, usable: Mask) -> PictureFit:
     return fit
 
 
-def _result(fit: PictureFit) -> Match:
-    """The match in the window's own pixels."""
+def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
+    """The match in the pixels of the fit's own window; free: which pixels of the whole window may be blank film."""
     model, used = fit.model, fit.used
     noise = noise_model(model.residuals, used, len(model.design))
     covariance, gain_sigma = np.full((2, 2), np.inf), np.inf
     edges: EdgePlace | None = None
     if not fit.reason:
-        masked = model.design * used
-        if not noise.is_white:
-            noise = grain_model(model.residuals, used, masked, noise.neighbour_correlation)
-        normal = _normal(masked, masked) + np.diag(model.prior_weights() * max(noise.variance_dn2, 1e-12))
-        middle = normal * noise.variance_dn2
-        if not noise.is_white:
-            middle = _normal(masked, correlated(masked, noise) * used)
-        inverse = np.linalg.inv(normal)
-        full = inverse @ middle @ inverse
-        covariance = (full[:2, :2] + full[:2, :2].T) / 2
+        patches = blank_patches(window, free, noise.variance_dn2)
+        if not noise.is_white or is_coloured(patches):
+            noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
+        full, by_grey = fit.weigh(noise)
+        covariance = full[:2, :2]
         gain_sigma = float(np.sqrt(max(full[-GREY, -GREY], 1e-12)))
-        by_grey = np.tensordot(inverse, masked, axes=1)
         edges = edge_place(
             model.residuals, used, model.design, by_grey, noise, float(np.sqrt(model.state.variance_px2))
         )
-        if not np.all(np.linalg.eigvalsh(covariance) > 0):
-            covariance = (inverse * noise.variance_dn2)[:2, :2]
     state = model.state
     return Match(
         converged=not fit.reason,
@@ -170,7 +182,3 @@ def _likeness(fit: PictureFit) -> float:
     without = grey - background.T @ np.linalg.lstsq(background.T, grey, rcond=None)[0]
     unexplained = np.sum(fit.model.residuals[fit.used] ** 2) / max(np.sum(without**2), 1e-12)
     return float(np.sqrt(max(1 - unexplained, 0.0)))
-
-
-def _normal(first: Array, second: Array) -> Array:
-    return np.asarray(np.tensordot(first, second, axes=((1, 2), (1, 2))))

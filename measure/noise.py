@@ -17,11 +17,13 @@ REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated ov
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
     """variance_dn2 of one pixel, and the (2 * reach + 1) square of autocovariances about it, a lone value for white
-    noise. neighbour_correlation: the mean correlation of pixels that touch along an edge."""
+    noise. neighbour_correlation: the mean correlation of pixels that touch along an edge. is_grain: whether blank film
+    shows it, and not a fit's residuals alone, which may be a landscape's."""
 
     variance_dn2: float
     autocovariance_dn2: Array
     neighbour_correlation: float
+    is_grain: bool = False
 
     @property
     def is_white(self) -> bool:

@@ -4,11 +4,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise import robust_scale
+from measure.noise import NoiseModel, correlated, robust_scale
 from measure.picture_model import PictureModel
 from measure.rendering import chip_mask, render
 from measure.robust import damage, solution, tukey_loss, tukey_weights
 from measure.shapes import MarkTemplate
+from measure.weighting import weighted
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -16,6 +17,10 @@ Mask = NDArray[np.bool_]
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
 _DAMAGE_FLOOR = 0.005  # of the contrast, under the scale of smoothed residuals, for the same reason
 _HALVINGS = 4
+_PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
+_LEAST_VARIANCE_DN2 = 1e-12
+_WEIGHTED_STEPS, _CLOSE_PX, _SETTLED_PX = 4, 0.002, 0.02
+_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
 
 
@@ -27,6 +32,7 @@ class PictureFit:
         self.model, self.usable = model, usable
         self.options = model.options
         self.area = self.used = usable
+        self.far = np.zeros_like(usable)
         self.variance_dn2 = 1.0
         self.reason = ""
 
@@ -52,7 +58,65 @@ class PictureFit:
             if self.used.sum() < 3 * len(self.model.design):
                 self.reason = "too little of the mark is undamaged"
                 return
+            if round_ == 0 and not self._is_plain():
+                self.reason = "the ground about the mark is not plain"
+                return
             self._adjust(robust=False, tolerance_px=0.002)
+
+    def _is_plain(self) -> bool:
+        """Whether undamaged pixels far from the mark vary as the nearer ones do."""
+        near, far = self.used & ~self.far, self.used & self.far
+        squares = self.model.residuals**2
+        floor_dn = _DAMAGE_FLOOR * self.contrast_dn
+        plain = far.sum() >= _PLAIN_SHARE * (self.area & self.far).sum()
+        return bool(not far.any() or (plain and squares[far].mean() < _PLAIN * (squares[near].mean() + floor_dn**2)))
+
+    def weigh(self, noise: NoiseModel) -> tuple[Array, Array]:
+        """Adjust once more with the weights of grain, if it is grain: the unknowns' covariance (unknowns, unknowns),
+        and their derivatives by the grey values (unknowns, height, width)."""
+        model, variance = self.model, max(noise.variance_dn2, _LEAST_VARIANCE_DN2)
+        plain = model.design * self.used / variance
+        if noise.is_white:
+            return self._covariance(plain, plain * variance)
+        smeared = correlated(plain, noise) * self.used
+        covariance, by_grey = self._covariance(plain, smeared)
+        if noise.is_grain:
+            before = model.state
+            weights, smeared = weighted(model.design, self.used, noise, self.contrast_dn)
+            moved = self._step_by(weights)
+            # What has more weight now measures the same place, or the noise is not what it was taken for.
+            if moved is not None and moved @ np.linalg.solve(covariance[:2, :2], moved) < _ODDS:
+                return self._covariance(weights, smeared)
+            model.state = before
+            model.linearise(self.used)
+        return covariance, by_grey
+
+    def _covariance(self, weights: Array, smeared: Array) -> tuple[Array, Array]:
+        """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these."""
+        priors = np.diag(self.model.prior_weights())
+        inverse = np.linalg.inv(_products(weights, self.model.design) + priors)
+        covariance = np.asarray(inverse @ (_products(weights, smeared) + priors) @ inverse.T)
+        if not np.all(np.linalg.eigvalsh(covariance[:2, :2] + covariance[:2, :2].T) > 0):
+            covariance = inverse  # lags that are noise themselves: as if it were white
+        return np.asarray((covariance + covariance.T) / 2), np.tensordot(inverse, weights, axes=1)
+
+    def _step_by(self, weights: Array) -> Array | None:
+        """Gauss-Newton with weighted derivatives: how far the mark moved, (2,) px; None where it does not settle."""
+        model, priors, start = self.model, self.model.prior_weights(), self.model.state.pixel_from_mark[:, 2]
+        for _ in range(_WEIGHTED_STEPS):
+            normal = _products(weights, model.design) + np.diag(priors)
+            right = np.tensordot(weights, model.residuals, axes=2) - priors * model.departures()
+            step: Array = np.asarray(np.linalg.solve(normal, right), float)
+            if model.blur_is_held(step):
+                free = np.arange(len(step)) != model.blur
+                step = np.zeros(len(right))
+                step[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free])
+            moved = model.step(step)
+            model.linearise(self.used)
+            if moved < _CLOSE_PX:
+                break
+        settled = moved < _SETTLED_PX and not model.ran_away()
+        return np.asarray(model.state.pixel_from_mark[:, 2] - start) if settled else None
 
     @property
     def contrast_dn(self) -> float:
@@ -66,7 +130,8 @@ class PictureFit:
             near = chip_mask(mark, place, width, height)
         else:
             outside = (render(mark, place, width, height, _OUTLINE_BLUR_PX).value < _SHOWN).astype(np.uint8)
-            near = cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= self.options.margin_px
+            distance = cv2.distanceTransform(outside, cv2.DIST_L2, 5)
+            near, self.far = distance <= self.options.margin_px, distance > self.options.plain_px
             if outside.all():
                 self.reason = "the mark lies outside of its window"
         self.area = self.used = self.usable & near
@@ -125,3 +190,7 @@ class PictureFit:
             free[model.blur] = False
             step = solution(normal, right, free)
         return step
+
+
+def _products(first: Array, second: Array) -> Array:
+    return np.asarray(np.tensordot(first, second, axes=((1, 2), (1, 2))))

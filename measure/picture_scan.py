@@ -33,14 +33,14 @@ def open_picture(path: Path, start: bytes) -> tuple[Segments, Pitch, tuple[str, 
             f"{path} is no TIFF, JPEG or PNG picture (it begins with {start[:8]!r}): "
             "give the scan itself, or convert it"
         )
-    return WholePicture(samples), pitch, ()
+    return WholePicture(samples, start.startswith(JPEG_START)), pitch, ()
 
 
 class WholePicture:
     """A picture in memory: (height, width, channels) of 8 or 16 bits, one segment."""
 
-    def __init__(self, samples: Samples) -> None:
-        self._samples = samples
+    def __init__(self, samples: Samples, is_lossy: bool = False) -> None:
+        self._samples, self.is_lossy = samples, is_lossy
         self.height_px, self.width_px, self.channels = samples.shape
         self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
         self.full_scale_dn = float(np.iinfo(samples.dtype).max)

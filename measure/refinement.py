@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.blank_film import BESIDE_PX
 from measure.candidates import FAINT, correlate, detail_px
+from measure.compression import with_loss
 from measure.frame_corner import corner_of_edges
 from measure.matching import Match, MatchOptions, match, window_about
 from measure.rendering import extent_px, picture
@@ -37,16 +39,19 @@ def sight(
     polarity: int,
     weights: Sequence[float] | None,
     options: MatchOptions,
+    frame_sigma: float | None = None,
 ) -> Sighting:
     """Look for the mark within search_px of its predicted place and match it there.
 
     pixel_from_mark: (2, 3), predicted. polarity: +1 for a mark lighter than its surroundings, -1 for a darker one.
+    frame_sigma: standard deviation of the predicted rotation (rad) and scale, where a frame fitted to all marks gives
+    them.
     """
     predicted = pixel_from_mark[:, 2].copy()
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
         return Sighting(predicted, False, None, "its place is outside of the scan")
-    fit = _fitted(scan, mark, pixel_from_mark, search_px, polarity, weights, options)
+    fit = _fitted(scan, mark, pixel_from_mark, search_px, polarity, weights, options, frame_sigma)
     if fit is None:
         return Sighting(predicted, True, None, f"nothing within {search_px:.0f} px of its place looks like it")
     if not fit.converged:
@@ -55,7 +60,7 @@ def sight(
         return Sighting(predicted, True, None, "there is no contrast at its place")
     if fit.contrast_dn * polarity <= 0:
         return Sighting(predicted, True, None, "what lies there has the other polarity")
-    return Sighting(predicted, True, fit)
+    return Sighting(predicted, True, replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan)))
 
 
 def _fitted(
@@ -66,6 +71,7 @@ def _fitted(
     polarity: int,
     weights: Sequence[float] | None,
     options: MatchOptions,
+    frame_sigma: float | None,
 ) -> Match | None:
     """The mark matched where it looks most like itself; None where nothing looks like it."""
     if isinstance(mark, FrameCorner):
@@ -74,10 +80,10 @@ def _fitted(
     start[:, 2], height = strongest(scan, mark, pixel_from_mark, search_px, polarity, weights)
     if height < _LEAST_RESPONSE:
         return None
-    col0, row0, width, tall = window_about(mark, start, options.margin_px + 4)
+    col0, row0, width, tall = window_about(mark, start, options.margin_px + BESIDE_PX)
     window = scan.window(col0, row0, width, tall, weights).astype(float)
     valid = _inside_scan(scan, col0, row0, width, tall)
-    return match(window, (col0, row0), mark, start, _options_for(mark, options), valid)
+    return match(window, (col0, row0), mark, start, _options_for(mark, options, frame_sigma), valid, scan.is_lossy)
 
 
 def strongest(
@@ -107,8 +113,16 @@ def _inside_scan(scan: Scan, col0: int, row0: int, width: int, height: int) -> N
     return inside_row[:, None] & inside_col[None, :]
 
 
-def _options_for(mark: Mark, options: MatchOptions) -> MatchOptions:
-    """A wedge's or a notch's edges do not tell its scale from its place: both come from the other marks."""
-    if isinstance(mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.parts):
+def _options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
+    """Where the mark leans on the frame, its rotation and scale stay as predicted, or near it."""
+    if not leans_on_frame(mark):
+        return options
+    if frame_sigma is None:
         return replace(options, freedom="shift")
-    return options
+    return replace(options, freedom="similarity", linear_sigma=frame_sigma)
+
+
+def leans_on_frame(mark: Mark) -> bool:
+    """Whether the mark's own picture does not tell its scale from its place, as of a wedge's or a notch's edges: then
+    rotation and scale come from the other marks."""
+    return isinstance(mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.parts)

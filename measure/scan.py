@@ -32,7 +32,8 @@ Result = TypeVar("Result")
 class Scan:
     """An opened scan: its size, its pitch, and windows of grey values that grow with light on the scanner's sensor.
 
-    width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows; pitch_um:
+    width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows; is_lossy:
+    whether the file is compressed with loss; pitch_um:
     (x, y) from the file's resolution tags, None where it has none that can be believed, and then pitch_note says why;
     notes: what else is unusual about the file, a sentence each.
     The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
@@ -45,6 +46,7 @@ class Scan:
         self.height_px = segments.height_px
         self.channels = segments.channels
         self.full_scale_dn = segments.full_scale_dn
+        self.is_lossy = segments.is_lossy
         self.pitch_um = pitch.um
         self.pitch_note = pitch.note
         self.notes = notes

@@ -132,6 +132,7 @@ class TiffSegments:
         self._file, self._page, self._path = file, page, path
         self._reading = Lock()  # the file has one position for all threads
         self._radiometry = page_radiometry(page, path)
+        self.is_lossy = page.compression in JPEG_COMPRESSIONS
         self.channels, self.full_scale_dn = self._radiometry.channels, self._radiometry.full_scale_dn
         self.height_px, self.width_px = page.imagelength, page.imagewidth
         self.segment_height_px = page.tilelength if page.is_tiled else min(page.rowsperstrip, self.height_px)

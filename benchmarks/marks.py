@@ -1,0 +1,335 @@
+"""Marks measured against their truth: the Cramér-Rao bound, honesty of the standard deviations, other methods.
+
+PYTHONPATH=.:tests/measure python benchmarks/marks.py [MARKS] [STUDY ...] [--kind KIND ...] [--hipp PYTHON]
+
+MARKS: of every cell; 100 where none is given, 2000 for a full run. STUDY: one or more of the names below; all where
+none is given. --hipp: the interpreter of an environment with hipp 0.2, measured beside the others.
+
+The pictures are drawn by `synthetic_images` (exact areas, blurred before they are averaged over pixels); the bounds are
+from differences of the same pictures. What is measured with is what `reseau measure` calls: `measure.refinement.sight`,
+and `measure.disks.fit_disk` for the ellipse.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from true_marks import (
+    KIND,
+    KINDS,
+    Kind,
+    TrueMark,
+    scan_of,
+    some_mark,
+)
+
+from measure.disks import fit_disk
+from measure.fiducial_options import FiducialOptions
+from measure.refinement import sight
+from synthetic_images.optics import seen_coverage
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+GROUND, CONTRAST = 25000.0, 15000.0
+SNRS, BLURS_PX = (5.0, 10.0, 20.0, 50.0, 100.0), (0.6, 1.0, 1.6, 2.5)
+SEED = 20
+SHIFT_PX, SEARCH_PX = 1.5, 3.0  # of the start, and the radius of the search
+POOL, FEW = 10, 3  # different marks in a cell; where the bound of each takes seconds
+GRAINS_PX, GRAIN_SNR, WHITE = (0.7, 1.0, 1.5), 20.0, 0.1
+DUST, DUST_SNR = (0.01, 0.03, 0.05), 20.0
+LARGE_PX = 0.3
+QUALITIES, JPEG_SNR = (50, 75, 90, 95), 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A place with its covariance; flagged: `weak`, or not measured at all."""
+
+    center_px: Array
+    covariance_px2: Array
+    flagged: str = ""
+
+
+@dataclass
+class Cell:
+    """What became of the marks of one cell: errors (2,) with the covariances claimed, and beside each the error of the
+    best linear estimate in the very same noise with its bound."""
+
+    errors: list[Array] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    best: list[Array] = field(default_factory=list)
+    bounds: list[Array] = field(default_factory=list)
+    lost: int = 0
+
+    def add(self, mark: TrueMark, found: Found | None, best: Array, bound: Array) -> None:
+        if found is None or found.flagged:
+            self.lost += 1
+            return
+        self.errors.append(found.center_px - mark.place[:, 2])
+        self.covariances.append(found.covariance_px2)
+        self.best.append(best)
+        self.bounds.append(bound)
+
+    @property
+    def to_bound(self) -> float:
+        """rms over that of the best estimates: over the bound, freed of most of chance."""
+        return float(np.sqrt(np.mean(np.square(self.errors)) / np.mean(np.square(self.best))))
+
+    @property
+    def to_claimed(self) -> float:
+        """rms in units of the standard deviations claimed, less what chance made of the best estimates too."""
+        return whitened_rms(self.errors, self.covariances) / whitened_rms(self.best, self.bounds)
+
+    def words(self) -> str:
+        if not self.errors:
+            return f"{'all lost':>14}"
+        lost = f"-{self.lost}" if self.lost else ""
+        return f"{self.to_bound:7.3f} {self.to_claimed:5.3f}{lost:<4}"
+
+
+def whitened_rms(errors: Sequence[Array], covariances: Sequence[Array]) -> float:
+    """rms of errors (2,) in units of their own standard deviations."""
+    whitened = [np.linalg.solve(np.linalg.cholesky(c), e) for e, c in zip(errors, covariances, strict=True)]
+    return float(np.sqrt(np.mean(np.square(whitened))))
+
+
+def measured(
+    mark: TrueMark,
+    grey: Array,
+    rng: np.random.Generator,
+    full_scale: int = 65535,
+    exact: bool = False,
+    is_lossy: bool = False,
+) -> Found | None:
+    """The mark as the program measures it, from a start off by some px, and by 0.3 % and 3 mrad or, exact, no more than
+    0.001 % where the frame gives these."""
+    scan = scan_of(grey, full_scale, is_lossy)
+    center = mark.place[:, 2] + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
+    if mark.kind.name == "ellipse":
+        disk = fit_disk(scan, mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1))
+        return None if disk.reason else Found(disk.center_px, disk.covariance_px2, disk.weakness)
+    scale, turn = rng.normal(0, min(mark.kind.known * (0.1 if exact else 1), 0.003), 2)
+    start = np.column_stack([np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ mark.place[:, :2], center])
+    polarity = 1 if grey_is_light(mark, grey) else -1
+    frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
+    options = FiducialOptions().match
+    fit = sight(scan, mark.kind.shape, start, SEARCH_PX, polarity, None, options, frame_sigma).fit
+    return None if fit is None else Found(fit.center_px, fit.covariance_px2)
+
+
+def grey_is_light(mark: TrueMark, grey: Array) -> bool:
+    return float((grey * (mark.picture - mark.picture.mean())).sum()) > 0
+
+
+def accuracy(kinds: Sequence[Kind], count: int) -> None:
+    """White noise: every kind, blur and SNR."""
+    print("\nwhite noise: rms / bound, realised / claimed; -n: lost")
+    print(f"{'':14}{'blur':>5}" + "".join(f"{f'SNR {snr:g}':>17}" for snr in SNRS))
+    for kind in kinds:
+        for blur in BLURS_PX:
+            rng = np.random.default_rng([SEED, KINDS.index(kind), int(10 * blur)])
+            marks = [some_mark(kind, blur, rng) for _ in range(min(POOL, count))]
+            cells = [Cell() for _ in SNRS]
+            for snr, cell in zip(SNRS, cells, strict=True):
+                for number in range(count):
+                    mark = marks[number % len(marks)]
+                    noise = rng.standard_normal((mark.size, mark.size)) / snr
+                    grey, sign = drawn(mark, rng)
+                    found = measured(mark, grey + CONTRAST * noise, rng)
+                    cell.add(mark, found, mark.best_errors(sign * noise, 1 / snr), mark.bound(1 / snr))
+            print(f"{kind.name:14}{blur:5.1f}" + "".join(f"{cell.words():>17}" for cell in cells), flush=True)
+
+
+def drawn(
+    mark: TrueMark, rng: np.random.Generator, contrast: float = CONTRAST, ground: float = GROUND
+) -> tuple[Array, int]:
+    """The mark, light (1) or dark (-1), on a ground with a gradient of up to a third of its contrast."""
+    sign, direction = int(rng.choice((-1, 1))), rng.uniform(0, 2 * np.pi)
+    row, col = np.mgrid[: mark.size, : mark.size] / mark.size - 0.5
+    slope = contrast / 3 * rng.uniform() * (np.cos(direction) * col + np.sin(direction) * row)
+    return ground + (1 - sign) / 2 * contrast + slope + sign * contrast * mark.picture, sign
+
+
+def grain(kinds: Sequence[Kind], count: int) -> None:
+    """Grain with a tenth of white noise in its variance: the bound is that of noise so correlated."""
+    print(f"\ngrain at SNR {GRAIN_SNR:g}, blur 1: rms / coloured bound, realised / claimed")
+    print(f"{'':14}" + "".join(f"{f'grain {grain_px:g} px':>17}" for grain_px in GRAINS_PX))
+    for kind in kinds:
+        rng = np.random.default_rng([SEED, KINDS.index(kind)])
+        marks = [some_mark(kind, 1.0, rng) for _ in range(FEW)]
+        words = []
+        for grain_px in GRAINS_PX:
+            cell, correlation = Cell(), grain_correlation(grain_px)
+            for number in range(count):
+                mark = marks[number % len(marks)]
+                noise = grainy(mark.size, grain_px, rng) / GRAIN_SNR
+                grey, sign = drawn(mark, rng)
+                best = mark.best_errors(sign * noise, 1 / GRAIN_SNR, None, correlation)
+                bound = mark.bound(1 / GRAIN_SNR, None, correlation)
+                cell.add(mark, measured(mark, grey + CONTRAST * noise, rng), best, bound)
+            words.append(cell.words())
+        print(f"{kind.name:14}" + "".join(f"{each:>17}" for each in words), flush=True)
+
+
+def grainy(size: int, grain_px: float, rng: np.random.Generator) -> Array:
+    """(size, size) white noise after a Gaussian, with white noise, of unit variance in all."""
+    reach = int(np.ceil(4 * grain_px))
+    smooth = gaussian_filter(rng.standard_normal((size + 2 * reach,) * 2), grain_px)[reach:-reach, reach:-reach]
+    unit = smooth * 2 * grain_px * np.sqrt(np.pi)
+    return np.asarray(np.sqrt(1 - WHITE) * unit + np.sqrt(WHITE) * rng.standard_normal((size, size)))
+
+
+def grain_correlation(grain_px: float, reach: int = 9) -> Array:
+    """(2 reach + 1, 2 reach + 1) the autocorrelation of `grainy`."""
+    index = np.arange(-reach, reach + 1)
+    correlation = (1 - WHITE) * np.exp(-(index[:, None] ** 2 + index[None] ** 2) / (4 * grain_px**2))
+    correlation[reach, reach] = 1.0
+    return np.asarray(correlation)
+
+
+def dust(kinds: Sequence[Kind], count: int) -> None:
+    """Specks of up to 4 px on a part of the mark's window: the bound is that of the pixels without dust."""
+    print(f"\ndust at SNR {DUST_SNR:g}, blur 1: rms / bound of what the dust leaves, realised / claimed; -n: flagged")
+    print(f"{'':14}" + "".join(f"{f'{100 * share:g} %':>17}" for share in DUST))
+    for kind in kinds:
+        rng = np.random.default_rng([SEED, KINDS.index(kind)])
+        marks = [some_mark(kind, 1.0, rng) for _ in range(min(POOL, count))]
+        words = []
+        for share in DUST:
+            cell = Cell()
+            for number in range(count):
+                mark = marks[number % len(marks)]
+                noise = rng.standard_normal((mark.size, mark.size)) / DUST_SNR
+                grey, sign = drawn(mark, rng)
+                speckled, seen = dusty(mark, grey + CONTRAST * noise, share, rng)
+                best = mark.best_errors(sign * noise, 1 / DUST_SNR, seen)
+                cell.add(mark, measured(mark, speckled, rng), best, mark.bound(1 / DUST_SNR, seen))
+            words.append(cell.words())
+        print(f"{kind.name:14}" + "".join(f"{each:>17}" for each in words), flush=True)
+
+
+def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> tuple[Array, Mask]:
+    """The picture with dark specks on so much of the pixels near the mark, and which pixels they leave."""
+    speckled, seen = grey.copy(), np.ones(grey.shape, dtype=bool)
+    rows, cols = np.nonzero(mark.near)
+    while (mark.near & ~seen).sum() < share * mark.near.sum():
+        radius = min(float(rng.lognormal(0.3, 0.5)), 4.0) * rng.uniform(0.7, 1.3, 12)
+        angle = np.arange(12) * (2 * np.pi / 12)
+        pixel = rng.integers(len(rows))
+        outline = np.array([cols[pixel], rows[pixel]]) + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+        cover = seen_coverage(((outline,),), 0, 0, mark.size, mark.size, mark.blur_px)
+        speckled = speckled * (1 - cover) + (GROUND - CONTRAST) * cover
+        seen &= cover < 0.5 / DUST_SNR
+    return speckled, seen
+
+
+def small_disks(kinds: Sequence[Kind], count: int) -> None:
+    """Disks of 2 to 4 px among dust: are large errors flagged?"""
+    print(f"\nsmall disks with dust on 0 to 5 % of their windows, SNR 10 to 50: errors above {LARGE_PX:g} px")
+    rng = np.random.default_rng([SEED, 99])
+    large = unflagged = flagged = 0
+    worst = 0.0
+    for _ in range(20 * count):
+        radius = rng.uniform(2.0, 4.0)
+        mark = some_mark(KIND["ellipse"], rng.uniform(0.6, 1.4), rng, 81, 10 * radius / 6)
+        grey = drawn(mark, rng)[0] + CONTRAST / rng.uniform(10, 50) * rng.standard_normal((mark.size, mark.size))
+        grey, _ = dusty(mark, grey, rng.choice((0.0, 0.01, 0.03, 0.05)), rng)
+        found = measured(mark, grey, rng)
+        flagged += found is None or bool(found.flagged)
+        if found is not None:
+            error = float(np.hypot(*(found.center_px - mark.place[:, 2])))
+            large += error > LARGE_PX
+            missed = error > LARGE_PX and not found.flagged
+            unflagged += missed
+            worst = max(worst, error if missed else 0.0)
+    print(
+        f"{20 * count} disks, {flagged} flagged or refused; {large} measured with large errors, {unflagged} of them "
+        f"not flagged, the worst {worst:.2f} px"
+    )
+
+
+def bias(kinds: Sequence[Kind], count: int) -> None:
+    """Pictures without noise: what is left is the program's own error, and rounding."""
+    print("\nno noise; largest error of a coordinate in px (phase, rotation, scale, gradient, polarity at random)")
+    print(f"{'':14}" + "".join(f"{f'16 bit, {blur:g}':>12}" for blur in BLURS_PX) + f"{'8 bit, 1':>12}{'rms':>9}")
+    for kind in kinds:
+        words = []
+        for blur in BLURS_PX:
+            rng = np.random.default_rng([SEED, KINDS.index(kind), int(10 * blur)])
+            marks = [some_mark(kind, blur, rng) for _ in range(max(count // 2, 10))]
+            words.append(f"{np.abs([clean_error(mark, rng, 65535) for mark in marks]).max():12.4f}")
+            if blur == 1.0:
+                eight = [clean_error(mark, rng, 255) for mark in marks]
+        words.append(f"{np.abs(eight).max():12.4f}{np.sqrt(np.mean(np.square(eight))):9.4f}")
+        print(f"{kind.name:14}" + "".join(words), flush=True)
+
+
+def clean_error(mark: TrueMark, rng: np.random.Generator, full_scale: int) -> Array:
+    """The error without noise, with rotation and scale known exactly where they come from the frame."""
+    contrast, ground = (CONTRAST, GROUND) if full_scale > 255 else (120.0, 60.0)
+    found = measured(mark, drawn(mark, rng, contrast, ground)[0], rng, full_scale, exact=True)
+    if found is None:
+        return np.full(2, np.inf)
+    return np.asarray(found.center_px - mark.place[:, 2])
+
+
+def jpeg(kinds: Sequence[Kind], count: int) -> None:
+    """JPEG of several qualities, 8 bit, contrast of 120 grey values."""
+    print("\nJPEG, SNR 100, blur 1: rms in px, rms / bound without compression, realised / claimed")
+    print(f"{'':14}" + "".join(f"{f'quality {quality}':>24}" for quality in QUALITIES))
+    for kind in kinds:
+        words = []
+        for quality in QUALITIES:
+            rng = np.random.default_rng([SEED, KINDS.index(kind), quality])
+            marks = [some_mark(kind, 1.0, rng) for _ in range(min(POOL, count))]
+            cell = Cell()
+            for number in range(count):
+                mark = marks[number % len(marks)]
+                noise = rng.standard_normal((mark.size, mark.size)) / JPEG_SNR
+                grey, sign = drawn(mark, rng, 120.0, 60.0)
+                stored = np.clip(np.rint(grey + 120.0 * noise), 0, 255).astype(np.uint8)
+                found = measured(mark, decoded(stored, quality), rng, 255, is_lossy=True)
+                cell.add(mark, found, mark.best_errors(sign * noise, 1 / JPEG_SNR), mark.bound(1 / JPEG_SNR))
+            words.append(f"{np.sqrt(np.mean(np.square(cell.errors))):8.4f} {cell.words()}")
+        print(f"{kind.name:14}" + "".join(f"{each:>24}" for each in words), flush=True)
+
+
+def decoded(stored: NDArray[np.uint8], quality: int) -> Array:
+    """What JPEG makes of a picture."""
+    data = cv2.imencode(".jpg", stored, (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), float)
+
+
+STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
+    "accuracy": accuracy,
+    "bias": bias,
+    "grain": grain,
+    "dust": dust,
+    "small_disks": small_disks,
+    "jpeg": jpeg,
+}
+
+
+def main() -> None:
+    """Print the studies asked for."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("marks", type=int, nargs="?", default=100)
+    parser.add_argument("studies", nargs="*", choices=[*STUDIES, []])
+    parser.add_argument("--kind", action="append", choices=list(KIND))
+    arguments = parser.parse_args()
+    kinds = [KIND[name] for name in arguments.kind] if arguments.kind else KINDS
+    print(f"{arguments.marks} marks a cell, seed {SEED}")
+    for name in arguments.studies or STUDIES:
+        begin = time.perf_counter()
+        STUDIES[name](kinds, arguments.marks)
+        print(f"({name}: {time.perf_counter() - begin:.0f} s)", flush=True)
+
+
+if __name__ == "__main__":
+    main()
