@@ -130,6 +130,17 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout) -> Pose:
     if len(alike) == 1:
         return Pose(best.pose, True, against or (f"no other pose explains the {seen} marks found.",))
     names = ", ".join(verdict.pose for verdict in alike)
+    lead = best.total - alike[0].total
+    if lead > _TOLD:
+        return Pose(
+            best.pose,
+            False,
+            (
+                f"the {seen} marks found do not tell the poses {names} apart with certainty: {best.pose} is assumed, "
+                f"likelier than {alike[0].pose} by log-odds of only {lead:.1f}.",
+                *against,
+            ),
+        )
     return Pose(
         alike[0].pose,
         False,

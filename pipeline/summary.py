@@ -22,12 +22,14 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True)
 class Summary:
-    """The end of a command. files: what was written, by a word for it."""
+    """The end of a command. poses: of the scans, each with its evidence, as measurement.json has them. files: what was
+    written, by a word for it."""
 
     level: str
     sentence: str
     problems: tuple[Problem, ...]
     frames: Mapping[str, Mapping[str, int]]
+    poses: Mapping[str, Json]
     adjustment: Json | None
     check: Json | None
     files: Mapping[str, Path] = field(default_factory=dict)
@@ -39,6 +41,7 @@ class Summary:
             "sentence": self.sentence,
             "problems": [{"what": problem.what, "next_step": problem.next_step} for problem in self.problems],
             "frames": {name: dict(counts) for name, counts in self.frames.items()},
+            "poses": dict(self.poses),
             "adjustment": self.adjustment and _main_numbers(self.adjustment),
             "check": self.check and {"verdict": self.check["verdict"], "reason": self.check["reason"]},
             "files": {word: str(path) for word, path in self.files.items()},
@@ -52,7 +55,9 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     for mark in data.comparator:
         counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
         counts[mark.status] += 1
-    return Summary(verdict.level, verdict.sentence, verdict.problems, frames, data.adjustment, data.check, files)
+    scans = data.measurement["images"] if data.measurement else {}
+    poses = {name: scan["pose"] for name, scan in scans.items() if scan.get("pose")}
+    return Summary(verdict.level, verdict.sentence, verdict.problems, frames, poses, data.adjustment, data.check, files)
 
 
 def print_summary(summary: Summary, console: Console) -> None:
@@ -63,7 +68,10 @@ def print_summary(summary: Summary, console: Console) -> None:
         if problem.next_step:
             console.print(Text(f"  {problem.next_step}", style="dim"))
     if summary.frames:
-        console.print(_frame_table(summary.frames))
+        console.print(_frame_table(summary.frames, summary.poses))
+        for name, pose in summary.poses.items():
+            if pose["decided"]:
+                console.print(Text(f"{name}: pose {pose['name']}. {' '.join(pose['evidence'])}", style="dim"))
     if summary.adjustment:
         calibrated = any(camera_is_calibrated(camera) for camera in summary.adjustment["cameras"].values())
         console.print((_camera_table if calibrated else _film_table)(summary.adjustment))
@@ -76,10 +84,13 @@ def _main_numbers(adjustment: Json) -> Json:
     return {key: adjustment[key] for key in keys}
 
 
-def _frame_table(frames: Mapping[str, Mapping[str, int]]) -> Table:
-    table = Table("image", *(str(status) for status in Status), title="Marks", title_justify="left")
+def _frame_table(frames: Mapping[str, Mapping[str, int]], poses: Mapping[str, Json]) -> Table:
+    columns = ("image", "pose", *Status) if poses else ("image", *Status)
+    table = Table(*(str(column) for column in columns), title="Marks", title_justify="left")
     for name, counts in frames.items():
-        table.add_row(Text(name), *(str(counts[status]) for status in Status))
+        pose = poses.get(name)
+        told = "" if pose is None else pose["name"] + ("" if pose["decided"] else ", assumed")
+        table.add_row(Text(name), *([told] if poses else []), *(str(counts[status]) for status in Status))
     return table
 
 

@@ -21,11 +21,13 @@ LONGEST_VECTOR_PX = 42.0
 
 @dataclass(frozen=True)
 class Card:
-    """A mark's picture and numbers. picture: None where there is no scan to cut it from."""
+    """A mark's picture and numbers. picture: None where there is no scan to cut it from; by_edges: how far off the
+    second method puts it."""
 
     mark: Mark
     picture: Markup | None
     sigma: str
+    by_edges: str
     residual: str
     w: str
     is_suspect: bool
@@ -122,12 +124,20 @@ def _card(
         mark=mark,
         picture=thumbnails.drawn(mark, thumbnail, px_per_um, most_px) if thumbnail else None,
         sigma=_sigma(mark),
+        by_edges=_by_edges(mark.quality),
         residual=f"{fixed(residual['vx_um'], 1, sign=True)}, {fixed(residual['vy_um'], 1, sign=True)}"
         if residual
         else "",
         w=fixed(mark.w, 1, sign=True) if mark.w is not None else "no check" if residual else "",
         is_suspect=residual is not None and residual in suspect,
     )
+
+
+def _by_edges(quality: Json) -> str:
+    if "second_method_sigmas" not in quality:
+        return ""
+    off = (fixed(quality[f"second_method_{axis}_px"], 3, sign=True) for axis in ("col", "row"))
+    return f"{', '.join(off)} px; {fixed(quality['second_method_sigmas'], 1)} σ"
 
 
 def _sigma(mark: Mark) -> str:

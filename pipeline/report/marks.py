@@ -19,7 +19,8 @@ class Mark:
     """One mark of one frame.
 
     center_px (2,), covariance_px2 (2, 2) in the scan, sigma_um (2,) along x and y: None where nothing was fitted.
-    residual: its row of adjustment.json; None where it was no observation of the adjustment.
+    residual: its row of adjustment.json; None where it was no observation of the adjustment. quality: the figures of
+    its fit by name.
     """
 
     image: str
@@ -31,6 +32,7 @@ class Mark:
     covariance_px2: Array | None
     sigma_um: Array | None
     residual: Json | None
+    quality: Json = field(default_factory=dict)
 
     @property
     def is_fiducial(self) -> bool:
@@ -99,6 +101,7 @@ def _mark(key: tuple[str, bool, str], pixel: Json | None, row: ComparatorPoint |
         covariance_px2=None if known.get("covariance_px2") is None else np.array(known["covariance_px2"]),
         sigma_um=_sigma_um(residual, row),
         residual=residual,
+        quality=known.get("quality", {}),
     )
 
 

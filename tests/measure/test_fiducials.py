@@ -113,6 +113,16 @@ def test_like_marks_leave_the_pose_assumed_and_say_so(tmp_path: Path) -> None:
     assert_right(result, ALIKE, matrix)
 
 
+def test_writing_beside_one_mark_names_no_pose(tmp_path: Path) -> None:
+    """Three dots beside a mark of a camera whose first mark has none, and whose others have one to three."""
+    matrix = pixel_from_camera("0")
+    grey = frame_picture(ALIKE, matrix)
+    paint(grey, MarkShape(tuple(Disk((1.0, 0.3 * k - 0.3), 0.08) for k in range(3))), CORNERS[1], matrix, 9000.0)
+    result = measured(grey, NUMBERED, tmp_path)
+    assert result.pose is not None
+    assert not result.pose.decided, result.pose.evidence
+
+
 def test_the_users_pose_is_taken(tmp_path: Path) -> None:
     matrix = pixel_from_camera("270m")
     result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, FiducialOptions(pose="270m"))
