@@ -38,12 +38,14 @@ class Derivatives:
 class SeenTargets:
     """The targets of one camera as they appear for a state.
 
-    rows: their observations; ray (n, 2) and the image of it; in_camera (n, 3): the points in the camera's axes.
+    rows: their observations; rotation (n, 3, 3) of their images; ray (n, 2) and the image of it; in_camera (n, 3): the
+    points in the camera's axes.
     """
 
     camera: str
     rows: Rows
     sight: SightVectors
+    rotation: Array
     ray: Array
     in_camera: Array
     imaged: Imaged
@@ -99,9 +101,10 @@ def _seen(problem: Problem, state: State, camera: str, targets: Indices) -> Seen
     stations = state.values[problem.exterior[:, :3].T[:, images]].T
     points = state.values[problem.places.T[:, rows]].T
     sight = sight_vectors(problem.network.line_of_sight, stations, points)
-    ray, in_camera = rays(of_each(state.rotations, images), sight.vector)
+    rotation = of_each(state.rotations, images)
+    ray, in_camera = rays(rotation, sight.vector)
     _, parameters, distortion = _camera(problem, state, camera)
-    return SeenTargets(camera, rows, sight, ray, in_camera, imaged_ray(distortion, parameters, ray))
+    return SeenTargets(camera, rows, sight, rotation, ray, in_camera, imaged_ray(distortion, parameters, ray))
 
 
 def _camera(problem: Problem, state: State, name: str) -> tuple[Array, Array, Distortion]:
@@ -146,7 +149,7 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         images, rows = problem.image_numbers[seen.rows], seen.rows
         at = equations_of(distortion, interior, parameters, at_distorted.camera_xy[rows], seen.imaged)
         by_in_camera = _by_in_camera(at.by_ray, seen)
-        by_vector = product(by_in_camera, of_each(state.rotations, images))
+        by_vector = product(by_in_camera, seen.rotation)
         by_attitude = cross(seen.in_camera[:, None, :], by_in_camera)
         if problem.keeps_angles.any():
             by_attitude = product(by_attitude, of_each(problem.attitude_by_unknowns(state), images))

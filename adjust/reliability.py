@@ -21,6 +21,7 @@ from adjust.probabilities import Probabilities
 from adjust.problem import ABSENT, Problem
 from adjust.result import OuterEffect, Reliability
 from adjust.rows import prior_differences
+from adjust.small_matrices import applied, eigen, inverse, laid_out, product
 from adjust.tested import Tested, TestedUnits
 
 Array = NDArray[np.float64]
@@ -48,9 +49,13 @@ class UnitRows:
 
 @dataclass(frozen=True)
 class Misfits:
-    """All that is tested, in unit weight: T, H (N, 2, 2), T v (N, 2); behind a single coordinate H is 1, T and v 0."""
+    """All that is tested, in unit weight: T, H (N, 2, 2), T v (N, 2); behind a single coordinate H is 1, T and v 0.
+
+    back (N, 2, 2): from unit weight to the coordinates, the inverse of T where that is regular.
+    """
 
     transform: Array
+    back: Array
     hat: Array
     residual: Array
 
@@ -58,7 +63,7 @@ class Misfits:
 def misfits(numbering: Numbering, end: Linearised, factor: Factor) -> Misfits:
     """Residuals and hat matrices of everything that is tested."""
     units = TestedUnits(numbering.problem)
-    transform = _transforms(numbering.problem, end, units)
+    transform, back = _transforms(numbering.problem, end, units)
     hat = np.zeros((len(units) + 1, 2, 2))  # the last stands for ABSENT
     for rows in unit_rows(numbering, end, factor):
         roots = np.concatenate([rows.own, rows.through @ factor.triangle.root_of(rows.shared)[:, None]], axis=3)
@@ -68,7 +73,8 @@ def misfits(numbering: Numbering, end: Linearised, factor: Factor) -> Misfits:
     v = np.zeros((len(units), 2))
     v[: len(end.v_mm)] = end.v_mm
     v[len(end.v_mm) :] = -_of_pairs(units, prior_differences(numbering.problem, end.state))
-    return Misfits(transform, hat, (transform @ v[..., None])[..., 0])
+    transform, hat = laid_out(transform), laid_out(hat)
+    return Misfits(transform, laid_out(back), hat, applied(transform, laid_out(v)))
 
 
 def unit_rows(numbering: Numbering, end: Linearised, factor: Factor) -> Iterator[UnitRows]:
@@ -123,11 +129,15 @@ def _of_pairs(units: TestedUnits, values: Array) -> Array:
     return np.append(values, 0.0)[units.positions]
 
 
-def _transforms(problem: Problem, end: Linearised, units: TestedUnits) -> Array:
-    transform = np.zeros((len(units), 2, 2))
-    transform[: len(end.v_mm)] = np.linalg.solve(end.rows.root, end.by_observation)
-    transform[len(end.v_mm) :, [0, 1], [0, 1]] = _of_pairs(units, _prior_root_weights(problem))
-    return transform
+def _transforms(problem: Problem, end: Linearised, units: TestedUnits) -> tuple[Array, Array]:
+    """T and what leads back (N, 2, 2); of a prior both are diagonal."""
+    transform, back = np.zeros((2, len(units), 2, 2))
+    count, root, a = len(end.v_mm), end.rows.root, end.by_observation
+    transform[:count], back[:count] = product(inverse(root), a), product(inverse(a), root)
+    weights = _of_pairs(units, _prior_root_weights(problem))
+    transform[count:, [0, 1], [0, 1]] = weights
+    back[count:, [0, 1], [0, 1]] = np.where(weights > 0.0, 1.0 / np.where(weights > 0.0, weights, 1.0), 0.0)
+    return transform, back
 
 
 @dataclass(frozen=True)
@@ -148,29 +158,28 @@ class Statistics:
 
 def statistics(misfits: Misfits, weights: Array) -> Statistics:
     """The test statistics of all units, weights (N,) the parts of the given weights that the adjustment used."""
-    adjusted, axes = np.linalg.eigh(misfits.hat)
+    adjusted, axes = eigen(misfits.hat)
     free = np.clip(1.0 - adjusted, 0.0, None)
     of_given = weights[:, None] * free + adjusted
-    along = (axes.transpose(0, 2, 1) @ misfits.residual[..., None])[..., 0]
+    along = applied(axes.transpose(0, 2, 1), misfits.residual)
     seen = free > UNCHECKED
     squares = np.where(seen, along**2 / np.where(seen, free * of_given, 1.0), 0.0)
-    inward = misfits.transform.transpose(0, 2, 1) @ axes
-    weight = (inward * (free / of_given)[:, None, :]) @ inward.transpose(0, 2, 1)
-    pull = (inward @ (along / of_given)[..., None])[..., 0]
-    own_weight = np.einsum("nki,nki->ni", misfits.transform, misfits.transform) / weights[:, None]
+    inward = product(misfits.transform.transpose(0, 2, 1), axes)
+    weight = product(inward * (free / of_given)[:, None, :], inward.transpose(0, 2, 1))
+    pull = applied(inward, along / of_given)
+    own_weight = (misfits.transform**2).sum(axis=1) / weights[:, None]
     variance = np.einsum("nii->ni", weight)
     checked = variance > UNCHECKED * own_weight
     w = np.where(checked, pull / np.sqrt(np.where(checked, variance, 1.0)), 0.0)
-    contradiction = (axes @ np.where(seen, -along / np.where(seen, free, 1.0), 0.0)[..., None])[..., 0]
-    back = np.linalg.pinv(misfits.transform)
-    error = (back @ contradiction[..., None])[..., 0]
+    contradiction = applied(axes, np.where(seen, -along / np.where(seen, free, 1.0), 0.0))
+    error = applied(misfits.back, contradiction)
     return Statistics(w, squares.sum(axis=1), seen.sum(axis=1), weight, error, checked)
 
 
 def redundancies(misfits: Misfits) -> Array:
     """The diagonal (N, 2) of Q_v P; its sum is the redundancy of the adjustment."""
-    back = np.linalg.pinv(misfits.transform)
-    return np.asarray(np.einsum("nij,njk,nki->ni", back, np.eye(2) - misfits.hat, misfits.transform))
+    free = product(misfits.back, np.eye(2) - misfits.hat)
+    return np.asarray((free * misfits.transform.transpose(0, 2, 1)).sum(axis=2))
 
 
 def reliability(
@@ -189,11 +198,11 @@ def reliability(
     tests = statistics(found, weights)
     variance = np.einsum("nii->ni", tests.discrepancy_weight)
     smallest = _over(probabilities.noncentrality(1), variance, tests.checked)
-    hidden = np.einsum("nki,nkl,nli->ni", found.transform, found.hat, found.transform)
+    hidden = (found.transform * product(found.hat, found.transform)).sum(axis=1)
     effect = np.where(tests.checked, np.where(tests.checked, smallest, 0.0) * np.sqrt(hidden), np.inf)
     effect[(units.sizes == 1), 1] = 0.0
-    least = np.asarray(np.linalg.eigvalsh(tests.discrepancy_weight)[:, 0], dtype=np.float64)
-    own_weight = np.einsum("nki,nki->ni", found.transform, found.transform) / weights[:, None]
+    least = eigen(tests.discrepancy_weight)[0][:, 0]
+    own_weight = (found.transform**2).sum(axis=1) / weights[:, None]
     both = np.asarray(tests.checked.all(axis=1))
     everywhere = both & (least > UNCHECKED * own_weight.min(axis=1))
     together = np.where(both, _over(probabilities.noncentrality(2), least, everywhere), smallest.min(axis=1))
@@ -202,12 +211,11 @@ def reliability(
     errors = np.where(controlled, smallest, 0.0)
     outer = _outer(numbering, end, factor, found, errors, tested, shift)
     uncontrolled = zip(*np.nonzero(~controlled & (np.arange(2) < units.sizes[:, None])), strict=True)
-    back = np.linalg.pinv(found.transform)
     return Reliability(
         probabilities=probabilities,
         tested=tested,
-        v=(back @ found.residual[..., None])[..., 0],
-        sigma=np.linalg.norm(back, axis=2) * np.sqrt(weights)[:, None],
+        v=applied(found.back, found.residual),
+        sigma=np.sqrt((found.back**2).sum(axis=2)) * np.sqrt(weights)[:, None],
         redundancy=redundancies(found),
         w=tests.w,
         tau=tests.w / sigma0 if sigma0 > 0.0 else np.zeros_like(tests.w),

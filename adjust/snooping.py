@@ -21,6 +21,7 @@ from adjust.probabilities import Probabilities
 from adjust.reliability import UNCHECKED, Misfits, statistics, unit_rows
 from adjust.result import Reliability, Suspect
 from adjust.reweighting import Weighting, robust_scale
+from adjust.small_matrices import applied, eigen
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -228,8 +229,8 @@ def _without(search: Search, covariance: _Covariance, left_out: Sequence[int]) -
         through = columns @ inverse
         residual = residual - through @ residual[left_out].ravel()
         cofactor = cofactor - through @ columns.transpose(0, 2, 1)
-    variance, axes = np.linalg.eigh(cofactor)
-    along = (axes.transpose(0, 2, 1) @ residual[..., None])[..., 0]
+    variance, axes = eigen(cofactor)
+    along = applied(axes.transpose(0, 2, 1), residual)
     seen = variance > UNCHECKED
     statistic: Array = np.where(seen, along**2 / np.where(seen, variance, 1.0), 0.0).sum(axis=1)
     statistic[left_out] = 0.0
@@ -262,8 +263,8 @@ def _contradiction(
     others = _without(search, covariance, [each for each in chosen if each != unit])
     near = np.flatnonzero((others > limits) & (others > joint[at] - TOLD_APART))
     alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
-    back = np.linalg.pinv(search.found.transform[unit])
-    return Contradiction(unit, float(joint[at]), float(limits[unit]), back @ errors[at], tuple(alike))
+    error = search.found.back[unit] @ errors[at]
+    return Contradiction(unit, float(joint[at]), float(limits[unit]), error, tuple(alike))
 
 
 def suspects(

@@ -9,6 +9,7 @@ from adjust.network import Observations
 from adjust.result import Residuals
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 GROSS = 20.0  # a-priori standard deviations from which on a residual can be that of another mark
 NEARER = 0.5  # of the distance of two marks that each may lie from where the other is expected
@@ -18,22 +19,28 @@ UNCHECKED = 1e-6  # redundancy of all targets of an image that is none
 def suspicions(observations: Observations, residuals: Residuals) -> list[str]:
     """Sentences on marks whose numbers may be swapped, and on images whose orientation nothing checks."""
     found = []
-    images = np.array(observations.image)
-    fiducial = np.array(observations.kind) == "fiducial"
     gross = _is_gross(observations, residuals.v_mm)
-    for name in dict.fromkeys(observations.image):
-        of_image = images == name
+    for name, rows in _rows_by_image(observations).items():
+        fiducial = observations.is_fiducial[rows]
         for kind in (False, True):
-            rows = [int(row) for row in np.flatnonzero(of_image & (fiducial == kind) & gross)]
-            crossed = ((i, j) for i, j in combinations(rows, 2) if _cross(observations, residuals, i, j))
+            doubtful = [int(row) for row in rows[(fiducial == kind) & gross[rows]]]
+            crossed = ((i, j) for i, j in combinations(doubtful, 2) if _cross(observations, residuals, i, j))
             found += [_swapped(observations, i, j) for i, j in crossed]
-        targets = of_image & ~fiducial
-        if targets.any() and residuals.redundancy[targets].sum() < UNCHECKED:
+        targets = rows[~fiducial]
+        if len(targets) and residuals.redundancy[targets].sum() < UNCHECKED:
             found.append(
-                f"Nothing checks the orientation of image {name}: its {int(targets.sum())} targets just determine it, "
+                f"Nothing checks the orientation of image {name}: its {len(targets)} targets just determine it, "
                 f"and an error of one of them would not show. Measure more targets in it."
             )
     return found
+
+
+def _rows_by_image(observations: Observations) -> dict[str, Indices]:
+    """The rows of every image, in their order; images in the order in which they come."""
+    number = {name: i for i, name in enumerate(dict.fromkeys(observations.image))}
+    of = np.array([number[name] for name in observations.image], dtype=np.intp)
+    rows = np.split(np.argsort(of, kind="stable"), np.cumsum(np.bincount(of))[:-1])
+    return dict(zip(number, rows, strict=True))
 
 
 def _is_gross(observations: Observations, v_mm: Array) -> NDArray[np.bool_]:

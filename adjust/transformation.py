@@ -16,6 +16,7 @@ mirrored by their own parameters. conformal(1) is a similarity, and polynomial(1
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ POSSIBLE = (
 )
 
 
+@lru_cache
 def film_kind(spelling: str, mirrored: bool = False) -> FilmKind:
     """The formula of a transformation as it is spelt. Raises ValueError, with what is possible, for any other word."""
     match spelling:
@@ -78,6 +80,7 @@ def marks_needed(spelling: str) -> int:
     return marks_of(film_kind(spelling))
 
 
+@lru_cache
 def fewest_marks(spelling: str) -> int:
     """How many fiducial marks an adjustment needs to begin with: those of the simplest transformation of the family."""
     lower = simpler(spelling)

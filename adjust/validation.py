@@ -205,7 +205,8 @@ def _check_values(observations: Observations) -> None:
     finite = np.isfinite(observations.xy_mm).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     variances = np.einsum("nii->ni", covariance)
     determinant = covariance[:, 0, 0] * covariance[:, 1, 1] - covariance[:, 0, 1] * covariance[:, 1, 0]
-    symmetric = np.isclose(covariance[:, 0, 1], covariance[:, 1, 0], rtol=1e-9, atol=0.0)
+    with np.errstate(invalid="ignore"):
+        symmetric = np.abs(covariance[:, 0, 1] - covariance[:, 1, 0]) <= 1e-9 * np.abs(covariance[:, 1, 0])
     definite = (variances > 0.0).all(axis=1) & (determinant > 0.0) & symmetric
     for good, what in (
         (finite, "has a coordinate or covariance that is not a finite number"),
