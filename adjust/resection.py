@@ -193,10 +193,17 @@ def _triad(points: Array) -> Array:
 
 def _squared(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
     """Squared residuals (k, n) in units of the principal distance."""
-    camera = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
-    depth = np.where(camera[..., 2] < 0, -camera[..., 2], np.nan)
-    squared = ((camera[..., :2] / depth[..., None] - tangents) ** 2).sum(axis=2)
-    return np.asarray(np.minimum(np.nan_to_num(squared, nan=BEHIND), BEHIND))
+    u, v, w = _in_camera(rotations, shifts, points)
+    x, y = np.moveaxis(tangents, -1, 0)
+    seen = w < 0.0
+    depth = np.where(seen, w, -1.0)
+    squared = (u / depth + x) ** 2 + (v / depth + y) ** 2
+    return np.asarray(np.where(seen & (squared < BEHIND), squared, BEHIND))
+
+
+def _in_camera(rotations: Array, shifts: Array, points: Array) -> Array:
+    """U, V, W (3, k, n) of points (n, 3), or (k, n, 3), in the axes of k cameras."""
+    return np.asarray(np.moveaxis(rotations @ np.swapaxes(points, -1, -2) + shifts[..., None], 1, 0))
 
 
 def _best_of(rotations: Array, shifts: Array, points: Array, tangents: Array) -> tuple[Array, Array]:
@@ -224,8 +231,9 @@ def _smallest_half(squared: Array) -> Array:
 
 
 def _trimmed_cost(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
-    squared = np.sort(_squared(rotations, shifts, points, tangents), axis=1)
-    return np.asarray(squared[:, : _half(len(points))].sum(axis=1))
+    half = _half(len(points))
+    squared = _squared(rotations, shifts, points, tangents)
+    return np.asarray(np.partition(squared, half - 1, axis=1)[:, :half].sum(axis=1))
 
 
 def refined_poses(
@@ -259,18 +267,18 @@ def _normal_equations(
     rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
 ) -> tuple[Array, Array]:
     """J'WJ (k, 6, 6) and J'Wr (k, 6) for a small turn of the camera and a shift in its frame."""
-    camera = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
-    u, v, w = np.moveaxis(camera, 2, 0)
-    w = np.minimum(w, -1e-9)
-    p, q = -u / w, -v / w
-    zero = np.zeros_like(w)
-    by_shift = np.stack([np.stack([-1 / w, zero, -p / w], 2), np.stack([zero, -1 / w, -q / w], 2)], 2)  # (k, n, 2, 3)
-    cross = np.stack([np.stack([zero, w, -v], 2), np.stack([-w, zero, u], 2), np.stack([v, -u, zero], 2)], 2)
-    jacobian = np.concatenate([by_shift @ cross, by_shift], axis=3)
-    residual = tangents - np.stack([p, q], 2)
-    k, n = w.shape
-    weighted = (jacobian * weights[..., None, None]).reshape(k, 2 * n, 6).swapaxes(1, 2)
-    return weighted @ jacobian.reshape(k, 2 * n, 6), (weighted @ residual.reshape(k, 2 * n, 1))[..., 0]
+    u, v, w = _in_camera(rotations, shifts, points)
+    inverse = -1.0 / np.minimum(w, -1e-9)
+    p, q = u * inverse, v * inverse
+    (x, y), n = np.moveaxis(tangents, -1, 0), w.shape[1]
+    jacobian = np.zeros((len(w), 6, 2 * n))  # first all x, then all y
+    for k, (by_p, by_q) in enumerate(
+        ((p * q, 1 + q * q), (-1 - p * p, -p * q), (-q, p), (inverse, 0.0), (0.0, inverse), (p * inverse, q * inverse))
+    ):
+        jacobian[:, k, :n], jacobian[:, k, n:] = by_p, by_q
+    residual = np.concatenate([x - p, y - q], axis=1)[..., None]
+    weighted = jacobian * np.concatenate([weights, weights], axis=1)[:, None]
+    return weighted @ jacobian.swapaxes(1, 2), (weighted @ residual)[..., 0]
 
 
 def _robust_sigma(squared: Array) -> float:

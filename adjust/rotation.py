@@ -46,7 +46,7 @@ def angles_near(rotation: Array, reference_rad: Array) -> Array:
 
 def rotation_from_vector(vector_rad: Array) -> Array:
     """exp([t]x), the rotation by the vector t (Rodrigues): (..., 3) to (..., 3, 3)."""
-    angle = np.linalg.norm(vector_rad, axis=-1)[..., None, None]
+    angle = np.sqrt((vector_rad**2).sum(axis=-1))[..., None, None]
     cross = cross_matrix(vector_rad)
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
@@ -55,10 +55,11 @@ def rotation_from_vector(vector_rad: Array) -> Array:
 
 def cross_matrix(vector: Array) -> Array:
     """[t]x, so that [t]x u = t x u: (..., 3) to (..., 3, 3)."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    zero = np.zeros_like(x)
-    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    matrix = np.zeros((*vector.shape, 3), dtype=vector.dtype)
+    matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
+    matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1] = -x, -y, -z
+    return matrix
 
 
 def vector_by_angles(angles_rad: Array) -> Array:
