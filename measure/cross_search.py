@@ -62,7 +62,9 @@ def _octaves(search: CrossSearch, full_scale_dn: float) -> list["CrossOctave"]:
 
 
 def _reduction(half_px: float, line: float) -> int:
-    return max(1, int(min(half_px / SEARCHED_ARM_PX, line * half_px / THINNEST_PX)))
+    """A power of two: blocks are whole numbers of every octave's pixels."""
+    most = max(min(half_px / SEARCHED_ARM_PX, line * half_px / THINNEST_PX), 1.0)
+    return int(2 ** np.floor(np.log2(most)))
 
 
 @dataclass(frozen=True)

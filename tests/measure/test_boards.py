@@ -167,9 +167,10 @@ def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
     assert np.abs(errors.mean(axis=0)).max() < 0.01
 
 
-def test_aruco_corners() -> None:
-    spec = ArucoSpec("5X5_100", 3, 2, 63.0, 21.0, first_marker=7)
-    drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary("5X5_100"), np.arange(7, 13))
+@pytest.mark.parametrize("dictionary", ["5X5_100", "APRILTAG_36h11"])
+def test_aruco_and_apriltag_corners(dictionary: str) -> None:
+    spec = ArucoSpec(dictionary, 3, 2, 63.0, 21.0, first_marker=7)
+    drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, aruco_dictionary(dictionary), np.arange(7, 13))
     homography = board_from_pixel(4.0, 1e-4)
     picture = picture_of(spec, homography, printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
     board = measure_board(scan_of(picture), spec)
