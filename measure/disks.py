@@ -90,20 +90,25 @@ def fit_disk(
     )
     col0, row0, width, height = window_about(shape, start, wide + BESIDE_PX)
     window, valid = scan.window(col0, row0, width, height), inside(scan, col0, row0, width, height)
-    fit = match(window, (col0, row0), shape, start, options, valid, scan.is_lossy)
-    if not fit.converged and sure < wide:
-        fit = match(window, (col0, row0), shape, start, replace(options, margin_px=sure), valid, scan.is_lossy)
-    disk = FittedDisk(
-        center_px=fit.center_px,
-        covariance_px2=with_loss(fit.covariance_px2, scan),
-        pixel_from_disk=fit.pixel_from_mark[:, :2],
-        contrast_dn=fit.contrast_dn,
-        noise_dn=fit.noise_dn,
-        blur_px=fit.blur_px,
-        damaged_fraction=fit.damaged_fraction,
-        reason="" if fit.converged else fit.reason,
-    )
-    return judged(disk, fit.neighbour_correlation)
+
+    def fitted(margin_px: float) -> FittedDisk:
+        own = replace(options, margin_px=margin_px)
+        fit = match(window, (col0, row0), shape, start, own, valid, scan.is_lossy)
+        disk = FittedDisk(
+            center_px=fit.center_px,
+            covariance_px2=with_loss(fit.covariance_px2, scan),
+            pixel_from_disk=fit.pixel_from_mark[:, :2],
+            contrast_dn=fit.contrast_dn,
+            noise_dn=fit.noise_dn,
+            blur_px=fit.blur_px,
+            damaged_fraction=fit.damaged_fraction,
+            reason="" if fit.converged else fit.reason,
+        )
+        return judged(disk, fit.neighbour_correlation)
+
+    disk = fitted(wide)
+    # A narrow pad or a ring about the disk is no damage of the disk.
+    return fitted(sure) if sure < wide and (disk.reason or disk.damaged_fraction > WEAK_DAMAGE) else disk
 
 
 def inside(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
