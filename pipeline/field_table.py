@@ -13,13 +13,16 @@ from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarge
 Array = NDArray[np.float64]
 
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
-KINDS = ("disks", "crosses", "coded-rings", "chessboard", "circle-grid")
+KINDS = ("disks", "crosses", "coded-rings", "chessboard", "circle-grid", "natural")
 
 
 def read_field(table: Table, unit: str, seed: int) -> DiskField | BoardField:
-    """The test field. Sizes of targets and boards are mm, all coordinates in the unit. Raises InputError."""
+    """The test field; of kind natural, without any target. Sizes of targets and boards are mm, all coordinates in the
+    unit. Raises InputError."""
     mm = 1.0 / UNITS_MM[unit]
     kind = table.text("kind", "disks", KINDS)
+    if kind == "natural":
+        return DiskField((), 1.0)
     if kind == "chessboard":
         square = table.number("square_mm", above=0.0) * mm
         return BoardField("chessboard", table.whole("columns", least=2), table.whole("rows", least=2), square)

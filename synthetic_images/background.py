@@ -7,15 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetic_images.film import FrameGeometry
-from synthetic_images.projection import object_rotation
 from synthetic_images.scene import Scene
+from synthetic_images.terrain import ground_width, object_from_pixel
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
-TEXTURE_PX = 1024
-PARCELS = 130
 TEXEL_PX = 3.0  # scan pixels that one pixel of the texture covers
+LEAST_TEXTURE_PX, MOST_TEXTURE_PX = 1024, 4096  # it repeats itself: within a frame only where that is too large for it
+PARCEL_PX = 90  # about the width of a parcel
+NODE_PX = 8  # between pixels whose rays are followed to the terrain; those between are interpolated
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,18 +29,43 @@ class Background:
 
     def rows(self, geometry: FrameGeometry, row0: int, height: int) -> Picture:
         """(height, width) of the scan from row0 on, as if the whole scan were exposed."""
-        texture_from_pixel = self._texture_from_camera(geometry) @ geometry.camera_from_pixel
+        if self.scene.background == "terrain":
+            return self._terrain_rows(geometry, row0, height)
+        texture_from_pixel = np.diag([1 / self.texel, 1 / self.texel, 1.0]) @ geometry.camera_from_pixel
         texture_from_pixel = texture_from_pixel @ np.array([[1.0, 0.0, 0.0], [0.0, 1.0, row0], [0.0, 0.0, 1.0]])
         size = (geometry.width_px, height)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         picture = cv2.warpPerspective(self.texture, texture_from_pixel, size, None, flags, cv2.BORDER_WRAP)
         return np.asarray(picture, np.float32)
 
-    def _texture_from_camera(self, geometry: FrameGeometry) -> Array:
-        scale = np.diag([1 / self.texel, 1 / self.texel, 1.0])
-        if self.scene.background != "terrain":
-            return scale
-        return np.asarray(scale @ _ground_from_camera(geometry))
+    def _terrain_rows(self, geometry: FrameGeometry, row0: int, height: int) -> Picture:
+        """The terrain's own texture where the rays meet it, distortion, film and relief included."""
+        first = row0 // NODE_PX
+        rows = np.arange(first - 1, (row0 + height - 1) // NODE_PX + 3) * NODE_PX
+        columns = np.arange(-1, (geometry.width_px - 1) // NODE_PX + 3) * NODE_PX
+        nodes = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+        plan = object_from_pixel(geometry, nodes)[:, :2].reshape(len(rows), len(columns), 2)
+        coordinates = _between(_between(plan.transpose(2, 0, 1) / self.texel).transpose(0, 2, 1)).transpose(0, 2, 1)
+        inner = coordinates[:, row0 - first * NODE_PX :][:, :height, : geometry.width_px]
+        # Only the sky has no terrain; single precision is enough within the texture.
+        x, y = np.mod(np.nan_to_num(inner), len(self.texture)).astype(np.float32)
+        return np.asarray(cv2.remap(self.texture, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_WRAP), np.float32)
+
+
+def _between(nodes: Array) -> Array:
+    """Values at every pixel of the last axis from those at every NODE_PX-th, by cubics through four (Lagrange); the
+    first and the last two nodes only lend their values."""
+    t = np.arange(NODE_PX) / NODE_PX
+    weights = np.stack(
+        [
+            -t * (t - 1) * (t - 2) / 6,
+            (t + 1) * (t - 1) * (t - 2) / 2,
+            -(t + 1) * t * (t - 2) / 2,
+            (t + 1) * t * (t - 1) / 6,
+        ]
+    )
+    fours = np.lib.stride_tricks.sliding_window_view(nodes, 4, axis=-1)
+    return np.asarray((fours @ weights).reshape(*nodes.shape[:-1], -1))
 
 
 def scene_background(scene: Scene) -> Background:
@@ -50,62 +76,58 @@ def scene_background(scene: Scene) -> Background:
         return Background(scene, np.full((8, 8), tones.background, np.float32), texel)
     generator = np.random.default_rng([scene.seed, 2])
     if scene.background == "wall":
-        pattern = 0.8 * _rough(generator, 0.6) + 0.6 * _rough(generator, 1.6)
+        size = LEAST_TEXTURE_PX
+        pattern = 0.8 * _rough(generator, size, 0.6) + 0.6 * _rough(generator, size, 1.6)
     else:
-        height = abs(scene.images[0].exterior[2] - scene.ground)
-        texel *= height / scene.camera.principal_distance_mm
-        pattern = _landscape(generator)
+        texel *= ground_width(scene) / max(scene.camera.frame_mm)
+        pattern = _landscape(generator, _texture_size(ground_width(scene) / texel))
     pattern = np.clip(pattern, -3.0, 3.0)
     shares = np.clip(tones.background + tones.contrast * pattern, 0.0, 1.0)
     return Background(scene, shares.astype(np.float32), texel)
 
 
-def _ground_from_camera(geometry: FrameGeometry) -> Array:
-    """(3, 3) the plane Z = ground from x', y', 1 of the camera frame: rays without distortion, which no truth needs."""
-    scene = geometry.scene
-    x0, y0, z0, *angles = geometry.image.exterior
-    px, py = scene.camera.principal_point_mm
-    ray_from_camera = np.array([[1.0, 0.0, -px], [0.0, 1.0, -py], [0.0, 0.0, -scene.camera.principal_distance_mm]])
-    ray = object_rotation(*angles).T @ ray_from_camera
-    fall = scene.ground - z0
-    return np.stack([x0 * ray[2] + fall * ray[0], y0 * ray[2] + fall * ray[1], ray[2]])
+def _texture_size(width_px: float) -> int:
+    """A power of two in which a frame has room."""
+    return int(np.clip(2 ** np.ceil(np.log2(width_px)), LEAST_TEXTURE_PX, MOST_TEXTURE_PX))
 
 
-def _landscape(generator: np.random.Generator) -> Array:
+def _landscape(generator: np.random.Generator, size: int) -> Array:
     """Parcels with their own tones, woods, roads along some of their sides."""
-    parcels, road = _parcels(generator)
-    tone, wooded = generator.normal(0.0, 0.7, PARCELS)[parcels], (generator.random(PARCELS) < 0.3)[parcels]
-    soil = tone + 0.45 * _rough(generator, 1.3) + 0.2 * _rough(generator, 0.0)
-    wood = -0.9 + 0.9 * _rough(generator, 0.7)
+    parcels, road, count = _parcels(generator, size)
+    tone, wooded = generator.normal(0.0, 0.7, count)[parcels], (generator.random(count) < 0.3)[parcels]
+    soil = tone + 0.45 * _rough(generator, size, 1.3) + 0.2 * _rough(generator, size, 0.0)
+    wood = -0.9 + 0.9 * _rough(generator, size, 0.7)
     pattern = np.where(wooded, wood, soil) + 1.4 * cv2.GaussianBlur(road.astype(np.float64), (0, 0), 0.7)
     return np.asarray(pattern - pattern.mean())
 
 
-def _parcels(generator: np.random.Generator) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Which parcel every pixel belongs to (that of the nearest of some random places), and where roads run."""
-    places = generator.choice(TEXTURE_PX**2, PARCELS, replace=False)
-    owner = np.full(TEXTURE_PX**2, -1)
-    owner[places] = np.arange(PARCELS)
-    around = np.pad(owner.reshape(TEXTURE_PX, TEXTURE_PX), TEXTURE_PX // 4, mode="wrap")
+def _parcels(generator: np.random.Generator, size: int) -> tuple[NDArray[np.intp], NDArray[np.bool_], int]:
+    """Which parcel every pixel belongs to (that of the nearest of some random places), where roads run, and how many
+    parcels there are."""
+    count = round((size / PARCEL_PX) ** 2)
+    places = generator.choice(size**2, count, replace=False)
+    owner = np.full(size**2, -1)
+    owner[places] = np.arange(count)
+    around = np.pad(owner.reshape(size, size), size // 4, mode="wrap")
     free = (around < 0).astype(np.uint8)
     distance, labels = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     owner_of_label = np.zeros(int(labels.max()) + 1, np.float32)
     owner_of_label[labels[around >= 0]] = around[around >= 0]
     straight = owner_of_label[labels]
     # Sides that wind a little, as they do on the ground.
-    y, x = np.indices((TEXTURE_PX, TEXTURE_PX), np.float32) + np.float32(TEXTURE_PX // 4)
-    x += (5 * _rough(generator, 1.4)).astype(np.float32)
-    y += (5 * _rough(generator, 1.4)).astype(np.float32)
+    y, x = np.indices((size, size), np.float32) + np.float32(size // 4)
+    x += (5 * _rough(generator, size, 1.4)).astype(np.float32)
+    y += (5 * _rough(generator, size, 1.4)).astype(np.float32)
     parcels = cv2.remap(straight, x, y, cv2.INTER_NEAREST)
-    near = cv2.remap(distance, x, y, cv2.INTER_LINEAR) < TEXTURE_PX / 12
+    near = cv2.remap(distance, x, y, cv2.INTER_LINEAR) < PARCEL_PX
     road = (cv2.morphologyEx(parcels, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0) & near
-    return np.asarray(parcels, np.intp), np.asarray(road, np.bool_)
+    return np.asarray(parcels, np.intp), np.asarray(road, np.bool_), count
 
 
-def _rough(generator: np.random.Generator, exponent: float) -> Array:
+def _rough(generator: np.random.Generator, size: int, exponent: float) -> Array:
     """Noise of unit rms whose amplitude falls with frequency to the power `exponent`; it joins itself at the sides."""
-    frequency = np.hypot(np.fft.fftfreq(TEXTURE_PX)[:, None], np.fft.rfftfreq(TEXTURE_PX)[None, :])
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
     frequency[0, 0] = np.inf if exponent else 1.0
-    spectrum = np.fft.rfft2(generator.standard_normal((TEXTURE_PX, TEXTURE_PX))) * frequency**-exponent
-    noise = np.fft.irfft2(spectrum, (TEXTURE_PX, TEXTURE_PX))
+    spectrum = np.fft.rfft2(generator.standard_normal((size, size))) * frequency**-exponent
+    noise = np.fft.irfft2(spectrum, (size, size))
     return np.asarray((noise - noise.mean()) / noise.std())

@@ -13,6 +13,7 @@ from synthetic_images.scene import Scene, SceneImage
 Array = NDArray[np.float64]
 
 WAVES = 6  # of the smooth deformation
+INVERSION_STEPS = 5  # of the smooth deformation, each a ten-thousandth of the one before
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,14 @@ class FrameGeometry:
     def pixel_from_object(self, points: Array) -> Array:
         """(n, 2) column and row of object points (n, 3); nan where they cannot be imaged."""
         return self.pixel_from_camera(camera_from_object(self.scene.camera, self.image.exterior, points))
+
+    def camera_from_scan(self, pixels: Array) -> Array:
+        """(n, 2) points of the camera frame from column and row (n, 2), the inverse of `pixel_from_camera`."""
+        film = pixels @ self.camera_from_pixel[:2, :2].T + self.camera_from_pixel[:2, 2]
+        camera_mm = film
+        for _ in range(INVERSION_STEPS):
+            camera_mm = film - self.deformation_mm(camera_mm)
+        return np.asarray(camera_mm)
 
     def pixel_area(self, camera_mm: Area) -> Area:
         return tuple(self.pixel_from_camera(outline) for outline in camera_mm)

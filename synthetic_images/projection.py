@@ -55,6 +55,32 @@ def distorted(camera: SceneCamera, tangents: Array) -> Array:
     return np.asarray(_observed(camera.distortion, ideal, point) + point)
 
 
+def ray_from_camera(camera: SceneCamera, exterior: tuple[float, ...], camera_mm: Array) -> Array:
+    """(n, 3) directions in the object of what is seen at x', y' (n, 2) in mm: the inverse of `camera_from_object`."""
+    c, point = camera.principal_distance_mm, np.asarray(camera.principal_point_mm)
+    reduced = camera_mm - point
+    family = camera.distortion.family
+    if family == "opencv":
+        tangents = _opencv_ideal(camera.distortion, reduced / c)
+    elif family == "none":
+        tangents = reduced / c
+    else:
+        tangents = (reduced - correction(camera.distortion, reduced.astype(np.complex128), point).real) / c
+    rays = np.column_stack([tangents, np.full(len(tangents), -1.0)])
+    return np.asarray(rays @ object_rotation(*exterior[3:]))
+
+
+def _opencv_ideal(distortion: Distortion, tangents: Array) -> Array:
+    """The inverse of `_opencv_distorted`, by OpenCV's iteration."""
+    down = np.array([1.0, -1.0])
+    stretch = np.array([1.0 + distortion.parameters.get("b1", 0.0), 1.0])
+    coefficients = np.array([distortion.parameters.get(name, 0.0) for name in OPENCV_ORDER])
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 4 * INVERSION_STEPS, 1e-14)
+    seen = np.ascontiguousarray(tangents * down / stretch).reshape(-1, 1, 2)
+    ideal = cv2.undistortPoints(seen, np.eye(3), coefficients, criteria=until)
+    return np.asarray(np.reshape(ideal, (-1, 2)) * down, np.float64)
+
+
 def _opencv_distorted(distortion: Distortion, tangents: Array) -> Array:
     """OpenCV's own model, whose y points down; b1 makes its fx = c (1 + b1)."""
     down = np.array([1.0, -1.0])

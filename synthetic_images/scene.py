@@ -297,7 +297,8 @@ class Scene:
     """A series of photographs. pad_mm: radius of the unexposed disk behind every fiducial (0: none); corner_radius_mm:
     of the rounded corners of the exposed frame (0: sharp).
 
-    ground: height of the plane that carries the texture of a "terrain" background.
+    ground, relief: mean height of the terrain that carries the texture of a "terrain" background, and the rms of its
+    heights about it.
     """
 
     name: str
@@ -310,11 +311,13 @@ class Scene:
     tones: Tones = Tones()
     background: Background = "plain"
     ground: float = 0.0
+    relief: float = 0.0
     pad_mm: float = 0.0
     corner_radius_mm: float = 0.0
 
     def __post_init__(self) -> None:
         one_of("background", self.background, get_args(Background))
+        not_negative("relief", self.relief)
         not_negative("pad_mm", self.pad_mm)
         not_negative("corner_radius_mm", self.corner_radius_mm)
         if 2 * self.corner_radius_mm > min(self.camera.frame_mm):

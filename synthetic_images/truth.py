@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from synthetic_images.film import FrameGeometry
 from synthetic_images.scene import PARAMETERS, Scene
 from synthetic_images.targets import field_targets
+from synthetic_images.terrain import scene_terrain
 
 Array = NDArray[np.float64]
 
@@ -59,6 +60,7 @@ def truth_json(truth: Truth) -> str:
         "pixel_origin": "(col, row) = (0, 0) is the centre of the top-left pixel; rows count downwards",
         "comparator": "x = col * pitch_x, y = -row * pitch_y, mm",
         "cameras": {camera.name: _camera(truth.scene)},
+        "terrain": _terrain(truth.scene),
         "images": {frame.geometry.image.name: _frame(frame) for frame in truth.frames},
         "points": {
             target.id: _values(("X", "Y", "Z"), target.center) | {"normal": target.normal.tolist()}
@@ -66,6 +68,19 @@ def truth_json(truth: Truth) -> str:
         },
     }
     return json.dumps(content, indent=1) + "\n"
+
+
+def _terrain(scene: Scene) -> dict[str, Any] | None:
+    """Z = ground + the sum of amplitude sin(wave · (X, Y) + phase), what lies between the targets."""
+    if scene.background != "terrain":
+        return None
+    terrain = scene_terrain(scene)
+    return {
+        "ground": terrain.ground,
+        "amplitude": terrain.amplitudes.tolist(),
+        "wave": terrain.waves.tolist(),
+        "phase_rad": terrain.phases_rad.tolist(),
+    }
 
 
 def _camera(scene: Scene) -> dict[str, Any]:
