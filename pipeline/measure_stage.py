@@ -27,6 +27,7 @@ from pipeline.measurement_file import MeasuredScan
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
 from pipeline.target_stage import measure_targets
+from pipeline.tie_stage import check_tie_names, with_ties
 
 
 def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, ...]:
@@ -39,11 +40,16 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
         raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
     if project.targets is not None and project.targets.code is not None:
         CodedSheet.of(project, project.targets)
+    check_tie_names(project)
     _check_readable(list(project.scans.values()))
     with _workers(len(project.scans)) as workers:
         learned = learn_marks(project, reporter, workers)
         scans = _measured_scans(learned, reporter, workers)
-    return _checked(learned, _one_definition(project, scans))
+        checked = _checked(learned, _one_definition(project, scans))
+        if project.ties is None:
+            return checked
+        with reporter.stage("natural points sought in") as count:
+            return with_ties(project, project.ties, checked, count, workers)
 
 
 def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> list[MeasuredScan]:

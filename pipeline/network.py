@@ -130,7 +130,7 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
 
 def _expects_targets(project: Project) -> bool:
     """Whether a project has object points to be seen; without them, film transformations are all it can ask for."""
-    return project.targets is not None or project.given_points is not None
+    return any(part is not None for part in (project.targets, project.ties, project.given_points))
 
 
 def _has_film_transformation(image: Image, fiducials: int) -> bool:
@@ -221,8 +221,15 @@ def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectP
     for mark in marks:
         if mark.kind == "fiducial" or mark.point in points:
             continue
-        points[mark.point] = given.get(mark.point, ObjectPoint(mark.point, None, None, None))
+        points[mark.point] = given.get(mark.point) or _unnamed(project, mark)
     return tuple(points.values())
+
+
+def _unnamed(project: Project, mark: ComparatorPoint) -> ObjectPoint:
+    """A point that nothing gives; of natural points the ground's height may be known."""
+    if mark.kind == "tie" and project.ties is not None:
+        return project.ties.point(mark.point)
+    return ObjectPoint(mark.point, None, None, None)
 
 
 def given_points(project: Project) -> Mapping[str, ObjectPoint]:

@@ -21,6 +21,7 @@ from pipeline.library import camera_path
 from pipeline.points_file import GivenPoints, read_points
 from pipeline.tables import Table, read_toml
 from pipeline.target_table import TargetSettings, read_targets
+from pipeline.tie_table import TieSettings, read_ties
 
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
@@ -67,6 +68,7 @@ class Project:
     output: Path
     pose: str
     targets: TargetSettings | None
+    ties: TieSettings | None
     given_points: GivenPoints | None
     given_images: GivenImages | None
     given_distances: tuple[GivenDistance, ...]
@@ -130,6 +132,7 @@ def read_project(path: Path) -> Project:
         output=folder / table.text("output", "out"),
         pose=measure.text("pose", "auto", ("auto", *POSES)),
         targets=read_targets(table.table("targets")) if "targets" in table else None,
+        ties=read_ties(table.table("ties")) if "ties" in table else None,
         given_points=read_points(folder / objects.text("points")) if "points" in objects else None,
         given_images=given_images,
         given_distances=read_distances(folder / objects.text("distances")) if "distances" in objects else (),

@@ -71,10 +71,18 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
 
     write_atomically(out_dir / "camera.toml", camera_text(camera, save))
     targets = field_targets(scene_file.scene.field)
-    write_atomically(out_dir / "points.csv", _points_csv(scene_file, targets, generator))
-    middle = np.mean([target.center for target in targets], axis=0)
+    if targets:
+        write_atomically(out_dir / "points.csv", _points_csv(scene_file, targets, generator))
+    middle = _middle(scene_file.scene, targets)
     write_atomically(out_dir / "images.csv", _images_csv(scene_file, middle, generator))
     write_atomically(out_dir / "project.toml", _project_text(scene_file))
+
+
+def _middle(scene: Scene, targets: tuple[Target, ...]) -> Array:
+    """Of the field; without targets, the ground below the photographs."""
+    if targets:
+        return np.asarray(np.mean([target.center for target in targets], axis=0))
+    return np.array([*np.mean([image.exterior[:2] for image in scene.images], axis=0), scene.ground])
 
 
 def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> CameraFile:
@@ -180,17 +188,29 @@ output = "out"
 
 {_targets_text(scene_file)}
 [object]
-points = "points.csv"
-images = "images.csv"
+{_points_text(scene_file)}images = "images.csv"
 unit = "{scene_file.unit}"
 
 [adjust]
 transformation = "{film_transformation(scene_file)}"
-"""
+{_datum_text(scene_file)}"""
+
+
+def _datum_text(scene_file: SceneFile) -> str:
+    """Natural points bring no planimetric control."""
+    return "" if field_targets(scene_file.scene.field) else 'datum = "minimal"\n'
+
+
+def _points_text(scene_file: SceneFile) -> str:
+    return 'points = "points.csv"\n' if field_targets(scene_file.scene.field) else ""
 
 
 def _targets_text(scene_file: SceneFile) -> str:
     field, mm = scene_file.scene.field, UNITS_MM[scene_file.unit]
+    if not field_targets(field):
+        # The sigma of heights is that of the ground as given, and so of what its relief leaves unsaid.
+        scene, sigma = scene_file.scene, scene_file.given.point[1]
+        return f"[ties]\nheight = {scene.ground:.6g}\nheight_sigma = {np.hypot(sigma, scene.relief):.6g}\n"
     if isinstance(field, DiskField) and isinstance(field.figure, CrossFigure):
         arm = field.diameter / 2.0 * mm
         return f'[targets]\nkind = "cross"\narm_mm = {arm:.6g}\nline_mm = {field.figure.line * arm:.6g}\n'

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 TEXEL_PX = 3.0  # scan pixels that one pixel of the texture covers
-LEAST_TEXTURE_PX, MOST_TEXTURE_PX = 1024, 4096  # it repeats itself: within a frame only where that is too large for it
+LEAST_TEXTURE_PX, MOST_TEXTURE_PX = 1024, 4096  # it repeats itself: in sight only where frames are too large for it
 PARCEL_PX = 90  # about the width of a parcel
 NODE_PX = 8  # between pixels whose rays are followed to the terrain; those between are interpolated
 
@@ -80,14 +80,20 @@ def scene_background(scene: Scene) -> Background:
         pattern = 0.8 * _rough(generator, size, 0.6) + 0.6 * _rough(generator, size, 1.6)
     else:
         texel *= ground_width(scene) / max(scene.camera.frame_mm)
-        pattern = _landscape(generator, _texture_size(ground_width(scene) / texel))
+        pattern = _landscape(generator, _texture_size(_block_width(scene) / texel))
     pattern = np.clip(pattern, -3.0, 3.0)
     shares = np.clip(tones.background + tones.contrast * pattern, 0.0, 1.0)
     return Background(scene, shares.astype(np.float32), texel)
 
 
+def _block_width(scene: Scene) -> float:
+    """The longer side of the ground that all frames show together, were they vertical."""
+    stations = np.array([image.exterior[:2] for image in scene.images])
+    return float(np.ptp(stations, axis=0).max()) + ground_width(scene)
+
+
 def _texture_size(width_px: float) -> int:
-    """A power of two in which a frame has room."""
+    """A power of two in which so much has room."""
     return int(np.clip(2 ** np.ceil(np.log2(width_px)), LEAST_TEXTURE_PX, MOST_TEXTURE_PX))
 
 

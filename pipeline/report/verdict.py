@@ -249,9 +249,10 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     if data.adjustment:
         yield from _weight_notes(data.adjustment)
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
-        number = sum(mark.status is status and not mark.is_fiducial for frame in shots for mark in frame.marks)
-        if number:
-            yield f"{_count(number, 'target')} {status} (their reasons stand with the marks)."
+        for kind, word in (("target", "target"), ("tie", "sight of a natural point")):
+            number = sum(mark.status is status and mark.kind == kind for frame in shots for mark in frame.marks)
+            if number:
+                yield f"{_count(number, word)} {status} (their reasons stand with the marks)."
 
 
 def _weight_notes(adjustment: Json) -> Iterator[str]:
