@@ -95,3 +95,18 @@ def test_green_alone_is_the_grey_value_of_a_scan_asked_for_it() -> None:
     np.testing.assert_array_equal(scan.window(2, 3, 10, 8), before)
     grey = scan_of(colours[..., 0].astype(float))
     np.testing.assert_array_equal(grey.green().window(0, 0, 30, 20), colours[..., 0])
+
+
+def test_the_published_choice_of_numbers() -> None:
+    """As many as the published generator of the patent's codes gives: 516 of 14 bits."""
+    assert len(RingCode(14).published_numbers()) == 516
+    code = RingCode()
+    numbers = code.published_numbers()
+    assert all(code.least_turn(number) == number for number in numbers)
+
+
+def test_a_ring_seen_from_behind() -> None:
+    code = RingCode()
+    segments = np.array([0, 0, 0, 0, 0, 1, 0, 1, 1, 1, 0, 0], bool)
+    assert code.mirrored(code.number(segments[::-1])) == code.number(segments)
+    assert code.number(segments[::-1]) != code.number(segments)
