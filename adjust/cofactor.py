@@ -77,16 +77,19 @@ class FactorCofactor:
     def of_each(self, groups: Indices) -> Array:
         """The cofactor matrices (g, k, k) of groups of quantities (g, k), each of one point's or of one image's."""
         functions = self.by_free[groups.ravel()]
-        if np.diff(functions.indptr).max(initial=0) > 1:  # angles and film parameters, of images: these are few
-            return np.array([self.of(at) for at in groups])
-        number = np.full(groups.shape, -1, dtype=np.intp)
-        number.reshape(-1)[np.diff(functions.indptr) == 1] = functions.indices
-        free = number >= 0
-        cofactors = np.zeros((*groups.shape, groups.shape[1]))
-        some = free.any(axis=1)
-        stand_in = number.max(axis=1, keepdims=True)  # for what is fixed
-        cofactors[some] = self.factor.cofactors(np.where(free, number, stand_in)[some])
-        cofactors *= free[:, :, None] & free[:, None, :]
+        (count, width), free = groups.shape, self.by_free.shape[1]
+        row = np.repeat(np.arange(groups.size), np.diff(functions.indptr))
+        # Every pair of a group and an unknown that it depends on, group by group.
+        pairs, place = np.unique(row // width * free + functions.indices, return_inverse=True)
+        first = np.searchsorted(pairs, np.arange(count) * free)
+        widths = np.diff(first, append=len(pairs))
+        by_unknowns = np.zeros((count, width, int(widths.max(initial=0))))
+        by_unknowns[row // width, row % width, place - first[row // width]] = functions.data
+        cofactors = np.zeros((*groups.shape, width))
+        for some in (np.flatnonzero(widths == each) for each in np.unique(widths[widths > 0])):
+            numbers = pairs[first[some][:, None] + np.arange(widths[some[0]])] % free
+            by = by_unknowns[some][..., : numbers.shape[1]]
+            cofactors[some] = by @ self.factor.cofactors(numbers) @ by.swapaxes(1, 2)
         return cofactors if self.datum is None else cofactors + np.array([self.datum.of(at) for at in groups])
 
     @cached_property

@@ -49,7 +49,7 @@ Figures = dict[str, Any]
 
 VIEWS, VIEWS_OF_RESEAU_ALONE = (50, 200, 1000), (4000,)
 NETWORKS = ((50, 2000), (200, 20000))  # images and unknown points
-STRIPS, STRIPS_OF_RESEAU_ALONE = (500, 1000), (2000, 4000)  # images
+STRIPS, STRIPS_OF_RESEAU_ALONE, HANGING = (500,), (1000, 2000, 4000), 1000  # images
 POINTS_AN_IMAGE, CONTROL_EVERY = 50, 10  # of a strip: points that an image shows, images between known points
 PATIENCE_S = 300.0  # of CPU time, for SciPy
 SIGMA_MM = 0.005
@@ -93,17 +93,30 @@ def main() -> None:
     print("\nUnknown points; the covariance that each gives in the time behind +")
     for images, points in NETWORKS:
         print(f"{images} images, {points} points")
-        vpv = {}
-        for program in ("reseau", "scipy", "ceres"):
-            found = measured("unknown", program, images, points)
-            print(f"    {program:8} {_figures(found)}  {found.get('says', '')}")
-            if "vpv" in found and found.get("finished", True):
-                vpv[program] = found["vpv"]
-        different = [name for name in vpv if abs(vpv[name] / vpv["reseau"] - 1.0) > 1e-6]
-        same = ", ".join(name for name in vpv if name not in different)
-        print(f"    the same minimum v'Pv = {vpv['reseau']:.6f}: {same}")
-        if different:
-            sys.exit(f"another minimum: {', '.join(f'{name} {vpv[name]:.6f}' for name in different)}")
+        _compare("unknown", images, points)
+    for images in STRIPS:
+        print(f"A strip of {images} images")
+        _compare("strip", images)
+    for images in STRIPS_OF_RESEAU_ALONE:
+        ours = measured("strip", "reseau", images)
+        print(f"A strip of {images} images\n    reseau   {_figures(ours)}")
+    ours = measured("strip", "reseau", HANGING, 0)
+    print(f"A strip of {HANGING} images, known points in the first two alone\n    reseau   {_figures(ours)}")
+
+
+def _compare(task: str, *sizes: int) -> None:
+    """All programs on one network, and whether they have come to the same minimum."""
+    vpv = {}
+    for program in ("reseau", "scipy", "ceres"):
+        found = measured(task, program, *sizes)
+        print(f"    {program:8} {_figures(found)}  {found.get('says', '')}")
+        if "vpv" in found and found.get("finished", True):
+            vpv[program] = found["vpv"]
+    different = [name for name in vpv if abs(vpv[name] / vpv["reseau"] - 1.0) > 1e-6]
+    same = ", ".join(name for name in vpv if name not in different)
+    print(f"    the same minimum v'Pv = {vpv['reseau']:.6f}: {same}")
+    if different:
+        sys.exit(f"another minimum: {', '.join(f'{name} {vpv[name]:.6f}' for name in different)}")
 
 
 def measured(task: str, program: str, *sizes: int) -> Figures:
@@ -237,11 +250,14 @@ def _scene(
 
 
 def reseau(scene: Scene) -> Figures:
-    """With the standard deviations of everything; what the observations tell besides is measured by itself."""
+    """With the covariance of camera, images and points; what the observations tell besides is measured by itself."""
     result, seconds = _timed(lambda: adjust(scene.network, scene.start))
     assert result.converged
     cameras = [name for name in result.names if name.startswith("IO.")]
-    _, more = _timed(lambda: (result.cofactor.variances, result.cofactor_of(cameras)))
+    starts = {first: [i for i, name in enumerate(result.names) if name.endswith(first)] for first in (".X0", ".X")}
+    images, points = (np.add.outer(starts[first], np.arange(size)) for first, size in ((".X0", 6), (".X", 3)))
+    of_each = result.cofactor.of_each
+    _, more = _timed(lambda: (result.cofactor.variances, result.cofactor_of(cameras), of_each(images), of_each(points)))
     figures = {"seconds": seconds + more, "mib": _peak_mib(), "vpv": result.vpv, "says": "everything"}
     _, tests = _timed(lambda: (result.residuals, result.groups, result.reliability, result.suspects, result.warnings))
     return figures | {"tests_seconds": tests, "mib_with_tests": _peak_mib()}
