@@ -99,7 +99,7 @@ class TypicalMark:
             f"sigma_mm = [{sx:.3f}, {sy:.3f}]               # of {self.reports} report{'s' * (self.reports > 1)}{few}",
         ]
         if not kind.mark:
-            return lines
+            return [*lines, 'mark = "learned"']
         return [
             *lines,
             'mark = "drawn"'
@@ -108,6 +108,14 @@ class TypicalMark:
         ]
 
 
+LEARNED_NOTE = (
+    " They are learned from the scans, from what recurs in all of them or from clicks in one; or\n"
+    "# draw them. A learned mark lies off the reported one by as much as its template does, and its sigma grows by\n"
+    "# that."
+)
+LEARNED = """kind = "learned"
+size_mm = 5.0
+"""
 RING_CROSS = """kind = "ring-cross"
 ring_mm = 0.80
 ring_line_mm = 0.17
@@ -249,7 +257,7 @@ def _camera(
         "# Sigmas are the spread over the reports about their median. Seen with the data strip to the left.",
         *(f"# {note}" for note in kind.notes),
         *_separation_lines(kind, own),
-        f"# Shape of the marks: {kind.shape}." + ("" if kind.mark else " Draw them, or they cannot be found in scans."),
+        f"# Shape of the marks: {kind.shape}." + ("" if kind.mark else LEARNED_NOTE),
         "",
         f'name = "{kind.title}, {cone_mm} mm"',
         f"frame_mm = [{kind.frame_mm}, {kind.frame_mm}]",
@@ -271,8 +279,7 @@ def _camera(
     ]
     for mark in marks:
         lines += ["", *mark.lines(kind)]
-    if kind.mark:
-        lines += ["", "[mark.drawn]", kind.mark.rstrip()]
+    lines += ["", "[mark.drawn]", kind.mark.rstrip()] if kind.mark else ["", "[mark.learned]", LEARNED.rstrip()]
     return "\n".join(lines) + "\n"
 
 

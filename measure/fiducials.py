@@ -11,6 +11,7 @@ from measure.constellation import Bounds, Placement, PlacementSearch, same_pictu
 from measure.edge_place import EdgePlace
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame, measure_frame
+from measure.frame_fit import AFFINITY_SIGMA
 from measure.learned import honest_covariance
 from measure.pose_decision import decide_pose
 from measure.poses import POSES, up_from_camera
@@ -23,6 +24,9 @@ Array = NDArray[np.float64]
 
 _SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
 _STEP_TOLERANCE = 0.06
+_STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # each is within what a placement allows the frame of the next
+_FLAWLESS = Status.MEASURED
+_LEAST_FLAWLESS = 3
 _SET = ("set in the project.",)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
@@ -44,6 +48,8 @@ def measure_fiducials(
     found, frame = _in_the_middle(scan, layout, pitch_um, options)
     if frame is None or not is_complete(frame):
         found, frame = _anywhere(scan, layout, pitch_um, options)
+    if frame is not None and not frame.accepted and pitch_um is not None:
+        found, frame = _stretched(scan, layout, pitch_um, options, (found, frame))
     if frame is None:
         return _nothing(scan, layout, "nothing in the scan looks like two or more of the camera's marks")
     if not frame.accepted:
@@ -84,6 +90,35 @@ def _anywhere(
             break
         frames.append(measure_frame(scan, layout, placement, options))
     return found, max(frames, key=lambda frame: (frame.accepted, frame.belongs.sum()))
+
+
+def _stretched(
+    scan: Scan,
+    layout: FiducialLayout,
+    pitch_um: tuple[float, float],
+    options: FiducialOptions,
+    before: tuple[list[Placement], Frame],
+) -> tuple[list[Placement], Frame]:
+    """The same with pixels longer one way than the other, where two marks are clear and no third is found: an office
+    scanner's carriage may run by per cents too fast. So much freedom finds false marks too: here only marks without
+    any blemish count, and the best frame has most of them and the likest ones."""
+
+    def likeness(frame: Frame) -> list[float]:
+        verdicts = [frame.verdict(index)[0] if fit else None for index, fit in enumerate(frame.fits)]
+        return [fit.likeness for fit, status in zip(frame.fits, verdicts, strict=True) if fit and status is _FLAWLESS]
+
+    if len(likeness(before[1])) < 2:
+        return before
+    best, highest = before, 0.0
+    for stretch in _STRETCHES:
+        found, frame = _anywhere(
+            scan, layout, (pitch_um[0] * (1 + stretch / 2), pitch_um[1] * (1 - stretch / 2)), options
+        )
+        if frame is None or not frame.accepted or len(likeness(frame)) < _LEAST_FLAWLESS:
+            continue
+        if sum(likeness(frame)) > highest:
+            best, highest = (found, frame), sum(likeness(frame))
+    return best
 
 
 def _found(
@@ -194,6 +229,12 @@ def _measurement(
             Pose(pose.name, False, (*pose.evidence, *(f"{sentence}." for sentence in rivals)))
             if pose.evidence != _SET
             else pose
+        )
+    per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
+    if abs(per_mm[0] / per_mm[1] - 1) > 2 * AFFINITY_SIGMA:
+        problems.append(
+            f"by the marks a pixel is {1000 / per_mm[0]:.1f} um wide and {1000 / per_mm[1]:.1f} um tall: film is never "
+            "stretched so much. Look whether the scanner, or the camera file, is to blame."
         )
     used = int(frame.belongs.sum())
     if used <= 3:

@@ -56,6 +56,8 @@ def decide_pose(
         for each in (_Named.of(placement, layout, seen, missed, options) for placement in placements)
         if each is not None
     ]
+    if not named:
+        return _decision([], layout)
     sites = [Site(scan, fit, fit.center_px, frame.weights) for fit in seen]
     # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
     usual = sorted(seen, key=lambda fit: abs(fit.contrast_dn))[len(seen) // 2]

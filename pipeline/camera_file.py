@@ -17,6 +17,7 @@ from pipeline.spelling import did_you_mean
 from pipeline.tables import Table, read_toml
 
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
+LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
 CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
 
@@ -30,6 +31,14 @@ class GivenFiducial:
     sigma_mm: shapes.Point
     mark: shapes.Mark | shapes.LearnedMark | None
     passed_over: bool = False
+
+    @property
+    def prior_sigma_mm(self) -> tuple[float, float]:
+        """For the adjustment: a learned mark is measured where its template has its origin, somewhere on the mark. What
+        the file fixes stays fixed."""
+        origin = self.mark.size_mm * LEARNED_ORIGIN if isinstance(self.mark, shapes.LearnedMark) else 0.0
+        sx, sy = (sigma and math.hypot(sigma, origin) for sigma in self.sigma_mm)
+        return sx, sy
 
 
 @dataclass(frozen=True)
@@ -123,8 +132,7 @@ class CameraFile:
             distortion=self.distortion,
             fiducials={
                 fiducial.id: network.Fiducial(
-                    network.Prior(fiducial.xy_mm[0], fiducial.sigma_mm[0]),
-                    network.Prior(fiducial.xy_mm[1], fiducial.sigma_mm[1]),
+                    *(network.Prior(*pair) for pair in zip(fiducial.xy_mm, fiducial.prior_sigma_mm, strict=True))
                 )
                 for fiducial in self.fiducials
             },

@@ -25,8 +25,9 @@ def library_path(name: str) -> Path:
     """The file of one camera of the library. Raises InputError with the names near to a misspelt one."""
     names = library_names()
     if name not in names:
-        begun = [known for known in names if name and known.startswith(name)]
-        near = f" Did you mean {' or '.join(map(repr, begun))}?" if begun else did_you_mean(name, names)
+        plain = name.casefold().replace(" ", "-").replace("_", "-")
+        begun = [known for known in names if plain and known.startswith(plain)]
+        near = f" Did you mean {' or '.join(map(repr, begun))}?" if begun else did_you_mean(plain, names)
         raise InputError(f"the camera library has no {name!r}.{near} `reseau cameras` lists them.")
     return FOLDER / f"{name}.toml"
 
@@ -51,13 +52,13 @@ def print_library(console: Console) -> None:
         table.add_column(heading, no_wrap=True)
     sources: dict[str, str] = {}
     for entry in library_json():
-        c, drawn = entry["principal_distance_mm"], len(entry["drawn"])
+        c = entry["principal_distance_mm"]
         table.add_row(
             entry["name"],
             " x ".join(f"{side:g}" for side in entry["frame_mm"]),
             f"{c['value']:.2f} ± {c['sigma']:.2f}",
             str(entry["fiducials"]),
-            "known" if drawn == entry["fiducials"] else f"of {drawn}" if drawn else "not known",
+            _shape(entry),
             str(entry["reports"]),
         )
         sources[entry["name"].rsplit("-", 1)[0]] = entry["source"]
@@ -66,9 +67,16 @@ def print_library(console: Console) -> None:
         console.print(f"{kind}: {source}", highlight=False)
     console.print(
         'camera = "library:NAME" in the project takes one; `reseau cameras NAME` prints its file, to start from. '
-        "Marks whose shape is not known can be adjusted, not found in scans.",
+        "Marks whose shape is not known are learned from the scans, or passed over.",
         highlight=False,
     )
+
+
+def _shape(entry: Json) -> str:
+    drawn, learned = len(entry["drawn"]), len(entry["learned"])
+    if learned:
+        return "learned"
+    return "known" if drawn == entry["fiducials"] else f"of {drawn}" if drawn else "not known"
 
 
 def _entry(name: str, camera: CameraFile) -> Json:
@@ -82,6 +90,7 @@ def _entry(name: str, camera: CameraFile) -> Json:
         },
         "fiducials": len(camera.fiducials),
         "drawn": [mark.id for mark in camera.drawn],
+        "learned": [one.id for one in camera.learned],
         "reports": camera.source.reports if camera.source else 0,
         "source": camera.source.text if camera.source else "",
     }

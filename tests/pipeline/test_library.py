@@ -57,7 +57,7 @@ def test_every_camera_is_listed_with_its_source(capsys: pytest.CaptureFixture[st
     assert run(["cameras"]) == 0
     printed = capsys.readouterr().out
     assert all(name in printed for name in listed)
-    assert "not known" in printed
+    assert "learned" in printed
 
 
 @pytest.mark.parametrize("name", library_names())
@@ -69,8 +69,8 @@ def test_a_camera_is_typical_and_its_spread_is_one_of_cameras(name: str) -> None
     assert 0.0 < camera.principal_distance_sigma_mm < 0.011 * nominal
     sigmas = np.array([one.sigma_mm for one in camera.fiducials])
     assert (sigmas >= 0.005).all()
-    assert (sigmas < (0.3 if name.startswith("fairchild") else 0.05)).all()
-    assert len(camera.fiducials) in (4, 8, 25)
+    assert (sigmas < {"fairchild": 0.3, "register": 0.6}.get(name.split("-")[0], 0.05)).all()
+    assert len(camera.fiducials) in (4, 8, 9, 25)
     for words, mm, spread, _ in SEPARATION.findall(library_path(name).read_text(encoding="utf-8")):
         assert distance(camera, *ENDS[words]) == pytest.approx(float(mm), abs=max(0.02, 1.5 * float(spread)))
 
@@ -95,6 +95,7 @@ def test_a_printed_camera_is_a_file_to_start_from(tmp_path: Path, capsys: pytest
         ("wild-rc8", "'wild-rc8-153'"),
         ("wild-rc10", "'wild-rc10-153' or 'wild-rc10-214'"),
         ("wild-rc9-87", "'wild-rc9-88'"),
+        ("Wild RC9", "'wild-rc9-88'"),
     ],
 )
 def test_a_misspelt_camera_is_told_its_neighbours(
@@ -140,11 +141,17 @@ def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
     assert (frame.parent / "comparator.csv").read_text(encoding="utf-8").count(",fiducial,") == 4
 
 
-def test_a_camera_with_marks_of_unknown_shape_is_not_measured(frame: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(
+    frame: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     other = frame.with_name("other.toml")
     other.write_text(frame.read_text(encoding="utf-8").replace(RENDERED, "jena-lmk-153"), encoding="utf-8")
     assert run(["measure", str(other)]) == 2
-    assert "jena-lmk-153.toml: fiducial '1' has no mark, and so cannot be found in a scan" in capsys.readouterr().err
+    assert "jena-lmk-153.toml: the marks are to be learned, and with one scan nothing" in capsys.readouterr().err
+    camera = LIBRARY["jena-lmk-153"]
+    assert len(camera.learned) == 8
+    # A template's origin lies somewhere on its mark, of which the reports know nothing.
+    assert all(fiducial.x_mm.sigma > 1.0 for fiducial in camera.camera().fiducials.values())
 
 
 def test_the_frame_is_told_from_another_camera(frame: Path) -> None:
