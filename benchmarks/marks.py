@@ -13,19 +13,22 @@ and `measure.disks.fit_disk` for the ellipse.
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from other_methods import METHODS, Template, hipp
 from true_marks import (
     KIND,
     KINDS,
     Kind,
     TrueMark,
+    grain_correlation,
+    grainy,
     scan_of,
     some_mark,
+    whitened_rms,
 )
 
 from measure.disks import fit_disk
@@ -41,9 +44,10 @@ SNRS, BLURS_PX = (5.0, 10.0, 20.0, 50.0, 100.0), (0.6, 1.0, 1.6, 2.5)
 SEED = 20
 SHIFT_PX, SEARCH_PX = 1.5, 3.0  # of the start, and the radius of the search
 POOL, FEW = 10, 3  # different marks in a cell; where the bound of each takes seconds
-GRAINS_PX, GRAIN_SNR, WHITE = (0.7, 1.0, 1.5), 20.0, 0.1
+GRAINS_PX, GRAIN_SNR = (0.7, 1.0, 1.5), 20.0
 DUST, DUST_SNR = (0.01, 0.03, 0.05), 20.0
 LARGE_PX = 0.3
+HIPP = ""  # the interpreter of an environment that has it
 QUALITIES, JPEG_SNR = (50, 75, 90, 95), 100.0
 
 
@@ -91,12 +95,6 @@ class Cell:
             return f"{'all lost':>14}"
         lost = f"-{self.lost}" if self.lost else ""
         return f"{self.to_bound:7.3f} {self.to_claimed:5.3f}{lost:<4}"
-
-
-def whitened_rms(errors: Sequence[Array], covariances: Sequence[Array]) -> float:
-    """rms of errors (2,) in units of their own standard deviations."""
-    whitened = [np.linalg.solve(np.linalg.cholesky(c), e) for e, c in zip(errors, covariances, strict=True)]
-    return float(np.sqrt(np.mean(np.square(whitened))))
 
 
 def measured(
@@ -175,22 +173,6 @@ def grain(kinds: Sequence[Kind], count: int) -> None:
                 cell.add(mark, measured(mark, grey + CONTRAST * noise, rng), best, bound)
             words.append(cell.words())
         print(f"{kind.name:14}" + "".join(f"{each:>17}" for each in words), flush=True)
-
-
-def grainy(size: int, grain_px: float, rng: np.random.Generator) -> Array:
-    """(size, size) white noise after a Gaussian, with white noise, of unit variance in all."""
-    reach = int(np.ceil(4 * grain_px))
-    smooth = gaussian_filter(rng.standard_normal((size + 2 * reach,) * 2), grain_px)[reach:-reach, reach:-reach]
-    unit = smooth * 2 * grain_px * np.sqrt(np.pi)
-    return np.asarray(np.sqrt(1 - WHITE) * unit + np.sqrt(WHITE) * rng.standard_normal((size, size)))
-
-
-def grain_correlation(grain_px: float, reach: int = 9) -> Array:
-    """(2 reach + 1, 2 reach + 1) the autocorrelation of `grainy`."""
-    index = np.arange(-reach, reach + 1)
-    correlation = (1 - WHITE) * np.exp(-(index[:, None] ** 2 + index[None] ** 2) / (4 * grain_px**2))
-    correlation[reach, reach] = 1.0
-    return np.asarray(correlation)
 
 
 def dust(kinds: Sequence[Kind], count: int) -> None:
@@ -306,6 +288,49 @@ def decoded(stored: NDArray[np.uint8], quality: int) -> Array:
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), float)
 
 
+def methods(kinds: Sequence[Kind], count: int) -> None:
+    """Other methods on the same pictures, light marks of blur 1 within 3 mrad and 0.3 % of their templates; these are
+    without noise, but for hipp, whose user cuts it out of a scan."""
+    names = ["reseau", *METHODS, *(["hipp"] if HIPP else [])]
+    print("\nother methods, 16 bit (hipp: 8 bit, less its mean error), blur 1: rms in px of those that gave a place")
+    print(f"{'':14}{'SNR':>5}{'bound':>9}" + "".join(f"{name:>13}" for name in names))
+    for kind in kinds:
+        for snr in (20.0, 100.0):
+            rng = np.random.default_rng([SEED, KINDS.index(kind), int(snr)])
+            base = some_mark(kind, 1.0, rng)
+            center = np.full(2, (base.size - 1) / 2)
+            ideal = TrueMark(kind, np.column_stack([base.place[:, :2], center]), base.size, 1.0)
+            reach = int(np.ceil(max(np.abs(np.argwhere(ideal.picture > 0.01) - center).max(), 5))) + 4
+            middle = slice(base.size // 2 - reach, base.size // 2 + reach + 1)
+            template = Template(GROUND + CONTRAST * ideal.picture[middle, middle], np.full(2, float(reach)))
+            errors: dict[str, list[Array]] = {name: [] for name in names}
+            images, places, bounds = [], [], []
+            for _ in range(count):
+                scale, turn = rng.normal(0, 0.003, 2)
+                linear = np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ base.place[:, :2]
+                mark = TrueMark(kind, np.column_stack([linear, center + rng.uniform(-0.5, 0.5, 2)]), base.size, 1.0)
+                noise = rng.standard_normal((mark.size, mark.size)) / snr
+                grey = GROUND + CONTRAST * (mark.picture + noise)
+                found = measured(mark, grey, rng)
+                if found is not None:
+                    errors["reseau"].append(found.center_px - mark.place[:, 2])
+                for name, method in METHODS.items():
+                    place = method(grey, center, template)
+                    if place is not None:
+                        errors[name].append(place - mark.place[:, 2])
+                images.append(grey)
+                places.append(mark.place[:, 2])
+                bounds.append(np.trace(base.bound(1 / snr)) / 2)
+            if HIPP:
+                scan_noise = rng.standard_normal(template.image.shape)
+                off = hipp(HIPP, images, replace(template, image=template.image + CONTRAST / snr * scan_noise)) - places
+                errors["hipp"] = list(off - off.mean(axis=0))
+            words = [
+                f"{np.sqrt(np.mean(np.square(errors[name]))):13.4f}" if errors[name] else f"{'-':>13}" for name in names
+            ]
+            print(f"{kind.name:14}{snr:5.0f}{np.sqrt(np.mean(bounds)):9.4f}" + "".join(words), flush=True)
+
+
 STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
     "accuracy": accuracy,
     "bias": bias,
@@ -313,6 +338,7 @@ STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
     "dust": dust,
     "small_disks": small_disks,
     "jpeg": jpeg,
+    "methods": methods,
 }
 
 
@@ -321,8 +347,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("marks", type=int, nargs="?", default=100)
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []])
+    parser.add_argument("--hipp", default="")
     parser.add_argument("--kind", action="append", choices=list(KIND))
     arguments = parser.parse_args()
+    global HIPP
+    HIPP = arguments.hipp
     kinds = [KIND[name] for name in arguments.kind] if arguments.kind else KINDS
     print(f"{arguments.marks} marks a cell, seed {SEED}")
     for name in arguments.studies or STUDIES:

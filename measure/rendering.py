@@ -62,7 +62,7 @@ def _sharp(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
         cells = max(1, round(_pixels_per_sample(mark, pixel_from_mark) ** -1))
         sharp = _sampled(mark, shifted, *size, cells)
     else:
-        cells = CELLS if blur_px < 1.5 else CELLS // 2  # blur hides what coarser cells get wrong
+        cells = CELLS if blur_px < 1.5 else CELLS - 1  # blur hides what coarser cells get wrong
         sharp = cell_coverage(mark, shifted, *size, cells)
     return sharp.astype(np.float32), cells
 

@@ -1,6 +1,7 @@
 """Marks with truth for tests and benchmarks: exact areas from `synthetic_images`, and the Cramér-Rao bound of their
 places from differences of those pictures. Nothing of `measure` draws here."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import gaussian_filter
 
 from measure.picture_scan import WholePicture
 from measure.radiometry import Samples
@@ -26,6 +28,7 @@ TURN, SCALE = (0.0, -1.0, 1.0, 0.0), (1.0, 0.0, 0.0, 1.0)
 STRETCH, SHEAR = (1.0, 0.0, 0.0, -1.0), (0.0, 1.0, 1.0, 0.0)
 GREYS = 4  # gain, offset, two slopes
 MARGIN_PX = 8
+WHITE = 0.1  # of the variance of grain: the scanner's own noise
 
 
 @dataclass(frozen=True)
@@ -210,3 +213,25 @@ def scan_of(grey: Array, full_scale: int = 65535, is_lossy: bool = False) -> Sca
     rounded = np.clip(np.rint(grey), 0, full_scale)[..., None]
     stored: Samples = rounded.astype(np.uint16) if full_scale > 255 else rounded.astype(np.uint8)
     return Scan(Path("true.tif"), WholePicture(stored, is_lossy), NO_TAGS)
+
+
+def grainy(size: int, grain_px: float, rng: np.random.Generator) -> Array:
+    """(size, size) white noise after a Gaussian, and a share of white noise, of unit variance in all."""
+    reach = int(np.ceil(4 * grain_px))
+    smooth = gaussian_filter(rng.standard_normal((size + 2 * reach,) * 2), grain_px)[reach:-reach, reach:-reach]
+    unit = smooth * 2 * grain_px * np.sqrt(np.pi)
+    return np.asarray(np.sqrt(1 - WHITE) * unit + np.sqrt(WHITE) * rng.standard_normal((size, size)))
+
+
+def grain_correlation(grain_px: float, reach: int = 9) -> Array:
+    """(2 reach + 1, 2 reach + 1) the autocorrelation of `grainy`."""
+    index = np.arange(-reach, reach + 1)
+    correlation = (1 - WHITE) * np.exp(-(index[:, None] ** 2 + index[None] ** 2) / (4 * grain_px**2))
+    correlation[reach, reach] = 1.0
+    return np.asarray(correlation)
+
+
+def whitened_rms(errors: Sequence[Array], covariances: Sequence[Array]) -> float:
+    """rms of errors (2,) in units of their own standard deviations."""
+    whitened = [np.linalg.solve(np.linalg.cholesky(c), e) for e, c in zip(errors, covariances, strict=True)]
+    return float(np.sqrt(np.mean(np.square(whitened))))

@@ -1,0 +1,96 @@
+"""Marks at the Cramér-Rao bound, by the error that the best linear estimate makes in the very same noise."""
+
+import numpy as np
+import pytest
+from true_marks import (
+    KIND,
+    WING,
+    Kind,
+    TrueMark,
+    grain_correlation,
+    grainy,
+    scan_of,
+    some_mark,
+    whitened_rms,
+)
+
+from measure.disks import fit_disk
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.matching import Match
+from measure.refinement import sight
+from measure.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned
+
+GROUND, CONTRAST, SNR = 25000.0, 15000.0, 20.0
+
+
+def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, is_lossy: bool = False) -> Match:
+    start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
+    frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
+    scan, options = scan_of(grey, is_lossy=is_lossy), FiducialOptions().match
+    fit = sight(scan, mark.kind.shape, start, 3.0, 1, None, options, frame_sigma).fit
+    assert fit is not None
+    return fit
+
+
+@pytest.mark.parametrize(("name", "grain_px"), [("ring-dot", 0.0), ("wing", 0.0), ("dot", 1.0)])
+def test_marks_are_at_the_bound_with_honest_sigmas_in_white_noise_and_in_grain(name: str, grain_px: float) -> None:
+    rng = np.random.default_rng(1)
+    correlation = grain_correlation(grain_px) if grain_px else None
+    marks = [some_mark(KIND[name], 1.0, rng) for _ in range(2)]
+    errors, covariances, best, bounds = [], [], [], []
+    for number in range(16):
+        mark = marks[number % len(marks)]
+        unit = grainy(mark.size, grain_px, rng) if grain_px else rng.standard_normal((mark.size, mark.size))
+        fit = sighted(mark, GROUND + CONTRAST * (mark.picture + unit / SNR), rng)
+        errors.append(fit.center_px - mark.place[:, 2])
+        covariances.append(fit.covariance_px2)
+        best.append(mark.best_errors(unit / SNR, 1 / SNR, None, correlation))
+        bounds.append(mark.bound(1 / SNR, None, correlation))
+    assert np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(best))) < 1.12
+    assert 0.9 < whitened_rms(errors, covariances) / whitened_rms(best, bounds) < 1.1
+
+
+def test_a_disk_on_plain_ground_uses_more_of_it() -> None:
+    rng = np.random.default_rng(2)
+    mark = some_mark(KIND["ellipse"], 1.0, rng)
+    grey = GROUND + CONTRAST * mark.picture + 300 * rng.standard_normal((mark.size, mark.size))
+    plain = fit_disk(scan_of(grey), mark.place[:, 2] + 0.3, mark.place[:, :2])
+    near = fit_disk(scan_of(grey), mark.place[:, 2] + 0.3, mark.place[:, :2], longest_margin_px=2.5)
+    col = np.arange(mark.size) - mark.place[0, 2]
+    beside = fit_disk(scan_of(grey + 9000 * (col > 10)), mark.place[:, 2] + 0.3, mark.place[:, :2])
+    assert np.trace(plain.covariance_px2) < 0.85 * np.trace(near.covariance_px2)
+    np.testing.assert_allclose(beside.center_px, mark.place[:, 2], atol=0.06)
+    assert not beside.reason
+
+
+def test_wings_take_rotation_and_scale_from_their_frame() -> None:
+    rng = np.random.default_rng(3)
+    places = [(-25.0, 0.0, 90.0), (25.0, 0.0, -90.0), (0.0, 25.0, 0.0), (3.0, -25.0, 180.0)]
+    marks = tuple(
+        LayoutMark(str(number), (x, y), (0.01, 0.01), turned(MarkShape(polygon(WING)), turn))
+        for number, (x, y, turn) in enumerate(places)
+    )
+    c, s = np.cos(0.026), np.sin(0.026)
+    linear = 9.93 * np.array([[c, -s], [-s, -c]])
+    grey, true = np.full((640, 640), GROUND), []
+    for mark in marks:
+        center = np.array([320.3, 319.8]) + linear @ mark.xy_mm
+        corner = np.floor(center).astype(int) - 40
+        kind = Kind("wing", MarkShape(mark.mark.parts) if isinstance(mark.mark, MarkShape) else KIND["wing"].shape)
+        shown = TrueMark(kind, np.column_stack([linear, center - corner]), 81, 1.0).picture
+        grey[corner[1] : corner[1] + 81, corner[0] : corner[0] + 81] += CONTRAST * shown
+        true.append(center)
+    grey += 150 * rng.standard_normal(grey.shape)
+    result = measure_fiducials(scan_of(grey), FiducialLayout(marks, (60.0, 60.0)), (100.7, 100.7))
+    errors = [np.asarray(mark.center_px) - place for mark, place in zip(result.marks, true, strict=True)]
+    assert np.sqrt(np.mean(np.square(errors))) < 0.009  # of a placement's rotation alone: 0.012 and more
+
+
+def test_what_compression_hides_is_added_to_the_sigma() -> None:
+    rng = np.random.default_rng(4)
+    mark = some_mark(KIND["ring-dot"], 1.0, rng)
+    grey = GROUND + CONTRAST * (mark.picture + grainy(mark.size, 1.0, rng) / 100)
+    film, compressed = (sighted(mark, grey, np.random.default_rng(5), is_lossy) for is_lossy in (False, True))
+    assert np.trace(film.covariance_px2) / 2 < 0.006**2
+    assert np.trace(compressed.covariance_px2) / 2 > 0.01**2
