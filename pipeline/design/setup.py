@@ -60,9 +60,15 @@ class Setup:
 
 
 def setup_of(scene_file: SceneFile) -> Setup:
-    """The plan of a scene. Raises InputError where it names control points that the field does not have."""
+    """The plan of a scene. Raises InputError where it names control points that the field does not have, or has no
+    targets at all."""
     settings = scene_file.design
     targets = field_targets(scene_file.scene.field)
+    if not targets:
+        raise InputError(
+            f"{scene_file.path}: [field] has no targets, and nobody knows beforehand where natural points will be. "
+            "To plan such a field, give as many targets as points are hoped for, in a [[field.scatter]]."
+        )
     strangers = set(settings.control_points) - {target.id for target in targets}
     if strangers:
         raise InputError(

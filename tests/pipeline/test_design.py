@@ -13,10 +13,11 @@ from pipeline.design.alone import alone
 from pipeline.design.alternatives import alternatives, gains
 from pipeline.design.expected import expect, rms
 from pipeline.design.settings import Sweep
-from pipeline.design.setup import planned_network
+from pipeline.design.setup import planned_network, setup_of
 from pipeline.design.sweeps import Swept, over_layouts, sweep
 from pipeline.design.variations import Variations
 from pipeline.errors import InputError
+from pipeline.scene_file import read_scene
 
 SCENES = Path(str(resources.files("synthetic_images").joinpath("scenes")))
 JUHL = SCENES / "juhl_example.toml"
@@ -315,3 +316,8 @@ def test_fiducials_of_photographs_alone_are_the_mean_of_as_many(tmp_path: Path) 
         sigmas = alone(expect(Variations.read(scene).setup()))
         marks = [sigma for name, sigma in sigmas.items() if name.startswith("FID.")]
         assert rms(marks) == pytest.approx(0.003 / math.sqrt(2) * math.sqrt(1 - 4 / 8), rel=1e-4)
+
+
+def test_a_field_of_natural_points_cannot_be_planned() -> None:
+    with pytest.raises(InputError, match="has no targets"):
+        setup_of(read_scene(SCENES / "juhl_natural.toml"))
