@@ -49,6 +49,7 @@ Figures = dict[str, Any]
 
 VIEWS, VIEWS_OF_RESEAU_ALONE = (50, 200, 1000), (4000,)
 NETWORKS = ((50, 2000), (200, 20000))  # images and unknown points
+NETWORK_OF_RESEAU_ALONE = (1000, 50000)
 STRIPS, STRIPS_OF_RESEAU_ALONE, HANGING = (500,), (1000, 2000, 4000), 1000  # images
 POINTS_AN_IMAGE, CONTROL_EVERY = 50, 10  # of a strip: points that an image shows, images between known points
 PATIENCE_S = 300.0  # of CPU time, for SciPy
@@ -94,6 +95,8 @@ def main() -> None:
     for images, points in NETWORKS:
         print(f"{images} images, {points} points")
         _compare("unknown", images, points)
+    images, points = NETWORK_OF_RESEAU_ALONE
+    print(f"{images} images, {points} points\n    reseau   {_figures(measured('unknown', 'reseau', images, points))}")
     for images in STRIPS:
         print(f"A strip of {images} images")
         _compare("strip", images)
