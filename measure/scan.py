@@ -23,7 +23,7 @@ Array = NDArray[np.float32]
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
 GREEN = (0.0, 1.0, 0.0)
-BAND_PIXELS = 2 << 20  # that a thread takes at a time
+BAND_PIXELS = 1 << 20  # that a thread takes at a time
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -145,12 +145,14 @@ class Scan:
 
     def _planes(self, col0: int, row0: int, width: int, height: int, weights: Array) -> Array:
         """(n, height, width) for weights (n, channels); parts outside of the scan repeat its edge."""
-        cols = np.clip(np.arange(col0, col0 + width), 0, self.width_px - 1)
-        rows = np.clip(np.arange(row0, row0 + height), 0, self.height_px - 1)
-        inner = self._inside(int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1, weights)
+        top, bottom = (min(max(row, 0), self.height_px - 1) for row in (row0, row0 + height - 1))
+        left, right = (min(max(col, 0), self.width_px - 1) for col in (col0, col0 + width - 1))
+        inner = self._inside(top, bottom + 1, left, right + 1, weights)
         if inner.shape[1:] == (height, width):
             return inner
-        return inner[:, (rows - rows[0])[:, None], cols - cols[0]]
+        above, before = min(max(-row0, 0), height - 1), min(max(-col0, 0), width - 1)
+        below, after = height - above - inner.shape[1], width - before - inner.shape[2]
+        return np.stack([cv2.copyMakeBorder(each, above, below, before, after, cv2.BORDER_REPLICATE) for each in inner])
 
     def _inside(self, row0: int, row1: int, col0: int, col1: int, weights: Array) -> Array:
         """Rows row0 to row1 and columns col0 to col1 (exclusive), all inside the scan, from the segments they touch."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from brute_marks import Array, scan_of
-from test_fiducials import ALIKE, CORNERS, NUMBERED, assert_right, frame_picture, layout_of, pixel_from_camera
+from test_fiducials import CORNERS, NUMBERED, assert_right, frame_picture, layout_of, pixel_from_camera
 
 from measure import fiducials
 from measure.centred_frame import is_lattice
@@ -73,15 +73,6 @@ def test_a_frame_off_the_middle_or_with_a_mark_hidden_is_searched_everywhere(
         if mark.status is Status.MEASURED and mark.center_px is not None
     ]
     assert max(off) < 0.1
-
-
-def test_another_camera_is_refused_from_its_windows_as_from_the_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    grey = frame_picture(layout_of([], ()), pixel_from_camera("0"))
-    result, whole = measured(grey, ALIKE, tmp_path, monkeypatch)
-    assert whole
-    assert not any(mark.status.is_observation for mark in result.marks)
 
 
 def test_a_lattice_is_told_from_a_frame() -> None:
