@@ -14,6 +14,7 @@ from measure.glimpse import Glimpse, glimpse
 from measure.matching import Match
 from measure.poses import up_from_camera
 from measure.refinement import Sighting, leans_on_frame, sight, strongest
+from measure.rendering import extent_px
 from measure.scan import LUMINANCE, Scan
 from measure.shapes import FiducialLayout, FrameCorner, Mark
 from measure.status import Status
@@ -34,6 +35,7 @@ _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
 _REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
 _CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
 _FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
+_SHOWS = 1 / 3  # of the others' contrast: ground that leaves less to a mark hides it
 _FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
 _LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
 _SAME_PX = 1.0
@@ -247,15 +249,35 @@ class _Sighter:
                 blur_px,
                 self.weights,
             )
-            self._take(index, sighting, seen if seen is not None and self._certain(seen) else None, reach_px)
+            certain = seen if seen is not None and self._certain(seen) else None
+            self._take(index, sighting, certain, self._unseen(index, sign, float(extremes[int(sign > 0)]), reach_px))
 
-    def _take(self, index: int, sighting: Sighting, seen: Glimpse | None, reach_px: float) -> None:
+    def _unseen(self, index: int, sign: int, extreme_dn: float, reach_px: float) -> str:
+        """Why a mark may not be seen: on ground as dark as anything in the scan no dark mark can show; on other ground
+        its texture hides it."""
+        least, greatest = extent_px(self.layout.marks[index].mark, self._start(index))
+        low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
+        ground = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
+        room_dn = max(sign * (extreme_dn - float(np.median(ground))), 0.0)
+        seen = [s.fit for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s is not None]
+        usual_dn = float(np.median([abs(fit.contrast_dn) for fit in seen if fit is not None]))
+        shade = "dark" if sign < 0 else "light"
+        if room_dn < _SHOWS * usual_dn:
+            return (
+                f"the ground at its place is so {shade} that the mark could change it by {room_dn:.0f} grey values "
+                f"only, the others by {usual_dn:.0f}"
+            )
+        return (
+            f"nothing within {reach_px:.0f} px of its place stands out of the texture like it: the ground there varies "
+            f"by {float(ground.std()):.0f} grey values, and a mark could change it by {min(room_dn, usual_dn):.0f}"
+        )
+
+    def _take(self, index: int, sighting: Sighting, seen: Glimpse | None, unseen: str) -> None:
         """Keep a clear fit where the glimpse is of the same; else the glimpse counts, or that there was none."""
         clear = self.clear(index)
         self.vouched[index] = seen is not None
         if seen is None and not clear:
-            reason = f"nothing within {reach_px:.0f} px of its place stands out of the texture like it"
-            self.sightings[index] = Sighting(sighting.predicted_px, True, None, reason)
+            self.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
         elif seen is not None:
             off = np.inf if sighting.fit is None else np.hypot(*(sighting.fit.center_px - seen.fit.center_px))
             if not clear or off > _SAME_PX:
