@@ -1,12 +1,14 @@
 """Fiducial marks of one scan: found by their constellation, named by the frame's pose, measured at full resolution."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from measure.candidates import Look, respond, respond_about
 from measure.centred_frame import centred_places_px, is_complete, is_worth_a_look, reach_mm
+from measure.chance import doubt
 from measure.constellation import Bounds, Placement, PlacementSearch, same_picture, signs_of
 from measure.edge_place import EdgePlace
 from measure.fiducial_options import FiducialOptions
@@ -61,7 +63,7 @@ def measure_fiducials(
         pose = decide_pose(scan, layout, posed, frame, options)
         if pose.name != frame.placement.pose:
             frame = measure_frame(scan, layout, posed[POSES.index(pose.name)], options)
-    return _measurement(scan, layout, frame, pose, _rivals(found, frame.placement))
+    return _measurement(scan, layout, frame, pose, _rivals(found, frame.placement), doubt(scan, layout, frame, options))
 
 
 def _in_the_middle(
@@ -220,16 +222,18 @@ def _nothing(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasuremen
 
 
 def _measurement(
-    scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, rivals: Sequence[str]
+    scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, rivals: Sequence[str], chance: str
 ) -> FrameMeasurement:
+    """rivals, chance: why the frame may lie elsewhere, sentences; if it may be chance none of its marks is certain."""
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
-    problems = [f"{sentence}." for sentence in rivals]
-    if rivals:
-        pose = (
-            Pose(pose.name, False, (*pose.evidence, *(f"{sentence}." for sentence in rivals)))
-            if pose.evidence != _SET
-            else pose
+    if chance:
+        marks = tuple(
+            replace(mark, status=Status.WEAK, reason=chance) if mark.status is Status.MEASURED else mark
+            for mark in marks
         )
+    problems = [f"{sentence}." for sentence in (*rivals, *([chance] if chance else []))]
+    if problems and pose.evidence != _SET:
+        pose = Pose(pose.name, False, (*pose.evidence, *problems))
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     if abs(per_mm[0] / per_mm[1] - 1) > 2 * AFFINITY_SIGMA:
         problems.append(

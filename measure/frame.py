@@ -25,14 +25,14 @@ Mask = NDArray[np.bool_]
 _LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well
 _LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
 _MANY = 6  # marks that agree and tell where a faint one must be
-_CLEAR_LIKENESS = 0.5
+CLEAR_LIKENESS = 0.5
 _CLEAR_RESPONSE = 0.25  # correlation of the same marks before they are fitted
 _CLEAR_SNR = 3.0
 _CLEAR_DAMAGE = 0.25
 _CLEAR_SIGMA_PX = 0.3
 _GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
 _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
-_REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
+REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
 _CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
 _FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
 _SHOWS = 1 / 3  # of the others' contrast: ground that leaves less to a mark hides it
@@ -69,7 +69,7 @@ class Frame:
     @property
     def all_clear(self) -> bool:
         """Whether every mark that belongs is plainly there."""
-        return all(fit is None or fit.likeness >= _CLEAR_LIKENESS for fit in self.fits)
+        return all(fit is None or fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
 
     @property
     def missed_px(self) -> list[Array]:
@@ -84,7 +84,7 @@ class Frame:
         three of them clear ones."""
         inside = sum(sighting.inside for sighting in self.sightings)
         least = max(min(3, len(self.sightings)), 2)
-        clear = sum(fit is not None and fit.likeness >= _CLEAR_LIKENESS for fit in self.fits)
+        clear = sum(fit is not None and fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
         return int(self.belongs.sum()) >= max(least, int(np.ceil(0.3 * inside))) and clear >= least
 
     def misfit(self) -> str:
@@ -101,7 +101,7 @@ class Frame:
             off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.belongs.sum())} marks put it"
             return Status.REJECTED, f"what was measured lies {off}"
         reasons = [self.sightings[index].reason] if self.sightings[index].reason else []
-        if fit.likeness < _CLEAR_LIKENESS:
+        if fit.likeness < CLEAR_LIKENESS:
             reasons.append(f"it correlates with its drawing by only {fit.likeness:.2f}")
         if fit.snr < _CLEAR_SNR:
             reasons.append(f"its contrast is only {fit.snr:.1f} times the noise")
@@ -157,7 +157,7 @@ class _Sighter:
         self.vouched: Mask = np.zeros(len(layout.marks), dtype=bool)
         self.weights: tuple[float, ...] | None = None
         gate_px = options.gate_mm / float(self.pitch.mean())
-        self.first_search_px = _REDUCED_PX * placement.reduction + options.search_mm(layout) / float(self.pitch.mean())
+        self.first_search_px = REDUCED_PX * placement.reduction + options.search_mm(layout) / float(self.pitch.mean())
         self.gate_px = gate_px
 
     def choose_channels(self) -> None:
@@ -298,7 +298,7 @@ class _Sighter:
     def clear(self, index: int) -> bool:
         """Whether a mark needs no second look: it is plainly there, be it where the others put it or not."""
         sighting = self.sightings[index]
-        return sighting is not None and sighting.fit is not None and sighting.fit.likeness >= _CLEAR_LIKENESS
+        return sighting is not None and sighting.fit is not None and sighting.fit.likeness >= CLEAR_LIKENESS
 
     def reach_px(self) -> float:
         """How far a faint mark can be from where many others put it."""
