@@ -19,7 +19,9 @@ from adjust.triangle import Triangle
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-STEADY = 1e3  # norm of the inverse of triangles up to which squares will do: variances are then right to some 1e-10
+# Norm of the inverse of triangles up to which squares will do: variances are then right to some 1e-10. No singular
+# value of the rows can then be below 1e-6 over the norm of a border, which is about 1.
+STEADY = 1e3
 TALL = 3  # rows over columns of a block from which on its square is quicker than its reflections
 
 
@@ -68,7 +70,7 @@ def by_squares(normals: Sequence[Normal], scale: Array, priors: tuple[Array, Arr
     if _norm_of_inverse(root[None]) > STEADY:
         return None
     triangle = Triangle(fronts, (root.T,), (np.zeros((count, 0)),))
-    return Factor(tuple(factors), triangle, solve_triangular(root, right, lower=True), scale)
+    return Factor(tuple(factors), triangle, solve_triangular(root, right, lower=True), scale, steady=True)
 
 
 def _own_factors(normal: Normal, scale: Array, priors: tuple[Array, Array]) -> BlockFactors:

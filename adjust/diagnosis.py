@@ -31,6 +31,8 @@ UNDETERMINED = 0.99  # posterior over prior standard deviation above which the o
 
 def singular_directions(problem: Problem, state: State, free: Indices, factor: Factor) -> tuple[NullDirection, ...]:
     """The null directions of the factor of a state, at its computed observations; none where it is regular."""
+    if factor.steady:
+        return ()
     blind = blind_blocks(factor)
     null, _ = null_space(factor, blind, SINGULAR)
     found = _named(problem, state, free, factor, blind, null, PURE)

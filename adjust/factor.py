@@ -57,13 +57,15 @@ class Factor:
     """The square root of the normal equations: the blocks' triangles, and that of the s shared unknowns.
 
     All columns are scaled: the unknowns are those of the rows times `scale` (n,), which makes every column's norm 1.
-    The shared unknowns are the first s.
+    The shared unknowns are the first s. steady: the inverses of its triangles are known to be so small that no singular
+    value of the rows is near 0.
     """
 
     blocks: tuple[BlockFactors, ...]
     triangle: Triangle
     right: Array
     scale: Array
+    steady: bool = False
 
     @property
     def shared_count(self) -> int:

@@ -155,7 +155,10 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
             by_attitude = product(by_attitude, of_each(problem.attitude_by_unknowns(state), images))
         by_station = -by_vector if straight else product(by_vector, seen.sight.by_station)
         by_point = by_vector if straight else product(by_vector, seen.sight.by_point)
-        by_camera_xy[rows] = at.by_xy
+        if len(at.value) == len(xy_mm):
+            by_camera_xy = at.by_xy
+        else:
+            by_camera_xy[rows] = at.by_xy
         by_exterior = by_station, by_attitude
         _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
         _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])

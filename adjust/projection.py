@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.correction import Imaged
+from adjust.correction import Imaged, no_correction
 from adjust.distortion import image_equations
 from adjust.families import family, parameter_names
 from adjust.line_of_sight import sight_vectors
@@ -142,6 +142,8 @@ def camera_from_image(distortion: Distortion, interior: Array, parameters: Array
     with np.errstate(over="ignore", invalid="ignore"):
         xy_mm = ideal_mm = principal_point + c * imaged.value
         unfolded = _unfolded(determinant(imaged.by_ray))
+        if correct is no_correction:
+            return ideal_mm, unfolded & np.isfinite(ideal_mm).all(axis=1)
         tolerance_mm = 4 * NEWTON_TOLERANCE * (abs(c) + np.abs(ideal_mm).max(axis=1))
         for _ in range(NEWTON_STEPS):
             correction = correct(distortion, xy_mm, principal_point, parameters)
