@@ -13,7 +13,7 @@ from adjust.triangle import Triangle
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-SINGULAR = 1e-10  # singular values of the scaled rows, over the largest, below which there is no solution
+SINGULAR = 1e-8  # singular values of the scaled rows, over the largest, below which there is no solution
 DENSE = 100  # shared unknowns up to which all singular values are computed
 FIRST_COUNT = 24  # vectors that are iterated at a time where there are more
 ITERATIONS = 50
