@@ -12,7 +12,19 @@ from numpy.typing import NDArray
 from measure.picture_scan import WholePicture
 from measure.resolution import NO_TAGS
 from measure.scan import Scan
-from measure.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, Part, cross, dot, polygon, ring_cross, turned
+from measure.shapes import (
+    Disk,
+    FiducialLayout,
+    LayoutMark,
+    MarkShape,
+    Part,
+    cross,
+    dot,
+    polygon,
+    ring_cross,
+    turned,
+    turned_part,
+)
 from pipeline.scene_file import scene_mark
 from synthetic_images.background import scene_background
 from synthetic_images.film import FrameGeometry
@@ -23,6 +35,7 @@ from synthetic_images.scene import (
     POSES,
     Background,
     DiskField,
+    DrawnMark,
     Film,
     FilmTransformation,
     Scanner,
@@ -109,7 +122,7 @@ def _layout(rng: Generator, kind: str, symmetry: str) -> FiducialLayout:
     for number, ((x, y), (dx, dy), parts) in enumerate(zip(places, offsets.tolist(), drawings, strict=True)):
         shape = MarkShape(parts)
         if kind == "wing":
-            shape = MarkShape(tuple(turned(shape, float(np.degrees(np.arctan2(y, x)))).parts))  # type: ignore[union-attr]
+            shape = MarkShape(tuple(turned_part(part, float(np.degrees(np.arctan2(y, x)))) for part in parts))
         marks.append(LayoutMark(str(number + 1), (x + dx, y + dy), (GIVEN_SIGMA_MM, GIVEN_SIGMA_MM), shape))
     return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
 
@@ -211,7 +224,8 @@ def _figure(rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, ton
     shown = turned(drawn, float(rng.uniform(0.0, 360.0)) if rng.random() < 0.3 else 0.0)
     place, size = _free_place(rng, layout), 1.0 if rng.random() < 0.5 else float(rng.uniform(0.5, 2.0))
     mark = scene_mark(shown)
-    areas = tuple(tuple(size * outline + place for outline in area) for area in mark.areas)  # type: ignore[union-attr]
+    assert isinstance(mark, DrawnMark)
+    areas = tuple(tuple(size * outline + place for outline in area) for area in mark.areas)
     tone = tones.mark if rng.random() < 0.7 else tones.dark_mark
     return AreaPaint(tuple(geometry.pixel_area(area) for area in areas), tone)
 

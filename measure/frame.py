@@ -232,35 +232,37 @@ class _Sighter:
             if sighting is not None and sighting.inside and not (self.clear(index) and self.belongs[index])
             if not isinstance(self.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
         ]
-        if not faint:
+        agreeing = [s.fit for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s is not None and s.fit]
+        if not faint or not agreeing:
             return
+        # The marks that agree tell both better than a faint mark does itself.
+        blur_px = float(np.median([fit.blur_px for fit in agreeing]))
+        usual_dn = float(np.median([abs(fit.contrast_dn) for fit in agreeing]))
         extremes = np.percentile(self.scan.reduced(self.placement.reduction, self.weights), _EXTREMES)
-        blur_px = self._blur_px()
         for index, sighting in faint:
             mark = self.layout.marks[index].mark
             sign = self._sign(mark)
+            extreme_dn = float(extremes[int(sign > 0)])
             seen = glimpse(
                 self.scan,
                 mark,
                 self._start(index),
                 reach_px,
                 sign,
-                float(extremes[int(sign > 0)]),
+                extreme_dn,
                 blur_px,
                 self.weights,
             )
             certain = seen if seen is not None and self._certain(seen) else None
-            self._take(index, sighting, certain, self._unseen(index, sign, float(extremes[int(sign > 0)]), reach_px))
+            self._take(index, sighting, certain, self._unseen(index, sign, extreme_dn, usual_dn, reach_px))
 
-    def _unseen(self, index: int, sign: int, extreme_dn: float, reach_px: float) -> str:
+    def _unseen(self, index: int, sign: int, extreme_dn: float, usual_dn: float, reach_px: float) -> str:
         """Why a mark may not be seen: on ground as dark as anything in the scan no dark mark can show; on other ground
         its texture hides it."""
         least, greatest = extent_px(self.layout.marks[index].mark, self._start(index))
         low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
         ground = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
         room_dn = max(sign * (extreme_dn - float(np.median(ground))), 0.0)
-        seen = [s.fit for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s is not None]
-        usual_dn = float(np.median([abs(fit.contrast_dn) for fit in seen if fit is not None]))
         shade = "dark" if sign < 0 else "light"
         if room_dn < _SHOWS * usual_dn:
             return (
@@ -285,10 +287,6 @@ class _Sighter:
                     f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
                 )
                 self.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
-
-    def _blur_px(self) -> float:
-        """The marks that agree tell it better than a faint mark does itself."""
-        return float(np.median([s.fit.blur_px for s in np.array(self.sightings)[self.belongs] if s.fit is not None]))
 
     def _certain(self, seen: Glimpse) -> bool:
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(seen.fit.covariance_px2)[-1]))

@@ -36,7 +36,7 @@ def _parse(path: Path) -> dict[str, Any]:
 class Table:
     """One table of a TOML file, with its file and its place in it ("" the root, "distortion.sigma", "fiducial[2]").
 
-    Every key that is read is remembered; `done` refuses the others.
+    Every key that is read or asked after is remembered; `done` refuses the others.
     """
 
     def __init__(self, values: Mapping[str, Any], file: Path, place: str) -> None:
@@ -46,6 +46,7 @@ class Table:
         self._known: list[str] = []
 
     def __contains__(self, key: str) -> bool:
+        self._known.append(key)
         return key in self.values
 
     def error(self, key: str, message: str) -> InputError:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from synthetic_images.film import FrameGeometry
 from synthetic_images.scene import Scene
@@ -14,8 +15,10 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 TEXEL_PX = 3.0  # scan pixels that one pixel of the texture covers
-LEAST_TEXTURE_PX, MOST_TEXTURE_PX = 1024, 4096  # it repeats itself: in sight only where frames are too large for it
+LEAST_TEXTURE_PX = 1024
+MOST_TEXTURE_PX = 3072  # its making takes 0.3 GB; a frame of more than some 9000 pixels sees it repeat itself
 PARCEL_PX = 90  # about the width of a parcel
+MARGIN_PX = 256  # beyond which hardly any pixel has the parcel nearest to it
 NODE_PX = 8  # between pixels whose rays are followed to the terrain; those between are interpolated
 
 
@@ -93,47 +96,72 @@ def _block_width(scene: Scene) -> float:
 
 
 def _texture_size(width_px: float) -> int:
-    """A power of two in which so much has room."""
+    """A power of two in which so much has room, within limits."""
     return int(np.clip(2 ** np.ceil(np.log2(width_px)), LEAST_TEXTURE_PX, MOST_TEXTURE_PX))
 
 
-def _landscape(generator: np.random.Generator, size: int) -> Array:
-    """Parcels with their own tones, woods, roads along some of their sides."""
+def _landscape(generator: np.random.Generator, size: int) -> Picture:
+    """Parcels with their own tones, woods, roads along some of their sides.
+
+    In single precision and one sheet at a time: making it is to take no more memory than a large frame does.
+    """
     parcels, road, count = _parcels(generator, size)
-    tone, wooded = generator.normal(0.0, 0.7, count)[parcels], (generator.random(count) < 0.3)[parcels]
-    soil = tone + 0.45 * _rough(generator, size, 1.3) + 0.2 * _rough(generator, size, 0.0)
-    wood = -0.9 + 0.9 * _rough(generator, size, 0.7)
-    pattern = np.where(wooded, wood, soil) + 1.4 * cv2.GaussianBlur(road.astype(np.float64), (0, 0), 0.7)
-    return np.asarray(pattern - pattern.mean())
+    tones, are_woods = generator.normal(0.0, 0.7, count).astype(np.float32), generator.random(count) < 0.3
+    pattern = tones[parcels]
+    pattern += np.float32(0.45) * _rough(generator, size, 1.3)
+    pattern += np.float32(0.2) * _rough(generator, size, 0.0)
+    wood = np.float32(0.9) * _rough(generator, size, 0.7) - np.float32(0.9)
+    np.copyto(pattern, wood, where=are_woods[parcels])
+    pattern += np.float32(1.4) * cv2.GaussianBlur(road.astype(np.float32), (0, 0), 0.7)
+    pattern -= pattern.mean(dtype=np.float64)
+    return pattern
 
 
-def _parcels(generator: np.random.Generator, size: int) -> tuple[NDArray[np.intp], NDArray[np.bool_], int]:
+def _parcels(generator: np.random.Generator, size: int) -> tuple[NDArray[np.int16], NDArray[np.bool_], int]:
     """Which parcel every pixel belongs to (that of the nearest of some random places), where roads run, and how many
     parcels there are."""
     count = round((size / PARCEL_PX) ** 2)
     places = generator.choice(size**2, count, replace=False)
-    owner = np.full(size**2, -1)
+    owner = np.full(size**2, -1, np.int16)
     owner[places] = np.arange(count)
-    around = np.pad(owner.reshape(size, size), size // 4, mode="wrap")
-    free = (around < 0).astype(np.uint8)
-    distance, labels = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    owner_of_label = np.zeros(int(labels.max()) + 1, np.float32)
-    owner_of_label[labels[around >= 0]] = around[around >= 0]
-    straight = owner_of_label[labels]
+    straight, distance = _nearest(np.pad(owner.reshape(size, size), MARGIN_PX, mode="wrap"))
     # Sides that wind a little, as they do on the ground.
-    y, x = np.indices((size, size), np.float32) + np.float32(size // 4)
-    x += (5 * _rough(generator, size, 1.4)).astype(np.float32)
-    y += (5 * _rough(generator, size, 1.4)).astype(np.float32)
+    along = np.arange(MARGIN_PX, MARGIN_PX + size, dtype=np.float32)
+    x, y = _rough(generator, size, 1.4), _rough(generator, size, 1.4)
+    x *= 5
+    x += along[None, :]
+    y *= 5
+    y += along[:, None]
     parcels = cv2.remap(straight, x, y, cv2.INTER_NEAREST)
     near = cv2.remap(distance, x, y, cv2.INTER_LINEAR) < PARCEL_PX
     road = (cv2.morphologyEx(parcels, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0) & near
-    return np.asarray(parcels, np.intp), np.asarray(road, np.bool_), count
+    return np.asarray(parcels, np.int16), np.asarray(road, np.bool_), count
 
 
-def _rough(generator: np.random.Generator, size: int, exponent: float) -> Array:
+def _nearest(owner: NDArray[np.int16]) -> tuple[NDArray[np.int16], Picture]:
+    """The owner of the nearest pixel that has one (0 and up), and how far that is, at every pixel."""
+    distance, labels = cv2.distanceTransformWithLabels(
+        (owner < 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    owner_of_label = np.zeros(int(labels.max()) + 1, np.int16)
+    owned = owner >= 0
+    owner_of_label[labels[owned]] = owner[owned]
+    return owner_of_label[labels], np.asarray(distance, np.float32)
+
+
+def _rough(generator: np.random.Generator, size: int, exponent: float) -> Picture:
     """Noise of unit rms whose amplitude falls with frequency to the power `exponent`; it joins itself at the sides."""
-    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
-    frequency[0, 0] = np.inf if exponent else 1.0
-    spectrum = np.fft.rfft2(generator.standard_normal((size, size))) * frequency**-exponent
-    noise = np.fft.irfft2(spectrum, (size, size))
-    return np.asarray((noise - noise.mean()) / noise.std())
+    white = np.empty((size, size), np.float32)
+    for row in white:
+        row[:] = generator.standard_normal(size)
+    spectrum = fft.rfft2(white, overwrite_x=True)
+    columns = np.fft.rfftfreq(size)
+    for along, frequency in zip(spectrum, np.fft.fftfreq(size), strict=True):
+        away = np.hypot(frequency, columns)
+        away[away == 0.0] = np.inf if exponent else 1.0
+        along *= (away**-exponent).astype(np.float32)
+    noise = np.asarray(fft.irfft2(spectrum, (size, size), overwrite_x=True), np.float32)
+    mean, deviation = cv2.meanStdDev(noise)
+    noise -= np.float32(mean.item())
+    noise /= np.float32(deviation.item())
+    return noise
