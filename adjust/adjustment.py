@@ -12,6 +12,7 @@ from adjust.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.datum_choice import chosen_coordinates, chosen_points, with_held
 from adjust.errors import AdjustmentError
+from adjust.kept_memory import keep_freed_memory
 from adjust.network import STRAIGHT, Approximations, Network
 from adjust.options import Datum, Method, Options
 from adjust.problem import Problem, number
@@ -36,6 +37,7 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
     has no image, or where the chosen datum does not hold the object space.
     """
+    keep_freed_memory()
     validate(network)
     options = options or Options()
     result = adjust_problem(number(network, approximations, options.method == "elements"), options)
