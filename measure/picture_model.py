@@ -128,10 +128,10 @@ class PictureModel:
         row, col = np.mgrid[:height, :width].astype(float)
         return np.stack([np.ones_like(col), (col - (width - 1) / 2) / scale, (row - (height - 1) / 2) / scale])
 
-    def _detail(self, image: Array) -> Array:
+    def _detail(self, image: NDArray[np.floating]) -> Array:
         """Grey values, or their model, without what is coarser than the mark's lines."""
         if self.background_px is None:
-            return image
+            return np.asarray(image, float)
         return np.asarray(image - cv2.GaussianBlur(image, (0, 0), self.background_px))
 
     def _variance_range(self) -> tuple[float, float]:

@@ -1,29 +1,41 @@
 """The picture of a mark as film and scanner show it: its coverage, or a chip cut from a scan, under a Gaussian blur,
 with the derivatives that least-squares matching needs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from measure.coverage import CELLS, cell_coverage, outline_mm
-from measure.shapes import Mark, MarkTemplate
+from measure.shapes import Mark, MarkShape, MarkTemplate
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
+Integers = NDArray[np.int_]
+
+_DRAWINGS = 16  # kept: more than a camera has kinds of marks
+_BLOCK = 8  # pixels that are averaged at once
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """A mark's picture and its derivatives, each (height, width): by column and row in px, and the second derivative
-    by place, which is twice that by the blur's variance."""
+    """A mark's picture and its first and second derivatives by column and row in px, each (height, width)."""
 
-    value: Array
-    by_col: Array
-    by_row: Array
-    laplacian: Array
+    value: Single
+    by_col: Single
+    by_row: Single
+    by_col_col: Single
+    by_col_row: Single
+    by_row_row: Single
+
+    @property
+    def laplacian(self) -> Single:
+        """Twice the derivative by the blur's variance."""
+        return np.asarray(self.by_col_col + self.by_row_row)
 
 
 def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Rendering:
@@ -32,39 +44,15 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
     A drawn mark is 1 inside and 0 outside; a chip, to whose blur this one is added, spans 0 to 1.
     pixel_from_mark: (2, 3), from (x_mm, y_mm, 1) to (col, row) of the window.
     """
-    sharp, cells = _sharp(mark, pixel_from_mark, width, height, blur_px)
-    over, across, twice_across = _averages(blur_px, cells, width, sharp.shape[1])
-    along, down, twice_down = _averages(blur_px, cells, height, sharp.shape[0])
-    smooth_rows = along @ sharp
-    return Rendering(
-        value=np.asarray(smooth_rows @ over.T, float),
-        by_col=np.asarray(smooth_rows @ across.T, float),
-        by_row=np.asarray(down @ sharp @ over.T, float),
-        laplacian=np.asarray(smooth_rows @ twice_across.T + twice_down @ sharp @ over.T, float),
+    value, by_col, by_row, by_col_col, by_col_row, by_row_row = _seen(
+        mark, pixel_from_mark, (width, height), blur_px, ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     )
+    return Rendering(value, by_col, by_row, by_col_col, by_col_row, by_row_row)
 
 
 def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
     """(height, width): the mark as `render` makes it, without derivatives."""
-    sharp, cells = _sharp(mark, pixel_from_mark, width, height, blur_px)
-    over, _, _ = _averages(blur_px, cells, width, sharp.shape[1])
-    along, _, _ = _averages(blur_px, cells, height, sharp.shape[0])
-    return np.asarray(along @ sharp @ over.T, float)
-
-
-def _sharp(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> tuple[Single, int]:
-    """The mark without blur in a window as much larger as the blur reaches, in cells, so many along a pixel's side."""
-    pad = int(np.ceil(4 * blur_px)) + 2
-    shifted = np.array(pixel_from_mark, dtype=float)
-    shifted[:, 2] += pad
-    size = width + 2 * pad, height + 2 * pad
-    if isinstance(mark, MarkTemplate):
-        cells = max(1, round(_pixels_per_sample(mark, pixel_from_mark) ** -1))
-        sharp = _sampled(mark, shifted, *size, cells)
-    else:
-        cells = CELLS if blur_px < 1.5 else CELLS - 1  # blur hides what coarser cells get wrong
-        sharp = cell_coverage(mark, shifted, *size, cells)
-    return sharp.astype(np.float32), cells
+    return _seen(mark, pixel_from_mark, (width, height), blur_px, ((0, 0),))[0].astype(float)
 
 
 def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
@@ -91,25 +79,116 @@ def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: in
     return np.asarray(inside)
 
 
-def _averages(blur_px: float, cells: int, pixels: int, padded: int) -> tuple[Single, Single, Single]:
-    """Three matrices (pixels, padded cells): the mean over every pixel of the blurred cells, and of their first and
-    second derivative in px. Blur and mean in one product cost a fraction of a filter over the cells."""
-    first = (padded - pixels * cells) // 2 + cells * np.arange(pixels)
-    matrices = []
-    for kernel, per_px in zip(_kernels(blur_px * cells), (1, cells, cells**2), strict=True):
-        mean = np.convolve(kernel, np.full(cells, per_px / cells))
-        reach = len(kernel) // 2
-        matrix = np.zeros((pixels, padded), np.float32)
-        matrix[np.arange(pixels)[:, None], first[:, None] - reach + np.arange(len(mean))] = mean
-        matrices.append(matrix)
-    return matrices[0], matrices[1], matrices[2]
+@dataclass(frozen=True, eq=False)
+class _Drawing:
+    """A mark without blur: sharp (rows, columns) in cells, so many along a pixel's side. first: pixel (col, row) of the
+    window that the first cells belong to, and shift_px (2,), how far right and down of it they still have to move."""
+
+    sharp: Single
+    cells: int
+    first: Integers
+    shift_px: Array
 
 
-@lru_cache(maxsize=256)
-def _kernels(sigma: float) -> tuple[Array, Array, Array]:
-    """A sampled Gaussian and its first and second derivative, normalised so that polynomials come out right."""
+def _seen(
+    mark: Mark, pixel_from_mark: Array, size: tuple[int, int], blur_px: float, orders: Sequence[tuple[int, int]]
+) -> list[Single]:
+    """The derivatives of the picture, each of an order by column and by row, in a window of a size (width, height)."""
+    place = np.asarray(pixel_from_mark, dtype=float)
+    if isinstance(mark, MarkTemplate):
+        drawing = _chip_drawing(mark, place, size, blur_px)
+    else:
+        drawing = _drawing(mark, place, blur_px)
+    cells, most = drawing.cells, np.max(orders, axis=0)
+    along = [_Average(blur_px, cells, shift, int(order)) for shift, order in zip(drawing.shift_px, most, strict=True)]
+    # Of the window only what the blurred mark reaches is computed: all else is empty.
+    spare = int(np.ceil(along[0].reach / cells)) + 1
+    low = np.maximum(drawing.first - spare, 0)
+    high = np.minimum(drawing.first + np.array(drawing.sharp.shape[::-1]) // cells + spare, size)
+    images = [np.zeros(size[::-1], np.float32) for _ in orders]
+    if np.any(high <= low):
+        return images
+    (col0, row0), (cols, rows) = low - drawing.first, high - low
+    by_row = along[1].of(drawing.sharp, int(row0), int(rows))
+    by_both = along[0].of(
+        np.ascontiguousarray(by_row.transpose(2, 0, 1)).reshape(len(by_row[0, 0]), -1), int(col0), int(cols)
+    )
+    by_both = by_both.reshape(len(by_both), int(cols), len(by_row), int(rows))
+    for image, (order_col, order_row) in zip(images, orders, strict=True):
+        image[low[1] : high[1], low[0] : high[0]] = by_both[order_col, :, order_row].T
+    return images
+
+
+def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float) -> _Drawing:
+    cells = CELLS if blur_px < 1.5 else CELLS - 1  # blur hides what coarser cells get wrong
+    whole = np.floor(pixel_from_mark[:, 2])
+    rest = pixel_from_mark[:, 2] - whole
+    # Sharp cells cannot be moved by a part of their own size.
+    drawn_at = np.zeros(2) if blur_px * cells >= 1.0 else rest
+    sharp, origin = _drawn(mark, pixel_from_mark[:, :2].tobytes(), tuple(drawn_at.tolist()), cells)
+    return _Drawing(sharp, cells, whole.astype(int) - origin, rest - drawn_at)
+
+
+@lru_cache(maxsize=_DRAWINGS)
+def _drawn(mark: MarkShape, linear: bytes, origin_px: tuple[float, float], cells: int) -> tuple[Single, Integers]:
+    """The mark's cells, its origin so far right and down of a pixel's centre; and which pixel (col, row) that is. Marks
+    of a camera that are drawn alike share them."""
+    place = np.column_stack([np.frombuffer(linear).reshape(2, 2), origin_px])
+    least, greatest = extent_px(mark, place)
+    low, high = np.floor(least + 0.5).astype(int), np.ceil(greatest + 0.5).astype(int)
+    place[:, 2] -= low
+    width, height = np.maximum(high - low, 1).tolist()
+    return cell_coverage(mark, place, width, height, cells), -low
+
+
+def _chip_drawing(mark: MarkTemplate, pixel_from_mark: Array, size: tuple[int, int], blur_px: float) -> _Drawing:
+    pad = int(np.ceil(4 * blur_px)) + 2
+    shifted = pixel_from_mark.copy()
+    shifted[:, 2] += pad
+    cells = max(1, round(_pixels_per_sample(mark, pixel_from_mark) ** -1))
+    sharp = _sampled(mark, shifted, size[0] + 2 * pad, size[1] + 2 * pad, cells).astype(np.float32)
+    return _Drawing(sharp, cells, np.array([-pad, -pad]), np.zeros(2))
+
+
+class _Average:
+    """The mean over every pixel of blurred cells, and its derivatives in px up to an order, along one axis."""
+
+    def __init__(self, blur_px: float, cells: int, shift_px: float, order: int) -> None:
+        whole = round(shift_px * cells)
+        kernels = _kernels(blur_px * cells, shift_px * cells - whole)[: order + 1]
+        self.cells = cells
+        self.taps = np.stack(
+            [np.convolve(kernel, np.full(cells, cells**power / cells)) for power, kernel in enumerate(kernels)]
+        ).astype(np.float32)
+        self.reach = len(kernels[0]) // 2 + abs(whole)
+        self.first = -(len(kernels[0]) // 2) - whole
+
+    def of(self, sharp: Single, first: int, count: int) -> Single:
+        """(orders, count, columns) of the pixels from the first one on, of cells (rows, columns).
+
+        Pixels are taken in blocks: a matrix for all of one is a small part of that for all pixels, which would be
+        nearly empty.
+        """
+        orders, taps = self.taps.shape
+        blocks = -(-count // _BLOCK)
+        span = (_BLOCK - 1) * self.cells + taps
+        band = np.zeros((orders, _BLOCK, span), np.float32)
+        for pixel in range(_BLOCK):
+            band[:, pixel, pixel * self.cells : pixel * self.cells + taps] = self.taps
+        begin, length = first * self.cells + self.first, (blocks - 1) * _BLOCK * self.cells + span
+        rows = np.zeros((length, sharp.shape[1]), np.float32)
+        inside = slice(max(begin, 0), max(min(begin + length, len(sharp)), 0))
+        rows[inside.start - begin : inside.stop - begin] = sharp[inside]
+        parts = sliding_window_view(rows, span, axis=0)[:: _BLOCK * self.cells].swapaxes(1, 2)
+        means = (band.reshape(-1, span) @ parts).reshape(blocks, orders, _BLOCK, -1)
+        return np.asarray(means.swapaxes(0, 1).reshape(orders, blocks * _BLOCK, -1)[:, :count])
+
+
+def _kernels(sigma: float, shift: float) -> tuple[Array, Array, Array]:
+    """A Gaussian sampled at whole numbers and so far off, and its first and second derivative, normalised so that
+    polynomials come out right."""
     reach = int(np.ceil(4 * sigma)) + 2
-    place = np.arange(-reach, reach + 1, dtype=float)
+    place = np.arange(-reach, reach + 1) + shift
     smooth = np.exp(-0.5 * (place / max(sigma, 1e-3)) ** 2)
     smooth /= smooth.sum()
     if sigma < 0.5:
