@@ -107,8 +107,8 @@ def fit_disk(
         return judged(disk, fit.neighbour_correlation)
 
     disk = fitted(wide)
-    # A narrow pad or a ring about the disk is no damage of the disk.
-    return fitted(sure) if sure < wide and (disk.reason or disk.damaged_fraction > WEAK_DAMAGE) else disk
+    # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better.
+    return fitted(sure) if sure < wide and disk.reason else disk
 
 
 def inside(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:

@@ -36,9 +36,10 @@ class Match:
 
     center_px (2,), covariance_px2 (2, 2), pixel_from_mark (2, 3): of the scan, not of the window.
     contrast_dn: the mark's grey value less the background's, negative for a dark mark. noise_dn: standard deviation of
-    one pixel. damaged_fraction: share of the pixels about the mark that were cut out. redundancy: pixels used less
-    unknowns. neighbour_correlation: of the residuals; they were taken as white where covariance_is_white. likeness:
-    correlation of the fitted picture with the window, less its plane background: 1 for a perfect mark, 0 for none.
+    one pixel. damaged_fraction: share of the pixels about the mark, within plain_px of it, that were cut out.
+    redundancy: pixels used less unknowns. neighbour_correlation: of the residuals; they were taken as white where
+    covariance_is_white. likeness: correlation of the fitted picture with the window, less its plane background: 1 for a
+    perfect mark, 0 for none.
     significance: the contrast over its own standard deviation. edges: the mark's place by another method, to compare.
     """
 
@@ -164,7 +165,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         contrast_dn=float(state.greys[0]),
         noise_dn=float(np.sqrt(noise.variance_dn2)),
         blur_px=float(np.sqrt(state.variance_px2)),
-        damaged_fraction=1.0 - float(used.sum() / max(fit.area.sum(), 1)),
+        damaged_fraction=fit.damaged_fraction,
         redundancy=int(used.sum()) - len(model.design),
         neighbour_correlation=noise.neighbour_correlation,
         covariance_is_white=noise.is_white,

@@ -21,6 +21,7 @@ _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and
 _LEAST_VARIANCE_DN2 = 1e-12
 _WEIGHTED_STEPS, _CLOSE_PX, _SETTLED_PX = 4, 0.002, 0.02
 _ODDS = 13.8  # chi-square of two coordinates: one in a thousand
+_UNSETTLED = "the adjustment did not converge"
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
 
 
@@ -43,6 +44,8 @@ class PictureFit:
             self.reason = "the picture is even there: nothing stands out"
         if not self.reason:
             self._adjust(robust=False, tolerance_px=0.05)
+        if self.reason == _UNSETTLED:  # dust may keep squares from settling, and not what holds against it
+            self.reason = ""
         if not self.reason:
             self._choose_area()
         if not self.reason:
@@ -122,6 +125,12 @@ class PictureFit:
     def contrast_dn(self) -> float:
         return abs(float(self.model.state.greys[0]))
 
+    @property
+    def damaged_fraction(self) -> float:
+        """Of the pixels about the mark, as far as the ground has to be plain there."""
+        near = self.area & ~self.far
+        return 1.0 - float((near & self.used).sum() / max(near.sum(), 1))
+
     def _choose_area(self) -> None:
         """The pixels within margin_px of the mark: beyond it the background only disturbs."""
         height, width = self.model.grey.shape
@@ -165,7 +174,7 @@ class PictureFit:
             self.reason = model.ran_away()
             if self.reason or moved < tolerance_px:
                 return
-        self.reason = "the adjustment did not converge"
+        self.reason = _UNSETTLED
 
     def _cost(self, scale_dn: float) -> float:
         """What the adjustment makes small: Tukey's loss, squares where the scale is infinite, and the priors'."""
