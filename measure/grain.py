@@ -6,10 +6,13 @@ too small. So what a model of noise would leave after the very same fit is compa
 the mark's own window, and in patches of blank film beside it, where there are any.
 """
 
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.optimize import nnls
 
 from measure.blank_film import PATCH_PX, PLANE
@@ -17,6 +20,7 @@ from measure.noise import NoiseModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Images = NDArray[np.float64] | NDArray[np.float32]
 
 # Standard deviations of the Gaussian that smears white noise into grain, and the coarsest that is still film's.
 GRAIN_PX = (0.4, 0.5, 0.6, 0.7, 0.8, 0.95, 1.1, 1.3, 1.5, 1.8, 2.2)
@@ -35,21 +39,19 @@ def grain_model(
     blank (n, PATCH_PX, PATCH_PX): patches of blank film less a plane.
     """
     window = _Window(used, design, _FARTHEST_PX)
-    left = window.by_distance(window.products(np.where(used, residuals, 0.0)[None])) * window.weights
-    expected = np.stack([window.expected(grain_px) * window.weights for grain_px in (None, *GRAIN_PX)])
-    beside_it = blank is not None and len(blank) > 0
-    if blank is not None and beside_it:
+    left = window.products(np.where(used, residuals, 0.0)[None]) * window.weights
+    expected = window.expected * window.weights
+    if blank is not None and len(blank) > 0:
         patch, count = _patch(), len(blank)
         weights = patch.weights / np.sqrt(count)
-        left = np.concatenate([left, patch.by_distance(patch.products(blank)) * weights])
-        beside = np.stack([_expected_blank(grain_px) * weights * count for grain_px in (None, *GRAIN_PX)])
-        expected = np.concatenate([expected, beside], axis=1)
+        left = np.concatenate([left, patch.products(blank) * weights])
+        expected = np.concatenate([expected, patch.expected * weights * count], axis=1)
     fits = [nnls(np.stack([expected[0], each], axis=1), left) for each in expected[1:]]
     best = min(range(len(fits)), key=lambda index: float(fits[index][1]))
     white_share, grain_share = fits[best][0]
     lags = grain_share * _kernel(GRAIN_PX[best])
     lags[REACH_PX, REACH_PX] += white_share
-    is_grain = beside_it and GRAIN_PX[best] <= _COARSEST_PX
+    is_grain = blank is not None and len(blank) > 0 and GRAIN_PX[best] <= _COARSEST_PX
     return NoiseModel(float(lags[REACH_PX, REACH_PX]), lags, neighbour_correlation, is_grain)
 
 
@@ -61,57 +63,73 @@ def _kernel(grain_px: float | None) -> Array:
 
 
 class _Window:
-    """The pixels of a fit and what it takes out of the noise there; sums over all pairs of pixels, by their lag."""
+    """The pixels of a fit and what it takes out of the noise there; sums over all pairs of pixels so far apart."""
 
     def __init__(self, used: Mask, design: Array, farthest_px: float) -> None:
         self.used = used
-        self.shape = (used.shape[0] + 2 * REACH_PX, used.shape[1] + 2 * REACH_PX)
+        self.rings = _rings(farthest_px)
         directions, _ = np.linalg.qr(design[:, used].T)
-        taken = np.zeros((directions.shape[1], *used.shape))
-        taken[:, used] = directions.T
-        self.taken = taken
-        self.spectra = np.fft.rfft2(taken, s=self.shape)
-        self.pairs = self.products(used.astype(float)[None])
-        distance = np.hypot(*np.meshgrid(np.arange(-REACH_PX, REACH_PX + 1), np.arange(-REACH_PX, REACH_PX + 1)))
-        self.near = distance <= farthest_px
-        self.group = np.unique(np.round(distance[self.near], 6), return_inverse=True)[1]
-        self.weights = 1.0 / np.sqrt(np.maximum(self.by_distance(self.pairs), 1.0))
+        self.taken = np.zeros((directions.shape[1], *used.shape), np.float32)
+        self.taken[:, used] = directions.T
+        self.pairs = self.products(used[None].astype(float))
+        self.weights = 1.0 / np.sqrt(np.maximum(self.pairs, 1.0))
 
     def products(self, images: Array) -> Array:
-        """Sum over the images of their own products at every lag."""
-        return self._at_lags((np.abs(np.fft.rfft2(images, s=self.shape)) ** 2).sum(axis=0))
+        """(distances,) sums over the images of the products of their pixels so far apart."""
+        return np.array([np.vdot(images, ring.sums(images)) for ring in self.rings])
 
-    def by_distance(self, lags: Array) -> Array:
-        """Summed over the lags of the same length."""
-        return np.bincount(self.group, weights=lags[self.near]).astype(np.float64)
+    @cached_property
+    def expected(self) -> Array:
+        """(1 + grains, distances) what white noise and noise of each grain leave of these sums, at unit variance.
 
-    def expected(self, grain_px: float | None) -> Array:
-        """What noise of that grain leaves: the trace of each lag with M C M, M taking the fit out."""
-        kernel = _kernel(grain_px)
-        padded = np.zeros(self.shape)
+        The fit leaves M C M of a covariance matrix C, with M = I - Q Q'. Summed over pixels so far apart, by D, that
+        is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
+        times the autocorrelation at that lag, whatever it is.
+        """
+        shape = [fft.next_fast_len(size + REACH_PX, real=True) for size in self.used.shape]
+        spectra = np.conj(fft.rfft2(self.taken, s=shape))
         index = np.arange(-REACH_PX, REACH_PX + 1)
-        padded[np.ix_(index, index)] = kernel
-        smeared = np.fft.irfft2(self.spectra * np.fft.rfft2(padded), s=self.shape)
-        smeared = smeared[:, : self.used.shape[0], : self.used.shape[1]] * self.used
-        crossed = np.fft.rfft2(smeared, s=self.shape)
-        among = np.tensordot(self.taken[:, self.used], smeared[:, self.used], axes=(1, 1))
-        once = self._at_lags((np.conj(self.spectra) * crossed).sum(axis=0))
-        twice = self._at_lags((np.conj(self.spectra) * np.tensordot(among, self.spectra, axes=(1, 0))).sum(axis=0))
-        return self.by_distance(self.pairs * kernel - once - once[::-1, ::-1] + twice)
-
-    def _at_lags(self, spectrum: Array) -> Array:
-        values = np.fft.irfft2(spectrum, s=self.shape)
-        index = np.arange(-REACH_PX, REACH_PX + 1)
-        return np.asarray(values[np.ix_(index, index)])
+        left = []
+        for ring, pairs in zip(self.rings, self.pairs, strict=True):
+            beside = ring.sums(self.taken) * self.used
+            among = np.tensordot(self.taken, beside, axes=((1, 2), (1, 2)))
+            beside = np.tensordot(among, self.taken, axes=1) - 2 * beside
+            lags = fft.irfft2((spectra * fft.rfft2(beside, s=shape)).sum(axis=0), s=shape)
+            taken = _KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel()
+            left.append(pairs * _KERNELS[(slice(None), *(REACH_PX + np.array(ring.lags[0])))] + taken)
+        return np.stack(left, axis=1)
 
 
-@cache
-def _expected_blank(grain_px: float | None) -> Array:
-    """What noise of that grain leaves in a patch of blank film."""
-    return _patch().expected(grain_px)
+@dataclass(frozen=True)
+class _Ring:
+    """All lags (rows, columns) of one length."""
+
+    lags: tuple[tuple[int, int], ...]
+
+    def sums(self, images: Images) -> Images:
+        """Of the pixels at these lags from each pixel of images (n, height, width)."""
+        total = np.zeros_like(images)
+        height, width = images.shape[1:]
+        for down, right in self.lags:
+            total[:, max(-down, 0) : height - max(down, 0), max(-right, 0) : width - max(right, 0)] += images[
+                :, max(down, 0) : height + min(down, 0), max(right, 0) : width + min(right, 0)
+            ]
+        return total
+
+
+def _rings(farthest_px: float) -> list[_Ring]:
+    reach = range(-int(farthest_px), int(farthest_px) + 1)
+    by_square: dict[int, list[tuple[int, int]]] = {}
+    for down, right in product(reach, repeat=2):
+        if down**2 + right**2 <= farthest_px**2:
+            by_square.setdefault(down**2 + right**2, []).append((down, right))
+    return [_Ring(tuple(lags)) for _, lags in sorted(by_square.items())]
 
 
 @cache
 def _patch() -> _Window:
     whole = np.ones((PATCH_PX, PATCH_PX), dtype=bool)
     return _Window(whole, PLANE.T.reshape(-1, PATCH_PX, PATCH_PX), _FARTHEST_BLANK_PX)
+
+
+_KERNELS = np.stack([_kernel(grain_px) for grain_px in (None, *GRAIN_PX)])

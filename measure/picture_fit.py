@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from measure.noise import NoiseModel, correlated, robust_scale
 from measure.picture_model import PictureModel
-from measure.rendering import chip_mask, render
+from measure.rendering import chip_mask, picture
 from measure.robust import damage, solution, tukey_loss, tukey_weights
 from measure.shapes import MarkTemplate
 from measure.weighting import weighted
@@ -134,11 +134,11 @@ class PictureFit:
     def _choose_area(self) -> None:
         """The pixels within margin_px of the mark: beyond it the background only disturbs."""
         height, width = self.model.grey.shape
-        mark, place = self.model.mark, self.model.state.pixel_from_mark
+        mark, place = self.model.mark, self.model.place_drawn()
         if isinstance(mark, MarkTemplate):
             near = chip_mask(mark, place, width, height)
         else:
-            outside = (render(mark, place, width, height, _OUTLINE_BLUR_PX).value < _SHOWN).astype(np.uint8)
+            outside = (picture(mark, place, width, height, _OUTLINE_BLUR_PX) < _SHOWN).astype(np.uint8)
             distance = cv2.distanceTransform(outside, cv2.DIST_L2, 5)
             near, self.far = distance <= self.options.margin_px, distance > self.options.plain_px
             if outside.all():

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.match_options import Freedom, MatchOptions
-from measure.rendering import render
+from measure.rendering import Rendering, extent_px, render
 from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
 
 Array = NDArray[np.float64]
@@ -24,6 +24,8 @@ _GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]]
     "ellipse": (_SCALE, _STRETCH, _SHEAR),
 }
 _BLUR_RANGE_PX = (0.3, 6.0)
+_BENT_PX = 0.05  # of the mark's outline: so far a series replaces a new drawing
+_PIXEL_VARIANCE_PX2 = 1 / 12
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
 
 
@@ -53,6 +55,7 @@ class PictureModel:
         # A chip already has its scan's blur: where none is estimated, none is added.
         sharp = isinstance(mark, MarkTemplate) and not options.estimate_blur
         self.state = State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
+        self.drawn = start[:, :2].copy()
         self.residuals = np.zeros_like(grey)
         self.design = np.zeros((0, *grey.shape))
 
@@ -60,7 +63,7 @@ class PictureModel:
         """Design and residuals of the present state; the greys from a linear fit to what is used, at first."""
         height, width = self.grey.shape
         place, blur_px = self.state.pixel_from_mark, float(np.sqrt(self.state.variance_px2))
-        shown = render(self.mark, place, width, height, blur_px)
+        shown = self._shown(width, height, blur_px)
         greys = np.stack([self._detail(shown.value), *self.ground()])
         if not self.state.greys.any():
             solved = np.linalg.lstsq(greys[:, used].T, self.grey[used], rcond=None)[0]
@@ -74,6 +77,21 @@ class PictureModel:
             columns.append(-0.5 * shown.laplacian)
         self.design = np.concatenate([[-gain * self._detail(column) for column in columns], greys])
         self.residuals = self.grey - np.tensordot(self.state.greys, greys, axes=1)
+
+    def place_drawn(self) -> Array:
+        """(2, 3) the present place of the mark as it was last drawn: its linear part is close to the present one."""
+        place = self.state.pixel_from_mark
+        least, greatest = extent_px(self.mark, place)
+        change = place[:, :2] @ np.linalg.inv(self.drawn) - np.eye(2)
+        if np.linalg.norm(change, 2) * np.hypot(*(greatest - least)) / 2 > _BENT_PX:
+            self.drawn = place[:, :2].copy()
+        return np.column_stack([self.drawn, place[:, 2]])
+
+    def _shown(self, width: int, height: int, blur_px: float) -> Rendering:
+        place = self.place_drawn()
+        shown = render(self.mark, place, width, height, blur_px)
+        change = self.state.pixel_from_mark[:, :2] @ np.linalg.inv(self.drawn) - np.eye(2)
+        return shown.bent(change, place[:, 2], self.state.variance_px2 + _PIXEL_VARIANCE_PX2) if change.any() else shown
 
     def step(self, step: Array) -> float:
         """Take a step, shortened where it leaves the range of a linearisation; its length in px."""

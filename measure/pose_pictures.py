@@ -1,7 +1,7 @@
 """What a found mark's picture says of which of the camera's marks it is, in whichever direction a pose shows it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,12 +12,14 @@ from measure.noise import robust_scale
 from measure.rendering import extent_px, picture
 from measure.robust import tukey_weights
 from measure.scan import Scan
-from measure.shapes import Mark
+from measure.shapes import Bar, Mark, MarkShape, Polygon
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _ALIKE = 0.05  # of the contrast: pictures that differ nowhere by more are one
+_SAME_PX = 0.1  # poses whose parts lie no farther apart show one drawing
+_CELLS = 2  # along a pixel's side: pictures right to a hundredth
 _ABOUT_PX = 3.0  # how far about the drawings the ground tells of its grey value
 _PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
 _OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
@@ -42,12 +44,16 @@ class Site:
     def likelihoods(self, shown: Sequence[Shown]) -> Array:
         """The log-likelihood of the picture under what each pose shows here, up to a constant: 0 for the best, and no
         less than the probability that something else spoils the picture."""
-        reach = max(_reach_px(each) for each in shown) + 2 * _ABOUT_PX
+        looks, look_of = _looks(shown)
+        if len(looks) == 1:
+            return np.zeros(len(shown))
+        reach = max(_reach_px(each) for each in looks) + 2 * _ABOUT_PX
         col0, row0 = np.floor(self.center_px - reach).astype(int)
         size = int(np.ceil(2 * reach)) + 1
         window = self.scan.window(int(col0), int(row0), size, size, self.weights).astype(float)
         center = self.center_px - (col0, row0)
-        pictures, picture_of = _distinct([self._picture(each, center, size) for each in shown])
+        pictures, kind_of = _distinct([self._picture(each, center, size) for each in looks])
+        picture_of = [kind_of[look] for look in look_of]
         area = _area(pictures)
         residuals = [self._residuals(window, each, area) for each in pictures]
         # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
@@ -59,7 +65,8 @@ class Site:
     def _picture(self, shown: Shown, center: Array, size: int) -> Array:
         if shown.mark is None:
             return np.zeros((size, size))
-        return picture(shown.mark, np.column_stack([shown.linear, center]), size, size, self.like.blur_px)
+        place = np.column_stack([shown.linear, center])
+        return picture(shown.mark, place, size, size, self.like.blur_px, _CELLS)
 
     def _residuals(self, window: Array, shown: Array, area: Mask) -> Array:
         """What the picture on a plane ground leaves, the mark being light or dark as the one that was found; its place
@@ -74,6 +81,43 @@ class Site:
             if solution[len(ground)] * self.like.contrast_dn > 0:
                 return residuals
         return _robust(ground, grey)[0]
+
+
+def _looks(shown: Sequence[Shown]) -> tuple[list[Shown], list[int]]:
+    """Those that are drawn apart, and which of them each is: a symmetric mark looks the same in several poses."""
+    looks: list[Shown] = []
+    drawn: list[tuple[object, Array]] = []
+    index = []
+    for each in shown:
+        own = _drawn(each)
+        alike = [number for number, other in enumerate(drawn) if _same(own, other)]
+        index.append(alike[0] if alike else len(looks))
+        if not alike:
+            looks.append(each)
+            drawn.append(own)
+    return looks, index
+
+
+def _drawn(shown: Shown) -> tuple[object, Array]:
+    """What is drawn: kinds and sizes in a fixed order, and (n, 2) px of the points by which these parts lie."""
+    if not isinstance(shown.mark, MarkShape):
+        return shown.mark, shown.linear
+    parts = []
+    for part in shown.mark.parts:
+        if isinstance(part, Bar):
+            middle = np.add(part.from_mm, part.to_mm) / 2
+            parts += [(f"bar {part.line_mm}", point) for point in (part.from_mm, middle, part.to_mm)]
+        elif isinstance(part, Polygon):
+            parts += [("corner", point) for point in part.vertices_mm]
+        else:
+            parts.append((str(replace(part, center_mm=(0.0, 0.0))), part.center_mm))
+    points = np.array([point for _, point in parts]) @ shown.linear.T
+    order = sorted(range(len(parts)), key=lambda index: (parts[index][0], *np.round(points[index]).tolist()))
+    return [parts[index][0] for index in order], points[order]
+
+
+def _same(first: tuple[object, Array], second: tuple[object, Array]) -> bool:
+    return first[0] == second[0] and float(np.abs(first[1] - second[1]).max()) < _SAME_PX
 
 
 def _distinct(pictures: Sequence[Array]) -> tuple[list[Array], list[int]]:
@@ -96,12 +140,12 @@ def _area(pictures: Sequence[Array]) -> Mask:
 
 def _robust(columns: Sequence[Array], grey: Array) -> tuple[Array, Array]:
     """Residuals and coefficients of a fit that holds against writing and dust in the window."""
-    design, weights = np.stack(columns, axis=1), np.ones_like(grey)
+    design, weights = np.stack(columns), np.ones_like(grey)
     residuals, solution = grey, np.zeros(len(columns))
     for _ in range(_ROUNDS):
-        root = np.sqrt(weights)
-        solution = np.asarray(np.linalg.lstsq(design * root[:, None], grey * root, rcond=None)[0], dtype=float)
-        residuals = grey - design @ solution
+        weighted = design * weights
+        solution = np.asarray(np.linalg.lstsq(weighted @ design.T, weighted @ grey, rcond=None)[0], dtype=float)
+        residuals = grey - solution @ design
         weights = tukey_weights(residuals, max(robust_scale(residuals), 1e-9))
     return residuals, solution
 

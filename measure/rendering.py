@@ -2,7 +2,7 @@
 with the derivatives that least-squares matching needs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -37,6 +37,22 @@ class Rendering:
         """Twice the derivative by the blur's variance."""
         return np.asarray(self.by_col_col + self.by_row_row)
 
+    def bent(self, change: Array, center_px: Array, variance_px2: float) -> "Rendering":
+        """The picture of a mark whose linear part is (I + change) times this one's, by a series to the second order;
+        its second derivatives stay as they are. variance_px2: of blur and pixel, which do not bend with the mark."""
+        (xx, xy), (yx, yy) = (np.eye(2) - np.linalg.inv(np.eye(2) + change)).astype(np.float32)
+        height, width = self.value.shape
+        col = np.arange(width, dtype=np.float32) - np.float32(center_px[0])
+        row = (np.arange(height, dtype=np.float32) - np.float32(center_px[1]))[:, None]
+        right, down = xx * col + xy * row, yx * col + yy * row
+        by_col = self.by_col - self.by_col_col * right - self.by_col_row * down
+        by_row = self.by_row - self.by_col_row * right - self.by_row_row * down
+        spread = np.float32(variance_px2) * change.astype(np.float32)
+        value = self.value - (right * (self.by_col + by_col) + down * (self.by_row + by_row)) / 2
+        value -= spread[0, 0] * self.by_col_col + (spread[0, 1] + spread[1, 0]) * self.by_col_row
+        value -= spread[1, 1] * self.by_row_row
+        return replace(self, value=value, by_col=by_col, by_row=by_row)
+
 
 def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Rendering:
     """The mark under a Gaussian of standard deviation blur_px, in a window of width x height px.
@@ -50,9 +66,9 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
     return Rendering(value, by_col, by_row, by_col_col, by_col_row, by_row_row)
 
 
-def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
-    """(height, width): the mark as `render` makes it, without derivatives."""
-    return _seen(mark, pixel_from_mark, (width, height), blur_px, ((0, 0),))[0].astype(float)
+def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float, cells: int = CELLS) -> Array:
+    """(height, width): the mark as `render` makes it, without derivatives; cells: of its drawing along a pixel."""
+    return _seen(mark, pixel_from_mark, (width, height), blur_px, ((0, 0),), cells)[0].astype(float)
 
 
 def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
@@ -91,14 +107,19 @@ class _Drawing:
 
 
 def _seen(
-    mark: Mark, pixel_from_mark: Array, size: tuple[int, int], blur_px: float, orders: Sequence[tuple[int, int]]
+    mark: Mark,
+    pixel_from_mark: Array,
+    size: tuple[int, int],
+    blur_px: float,
+    orders: Sequence[tuple[int, int]],
+    cells: int = CELLS,
 ) -> list[Single]:
     """The derivatives of the picture, each of an order by column and by row, in a window of a size (width, height)."""
     place = np.asarray(pixel_from_mark, dtype=float)
     if isinstance(mark, MarkTemplate):
         drawing = _chip_drawing(mark, place, size, blur_px)
     else:
-        drawing = _drawing(mark, place, blur_px)
+        drawing = _drawing(mark, place, blur_px, cells)
     cells, most = drawing.cells, np.max(orders, axis=0)
     along = [_Average(blur_px, cells, shift, int(order)) for shift, order in zip(drawing.shift_px, most, strict=True)]
     # Of the window only what the blurred mark reaches is computed: all else is empty.
@@ -119,8 +140,8 @@ def _seen(
     return images
 
 
-def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float) -> _Drawing:
-    cells = CELLS if blur_px < 1.5 else CELLS - 1  # blur hides what coarser cells get wrong
+def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float, cells: int) -> _Drawing:
+    cells = cells if blur_px < 1.5 else max(cells - 1, 2)  # blur hides what coarser cells get wrong
     whole = np.floor(pixel_from_mark[:, 2])
     rest = pixel_from_mark[:, 2] - whole
     # Sharp cells cannot be moved by a part of their own size.

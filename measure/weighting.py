@@ -1,7 +1,7 @@
 """Weights for grain: what the inverse of the noise's covariance matrix makes of a fit's derivatives.
 
 Generalised least squares solves `B r = 0`, B being the derivatives times that inverse. Conjugate gradients give B to
-one per cent in a few rounds without forming a matrix. B need not be exact: the estimate is unbiased with any, and its
+some per cent in a few rounds without forming a matrix. B need not be exact: the estimate is unbiased with any, and its
 covariance follows from the very B that was used.
 """
 
@@ -16,6 +16,7 @@ Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _ROUNDS = 8
+_CLOSE = 0.03  # of a derivative: so little left costs a thousandth of the standard deviation
 _WHITE = 0.02  # of the variance at least is taken as white: no film's grain is known better at the finest frequencies
 _MISFIT = 0.003  # of the contrast: what the drawing itself gets wrong from pixel to pixel
 
@@ -37,6 +38,8 @@ def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -
         solution += length * direction
         product += length * seen
         rest -= length * seen
+        if np.all(_dots(rest, rest) < _CLOSE**2):  # of columns of unit length
+            break
         ahead = covariance.roughly_inverse(rest)
         strength, before = _dots(rest, ahead), strength
         direction = np.asarray(ahead + strength / np.maximum(before, 1e-30) * direction, np.float32)
