@@ -1,10 +1,9 @@
-"""Patches found in the whole frame in one pass over its blocks, each read once and looked at in several reductions."""
+"""Patches found in the whole frame in one pass over it, its blocks looked at side by side in several reductions."""
 
 from collections.abc import Sequence
 from math import lcm
 from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -33,41 +32,45 @@ class Octave(Protocol):
 def search_blocks(scan: Scan, octaves: Sequence[Octave]) -> list[Candidate]:
     """The patches of all octaves in pixels of the scan, the strongest first, none within another.
 
-    Blocks are taken row by row, as high as the rows of the file that stay decoded, and side by side.
+    The scan is taken in bands of rows, no higher than its reductions keep: a band is reduced first, by all threads,
+    then its blocks are looked at side by side.
     """
     unit = lcm(*(octave.factor for octave in octaves))
+    reductions = reductions_of(scan, {octave.factor for octave in octaves})
     margin = max(octave.margin_px for octave in octaves)
-    rows = min(BLOCK_PX, scan.rows_kept - 2 * margin)
-    width, height = (max(size // unit, 1) * unit for size in (BLOCK_PX, rows))
+    kept = min(factor * reduction.rows_kept for factor, reduction in reductions.items())
+    width, height = (max(size // unit, 1) * unit for size in (BLOCK_PX, min(BLOCK_PX, kept - 2 * margin)))
 
-    def in_block(corner: tuple[int, int]) -> list[Candidate]:
-        col0, row0 = corner
-        fine = scan.window(col0 - margin, row0 - margin, width + 2 * margin, height + 2 * margin)
+    def in_block(block: tuple[Octave, int, int]) -> list[Candidate]:
+        octave, col0, row0 = block
+        factor, spare = octave.factor, octave.margin_px // octave.factor
+        col, row, cols, rows = (size // factor for size in (col0, row0, width, height))
+        small = reductions[factor].window(col - spare, row - spare, cols + 2 * spare, rows + 2 * spare)
         found = []
-        for patch in (patch for octave in octaves for patch in in_window(fine, margin, octave)):
-            col, row = patch.center_px + 0.5
-            in_scan = col + col0 <= scan.width_px and row + row0 <= scan.height_px
-            if in_scan and 0 <= col < width and 0 <= row < height:
-                found.append(Candidate(patch.center_px + corner, patch.pixel_from_disk, patch.contrast_dn))
+        for patch in octave.patches(small):
+            own = (patch.center_px - spare + 0.5) * factor
+            place = own + np.array([col0, row0])
+            if np.all((own >= 0) & (own < (width, height)) & (place <= (scan.width_px, scan.height_px))):
+                found.append(Candidate(place - 0.5, patch.pixel_from_disk * factor, patch.contrast_dn))
         return found
 
-    corners = [(col, row) for row in range(0, scan.height_px, height) for col in range(0, scan.width_px, width)]
-    found = [patch for own in scan.each(in_block, corners) for patch in own]
+    found: list[Candidate] = []
+    for row0 in range(0, scan.height_px, height):
+        for factor in sorted(reductions):
+            reductions[factor].decode((row0 - margin) // factor, (row0 + height + margin) // factor)
+        blocks = [(octave, col0, row0) for octave in octaves for col0 in range(0, scan.width_px, width)]
+        found += [patch for own in scan.each(in_block, blocks) for patch in own]
     found.sort(key=lambda patch: (-abs(patch.contrast_dn), *patch.center_px))
     return separate(found)
 
 
-def in_window(fine: Image, margin: int, octave: Octave) -> list[Candidate]:
-    """An octave's patches in a block (rows, columns) with a margin about it, in pixels from the block's corner."""
-    spare, factor = margin - octave.margin_px, octave.factor
-    part = fine[spare : fine.shape[0] - spare, spare : fine.shape[1] - spare]
-    size = (part.shape[1] // factor, part.shape[0] // factor)
-    small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.float32)
-    origin = (factor - 1) / 2 - octave.margin_px
-    return [
-        Candidate(patch.center_px * factor + origin, patch.pixel_from_disk * factor, patch.contrast_dn)
-        for patch in octave.patches(small)
-    ]
+def reductions_of(scan: Scan, factors: set[int]) -> dict[int, Scan]:
+    """The scan reduced by each factor, from the coarsest of the others that it divides."""
+    reductions = {1: scan}
+    for factor in sorted(factors):
+        finer = max(known for known in reductions if factor % known == 0)
+        reductions[factor] = reductions[finer].reduction(factor // finer)
+    return {factor: reductions[factor] for factor in factors}
 
 
 def separate(found: list[Candidate]) -> list[Candidate]:

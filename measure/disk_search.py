@@ -14,13 +14,14 @@ from measure.scan import Scan
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-SCALE_STEP = 1.35  # from one radius to the next
-SEARCH_RADIUS_PX = 3.0  # reduced so far that the smallest disk of an octave has about this radius
+SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk stands out by a tenth less
+SEARCH_RADIUS_PX = 2.2  # reduced so far that the smallest disk of an octave has at least this radius
 
 
 def find_disks(scan: Scan, search: DiskSearch) -> tuple[FittedDisk, ...]:
     """All disks of the frame that the fit does not refuse, from top to bottom."""
-    fitted = [fit_disk(scan, patch.center_px, patch.pixel_from_disk) for patch in disk_candidates(scan, search)]
+    patches = disk_candidates(scan, search)
+    fitted = scan.each(lambda patch: fit_disk(scan, patch.center_px, patch.pixel_from_disk), patches)
     kept = [disk for disk in fitted if not disk.reason and disk.half_axes_px[0] < search.diameter_px[1]]
     return tuple(sorted(without_doubles(kept), key=lambda disk: (disk.center_px[1], disk.center_px[0])))
 
@@ -54,17 +55,15 @@ class DiskOctave:
         return margin_px(self.radii) * self.factor
 
     def patches(self, small: Image) -> list[Candidate]:
-        return patches(small, self.radii, self.search, self.full_scale_dn)
+        return patches(small, self.radii, self.search, self.full_scale_dn, self.factor)
 
 
 def octaves_of(search: DiskSearch, full_scale_dn: float) -> list[DiskOctave]:
     """Radii from the smallest to the largest, each in the reduction that leaves it a few pixels."""
-    radius, largest = search.diameter_px[0] / 2, search.diameter_px[1] / 2
-    steps = [radius]
-    while steps[-1] < largest:
-        steps.append(steps[-1] * SCALE_STEP)
+    smallest, largest = search.diameter_px[0] / 2, search.diameter_px[1] / 2
+    count = int(np.ceil(np.log(largest / smallest) / np.log(SCALE_STEP))) + 1
     by_factor: dict[int, list[float]] = {}
-    for step in steps:
-        factor = max(1, int(2 ** np.floor(np.log2(max(step / SEARCH_RADIUS_PX, 1.0)))))
-        by_factor.setdefault(factor, []).append(step / factor)
+    for radius in np.geomspace(smallest, largest, count).tolist():
+        factor = max(1, int(2 ** np.floor(np.log2(max(radius / SEARCH_RADIUS_PX, 1.0)))))
+        by_factor.setdefault(factor, []).append(radius / factor)
     return [DiskOctave(factor, radii, search, full_scale_dn) for factor, radii in by_factor.items()]

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from measure.blank_film import BESIDE_PX
 from measure.compression import with_loss
+from measure.disk_patches import LEAST_SNR
 from measure.matching import MatchOptions, match, window_about
 from measure.scan import Scan
 from measure.shapes import Disk, MarkShape
@@ -20,7 +21,6 @@ PLAIN_MARGIN_PX = 7.0  # where it is plain, for a tenth less noise than with the
 LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
 SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
 SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from the disk
-LEAST_SNR = 4.0
 WEAK_DAMAGE, MOST_DAMAGE = 0.1, 0.35
 MOST_BLUR = 0.7  # of the shorter half axis
 WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast: texture and stains are no disks

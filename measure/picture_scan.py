@@ -43,7 +43,8 @@ class WholePicture:
         self._samples, self.is_lossy = samples, is_lossy
         self.height_px, self.width_px, self.channels = samples.shape
         self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
-        self.full_scale_dn = float(np.iinfo(samples.dtype).max)
+        self.sample_bytes = samples.itemsize
+        self.full_scale_dn = float(2 ** (8 * samples.itemsize) - 1)
 
     def read(self, row: int, column: int) -> Samples:
         """All of it."""

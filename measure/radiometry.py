@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Samples = NDArray[np.uint8 | np.uint16]
+Samples = NDArray[np.uint8 | np.uint16 | np.float32]  # means are the last
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,15 @@ class Radiometry:
             palette = palette[:, :1]
         return cls(palette.shape[1], 65535.0, palette=np.ascontiguousarray(palette))
 
+    @property
+    def sample_bytes(self) -> int:
+        return 1 if self.full_scale_dn < 256 else 2
+
     def apply(self, stored: NDArray[np.generic]) -> Samples:
         """(height, width, channels) values of (height, width, samples) stored numbers."""
         if self.palette is not None:
             indices = np.minimum(stored[..., 0].astype(np.intp), len(self.palette) - 1)
             return self.palette[indices]
-        dtype = np.uint8 if self.full_scale_dn < 256 else np.uint16
+        dtype = np.uint8 if self.sample_bytes == 1 else np.uint16
         samples: Samples = np.ascontiguousarray(stored[..., : self.channels], dtype)
         return dtype(self.full_scale_dn) - samples if self.inverted else samples

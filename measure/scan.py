@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from itertools import product
+from math import lcm
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
@@ -23,7 +25,9 @@ Array = NDArray[np.float32]
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
 GREEN = (0.0, 1.0, 0.0)
-BAND_PIXELS = 1 << 20  # that a thread takes at a time
+BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
+SEGMENT_PX = 512  # of the scan, that a segment of its reduction holds along a side, about
+REDUCED_SHARE = 0.25  # of a scan's cache, for a reduction of it
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -39,7 +43,14 @@ class Scan:
     The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
     """
 
-    def __init__(self, path: Path, segments: Segments, pitch: Pitch, notes: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        path: Path,
+        segments: Segments,
+        pitch: Pitch,
+        notes: tuple[str, ...] = (),
+        cache: SegmentCache | None = None,
+    ) -> None:
         self.path = path
         self.name = path.stem
         self.width_px = segments.width_px
@@ -51,7 +62,7 @@ class Scan:
         self.pitch_note = pitch.note
         self.notes = notes
         self._segments = segments
-        self._cache = SegmentCache(segments)
+        self._cache = cache or SegmentCache(segments)
         self._reduced: dict[int, Array] = {}
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
@@ -99,6 +110,23 @@ class Scan:
         themselves; parts outside of the scan repeat its edge."""
         return np.asarray(self._reduced_planes(factor, col0, row0, width, height, self._weights(weights)[None])[0])
 
+    def reduction(self, factor: int) -> "Scan":
+        """The grey values area-averaged by an integer factor, as `reduced` gives them, as a scan of its own: parts of
+        this one are read as its windows ask for them, and the last of them kept."""
+        if factor == 1:
+            return self
+        pitch = self.pitch_um and (self.pitch_um[0] * factor, self.pitch_um[1] * factor)
+        segments = ReducedSegments(self, factor)
+        cache = SegmentCache(segments, share=REDUCED_SHARE)
+        return Scan(self.path, segments, Pitch(pitch, self.pitch_note), self.notes, cache)
+
+    def decode(self, row0: int, row1: int) -> None:
+        """Decode what the rows row0 to row1 (exclusive) need, side by side: windows side by side would wait for the
+        strips that they share."""
+        tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
+        rows = range(max(row0, 0) // tall, (min(row1, self.height_px) - 1) // tall + 1)
+        self.each(lambda key: self._cache.read(*key), product(rows, range(-(-self.width_px // wide))))
+
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """What the function makes of each item, in their order, by as many threads as OpenCV may use: decoders and
         filters run side by side."""
@@ -120,7 +148,7 @@ class Scan:
         """(height, width, channels): every segment is decoded once."""
         result = np.empty((height, width, self.channels), np.float32)
         single = np.eye(self.channels, dtype=np.float32)
-        band = max(BAND_PIXELS // (width * factor * factor), 1)
+        band = reduced_rows(width, factor)
 
         def fill(row0: int) -> None:
             rows = min(band, height - row0)
@@ -132,9 +160,13 @@ class Scan:
 
     def _reduced_planes(self, factor: int, col0: int, row0: int, width: int, height: int, weights: Array) -> Array:
         """(n, height, width) of the reduced scan, for weights (n, channels)."""
-        fine = self._planes(col0 * factor, row0 * factor, width * factor, height * factor, weights)
-        size = (width, height)
-        return np.stack([cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in fine]).astype(np.float32)
+        result, band = np.empty((len(weights), height, width), np.float32), reduced_rows(width, factor)
+        for first in range(0, height, band):
+            rows = min(band, height - first)
+            fine = self._planes(col0 * factor, (row0 + first) * factor, width * factor, rows * factor, weights)
+            for plane, each in zip(result, fine, strict=True):
+                plane[first : first + rows] = cv2.resize(each, (width, rows), interpolation=cv2.INTER_AREA)
+        return result
 
     def _weights(self, weights: Sequence[float] | None) -> Array:
         if weights is None:
@@ -164,8 +196,44 @@ class Scan:
                 left, right = max(col0, j * wide), min(col1, (j + 1) * wide)
                 part = self._cache.read(i, j)[top - i * tall : bottom - i * tall, left - j * wide : right - j * wide]
                 for plane, each in zip(result, weights, strict=True):
-                    plane[top - row0 : bottom - row0, left - col0 : right - col0] = weighted(part, each)
+                    plane[top - row0 : bottom - row0, left - col0 : right - col0] = grey(part, each)
         return result
+
+
+class ReducedSegments:
+    """A scan's grey values area-averaged by a factor, in segments that hold whole ones of the scan where these are not
+    too large."""
+
+    def __init__(self, scan: Scan, factor: int) -> None:
+        self._scan, self._factor = scan, factor
+        self.height_px, self.width_px = scan.height_px // factor, scan.width_px // factor
+        tall, wide = scan._segments.segment_height_px, scan._segments.segment_width_px
+        self.segment_height_px = min(reduced_side(tall, factor), self.height_px)
+        # Strips are wanted once, whole.
+        self.segment_width_px = self.width_px if wide >= scan.width_px else reduced_side(wide, factor)
+        self.channels, self.full_scale_dn, self.is_lossy = 1, scan.full_scale_dn, scan.is_lossy
+        self.sample_bytes = 4
+
+    def read(self, row: int, column: int) -> Array:
+        """Segment (row, column) of the grid."""
+        row0, col0 = row * self.segment_height_px, column * self.segment_width_px
+        height = min(self.segment_height_px, self.height_px - row0)
+        width = min(self.segment_width_px, self.width_px - col0)
+        return self._scan.reduced_window(self._factor, col0, row0, width, height)[..., None]
+
+    def close(self) -> None:
+        """The scan stays open."""
+
+
+def reduced_side(fine_px: int, factor: int) -> int:
+    """The side of a reduced segment: whole segments of the scan, if these are no larger than it is to be."""
+    unit = lcm(fine_px, factor)
+    return max((unit * max(SEGMENT_PX // unit, 1) if unit <= 2 * SEGMENT_PX else SEGMENT_PX) // factor, 1)
+
+
+def reduced_rows(width: int, factor: int) -> int:
+    """How many rows of a reduced picture are averaged at a time."""
+    return max(BAND_PIXELS // (width * factor * factor), 1)
 
 
 def open_scan(path: Path) -> Scan:
@@ -199,6 +267,11 @@ def first_bytes(path: Path) -> bytes:
     if not start:
         raise MeasurementError(f"{path} is empty (0 bytes): copy or scan it anew")
     return start
+
+
+def grey(samples: Samples, weights: Array) -> Samples:
+    """(height, width) grey values of (height, width, channels) samples, as they are where there is one channel."""
+    return samples[..., 0] if len(weights) == 1 and weights[0] == 1.0 else weighted(samples, weights)
 
 
 def weighted(samples: Samples | Array, weights: Array) -> Array:

@@ -7,18 +7,19 @@ from threading import Lock
 from measure.radiometry import Samples
 from measure.segments import Segments
 
-CACHE_BYTES = 64 << 20
+CACHE_BYTES = 48 << 20
 
 
 class SegmentCache:
-    """As many segments as a memory limit allows, and at least two rows of the grid: reading a scan from top to bottom
-    decodes each once, wherever its bands begin. A thread that wants what another is decoding waits for it."""
+    """As many segments as a memory limit (or a share of it) allows, and at least two rows of the grid: reading a scan
+    from top to bottom decodes each once, wherever its bands begin. A thread that wants what another is decoding waits
+    for it."""
 
-    def __init__(self, segments: Segments) -> None:
+    def __init__(self, segments: Segments, share: float = 1.0) -> None:
         self._segments = segments
-        self._row_bytes = segments.width_px * segments.channels * (1 if segments.full_scale_dn < 256 else 2)
+        self._row_bytes = segments.width_px * segments.channels * segments.sample_bytes
         tall = min(2 * segments.segment_height_px, segments.height_px)
-        self._limit = max(CACHE_BYTES, tall * self._row_bytes)
+        self._limit = max(round(share * CACHE_BYTES), tall * self._row_bytes)
         self._held = 0
         self._decoded: OrderedDict[tuple[int, int], Future[Samples]] = OrderedDict()
         self._lock = Lock()

@@ -11,8 +11,8 @@ class Segments(Protocol):
     """A picture as its file stores it: a grid of tiles or strips, each decoded on its own.
 
     height_px, width_px: of the picture; segment_height_px, segment_width_px: of a segment, those at the right and lower
-    border being smaller; channels: 1 (grey) or 3 (red, green, blue); full_scale_dn: the largest value; is_lossy:
-    whether the values were compressed with loss, as JPEG does.
+    border being smaller; channels: 1 (grey) or 3 (red, green, blue); full_scale_dn: the largest value;
+    sample_bytes: 1, 2, or 4 for means; is_lossy: whether the values were compressed with loss, as JPEG does.
     """
 
     height_px: int
@@ -21,6 +21,7 @@ class Segments(Protocol):
     segment_width_px: int
     channels: int
     full_scale_dn: float
+    sample_bytes: int
     is_lossy: bool
 
     def read(self, row: int, column: int) -> Samples:

@@ -22,7 +22,7 @@ MOST_PAIRS = 150  # of coded dots
 GROWN = 8  # suggestions, the best ones, that are followed to their end
 LEAST_NAMED = 8
 LEAST_SHARE = 0.5  # of the sheet's points in the picture
-GATE_SIGMAS, LEAST_GATE_PX = 6.0, 2.0
+GATE_SIGMAS, LEAST_GATE_PX = 6.0, 3.0
 SHAPE = 1.35  # radii of a dot's ellipse over those expected, in any direction, or the reverse
 LARGEST_RADIAL = 0.6  # at the picture's corner, relative
 

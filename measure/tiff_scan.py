@@ -134,6 +134,7 @@ class TiffSegments:
         self._radiometry = page_radiometry(page, path)
         self.is_lossy = page.compression in JPEG_COMPRESSIONS
         self.channels, self.full_scale_dn = self._radiometry.channels, self._radiometry.full_scale_dn
+        self.sample_bytes = self._radiometry.sample_bytes
         self.height_px, self.width_px = page.imagelength, page.imagewidth
         self.segment_height_px = page.tilelength if page.is_tiled else min(page.rowsperstrip, self.height_px)
         self.segment_width_px = page.tilewidth if page.is_tiled else self.width_px

@@ -249,7 +249,7 @@ def test_a_window_decodes_only_its_tiles_and_a_whole_pass_each_tile_once(tmp_pat
             height_px, width_px = segments.height_px, segments.width_px
             segment_height_px, segment_width_px = segments.segment_height_px, segments.segment_width_px
             channels, full_scale_dn = segments.channels, segments.full_scale_dn
-            is_lossy = segments.is_lossy
+            sample_bytes, is_lossy = segments.sample_bytes, segments.is_lossy
 
             def read(self, row: int, column: int) -> Any:
                 reads.append((row, column))
@@ -295,6 +295,30 @@ def test_a_window_of_the_reduced_scan_is_that_part_of_it(tmp_path: Path) -> None
     with open_scan(tmp_path / "s.tif") as scan:
         whole = scan.reduced(3)
         np.testing.assert_allclose(scan.reduced_window(3, 20, 11, 31, 27), whole[11:38, 20:51], rtol=1e-5)
+
+
+@pytest.mark.parametrize("layout", [{"tile": (32, 48)}, {"rowsperstrip": 7}, {"rowsperstrip": HEIGHT}])
+@pytest.mark.parametrize("segment_px", [16, 96])
+def test_a_reduction_is_a_scan_of_the_means_and_decodes_each_segment_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: dict[str, Any], segment_px: int
+) -> None:
+    monkeypatch.setattr("measure.scan.SEGMENT_PX", segment_px)
+    tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", compression="lzw", **layout)
+    with open_scan(tmp_path / "s.tif") as scan:
+        reads: list[tuple[int, ...]] = []
+        original = scan._segments.read
+
+        def read(*key: int) -> Any:
+            reads.append(key)
+            return original(*key)
+
+        monkeypatch.setattr(scan._segments, "read", read)
+        twice, third = scan.reduction(2), scan.reduction(3)
+        four = twice.reduction(2)
+        four.decode(-5, 1000)
+        np.testing.assert_allclose(four.window(0, 0, four.width_px, four.height_px), scan.reduced(4), rtol=2e-6)
+        np.testing.assert_allclose(third.window(11, 9, 30, 40), scan.reduced(3)[9:49, 11:41], rtol=2e-6)
+        assert len(reads) == len(set(reads))
 
 
 def test_the_cache_keeps_to_its_limit_and_holds_two_rows_of_tiles(

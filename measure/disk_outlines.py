@@ -1,0 +1,130 @@
+"""Outlines of patches, seen along rays from their middles: where the grey values fall to half of the patch's height.
+
+A disk's picture is seen whole from its middle: each ray leaves it once. So the outlines of many patches are found at
+once, to a fraction of a pixel, and the ellipse with the moments of each is compared with it.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+RAYS, FEW_RAYS = 32, 16
+REACH = 3.0  # radii of a blob: where its patch must have ended
+CORE, AROUND = 0.5, (1.5, 2.5)  # radii of a blob: within, that it is as high as; between, that there is ground
+GROUND_SHARE = 1 / 3  # of the rays, that are lower there: other things may stand about
+LEAST_HEIGHT = 0.5  # of the blob's contrast
+_CHUNK = 1 << 19  # samples taken at a time: they stay in the processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class Blobs:
+    """What stands out: places (n, 2) in whole columns and rows, radius (n,) px and contrast (n,) of a disk that would
+    stand out as much."""
+
+    places: NDArray[np.intp]
+    radius: Array
+    contrast: Array
+
+    def part(self, chosen: Mask | slice | NDArray[np.intp]) -> "Blobs":
+        return Blobs(self.places[chosen], self.radius[chosen], self.contrast[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Of n patches: centers (n, 2), moments (n, 2, 2) of their area about them, px²; misfit (n,): rms distance of the
+    outline from the ellipse of these moments, in its radii; height (n,) above the ground."""
+
+    centers: Array
+    moments: Array
+    misfit: Array
+    height: Array
+
+    def part(self, chosen: Mask) -> "Outlines":
+        return Outlines(self.centers[chosen], self.moments[chosen], self.misfit[chosen], self.height[chosen])
+
+    @property
+    def radius(self) -> Array:
+        """(n,) of the circle of the same area."""
+        return np.asarray(2.0 * np.linalg.det(self.moments) ** 0.25)
+
+
+def outlines_about(image: Image, blobs: Blobs) -> Outlines:
+    """Of those blobs, light ones, that end on every ray; most of what stands out of a landscape runs on along some."""
+    found = []
+    for radius in np.unique(blobs.radius):
+        alike = blobs.part(blobs.radius == radius)
+        samples = RAYS * round(REACH * radius / 0.5)
+        for first in range(0, len(alike.radius), max(_CHUNK // samples, 1)):
+            some = alike.part(slice(first, first + max(_CHUNK // samples, 1)))
+            some = some.part(_Profiles(image, some, float(radius), FEW_RAYS, 1.0).ends)
+            if not len(some.radius):
+                continue
+            profiles = _Profiles(image, some, float(radius), RAYS, 0.5)
+            found.append(_outlines(some.places[profiles.ends], profiles))
+    return _joined(found)
+
+
+class _Profiles:
+    """Grey values along rays from blobs of one radius, at steps of so many px; ends (n,): whether all fall below half
+    of the blob's height."""
+
+    def __init__(self, image: Image, blobs: Blobs, radius: float, rays: int, step_px: float) -> None:
+        self.step_px = step_px
+        along = step_px * np.arange(int(np.ceil(REACH * radius / step_px)) + 1)
+        angle = 2 * np.pi * np.arange(rays) / rays
+        self.directions = np.stack([np.cos(angle), np.sin(angle)])
+        self.values = _sampled(image, blobs.places, self.directions[..., None] * along)
+        top = self.values[:, :, along <= CORE * radius].mean(axis=(1, 2))
+        beside = (along >= AROUND[0] * radius) & (along <= AROUND[1] * radius)
+        around = self.values[:, :, beside].mean(axis=2)
+        self.ground = np.partition(around, int(GROUND_SHARE * rays), axis=1)[:, int(GROUND_SHARE * rays)]
+        self.height = top - self.ground
+        self.level = (top + self.ground) / 2
+        below = self.values < self.level[:, None, None]
+        self.first_below = below.argmax(axis=2)
+        self.ends = (self.first_below > 0).all(axis=1) & (self.height >= LEAST_HEIGHT * blobs.contrast)
+
+    def radii(self) -> Array:
+        """(those that end, rays) px to where the rays fall below half of the height."""
+        patch, ray = np.flatnonzero(self.ends)[:, None], np.arange(self.values.shape[1])
+        last = self.first_below[self.ends] - 1
+        inner, outer = (self.values[patch, ray, last + k].astype(float) for k in (0, 1))
+        share = (inner - self.level[self.ends, None]) / np.maximum(inner - outer, 1e-9)
+        return np.asarray(self.step_px * (last + np.clip(share, 0.0, 1.0)))
+
+
+def _sampled(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
+    """(n, rays, steps) grey values at offsets (2, rays, steps) from places (n, 2)."""
+    col, row = ((offsets[axis].reshape(1, -1) + places[:, axis, None]).astype(np.float32) for axis in (0, 1))
+    values = cv2.remap(image, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, np.float32).reshape(len(places), *offsets.shape[1:])
+
+
+def _outlines(places: NDArray[np.intp], profiles: _Profiles) -> Outlines:
+    """Of the patches that end: the moments of the polygons that the rays' ends make, by Green's theorem."""
+    x, y = profiles.directions[:, None] * profiles.radii()
+    x1, y1 = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    twice = x * y1 - x1 * y
+    area = twice.sum(axis=1) / 2
+    col, row = ((twice * (a + b)).sum(axis=1) / (6 * area) for a, b in ((x, x1), (y, y1)))
+    xx, yy = ((twice * (a * a + a * b + b * b)).sum(axis=1) / (12 * area) for a, b in ((x, x1), (y, y1)))
+    xy = (twice * (x * y1 + 2 * x * y + 2 * x1 * y1 + x1 * y)).sum(axis=1) / (24 * area)
+    moments = np.stack([xx - col**2, xy - col * row, xy - col * row, yy - row**2], axis=1).reshape(-1, 2, 2)
+    center = np.stack([col, row], axis=1)
+    off = np.stack([x, y], axis=2) - center[:, None]
+    squares = np.einsum("nri,nij,nrj->nr", off, np.linalg.inv(moments), off) / 4
+    misfit = np.sqrt(np.mean((np.sqrt(np.maximum(squares, 0.0)) - 1) ** 2, axis=1))
+    return Outlines(places + center, moments, misfit, profiles.height[profiles.ends].astype(float))
+
+
+def _joined(parts: list[Outlines]) -> Outlines:
+    if not parts:
+        return Outlines(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0))
+    names = ("centers", "moments", "misfit", "height")
+    return Outlines(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
