@@ -46,6 +46,7 @@ SHIFT_PX, SEARCH_PX = 1.5, 3.0  # of the start, and the radius of the search
 POOL, FEW = 10, 3  # different marks in a cell; where the bound of each takes seconds
 GRAINS_PX, GRAIN_SNR = (0.7, 1.0, 1.5), 20.0
 DUST, DUST_SNR = (0.01, 0.03, 0.05), 20.0
+BEYOND, CLIPPED_SNR = (0.0, 0.3), 20.0
 LARGE_PX = 0.3
 HIPP = ""  # the interpreter of an environment that has it
 QUALITIES, JPEG_SNR = (50, 75, 90, 95), 100.0
@@ -261,6 +262,32 @@ def clean_error(mark: TrueMark, rng: np.random.Generator, full_scale: int) -> Ar
     return np.asarray(found.center_px - mark.place[:, 2])
 
 
+def clipping(kinds: Sequence[Kind], count: int) -> None:
+    """Dark marks on a ground beyond the scanner's range, and light marks that are beyond it themselves."""
+    print("\nclipped beyond so much of the contrast, blur 1: largest error without noise, px; then")
+    print(f"at SNR {CLIPPED_SNR:g} rms / bound of the same mark whole, realised / claimed; -n: lost")
+    names = [f"{'ground' if sign < 0 else 'mark'} {beyond:g}" for sign in (-1, 1) for beyond in BEYOND]
+    print(f"{'':14}" + "".join(f"{name:>24}" for name in names))
+    for kind in kinds:
+        rng = np.random.default_rng([SEED, KINDS.index(kind), 7])
+        marks = [some_mark(kind, 1.0, rng) for _ in range(min(POOL, count))]
+        words = []
+        for sign in (-1, 1):
+            for beyond in BEYOND:
+                cell, off = Cell(), []
+                for number in range(count):
+                    mark = marks[number % len(marks)]
+                    grey = 65535 + CONTRAST * (beyond + sign * mark.picture - (sign + 1) / 2)
+                    noise = rng.standard_normal((mark.size, mark.size)) / CLIPPED_SNR
+                    if number < len(marks):
+                        clean = measured(mark, grey, rng, exact=True)
+                        off.append(np.inf if clean is None else np.abs(clean.center_px - mark.place[:, 2]).max())
+                    best, bound = mark.best_errors(sign * noise, 1 / CLIPPED_SNR), mark.bound(1 / CLIPPED_SNR)
+                    cell.add(mark, measured(mark, grey + CONTRAST * noise, rng), best, bound)
+                words.append(f"{max(off):8.4f} {cell.words()}")
+        print(f"{kind.name:14}" + "".join(f"{each:>24}" for each in words), flush=True)
+
+
 def jpeg(kinds: Sequence[Kind], count: int) -> None:
     """JPEG of several qualities, 8 bit, contrast of 120 grey values."""
     print("\nJPEG, SNR 100, blur 1: rms in px, rms / bound without compression, realised / claimed")
@@ -337,6 +364,7 @@ STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
     "grain": grain,
     "dust": dust,
     "small_disks": small_disks,
+    "clipping": clipping,
     "jpeg": jpeg,
     "methods": methods,
 }

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.blank_film import BESIDE_PX
+from measure.clipping import clipped_sides
 from measure.compression import with_loss
 from measure.disk_patches import LEAST_SNR
 from measure.matching import MatchOptions, match, window_about
@@ -90,10 +91,11 @@ def fit_disk(
     )
     col0, row0, width, height = window_about(shape, start, wide + BESIDE_PX)
     window, valid = scan.window(col0, row0, width, height), inside(scan, col0, row0, width, height)
+    clipped = clipped_sides(scan, col0, row0, width, height, None)
 
     def fitted(margin_px: float) -> FittedDisk:
         own = replace(options, margin_px=margin_px)
-        fit = match(window, (col0, row0), shape, start, own, valid, scan.is_lossy)
+        fit = match(window, (col0, row0), shape, start, own, valid, clipped, scan.is_lossy)
         disk = FittedDisk(
             center_px=fit.center_px,
             covariance_px2=with_loss(fit.covariance_px2, scan),

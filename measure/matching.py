@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.blank_film import blank_patches, is_coloured
+from measure.clipping import Sides
 from measure.edge_place import EdgePlace, edge_place
 from measure.grain import grain_model
 from measure.match_options import MatchOptions
@@ -72,40 +73,47 @@ def match(
     pixel_from_mark: Array,
     options: MatchOptions | None = None,
     valid: Mask | None = None,
+    clipped: Sides | None = None,
     is_lossy: bool = False,
 ) -> Match:
     """Fit the mark to a window of the scan.
 
     window: (height, width) grey values whose top-left pixel's centre is at origin_px (col, row) of the scan; valid:
-    which of its pixels are true ones. pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col,
-    row): its last column is the approximate centre, right to a pixel or two. is_lossy: whether the grain in the
-    window was compressed, and tells nothing. Never raises for what the picture holds.
+    which of its pixels are true ones; clipped: which are at an end of the scanner's range, as `clipped_sides` gives it.
+    pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col, row): its last column is the
+    approximate centre, right to a pixel or two. is_lossy: whether the grain in the window was compressed, and tells
+    nothing. Never raises for what the picture holds.
     """
     options = options or MatchOptions()
     grey = np.asarray(window, dtype=float)
     usable = np.isfinite(grey) if valid is None else np.isfinite(grey) & valid
-    blank = np.zeros_like(usable) if is_lossy else usable
+    sides = np.zeros(grey.shape, np.int8) if clipped is None else clipped
+    blank = np.zeros_like(usable) if is_lossy else usable & (sides == 0)
     start = np.array(pixel_from_mark, dtype=float)
     start[:, 2] -= origin_px
-    result = _matched(np.where(usable, grey, 0.0), usable, blank, mark, start, options)
+    result = _matched(np.where(usable, grey, 0.0), usable, sides, blank, mark, start, options)
     if result.converged and options.margin_blurs * result.blur_px > options.margin_px:
         # The blur spreads the mark beyond its margin.
         wide = replace(options, blur_px=result.blur_px, margin_px=options.margin_blurs * result.blur_px)
-        result = _matched(np.where(usable, grey, 0.0), usable, blank, mark, start, wide)
+        result = _matched(np.where(usable, grey, 0.0), usable, sides, blank, mark, start, wide)
     moved = np.array(result.pixel_from_mark)
     moved[:, 2] += origin_px
     return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
 
 
-def _matched(window: Array, usable: Mask, blank: Mask, mark: Mark, start: Array, options: MatchOptions) -> Match:
+def _matched(
+    window: Array, usable: Mask, sides: Sides, blank: Mask, mark: Mark, start: Array, options: MatchOptions
+) -> Match:
     """The match in the whole window's own pixels: fitted in the part about the mark, its noise told by the rest too,
     where that may be blank film."""
     rows, cols = _cropped(window.shape, mark, start, options)
-    grey, seen, near = window[rows, cols], usable[rows, cols], start.copy()
+    grey, seen, ends, near = window[rows, cols], usable[rows, cols], sides[rows, cols], start.copy()
     near[:, 2] -= cols.start, rows.start
-    fit = _fitted(PictureModel(grey, mark, near, options), seen)
-    if fit.reason or is_textured(fit.model.residuals, fit.used):
-        detail = _fitted(PictureModel(grey, mark, near, options, background_px(mark, near)), seen)
+    fit = _fitted(PictureModel(grey, ends, mark, near, options), seen)
+    if fit.reason or is_textured(fit.model.residuals, fit.telling):
+        # What is left of a clipped grey value without its surroundings is no limit of anything.
+        whole, coarse_px = np.zeros_like(ends), background_px(mark, near)
+        detail = _fitted(PictureModel(grey, whole, mark, near, options, coarse_px), seen & (ends == 0))
         fit = fit if detail.reason else detail
     free = blank.copy()
     free[rows, cols] &= ~fit.area
@@ -141,7 +149,7 @@ def _fitted(model: PictureModel, usable: Mask) -> PictureFit:
 
 def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
     """The match in the pixels of the fit's own window; free: which pixels of the whole window may be blank film."""
-    model, used = fit.model, fit.used
+    model, used = fit.model, fit.telling
     noise = noise_model(model.residuals, used, len(model.design))
     covariance, gain_sigma = np.full((2, 2), np.inf), np.inf
     edges: EdgePlace | None = None

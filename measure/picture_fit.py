@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.noise import NoiseModel, correlated, robust_scale
-from measure.picture_model import PictureModel
+from measure.picture_model import ROUNDING_DN, PictureModel
 from measure.rendering import chip_mask, picture
 from measure.robust import damage, solution, tukey_loss, tukey_weights
 from measure.shapes import MarkTemplate
@@ -54,11 +54,12 @@ class PictureFit:
             if self.reason:
                 return
             floor_dn = _DAMAGE_FLOOR * self.contrast_dn
-            undamaged = self.area & ~damage(self.model.residuals, self.area, self.options.damage_sigmas, floor_dn)
+            shown = self.area & self.model.tells
+            undamaged = self.area & ~damage(self.model.residuals, shown, self.options.damage_sigmas, floor_dn)
             if round_ > 0 and np.array_equal(undamaged, self.used):
                 return
             self.used = undamaged
-            if self.used.sum() < 3 * len(self.model.design):
+            if self.telling.sum() < 3 * len(self.model.design):
                 self.reason = "too little of the mark is undamaged"
                 return
             if round_ == 0 and not self._is_plain():
@@ -126,6 +127,11 @@ class PictureFit:
         return abs(float(self.model.state.greys[0]))
 
     @property
+    def telling(self) -> Mask:
+        """The pixels used whose residuals say how large the noise is."""
+        return self.used & self.model.tells
+
+    @property
     def damaged_fraction(self) -> float:
         """Of the pixels about the mark, as far as the ground has to be plain there."""
         near = self.area & ~self.far
@@ -150,6 +156,7 @@ class PictureFit:
     def _adjust(self, robust: bool, tolerance_px: float) -> None:
         """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""
         model = self.model
+        model.noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
         model.linearise(self.used)
         self.variance_dn2 = self._tukey_scale() ** 2
         scale_dn = self._tukey_scale() if robust else np.inf
@@ -182,7 +189,7 @@ class PictureFit:
         return float(tukey_loss(self.model.residuals[self.used], scale_dn) + self.variance_dn2 * priors)
 
     def _tukey_scale(self) -> float:
-        return max(robust_scale(self.model.residuals[self.used]), _SCALE_FLOOR * self.contrast_dn, 1e-9)
+        return max(robust_scale(self.model.residuals[self.telling]), _SCALE_FLOOR * self.contrast_dn, 1e-9)
 
     def _solve(self, weights: Array) -> Array | None:
         """The step, None where it is not determined. A blur at its limit stays there instead of pulling the others."""

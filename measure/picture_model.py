@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.clipping import Sides, censored, tells
 from measure.match_options import Freedom, MatchOptions
 from measure.rendering import Rendering, extent_px, render
 from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
@@ -23,6 +24,7 @@ _GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]]
     "affine": (_SCALE, _STRETCH, _SHEAR, _TURN),
     "ellipse": (_SCALE, _STRETCH, _SHEAR),
 }
+ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values adds
 _BLUR_RANGE_PX = (0.3, 6.0)
 _BENT_PX = 0.05  # of the mark's outline: so far a series replaces a new drawing
 _PIXEL_VARIANCE_PX2 = 1 / 12
@@ -40,13 +42,24 @@ class State:
 
 class PictureModel:
     """The model at its present state: design (unknowns, height, width) and residuals (height, width). The unknowns are
-    column and row, the generators' parameters, the blur's variance if it is estimated, and the greys."""
+    column and row, the generators' parameters, the blur's variance if it is estimated, and the greys.
+
+    clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
+    values need; tells (height, width): False where a clipped one says nothing of it."""
 
     def __init__(
-        self, grey: Array, mark: Mark, start: Array, options: MatchOptions, background_px: float | None = None
+        self,
+        grey: Array,
+        clipped: Sides,
+        mark: Mark,
+        start: Array,
+        options: MatchOptions,
+        background_px: float | None = None,
     ) -> None:
         self.mark, self.start, self.options = mark, start, options
         self.background_px = background_px
+        self.clipped, self.noise_dn = clipped, ROUNDING_DN
+        self.tells = np.ones(grey.shape, dtype=bool)
         self.grey = self._detail(grey)
         generators = [g for g in _GENERATORS[options.freedom] if not (g is _TURN and is_round(mark))]
         self.generators = np.array(generators).reshape(-1, 2, 2)
@@ -77,6 +90,15 @@ class PictureModel:
             columns.append(-0.5 * shown.laplacian)
         self.design = np.concatenate([[-gain * self._detail(column) for column in columns], greys])
         self.residuals = self.grey - np.tensordot(self.state.greys, greys, axes=1)
+        self._censor()
+
+    def _censor(self) -> None:
+        """Clipped grey values hold the model on their side of the limit only."""
+        at = self.clipped != 0
+        if at.any():
+            self.residuals[at], slopes = censored(self.residuals[at], self.clipped[at], self.noise_dn)
+            self.design[:, at] *= slopes
+            self.tells[at] = tells(slopes)
 
     def place_drawn(self) -> Array:
         """(2, 3) the present place of the mark as it was last drawn: its linear part is close to the present one."""

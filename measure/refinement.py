@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from measure.blank_film import BESIDE_PX
 from measure.candidates import FAINT, correlate, detail_px
+from measure.clipping import clipped_sides
 from measure.compression import with_loss
 from measure.frame_corner import corner_of_edges
 from measure.matching import Match, MatchOptions, match, window_about
@@ -83,7 +84,9 @@ def _fitted(
     col0, row0, width, tall = window_about(mark, start, options.margin_px + BESIDE_PX)
     window = scan.window(col0, row0, width, tall, weights).astype(float)
     valid = _inside_scan(scan, col0, row0, width, tall)
-    return match(window, (col0, row0), mark, start, _options_for(mark, options, frame_sigma), valid, scan.is_lossy)
+    clipped = clipped_sides(scan, col0, row0, width, tall, weights)
+    own = _options_for(mark, options, frame_sigma)
+    return match(window, (col0, row0), mark, start, own, valid, clipped, scan.is_lossy)
 
 
 def strongest(

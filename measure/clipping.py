@@ -1,0 +1,64 @@
+"""Grey values at the end of a scanner's range: they say only that there was at least, or at most, so much light.
+
+Such an observation is censored (Tobin, 1958, Estimation of relationships for limited dependent variables): its
+likelihood is the probability that noise takes it beyond the limit. Least squares take it in as a residual whose square
+is -2 log of that probability (a deviance residual): where the model lies well within the range it is the ordinary one,
+where it lies well beyond there is none, and nothing has to be left out by a threshold, which would bias what stays.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from measure.scan import Scan
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Sides = NDArray[np.int8]
+
+_BITS = (8, 10, 12, 14, 16)  # of scanners' converters; their numbers are stored as they are, or moved up
+_LOG_DENSITY = -0.5 * np.log(2 * np.pi)
+_TELLS = 0.5  # derivative of the residual, from which on it is a residual like the others
+
+
+def clipped_sides(scan: Scan, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None) -> Sides:
+    """(height, width): 1 where a grey value of the window is at the upper end of the scanner's range, -1 at the lower,
+    0 elsewhere. weights: of the channels of a colour scan; none is negative, so that a channel at its end, of those
+    that count, is a limit of the whole."""
+    sides = np.zeros((height, width), np.int8)
+    for channel in range(scan.channels):
+        if weights is None or weights[channel] > 0:
+            only = tuple(float(index == channel) for index in range(scan.channels))
+            grey = scan.window(col0, row0, width, height, only)
+            if grey.max() in _limits(scan.full_scale_dn):
+                sides[grey == grey.max()] = 1
+            sides[grey == 0] = -1
+    return sides
+
+
+def censored(residuals: Array, sides: Sides, sigma_dn: float) -> tuple[Array, Array]:
+    """Residuals of clipped grey values, and their derivatives by the ordinary ones, between 0 and 1.
+
+    residuals, sides (n,): grey value less model; sigma_dn: standard deviation of the noise.
+    """
+    within = sides * residuals / sigma_dn
+    log_chance = np.asarray(log_ndtr(-within), dtype=float)
+    size = np.sqrt(np.maximum(-2 * log_chance, 1e-300))
+    slope = np.exp(_LOG_DENSITY - within**2 / 2 - log_chance) / size
+    return np.asarray(sides * sigma_dn * size), np.asarray(np.minimum(slope, 1.0))
+
+
+def tells(slopes: Array) -> Mask:
+    """Which residuals are as large as the noise makes them, and say how large it is."""
+    return np.asarray(slopes > _TELLS)
+
+
+def _limits(full_scale_dn: float) -> set[float]:
+    full_bits = int(full_scale_dn).bit_length()
+    limits = {full_scale_dn}
+    for bits in _BITS:
+        if bits < full_bits:
+            limits |= {float(2**bits - 1), float((2**bits - 1) << (full_bits - bits))}
+    return limits

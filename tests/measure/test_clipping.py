@@ -1,0 +1,71 @@
+"""Marks whose ground, or whose own light, is beyond the scanner's range."""
+
+import numpy as np
+import pytest
+from true_marks import KIND, TrueMark, scan_of, some_mark, whitened_rms
+
+from measure.clipping import censored, clipped_sides
+from measure.fiducial_options import FiducialOptions
+from measure.matching import Match
+from measure.refinement import sight
+
+FULL, CONTRAST = 65535.0, 20000.0
+
+
+def dark_mark(name: str, beyond: float, snr: float, rng: np.random.Generator) -> tuple[TrueMark, np.ndarray]:
+    """A mark and its picture on a ground that lies beyond the range by so much of the contrast."""
+    mark = some_mark(KIND[name], 1.0, rng)
+    noise = rng.standard_normal((mark.size, mark.size)) / snr
+    return mark, FULL + CONTRAST * (beyond - mark.picture + noise)
+
+
+def sighted(mark: TrueMark, grey: np.ndarray, polarity: int = -1) -> Match:
+    start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
+    frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
+    fit = sight(scan_of(grey), mark.kind.shape, start, 3.0, polarity, None, FiducialOptions().match, frame_sigma).fit
+    assert fit is not None
+    return fit
+
+
+@pytest.mark.parametrize("name", ["cross", "ring-dot", "wing", "notch"])
+@pytest.mark.parametrize("beyond", [0.0, 0.3])
+def test_clipping_does_not_move_a_mark(name: str, beyond: float) -> None:
+    rng = np.random.default_rng(1)
+    mark, grey = dark_mark(name, beyond, np.inf, rng)
+    np.testing.assert_allclose(sighted(mark, grey).center_px, mark.place[:, 2], atol=0.002)
+    np.testing.assert_allclose(sighted(mark, FULL - grey, 1).center_px, mark.place[:, 2], atol=0.002)
+
+
+@pytest.mark.parametrize("name", ["ring-dot", "wing"])
+def test_the_sigma_of_a_clipped_mark_says_what_was_lost(name: str) -> None:
+    rng = np.random.default_rng(2)
+    errors, covariances, whole = [], [], []
+    for _ in range(8):
+        mark, grey = dark_mark(name, 0.3, 20.0, rng)
+        fit = sighted(mark, grey)
+        errors.append(fit.center_px - mark.place[:, 2])
+        covariances.append(fit.covariance_px2)
+        whole.append(np.trace(mark.bound(1 / 20.0)))
+    assert 0.7 < whitened_rms(errors, covariances) < 1.3
+    assert np.mean([np.trace(each) for each in covariances]) > 1.4 * np.mean(whole)
+
+
+def test_a_censored_residual_is_twice_the_log_probability_and_derivatives_agree() -> None:
+    residuals, step = np.array([-30.0, -2.0, -0.3, 0.0, 0.8, 5.0, 300.0]), 1e-6
+    upper = np.ones(len(residuals), np.int8)
+    value, slope = censored(residuals, upper, 2.0)
+    more, less = censored(residuals + step, upper, 2.0)[0], censored(residuals - step, upper, 2.0)[0]
+    np.testing.assert_allclose(slope, (more - less) / (2 * step), atol=1e-5)
+    assert value[3] == pytest.approx(2.0 * np.sqrt(2 * np.log(2)))
+    np.testing.assert_allclose((value[0], value[-1]), (0.0, 300.0), atol=0.1)
+    np.testing.assert_allclose(censored(-residuals, np.negative(upper), 2.0)[0], -value)
+
+
+def test_ends_of_the_range_are_those_of_the_converter() -> None:
+    grey = np.full((40, 40), 9000.0)
+    grey[3, 4], grey[5, 6] = 4095 << 4, 0
+    sides = clipped_sides(scan_of(grey), 0, 0, 40, 40, None)
+    assert sides[3, 4] == 1
+    assert sides[5, 6] == -1
+    assert np.count_nonzero(sides) == 2
+    assert not clipped_sides(scan_of(grey), 10, 10, 20, 20, None).any()
