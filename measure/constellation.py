@@ -6,7 +6,6 @@ Places are complex numbers here, x + iy in mm of the scan's own axes (right, up)
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
 
 import cv2
 import numpy as np
@@ -232,11 +231,12 @@ class _Constellation:
 
     def _pairs(self) -> list[tuple[int, int]]:
         """Pairs of marks far apart, spread evenly over all marks where there are too many."""
-        pairs = list(combinations(range(len(self.camera)), 2))
-        length = np.array([abs(self.camera[i] - self.camera[j]) for i, j in pairs])
-        far = [pair for pair, distance in zip(pairs, length, strict=True) if distance >= 0.4 * length.max()]
+        first, second = np.triu_indices(len(self.camera), 1)
+        length = np.abs(self.camera[first] - self.camera[second])
+        far = np.flatnonzero(length >= 0.4 * length.max())
         step = max(1.0, len(far) / _PAIRS)
-        return [far[int(index * step)] for index in range(min(len(far), _PAIRS))]
+        chosen = far[(np.arange(min(len(far), _PAIRS)) * step).astype(int)]
+        return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
 
     def _scores(self, reached: Sequence[_Reach], scale: Complex, offset: Complex) -> tuple[Array, Array]:
         """Scores and numbers of supporting marks of many placements at once."""

@@ -5,6 +5,10 @@ pixels (col right, row down). Every part is an outline, a circle one of so many 
 theorem the area of a part in each pixel follows from the piece of outline in it and in the pixels left of it.
 """
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +17,7 @@ from measure.shapes import Bar, Disk, MarkShape, Part, Polygon, Ring
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
+Integers = NDArray[np.intp]
 
 CELLS = 4  # cells along a pixel's side: more than any blur of a scan tells apart
 _ROUND = 0.002  # cells: how far off its circle an outline may be
@@ -33,8 +38,8 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     cell_from_mark[:, 2] += 0.5
     cell_from_mark *= cells  # corners of cells are whole numbers
     covered = np.zeros((height * cells, width * cells), np.float32)
-    for part in shape.parts:
-        _add(covered, [_mapped(each, cell_from_mark) for each in _outlines(part, cell_from_mark)])
+    for pieces in _pieces_of(shape.parts, cell_from_mark):
+        _add(covered, pieces)
     return covered
 
 
@@ -56,6 +61,33 @@ def outline_mm(part: Part) -> Array:
         return np.stack([start - side, start + side, end + side, end - side])
     reach = part.radius_mm + (part.line_mm / 2 if isinstance(part, Ring) else 0.0)
     return np.asarray(part.center_mm) + reach * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """The outline of a part in pieces, each within one cell: (n,) the cells they lie in, how far down they go, and the
+    columns of their middles."""
+
+    row: Integers
+    col: Integers
+    tall: Array
+    middle: Array
+
+
+def _pieces_of(parts: Sequence[Part], cell_from_mark: Array) -> Iterator[_Pieces]:
+    """The outlines of all parts are cut at once."""
+    outlines = [_outlines(part, cell_from_mark) for part in parts]
+    corners = np.concatenate([outline for own in outlines for outline in own])
+    ends = np.concatenate([np.roll(outline, -1, axis=0) for own in outlines for outline in own])
+    part_of = np.repeat(np.arange(len(parts)), [sum(map(len, own)) for own in outlines])
+    linear, shift = cell_from_mark[:, :2].T, cell_from_mark[:, 2]
+    start, end, part_of = _split(corners @ linear + shift, ends @ linear + shift, part_of, axis=1)
+    start, end, part_of = _split(start, end, part_of, axis=0)
+    tall, middle = end[:, 1] - start[:, 1], (start + end) / 2
+    col, row = np.floor(middle).astype(np.intp).T
+    bounds = np.searchsorted(part_of, np.arange(len(parts) + 1)).tolist()
+    for own in (slice(*pair) for pair in pairwise(bounds)):
+        yield _Pieces(row[own], col[own], tall[own], middle[own, 0])
 
 
 def _outlines(part: Part, cell_from_mark: Array) -> list[Array]:
@@ -81,53 +113,41 @@ def _circle(part: Disk | Ring, radius_mm: float, cell_from_mark: Array) -> Array
     return np.asarray(part.center_mm + corner_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1))
 
 
-def _mapped(points_mm: Array, cell_from_mark: Array) -> Array:
-    return np.asarray(points_mm @ cell_from_mark[:, :2].T + cell_from_mark[:, 2])
-
-
-def _add(covered: Single, outlines: list[Array]) -> None:
-    """Add a part to what is covered already; only the cells about it are looked at."""
-    corners = np.concatenate(outlines)
-    size = covered.shape[::-1]
-    col0, row0 = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, size)
-    col1, row1 = np.clip(np.ceil(corners.max(axis=0)).astype(int), 0, size)
-    if col0 < col1 and row0 < row1:
-        about = covered[row0:row1, col0:col1]
-        part = _areas([each - (col0, row0) for each in outlines], int(col1 - col0), int(row1 - row0))
-        about += (1 - about) * part
-
-
-def _areas(outlines: list[Array], width: int, height: int) -> Single:
-    """(height, width) areas inside of closed outlines (n, 2): each piece of them within one cell adds its height to all
-    cells right of it, and to its own what lies right of it there."""
-    start = np.concatenate(outlines)
-    end = np.concatenate([np.roll(each, -1, axis=0) for each in outlines])
-    start, end = _split(*_split(start, end, axis=1), axis=0)
-    tall, middle = end[:, 1] - start[:, 1], (start + end) / 2
-    col, row = np.floor(middle).astype(np.intp).T
-    right_part = np.where(col < 0, 1.0, col + 1 - middle[:, 0])
-    seen = (row >= 0) & (row < height) & (col < width)
-    cell = (row * (width + 1) + np.maximum(col, 0))[seen]
-    own = (tall * right_part)[seen]
-    rest = tall[seen] - own
-    added = np.bincount(cell, own, height * (width + 1)) + np.bincount(cell + 1, rest, height * (width + 1))
-    areas = np.cumsum(added.reshape(height, width + 1)[:, :width], axis=1)
-    return np.clip(np.abs(areas), 0.0, 1.0).astype(np.float32)
-
-
-def _split(start: Array, end: Array, axis: int) -> tuple[Array, Array]:
-    """Lines (n, 2) cut where they cross whole numbers of a coordinate, in their order."""
+def _split(start: Array, end: Array, part_of: Integers, axis: int) -> tuple[Array, Array, Integers]:
+    """Lines (n, 2) cut where they cross whole numbers of a coordinate, in order, and the parts (n,) they are of."""
     first, last = np.floor(start[:, axis]), np.floor(end[:, axis])
     pieces = np.abs(last - first).astype(np.intp) + 1
     line = np.repeat(np.arange(len(start)), pieces)
     number = np.arange(len(line)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    step = (end - start)[line]
-    crossing = first[line] + np.where(step[:, axis] >= 0, number, 1 - number)
-    crosses = step[:, axis] != 0
-    share = np.divide(crossing - start[line, axis], step[:, axis], out=np.zeros(len(line)), where=crosses)
-    at = start[line] + share[:, None] * step
-    at[:, axis] = crossing
-    cut_start = np.where((number == 0)[:, None], start[line], at)
-    is_last = number == pieces[line] - 1
-    cut_end = np.where(is_last[:, None], end[line], np.roll(at, -1, axis=0))
-    return cut_start, cut_end
+    start, step = start[line], (end - start)[line]
+    along = step[:, axis]
+    crossing = first[line] + np.where(along >= 0, number, 1 - number)
+    share = np.divide(crossing - start[:, axis], along, out=np.zeros(len(line)), where=along != 0)
+    cut = start + share[:, None] * step
+    cut[:, axis] = crossing
+    is_first = number == 0
+    cut[is_first] = start[is_first]
+    # A piece ends where the next one of its line begins, the last one at the line's end.
+    cut_end = np.roll(cut, -1, axis=0)
+    is_last = np.roll(is_first, -1)
+    cut_end[is_last] = (start + step)[is_last]
+    return cut, cut_end, part_of[line]
+
+
+def _add(covered: Single, pieces: _Pieces) -> None:
+    """Add a part to what is covered already. Each piece of its outline adds its height to all cells right of it, and to
+    its own what lies right of it there. Only the cells about the part are looked at."""
+    height, width = covered.shape
+    seen = (pieces.row >= 0) & (pieces.row < height) & (pieces.col < width)
+    if not seen.any():
+        return
+    row, col, tall = pieces.row[seen], np.maximum(pieces.col[seen], 0), pieces.tall[seen]
+    own = tall * np.where(pieces.col[seen] < 0, 1.0, col + 1 - pieces.middle[seen])
+    row0, col0, col1 = row.min(), col.min(), min(pieces.col.max() + 1, width)
+    tall_cells, wide_cells = row.max() - row0 + 1, col1 - col0 + 1
+    cell = (row - row0) * wide_cells + col - col0
+    count = tall_cells * wide_cells
+    added = np.bincount(cell, own, count) + np.bincount(cell + 1, tall - own, count)
+    areas = np.abs(np.cumsum(added.reshape(tall_cells, wide_cells), axis=1)).astype(np.float32)
+    about = covered[row0 : row0 + tall_cells, col0:col1]
+    about += (1 - about) * np.minimum(areas[:, :-1], 1.0)

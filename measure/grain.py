@@ -76,7 +76,9 @@ class _Window:
 
     def products(self, images: Array) -> Array:
         """(distances,) sums over the images of the products of their pixels so far apart."""
-        return np.array([np.vdot(images, ring.sums(images)) for ring in self.rings])
+        shape = _padded(images.shape[1:])
+        lags = fft.irfft2((np.abs(fft.rfft2(images, s=shape)) ** 2).sum(axis=0), s=shape)
+        return np.array([lags[ring.index].sum() for ring in self.rings])
 
     @cached_property
     def expected(self) -> Array:
@@ -86,7 +88,7 @@ class _Window:
         is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
         times the autocorrelation at that lag, whatever it is.
         """
-        shape = [fft.next_fast_len(size + REACH_PX, real=True) for size in self.used.shape]
+        shape = _padded(self.used.shape)
         spectra = np.conj(fft.rfft2(self.taken, s=shape))
         index = np.arange(-REACH_PX, REACH_PX + 1)
         left = []
@@ -96,7 +98,7 @@ class _Window:
             beside = np.tensordot(among, self.taken, axes=1) - 2 * beside
             lags = fft.irfft2((spectra * fft.rfft2(beside, s=shape)).sum(axis=0), s=shape)
             taken = _KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel()
-            left.append(pairs * _KERNELS[(slice(None), *(REACH_PX + np.array(ring.lags[0])))] + taken)
+            left.append(pairs * _KERNELS[:, REACH_PX + ring.lags[0][0], REACH_PX + ring.lags[0][1]] + taken)
         return np.stack(left, axis=1)
 
 
@@ -105,6 +107,11 @@ class _Ring:
     """All lags (rows, columns) of one length."""
 
     lags: tuple[tuple[int, int], ...]
+
+    @property
+    def index(self) -> tuple[list[int], list[int]]:
+        """Of these lags in a picture of all of them that begins with none, negative ones at its end."""
+        return [down for down, _ in self.lags], [right for _, right in self.lags]
 
     def sums(self, images: Images) -> Images:
         """Of the pixels at these lags from each pixel of images (n, height, width)."""
@@ -124,6 +131,11 @@ def _rings(farthest_px: float) -> list[_Ring]:
         if down**2 + right**2 <= farthest_px**2:
             by_square.setdefault(down**2 + right**2, []).append((down, right))
     return [_Ring(tuple(lags)) for _, lags in sorted(by_square.items())]
+
+
+def _padded(shape: tuple[int, ...]) -> list[int]:
+    """The size of a transform in which lags up to the reach do not run into one another."""
+    return [fft.next_fast_len(size + REACH_PX, real=True) for size in shape]
 
 
 @cache

@@ -69,6 +69,7 @@ class PictureModel:
         sharp = isinstance(mark, MarkTemplate) and not options.estimate_blur
         self.state = State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
         self.drawn = start[:, :2].copy()
+        self.reach_px = float(np.hypot(*np.abs(np.array(extent_px(mark, start)) - start[:, 2]).max(axis=0)))
         self.residuals = np.zeros_like(grey)
         self.design = np.zeros((0, *grey.shape))
 
@@ -103,9 +104,8 @@ class PictureModel:
     def place_drawn(self) -> Array:
         """(2, 3) the present place of the mark as it was last drawn: its linear part is close to the present one."""
         place = self.state.pixel_from_mark
-        least, greatest = extent_px(self.mark, place)
         change = place[:, :2] @ np.linalg.inv(self.drawn) - np.eye(2)
-        if np.linalg.norm(change, 2) * np.hypot(*(greatest - least)) / 2 > _BENT_PX:
+        if float(np.sqrt(np.sum(change**2))) * self.reach_px > _BENT_PX:
             self.drawn = place[:, :2].copy()
         return np.column_stack([self.drawn, place[:, 2]])
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -18,7 +18,7 @@ Single = NDArray[np.float32]
 Integers = NDArray[np.int_]
 
 _DRAWINGS = 16  # kept: more than a camera has kinds of marks
-_BLOCK = 8  # pixels that are averaged at once
+_BLOCK = 16  # pixels that are averaged at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,12 +177,15 @@ class _Average:
     def __init__(self, blur_px: float, cells: int, shift_px: float, order: int) -> None:
         whole = round(shift_px * cells)
         kernels = _kernels(blur_px * cells, shift_px * cells - whole)[: order + 1]
+        kernels *= cells ** np.arange(order + 1.0)[:, None]
+        reach = kernels.shape[1] // 2
+        summed = np.zeros((order + 1, kernels.shape[1] + 2 * cells))
+        np.cumsum(kernels, axis=1, out=summed[:, cells:-cells])
+        summed[:, -cells:] = summed[:, -cells - 1, None]
         self.cells = cells
-        self.taps = np.stack(
-            [np.convolve(kernel, np.full(cells, cells**power / cells)) for power, kernel in enumerate(kernels)]
-        ).astype(np.float32)
-        self.reach = len(kernels[0]) // 2 + abs(whole)
-        self.first = -(len(kernels[0]) // 2) - whole
+        self.taps = ((summed[:, cells:] - summed[:, :-cells]) / cells)[:, :-1].astype(np.float32)
+        self.reach = reach + abs(whole)
+        self.first = -reach - whole
 
     def of(self, sharp: Single, first: int, count: int) -> Single:
         """(orders, count, columns) of the pixels from the first one on, of cells (rows, columns).
@@ -193,35 +196,41 @@ class _Average:
         orders, taps = self.taps.shape
         blocks = -(-count // _BLOCK)
         span = (_BLOCK - 1) * self.cells + taps
-        band = np.zeros((orders, _BLOCK, span), np.float32)
-        for pixel in range(_BLOCK):
-            band[:, pixel, pixel * self.cells : pixel * self.cells + taps] = self.taps
+        band = np.zeros((orders, _BLOCK * (span + self.cells)), np.float32)
+        # Each pixel's taps lie as many cells farther on than the last one's.
+        as_strided(band, (orders, _BLOCK, taps), (band.strides[0], 4 * (span + self.cells), 4))[:] = self.taps[:, None]
+        matrix = band[:, : _BLOCK * span].reshape(-1, span)
         begin, length = first * self.cells + self.first, (blocks - 1) * _BLOCK * self.cells + span
         rows = np.zeros((length, sharp.shape[1]), np.float32)
         inside = slice(max(begin, 0), max(min(begin + length, len(sharp)), 0))
         rows[inside.start - begin : inside.stop - begin] = sharp[inside]
-        parts = sliding_window_view(rows, span, axis=0)[:: _BLOCK * self.cells].swapaxes(1, 2)
-        means = (band.reshape(-1, span) @ parts).reshape(blocks, orders, _BLOCK, -1)
+        step = rows.strides[0]
+        parts = as_strided(rows, (blocks, span, rows.shape[1]), (_BLOCK * self.cells * step, step, rows.strides[1]))
+        means = (matrix @ parts).reshape(blocks, orders, _BLOCK, -1)
         return np.asarray(means.swapaxes(0, 1).reshape(orders, blocks * _BLOCK, -1)[:, :count])
 
 
-def _kernels(sigma: float, shift: float) -> tuple[Array, Array, Array]:
+def _kernels(sigma: float, shift: float) -> Array:
     """A Gaussian sampled at whole numbers and so far off, and its first and second derivative, normalised so that
     polynomials come out right."""
     reach = int(np.ceil(4 * sigma)) + 2
     place = np.arange(-reach, reach + 1) + shift
-    smooth = np.exp(-0.5 * (place / max(sigma, 1e-3)) ** 2)
+    kernels = np.zeros((3, len(place)))
+    smooth, slope, bend = kernels
+    smooth[:] = np.exp(-0.5 * (place / max(sigma, 1e-3)) ** 2)
     smooth /= smooth.sum()
     if sigma < 0.5:
-        slope, bend = np.zeros_like(smooth), np.zeros_like(smooth)
         # A chip's own detail is hardly coarser than its pixels: differences of the fourth order, over five of them.
         slope[reach - 2 : reach + 3] = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12
         bend[reach - 2 : reach + 3] = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / 12
-        return smooth, slope, bend
-    slope = place * smooth / (place**2 * smooth).sum()
-    bend = (place**2 - sigma**2) * smooth
+        return kernels
+    square = place**2
+    slope[:] = place * smooth
+    slope /= place @ slope
+    bend[:] = (square - sigma**2) * smooth
     bend -= smooth * bend.sum()
-    return smooth, slope, bend * 2 / (place**2 * bend).sum()
+    bend *= 2 / (square @ bend)
+    return kernels
 
 
 def _pixels_per_sample(mark: MarkTemplate, pixel_from_mark: Array) -> float:

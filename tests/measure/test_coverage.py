@@ -37,6 +37,15 @@ def test_a_blurred_disks_centroid_and_area_are_exact(phase: float) -> None:
     assert shown.sum() == pytest.approx(np.pi * 25, rel=5e-4)
 
 
+@pytest.mark.parametrize("name", MARKS)
+@pytest.mark.parametrize("corner", [(0, 0), (14, 3), (3, 14), (17, 17)])
+def test_what_a_small_window_shows_is_a_part_of_the_whole(name: str, corner: tuple[int, int]) -> None:
+    mark, (col0, row0) = MarkShape(MARKS[name]), corner
+    moved = SHEARED - np.array([[0, 0, col0], [0, 0, row0]])
+    whole = coverage(mark, SHEARED, 41, 41)[row0 : row0 + 9, col0 : col0 + 9]
+    np.testing.assert_allclose(coverage(mark, moved, 9, 9), whole, atol=1e-6)
+
+
 def test_a_polygons_area_is_exact() -> None:
     triangle = MarkShape(polygon([(0.0, 0.0), (1.1, 0.2), (0.3, 0.9)]))
     area_mm2 = 0.5 * (1.1 * 0.9 - 0.2 * 0.3)
