@@ -24,6 +24,7 @@ _SHARED_PX = 16  # of the reduced scan: places so near to one another share a wi
 _ALIKE = 0.8  # correlation above which two pictures of marks share one response
 _COARSE = 4.0  # times the finest detail: coarser structure is background
 _CLIP = 2.0  # times the local contrast
+_SMOOTHED_PX = 3.0  # the standard deviation of a Gaussian that a reduced picture still shows
 FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 
 
@@ -68,15 +69,17 @@ def respond(scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1))
     Of a colour scan every channel is tried, and the one that answers best at a place counts there.
     """
     reduction = _reduction(scan, looks)
-    templates = [_template(look, reduction) for look in looks]
-    kinds, index = _distinct(templates)
-    details = [detail_px(looks[index.index(kind)].mark, looks[0].linear) / reduction for kind in range(len(kinds))]
+    kinds, index = _distinct(_templates(looks, reduction))
+    details = [_reduced_detail_px(looks[index.index(kind)], reduction) for kind in range(len(kinds))]
+    half = max(template.shape[0] for template in kinds) // 2
     maps: dict[tuple[int, int], Map] = {}
     for weights in _channel_weights(scan):
         grey = scan.reduced(reduction, weights)
-        for kind, template in enumerate(kinds):
-            response = _correlation(grey, template, max(details[kind], 1.0), scan.full_scale_dn * FAINT)
-            _strongest(maps, kind, signs, response)
+        around = np.asarray(cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE), np.float32)
+        for detail in sorted(set(details)):
+            image = flattened(around, detail, scan.full_scale_dn * FAINT)
+            for kind in (kind for kind, own in enumerate(details) if own == detail):
+                _strongest(maps, kind, signs, _within(_correlated(image, kinds[kind], detail), grey.shape))
     return Responses(maps, reduction), index
 
 
@@ -86,9 +89,8 @@ def respond_about(
     """The same, of each look only about its place (n, 2) in the scan, as far as reach_px and a little farther: of the
     file only these windows are read. A kind is a look at one place."""
     reduction = _reduction(scan, looks)
-    templates = [_template(look, reduction) for look in looks]
-    shapes, shape_of = _distinct(templates)
-    detail = max(detail_px(looks[0].mark, looks[0].linear) / reduction, 1.0)
+    shapes, shape_of = _distinct(_templates(looks, reduction))
+    detail = _reduced_detail_px(looks[0], reduction)
     reach, half = int(np.ceil(reach_px / reduction)), max(template.shape[0] for template in shapes) // 2
     corners, corner_of = np.unique(np.floor(places_px / reduction / _SHARED_PX), axis=0, return_inverse=True)
     origins = corners.astype(int) * _SHARED_PX - reach
@@ -100,10 +102,9 @@ def respond_about(
         maps: dict[tuple[int, int], Map] = {}
         for weights in _channel_weights(scan):
             grey = scan.reduced_window(reduction, col0, row0, size + 2 * half, size + 2 * half, weights)
+            image = flattened(grey, detail, scan.full_scale_dn * FAINT)
             for kind, shape in ((kind, shape) for kind, (own, shape) in enumerate(kinds) if own == corner):
-                response = correlate(grey, shapes[shape], detail, scan.full_scale_dn * FAINT)
-                spare = half - shapes[shape].shape[0] // 2
-                _strongest(maps, kind, signs, response[spare : spare + size, spare : spare + size])
+                _strongest(maps, kind, signs, _within(_correlated(image, shapes[shape], detail), (size, size)))
         return maps
 
     every = {key: map_ for maps in scan.each(at_corner, range(len(corners))) for key, map_ in maps.items()}
@@ -140,16 +141,37 @@ def correlate(grey: NDArray[np.floating], template: Array, detail_px: float, fai
     clipped, so that a thin cross on a landscape answers as on an even ground. Contrasts of faint_dn or below count for
     less.
     """
-    image = flattened(np.asarray(grey, np.float32), detail_px, faint_dn)
+    return _correlated(flattened(np.asarray(grey, np.float32), detail_px, faint_dn), template, detail_px)
+
+
+def flattened(image: Map, detail_px: float, faint_dn: float) -> Map:
+    """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel."""
+    coarse_px = _COARSE * detail_px
+    detail = image - _smoothed(image, coarse_px)
+    contrast = np.sqrt(_smoothed(detail**2, 2 * coarse_px) + faint_dn**2)
+    return np.asarray(np.clip(detail / contrast, -_CLIP, _CLIP), np.float32)
+
+
+def _smoothed(image: Map, sigma_px: float) -> Map:
+    """The picture under a Gaussian; a wide one takes, for its price, hardly more than a reduced picture tells."""
+    factor = max(1, int(sigma_px / _SMOOTHED_PX))
+    height, width = image.shape
+    small = cv2.resize(image, (-(-width // factor), -(-height // factor)), interpolation=cv2.INTER_AREA)
+    # The averaging and the straight lines between its pixels blur by themselves: f^2 / 12 and f^2 / 6 of variance.
+    left = np.sqrt(sigma_px**2 - (factor**2 - 1) / 4) / factor
+    return np.asarray(cv2.resize(cv2.GaussianBlur(small, (0, 0), left), (width, height)), np.float32)
+
+
+def _correlated(image: Map, template: Array, detail_px: float) -> Map:
+    """The normalised correlation with a flattened picture, wherever the template lies inside of it."""
     chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), _COARSE * detail_px), np.float32)
     return np.asarray(cv2.matchTemplate(image, chip, cv2.TM_CCOEFF_NORMED), np.float32)
 
 
-def flattened(image: Map, detail_px: float, faint_dn: float) -> Map:
-    coarse_px = _COARSE * detail_px
-    detail = image - cv2.GaussianBlur(image, (0, 0), coarse_px)
-    contrast = np.sqrt(cv2.GaussianBlur(detail**2, (0, 0), 2 * coarse_px) + faint_dn**2)
-    return np.asarray(np.clip(detail / contrast, -_CLIP, _CLIP), np.float32)
+def _within(response: Map, shape: tuple[int, ...]) -> Map:
+    """The middle (rows, columns) of a response that reaches as far beyond it on every side."""
+    row0, col0 = ((whole - part) // 2 for whole, part in zip(response.shape, shape, strict=True))
+    return response[row0 : row0 + shape[0], col0 : col0 + shape[1]]
 
 
 def _reduction(scan: Scan, looks: Sequence[Look]) -> int:
@@ -161,6 +183,19 @@ def _reduction(scan: Scan, looks: Sequence[Look]) -> int:
         limits.append(min((greatest - least).max() / _EXTENT_PX, scale * thinnest_mm(look.mark) / _THINNEST_PX))
     needed = max(scan.width_px, scan.height_px) / _LARGEST_PX
     return max(1, int(min(limits)), int(np.ceil(needed)))
+
+
+def _reduced_detail_px(look: Look, reduction: int) -> float:
+    return max(detail_px(look.mark, look.linear) / reduction, 1.0)
+
+
+def _templates(looks: Sequence[Look], reduction: int) -> list[Array]:
+    """The picture of every look; the same mark in the same direction shares its own."""
+    drawn: dict[tuple[Mark, bytes], Array] = {}
+    for look in looks:
+        key = look.mark, look.linear.tobytes()
+        drawn[key] = drawn[key] if key in drawn else _template(look, reduction)
+    return [drawn[look.mark, look.linear.tobytes()] for look in looks]
 
 
 def _template(look: Look, reduction: int) -> Array:
@@ -178,28 +213,23 @@ def _centred(linear: Array) -> Array:
 def _distinct(templates: Sequence[Array]) -> tuple[list[Array], tuple[int, ...]]:
     """Templates that differ, and which of them stands for each."""
     kinds: list[Array] = []
-    index = []
+    kind_of: dict[int, int] = {}
     for template in templates:
+        if id(template) in kind_of:
+            continue
         likeness = [_likeness(template, kind) for kind in kinds]
         if likeness and max(likeness) > _ALIKE:
-            index.append(int(np.argmax(likeness)))
+            kind_of[id(template)] = int(np.argmax(likeness))
         else:
-            index.append(len(kinds))
+            kind_of[id(template)] = len(kinds)
             kinds.append(template)
-    return kinds, tuple(index)
+    return kinds, tuple(kind_of[id(template)] for template in templates)
 
 
 def _likeness(first: Array, second: Array) -> float:
     half = max(first.shape[0], second.shape[0]) // 2
     padded = np.stack([np.pad(t, half - t.shape[0] // 2).ravel() for t in (first, second)])
     return float(np.asarray(np.corrcoef(padded))[0, 1])
-
-
-def _correlation(grey: Map, template: Array, detail_px: float, faint_dn: float) -> Map:
-    """The correlation at every pixel, the scan's edge being repeated beyond it."""
-    half = template.shape[0] // 2
-    padded = cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE)
-    return correlate(np.asarray(padded, np.float32), template, detail_px, faint_dn)
 
 
 def _channel_weights(scan: Scan) -> tuple[tuple[float, ...], ...]:

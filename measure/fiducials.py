@@ -86,12 +86,26 @@ def _anywhere(
     found = _found(scan, layout, pitch_um, options)
     if not found:
         return [], None
-    frames = [measure_frame(scan, layout, found[0], options)]
+    frames = [_as_its_pictures_say(scan, layout, found, found[0], options)]
     for placement in _others(found):
         if frames[-1].accepted:
             break
-        frames.append(measure_frame(scan, layout, placement, options))
+        frames.append(_as_its_pictures_say(scan, layout, found, placement, options))
     return found, max(frames, key=lambda frame: (frame.accepted, frame.belongs.sum()))
+
+
+def _as_its_pictures_say(
+    scan: Scan, layout: FiducialLayout, found: Sequence[Placement], placement: Placement, options: FiducialOptions
+) -> Frame:
+    """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
+    names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
+    frame = measure_frame(scan, layout, placement, options)
+    if frame.accepted or not frame.belongs.any() or options.pose != "auto":
+        return frame
+    pose = decide_pose(scan, layout, [_posed(found, placement, pose) for pose in POSES], frame, options)
+    if not pose.decided or pose.name == placement.pose:
+        return frame
+    return measure_frame(scan, layout, _posed(found, placement, pose.name), options)
 
 
 def _stretched(

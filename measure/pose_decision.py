@@ -72,11 +72,11 @@ def decide_pose(
 @dataclass(frozen=True, eq=False)
 class _Named:
     """The places of marks, found or missed, by the names that a pose gives them (-1: none), and the frame through those
-    found."""
+    found, if there are two."""
 
     pose: str
     names: tuple[int, ...]
-    fit: FrameFit
+    fit: FrameFit | None
     linear: Array
 
     @classmethod
@@ -88,7 +88,7 @@ class _Named:
         missed: Sequence[Array],
         options: FiducialOptions,
     ) -> "_Named | None":
-        """None where the pose names fewer than two of the marks found, or two alike."""
+        """None where the pose names fewer than two of the marks found, having two, or gives two the same name."""
         pitch, camera = np.asarray(placement.pitch_mm), np.array([mark.xy_mm for mark in layout.marks])
         predicted = camera @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
         centers = np.array([*(fit.center_px for fit in seen), *missed])
@@ -100,7 +100,8 @@ class _Named:
             return None
         near, centers = near[: len(seen)], centers[: len(seen)]
         if near.sum() < 2:
-            return None
+            alone = cls(placement.pose, tuple(names.tolist()), None, placement.pixel_from_camera[:, :2])
+            return alone if len(seen) < 2 else None
         own = names[: len(seen)][near]
         given = np.array([min(max(layout.marks[name].sigma_mm), 1e3) for name in own])
         measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in seen])[near] * pitch.mean()
@@ -108,13 +109,15 @@ class _Named:
         up = centers[near] * pitch * (1.0, -1.0)
         fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose))
         linear = np.diag([1.0, -1.0]) @ fit.up_from_camera[:, :2] / pitch[:, None]
-        return cls(placement.pose, tuple(int(name) for name in names), fit, linear)
+        return cls(placement.pose, tuple(names.tolist()), fit, linear)
 
     def shown(self, site: int, layout: FiducialLayout) -> Shown:
         return Shown(None if self.names[site] < 0 else layout.marks[self.names[site]].mark, self.linear)
 
     def verdict(self, pictures: Array) -> _Verdict:
         """The coordinates' likelihood is Student's: nobody knows the film's standard deviation well."""
+        if self.fit is None:
+            return _Verdict(self.pose, self.names, pictures, 0.0, 0.0)
         degrees = _FILM_DEGREES + max(self.fit.redundancy, 0)
         coordinates = -degrees / 2 * float(np.log1p(self.fit.chi_square / _FILM_DEGREES))
         return _Verdict(self.pose, self.names, pictures, coordinates, self.fit.chi_square)
