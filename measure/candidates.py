@@ -23,7 +23,9 @@ _LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
 _SHARED_PX = 16  # of the reduced scan: places so near to one another share a window
 _ALIKE = 0.8  # correlation above which two pictures of marks share one response
 _COARSE = 4.0  # times the finest detail: coarser structure is background
-_CLIP = 2.0  # times the local contrast
+_CLIP = 3.0  # times the local contrast
+_MEAN = 0.3  # of the coarse: the side of the squares whose median is background
+_DRAWN = 0.05  # of the mark's own contrast: what differs by more from the ground is the mark
 _SMOOTHED_PX = 3.0  # the standard deviation of a Gaussian that a reduced picture still shows
 FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 
@@ -139,33 +141,59 @@ def correlate(grey: NDArray[np.floating], template: Array, detail_px: float, fai
 
     Both are freed of everything much coarser than the mark's finest detail (detail_px), and strong contrasts are
     clipped, so that a thin cross on a landscape answers as on an even ground. Contrasts of faint_dn or below count for
-    less.
+    less. Only pixels about the drawing count: beside it may lie the frame's edge, or writing.
     """
     return _correlated(flattened(np.asarray(grey, np.float32), detail_px, faint_dn), template, detail_px)
 
 
 def flattened(image: Map, detail_px: float, faint_dn: float) -> Map:
-    """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel."""
+    """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel.
+
+    The ground is a median, which keeps the frame's edge: a mean would spread it over the marks beside it, and drown
+    those that are faint.
+    """
     coarse_px = _COARSE * detail_px
-    detail = image - _smoothed(image, coarse_px)
+    detail = image - _ground(image, coarse_px)
     contrast = np.sqrt(_smoothed(detail**2, 2 * coarse_px) + faint_dn**2)
     return np.asarray(np.clip(detail / contrast, -_CLIP, _CLIP), np.float32)
+
+
+def _ground(image: Map, coarse_px: float) -> Map:
+    """The median of five by five means."""
+    return _enlarged(cv2.medianBlur(_reduced(image, max(1, int(_MEAN * coarse_px))), 5), image)
 
 
 def _smoothed(image: Map, sigma_px: float) -> Map:
     """The picture under a Gaussian; a wide one takes, for its price, hardly more than a reduced picture tells."""
     factor = max(1, int(sigma_px / _SMOOTHED_PX))
-    height, width = image.shape
-    small = cv2.resize(image, (-(-width // factor), -(-height // factor)), interpolation=cv2.INTER_AREA)
     # The averaging and the straight lines between its pixels blur by themselves: f^2 / 12 and f^2 / 6 of variance.
     left = np.sqrt(sigma_px**2 - (factor**2 - 1) / 4) / factor
-    return np.asarray(cv2.resize(cv2.GaussianBlur(small, (0, 0), left), (width, height)), np.float32)
+    return _enlarged(cv2.GaussianBlur(_reduced(image, factor), (0, 0), left), image)
+
+
+def _reduced(image: Map, factor: int) -> Map:
+    height, width = image.shape
+    size = -(-width // factor), -(-height // factor)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _enlarged(small: NDArray[np.integer | np.floating], image: Map) -> Map:
+    """A reduced picture in the size of the other."""
+    return np.asarray(cv2.resize(small, image.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _correlated(image: Map, template: Array, detail_px: float) -> Map:
     """The normalised correlation with a flattened picture, wherever the template lies inside of it."""
     chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), _COARSE * detail_px), np.float32)
-    return np.asarray(cv2.matchTemplate(image, chip, cv2.TM_CCOEFF_NORMED), np.float32)
+    response = cv2.matchTemplate(image, chip, cv2.TM_CCOEFF_NORMED, mask=_about(template, detail_px))
+    return np.where(np.isfinite(response), response, 0.0).astype(np.float32)  # nothing but even ground is no answer
+
+
+def _about(template: Array, detail_px: float) -> Map:
+    """1 on the drawing and as far about it as its finest detail is wide, 0 elsewhere."""
+    rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
+    beside = (np.abs(template - np.median(rim)) < _DRAWN).astype(np.uint8)
+    return np.asarray(cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= detail_px + 1, np.float32)
 
 
 def _within(response: Map, shape: tuple[int, ...]) -> Map:
