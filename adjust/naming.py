@@ -4,6 +4,9 @@ Hypothesis and test. Three object points that lie close together are taken to be
 which they would be are tested on the points about them, the best ones grow over the whole image, and what has grown is
 believed only if chance would hardly do as well (a contrario: Desolneux, Moisan and Morel 2008). Then it is tried
 whether the same marks could bear other names: a field that looks the same from another side has none, and that is said.
+
+Where the principal distance is not known, either, some far apart are tried: what lies about three points looks nearly
+the same with any, and the growing finds the right one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,6 +30,9 @@ ALIKE_SHARE = 0.7  # of the named marks, from which on other names explain the i
 MOST_POSES = 1_000_000  # that are tried: they bound the time
 MOST_LOG10_CHANCE_OF_CODES = -3.0  # of codes that agree: they were not chosen among many
 LEAST_CODES = 4  # three always give a pose
+KNOWN_SIGMA = 0.05  # of a principal distance that is known, relative
+# Where it is not known, over the frame's diagonal, the usual ones first; none is farther off than a factor of 1.41:
+UNKNOWN, UNKNOWN_SIGMA = (1.2, 0.6, 2.4, 0.3, 4.8), 0.3
 OTHER_CLUSTERS = 8  # named clusters that are tried as other points: with half of them seen, one case in 256 escapes
 
 
@@ -51,23 +57,23 @@ def name_marks(
     normals: Array,
     xy_mm: Array,
     frame_mm: tuple[Array, Array],
-    principal_distance_mm: float,
+    principal_distance_mm: float | None,
     sigma_mm: float,
 ) -> Names | str:
     """Name the marks of an image of known points; or why they have no names.
 
     xyz (n, 3), normals (n, 3): where the points face, nan where that is not known; xy_mm (m, 2): ideal coordinates of
     the marks about the principal point, y up, sigma_mm each; frame_mm: the least and the greatest (2,) that were
-    searched; principal_distance_mm: right to some percent. The same input gives the same names.
+    searched; principal_distance_mm: right to some percent, or None. The same input gives the same names.
     """
     n, m = len(xyz), len(xy_mm)
     if min(n, m) < LEAST_POINTS:
         return f"{m} marks and {n} points are too few: {LEAST_POINTS} that agree are needed"
     unit = _Unit.of(xyz)
-    marks = Marks.of(xy_mm, *frame_mm, sigma_mm, principal_distance_mm)
     own = unit.of_points(xyz)
-    search = _Search(own, normals, marks, clusters(own, normals, m / n))
-    found = search.first()
+    tried = clusters(own, normals, m / n)
+    assumed = _assumed(xy_mm, frame_mm, principal_distance_mm, sigma_mm)
+    search, found = _first([_Search(own, normals, marks, tried) for marks in assumed])
     if found is None:
         return f"the {m} marks found do not make the pattern that the {n} points would from any side"
     other = search.other(found)
@@ -76,7 +82,7 @@ def name_marks(
             f"the points look the same from another side, or moved on, as a regular grid does: {len(found.mark)} marks "
             f"agree with one naming, {len(other.mark)} with another one"
         )
-    return unit.names(found, principal_distance_mm)
+    return unit.names(found, search.marks.c)
 
 
 def name_coded(
@@ -84,7 +90,7 @@ def name_coded(
     normals: Array,
     xy_mm: Array,
     frame_mm: tuple[Array, Array],
-    principal_distance_mm: float,
+    principal_distance_mm: float | None,
     sigma_mm: float,
     codes: Mapping[int, int],
 ) -> Names | str:
@@ -94,28 +100,50 @@ def name_coded(
     """
     if len(codes) < LEAST_CODES:
         return f"{len(codes)} coded targets were recognised, and {LEAST_CODES} are needed"
-    coded, points = np.array(list(codes)), np.array(list(codes.values()))
-    resection = resect(xyz[points], xy_mm[coded], principal_distance_mm, np.random.default_rng(1), sigma_mm)
-    if resection is None:
+    unit = _Unit.of(xyz)
+    assumed = _assumed(xy_mm, frame_mm, principal_distance_mm, sigma_mm)
+    grown = [(marks, one) for marks in assumed if (one := _grown_from_codes(unit, xyz, normals, marks, codes))]
+    if not grown:
         return f"the {len(codes)} coded targets recognised lie on one line and do not orient the image"
-    unit, agree = _Unit.of(xyz), resection.inliers
-    shift = -resection.pose.rotation @ ((resection.pose.center - unit.origin) / unit.size)
-    marks = Marks.of(xy_mm, *frame_mm, sigma_mm, principal_distance_mm)
-    view = View(resection.pose.rotation, shift)
-    grown = grow(view, points[agree], coded[agree], unit.of_points(xyz), normals, marks)
-    right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
-    area = float(np.prod(marks.greatest - marks.least))
-    chance = min(np.pi * (2.0 * grown.gate) ** 2 / area, 1.0)
-    log10_chance = log10_of_chance(right, len(codes), chance, float(comb(len(codes), OF_POSE)))
-    if log10_chance > MOST_LOG10_CHANCE_OF_CODES:
+    marks, best = min(grown, key=lambda one: one[1].log10_chance)
+    right = sum(best.mark.get(point) == mark for mark, point in codes.items())
+    if best.log10_chance + np.log10(len(assumed)) > MOST_LOG10_CHANCE_OF_CODES:
         return f"{right} of the {len(codes)} coded targets recognised lie as their points would, which may be chance"
     numbers = set(codes.values())
     named = {
         point: mark
-        for point, mark in grown.mark.items()
+        for point, mark in best.mark.items()
         if codes.get(mark, point) == point and (mark in codes or point not in numbers)
     }
-    return unit.names(replace(grown, mark=named, log10_chance=log10_chance), principal_distance_mm)
+    return unit.names(replace(best, mark=named), marks.c)
+
+
+def _grown_from_codes(
+    unit: "_Unit", xyz: Array, normals: Array, marks: Marks, codes: Mapping[int, int]
+) -> Grown | None:
+    """What the pose that most codes agree with grows to, and how likely the codes would agree by chance; None where
+    they are on one line."""
+    coded, points = np.array(list(codes)), np.array(list(codes.values()))
+    resection = resect(xyz[points], marks.places[coded], 1.0, np.random.default_rng(1), marks.sigma)
+    if resection is None:
+        return None
+    shift = -resection.pose.rotation @ ((resection.pose.center - unit.origin) / unit.size)
+    view, agree = View(resection.pose.rotation, shift), resection.inliers
+    grown = grow(view, points[agree], coded[agree], unit.of_points(xyz), normals, marks)
+    right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
+    area = float(np.prod(marks.greatest - marks.least))
+    chance = min(np.pi * (2.0 * grown.gate) ** 2 / area, 1.0)
+    return replace(grown, log10_chance=log10_of_chance(right, len(codes), chance, float(comb(len(codes), OF_POSE))))
+
+
+def _assumed(
+    xy_mm: Array, frame_mm: tuple[Array, Array], principal_distance_mm: float | None, sigma_mm: float
+) -> list[Marks]:
+    """The marks in units of the principal distance, or of each that is tried where it is not known."""
+    if principal_distance_mm is not None:
+        return [Marks.of(xy_mm, *frame_mm, sigma_mm, principal_distance_mm, KNOWN_SIGMA)]
+    diagonal = float(np.linalg.norm(frame_mm[1] - frame_mm[0]))
+    return [Marks.of(xy_mm, *frame_mm, sigma_mm, share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,18 +175,11 @@ class _Search:
     marks: Marks
     clusters: Sequence[Cluster]
 
-    def first(self) -> Grown | None:
-        """The first naming that is believed, the clusters that need fewest trials first."""
-        tried = 0
-        for cluster in self.clusters:
-            poses = promising(
-                self.xyz, self.normals, self.marks, cluster.triple[None], mark_triples(cluster, self.marks)
-            )
-            found = self._believed(poses)
-            tried += poses.tried
-            if found is not None or tried > MOST_POSES:
-                return found
-        return None
+    def begun_with(self, cluster: Cluster) -> tuple[Grown | None, int]:
+        """The likeliest naming that one cluster leads to, if it leads to any, and how many poses were tried."""
+        triples = mark_triples(cluster, self.marks)
+        poses = promising(self.xyz, self.normals, self.marks, cluster.triple[None], triples)
+        return next(iter(self._grown(poses)), None), poses.tried
 
     def other(self, found: Grown) -> Grown | None:
         """Another naming that explains the image as well, if there is one: named clusters taken for other points."""
@@ -173,9 +194,6 @@ class _Search:
                     return grown
         return None
 
-    def _believed(self, poses: Poses) -> Grown | None:
-        return next((g for g in self._grown(poses) if g.log10_chance < MOST_LOG10_CHANCE), None)
-
     def _grown(self, poses: Poses) -> list[Grown]:
         grown = [
             grow(View(rotation, shift), *named, self.xyz, self.normals, self.marks)
@@ -183,3 +201,22 @@ class _Search:
         ]
         enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
         return sorted(enough, key=lambda one: one.log10_chance)
+
+
+def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
+    """The first naming that is believed, the clusters that need fewest trials first; the likeliest, if several
+    principal distances lead to one."""
+    most = MOST_LOG10_CHANCE - np.log10(len(searches))
+    tried = 0
+    for cluster in searches[0].clusters:
+        believed = []
+        for search in searches:
+            found, count = search.begun_with(cluster)
+            tried += count
+            if found is not None and found.log10_chance < most:
+                believed.append((search, found))
+        if believed:
+            return min(believed, key=lambda one: one[1].log10_chance)
+        if tried > MOST_POSES * len(searches):
+            break
+    return searches[0], None

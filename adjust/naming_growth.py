@@ -4,10 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom
 
 from adjust.rotation import rotation_from_vector
-from adjust.unnamed_marks import Marks
+from adjust.unnamed_marks import Marks, log10_of_agreement
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -15,8 +14,7 @@ Indices = NDArray[np.intp]
 _ROUNDS = 25
 _GATE_SIGMAS = 3.5
 _MOST_CHANCE = 0.1  # that a mark lies in a point's gate and is none: more is not named yet
-_PRIOR_SCALE = 0.05  # standard deviation of the principal distance, relative...
-_PRIOR_RADIAL = 0.1  # ...and of k1: a tenth of the distance where rays are 45 degrees oblique
+_PRIOR_RADIAL = 0.1  # standard deviation of k1: a tenth of the distance where rays are 45 degrees oblique
 _ROBUST = 2.0  # sigmas, from which on a residual counts less (Huber)
 _BEFORE = -1e-6
 OF_POSE = 3  # points whose agreement a pose can always have
@@ -92,7 +90,7 @@ def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array
     for _ in range(_ROUNDS):
         if len(points) <= OF_POSE:
             return Grown(view)
-        view, sigma, covariance = _fitted(view, xyz[points], marks.places[named], marks.sigma)
+        view, sigma, covariance = _fitted(view, xyz[points], marks.places[named], marks)
         before = points, named
         points, named = _near(view, xyz, normals, marks, sigma, covariance)
         if np.array_equal(points, before[0]) and np.array_equal(named, before[1]):
@@ -125,17 +123,17 @@ def _shown(view: View, xyz: Array, normals: Array, marks: Marks) -> NDArray[np.b
     return np.asarray(marks.inside(view.images(xyz)) & view.facing(xyz, normals))
 
 
-def _fitted(view: View, xyz: Array, places: Array, least_sigma: float) -> tuple[View, float, Array]:
+def _fitted(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, float, Array]:
     """Least squares, wrong names tolerated: the view, the marks' standard deviation, the parameters' covariance."""
-    priors = np.diag([0.0] * 6 + [_PRIOR_SCALE**-2, _PRIOR_RADIAL**-2])
-    sigma = least_sigma
+    priors = np.diag([0.0] * 6 + [marks.c_sigma**-2, _PRIOR_RADIAL**-2])
+    sigma = marks.sigma
     normal = np.eye(8)
     for _ in range(5):
         residuals = places - view.images(xyz)
         off = np.linalg.norm(np.nan_to_num(residuals, nan=1.0), axis=1)
         redundancy = max(2 * len(xyz) - 6, 1) / (2 * len(xyz))
         # The median of lengths of two normal coordinates is 1.18 of their standard deviation.
-        sigma = max(float(np.median(off)) / 1.1774 / np.sqrt(redundancy), least_sigma)
+        sigma = max(float(np.median(off)) / 1.1774 / np.sqrt(redundancy), marks.sigma)
         weights = np.minimum(1.0, _ROBUST * sigma / np.maximum(off, 1e-300)) / sigma**2
         by = np.nan_to_num(view.derivatives(xyz))
         weighted = by * weights[:, None, None]
@@ -170,5 +168,4 @@ def _judged(view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, 
 def log10_of_chance(agreeing: int, expected: int, chance: float, tests: float) -> float:
     """The logarithm of the expected number of poses with so many points that agree, if each agreed by chance; three of
     them always do, with up to four poses for each of the tests that are possible."""
-    tail = float(binom.logsf(agreeing - OF_POSE - 1, expected - OF_POSE, chance)) / np.log(10.0)
-    return float(tail + np.log10(4.0 * tests))
+    return log10_of_agreement(agreeing - OF_POSE, expected - OF_POSE, chance) + float(np.log10(4.0 * tests))

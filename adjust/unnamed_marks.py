@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.stats import binom
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -17,27 +18,32 @@ _CROWD = 6  # marks about a place that tell how dense they are there
 @dataclass(frozen=True, eq=False)
 class Marks:
     """places (m, 2): ideal image coordinates about the principal point, y up, over the principal distance; least,
-    greatest (2,): the corners of the frame that was searched; sigma: of one coordinate. All in principal distances."""
+    greatest (2,): the corners of the frame that was searched; sigma: of one coordinate. All in principal distances.
+    c: that distance, mm; c_sigma: how well it is known, relative."""
 
     places: Array
     least: Array
     greatest: Array
     sigma: float
+    c: float
+    c_sigma: float
     tree: cKDTree
     nearest_of_cell: Indices
     density_of_cell: Array
 
     @classmethod
-    def of(cls, xy_mm: Array, least_mm: Array, greatest_mm: Array, sigma_mm: float, c: float) -> "Marks":
+    def of(
+        cls, xy_mm: Array, least_mm: Array, greatest_mm: Array, sigma_mm: float, c: float, c_sigma: float
+    ) -> "Marks":
         """Marks (m, 2) in mm, of which there is at least one, in a frame between two corners."""
         places, least, greatest = xy_mm / c, np.asarray(least_mm) / c, np.asarray(greatest_mm) / c
         tree = cKDTree(places)
         nearest = np.asarray(tree.query(_centres(least, greatest, _CELLS))[1], dtype=np.intp)
-        crowd = min(_CROWD, len(places))
-        reach = np.asarray(tree.query(_centres(least, greatest, _COARSE_CELLS), k=[crowd])[0])[:, 0]
+        density = density_about(tree, _centres(least, greatest, _COARSE_CELLS))
         mean = len(places) / float(np.prod(greatest - least))
-        density = np.maximum(crowd / (np.pi * np.maximum(reach, 1e-12) ** 2), mean)
-        return cls(places, least, greatest, sigma_mm / c, tree, nearest, density)
+        return cls(
+            places, least, greatest, sigma_mm / c, c, c_sigma, tree, nearest, np.maximum(density, mean)
+        )  # fmt: skip
 
     def inside(self, places: Array) -> NDArray[np.bool_]:
         """Which of the places (..., 2) lie in the frame."""
@@ -50,14 +56,30 @@ class Marks:
     def chance(self, places: Array, reach: Array) -> Array:
         """The probability that some mark lies within reach (...) of places (..., 2) if marks lie where they like, as
         dense as they are there."""
-        expected = self.density_of_cell[self._cell(places, _COARSE_CELLS)] * np.pi * reach**2
-        return np.asarray(-np.expm1(-expected))
+        return chance_of_a_mark(self.density_of_cell[self._cell(places, _COARSE_CELLS)], reach)
 
     def _cell(self, places: Array, cells: int) -> Indices:
         share = (places - self.least) / (self.greatest - self.least)
         with np.errstate(invalid="ignore"):
             cell = np.clip(np.nan_to_num(share * cells), 0, cells - 1).astype(np.intp)
         return np.asarray(cell[..., 1] * cells + cell[..., 0], dtype=np.intp)
+
+
+def density_about(tree: cKDTree, places: Array) -> Array:
+    """(n,) how dense marks are about places (n, 2), by how far the nearest few reach."""
+    crowd = min(_CROWD, tree.n)
+    reach = np.asarray(tree.query(places, k=[crowd])[0])[:, 0]
+    return np.asarray(crowd / (np.pi * np.maximum(reach, 1e-12) ** 2))
+
+
+def chance_of_a_mark(density: Array, reach: Array | float) -> Array:
+    """The probability that a mark lies within reach of a place if marks lie where they like, as dense as this."""
+    return np.asarray(-np.expm1(-density * np.pi * np.square(reach)))
+
+
+def log10_of_agreement(agreeing: int, of: int, chance: float) -> float:
+    """The logarithm of the probability that so many or more agree, of so many that agree by chance independently."""
+    return float(binom.logsf(agreeing - 1, of, chance)) / float(np.log(10.0))
 
 
 def _centres(least: Array, greatest: Array, cells: int) -> Array:

@@ -2,9 +2,9 @@
 
 Fields of 20, 100 and 500 points, in a plane (jittered lattice) and in space (at random in a box); a frame from a random
 side and distance, turned at random; 0, 10 or 20 % of the points missing and as many marks that are none; the principal
-distance wrong by 2 %, the lens's radial distortion not known, marks off by 0.5 px.
+distance wrong by 2 %, or not known at all; the lens's radial distortion not known, marks off by 0.5 px.
 
-    python benchmarks/identification.py [--frames 50] [--points 20 100 500] [--seed 1]
+    python benchmarks/identification.py [--frames 50] [--points 20 100 500] [--shares 0 10 20] [--seed 1] [--unknown]
 """
 
 import argparse
@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 C_MM, HALF_MM, PITCH_MM = 50.0, np.array([18.0, 12.0]), 0.006
 SIGMA_PX = 0.5
+ZOOMS = 0.52, 3.5  # of a principal distance that is not known: 0.6 to 4 of the frame's diagonal
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +49,19 @@ def spatial(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
     return xyz, np.full((n, 3), np.nan)
 
 
-def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator) -> Frame:
-    """A picture from within 45 degrees of the z axis that the field fills more or less."""
+def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator, zoom: float = 1.0) -> Frame:
+    """A picture from within 45 degrees of the z axis that the field fills more or less; zoom: by how much farther off
+    the camera stands, with as much longer a principal distance."""
     tilt, around, roll = rng.uniform(0.0, np.pi / 4), rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 2 * np.pi)
     sight = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
     right = np.cross([np.cos(roll), np.sin(roll), 0.3], sight)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(sight, right), sight])
-    pose = Pose(rotation, sight * rng.uniform(1.3, 2.2) + rng.normal(0.0, 0.03, 3))
+    pose = Pose(rotation, sight * zoom * rng.uniform(1.3, 2.2) + rng.normal(0.0, 0.03, 3))
     camera = (xyz - pose.center) @ rotation.T
     p = camera[:, :2] / -camera[:, 2:]
-    p *= 1.0 + rng.uniform(-0.03, 0.03) * (p**2).sum(axis=1, keepdims=True) / 0.18
-    xy = C_MM * (1.0 + rng.normal(0.0, 0.02)) * p + rng.normal(0.0, SIGMA_PX * PITCH_MM, p.shape)
+    p *= 1.0 + rng.uniform(-0.03, 0.03) * (p**2).sum(axis=1, keepdims=True) / 0.18 * zoom**2
+    xy = C_MM * zoom * (1.0 + rng.normal(0.0, 0.02)) * p + rng.normal(0.0, SIGMA_PX * PITCH_MM, p.shape)
     seen = np.flatnonzero((np.abs(xy) < HALF_MM).all(axis=1) & (camera[:, 2] < 0.0))
     kept = seen[rng.random(len(seen)) >= share]
     false = rng.uniform(-HALF_MM, HALF_MM, (round(share * len(seen)), 2))
@@ -68,8 +70,8 @@ def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator) ->
     return Frame(xyz, normals, marks[order], point[order])
 
 
-def named(one: Frame) -> Names | str:
-    return name_marks(one.xyz, one.normals, one.xy_mm, (-HALF_MM, HALF_MM), C_MM, SIGMA_PX * PITCH_MM)
+def named(one: Frame, c_mm: float | None) -> Names | str:
+    return name_marks(one.xyz, one.normals, one.xy_mm, (-HALF_MM, HALF_MM), c_mm, SIGMA_PX * PITCH_MM)
 
 
 def verdict(one: Frame, names: Names | str) -> str:
@@ -87,23 +89,27 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=50)
     parser.add_argument("--points", type=int, nargs="+", default=[20, 100, 500])
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--shares", type=int, nargs="+", default=[0, 10, 20], help="missing and false, percent")
+    parser.add_argument("--unknown", action="store_true", help="principal distances of 0.6 to 4 diagonals, not known")
     options = parser.parse_args()
     print("| points | field | missing, false | right | few named | refused | wrong | s of a core, median | longest |")
     print("|---|---|---|---|---|---|---|---|---|")
     for n in options.points:
         for name, field in (("planar", planar), ("spatial", spatial)):
-            for share in (0.0, 0.1, 0.2):
+            for percent in options.shares:
                 results, seconds = [], []
                 for index in range(options.frames):
-                    rng = np.random.default_rng([options.seed, n, name == "planar", round(100 * share), index])
-                    one = frame(*field(n, rng), share, rng)
+                    rng = np.random.default_rng([options.seed, n, name == "planar", percent, index])
+                    points = field(n, rng)
+                    zoom = np.exp(rng.uniform(*np.log(ZOOMS))) if options.unknown else 1.0
+                    one = frame(*points, percent / 100, rng, zoom)
                     start = time.process_time()
-                    names = named(one)
+                    names = named(one, None if options.unknown else C_MM)
                     seconds.append(time.process_time() - start)
                     results.append(verdict(one, names))
                 counts = " | ".join(str(results.count(kind)) for kind in ("right", "few", "refused", "wrong"))
                 times = f"{np.median(seconds):.2f} | {max(seconds):.2f}"
-                print(f"| {n} | {name} | {share:.0%} | {counts} | {times} |", flush=True)
+                print(f"| {n} | {name} | {percent} % | {counts} | {times} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -15,19 +15,19 @@ Array = NDArray[np.float64]
 
 
 def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str:
-    """The image with its orientation left open; or what is missing."""
-    if camera.principal_distance_mm is None:
-        return f"{camera.path.name} gives no principal_distance_mm to predict the targets with"
+    """The image with its orientation left open; or what is missing. Where the camera's file gives no principal
+    distance, it is the scan's diagonal, as good as nothing."""
     film = _camera_from_comparator(camera, measured)
     if film is None:
         return "too few fiducials were measured to know where the camera's frame lies in the scan"
     middle = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0, measured.pitch_um)
+    c = camera.principal_distance_mm or 2.0 * float(np.linalg.norm(middle))
     x0, y0 = middle if camera.principal_point_mm is None else camera.principal_point_mm
     distortion = camera.distortion
     given = [distortion.parameters.get(name) for name in parameter_names(distortion.family)]
     return ImageModel(
         distortion,
-        np.array([camera.principal_distance_mm, x0, y0], dtype=np.float64),
+        np.array([c, x0, y0], dtype=np.float64),
         np.array([0.0 if prior is None else prior.value for prior in given]),
         np.eye(3),
         np.zeros(3),

@@ -10,7 +10,7 @@ from measure.results import MarkMeasurement
 from measure.scan import Scan
 from measure.status import Status
 from measure.targets import TargetOptions, TargetPrediction, measure_disks
-from pipeline.camera_model import camera_model, frame_mm
+from pipeline.camera_model import camera_model
 from pipeline.coded_sheet import CodedSheet, coded_candidates, coded_points, none_coded, read_numbers
 from pipeline.measurement_file import MeasuredScan
 from pipeline.network import listed
@@ -34,7 +34,7 @@ def measure_coded_field(
     elif not coded:
         named = none_coded(found, numbers, points)
     else:
-        named = name_field(field, model, measured, found, frame_mm(camera, model, measured), coded)
+        named = name_field(field, model, camera, measured, found, coded)
     if isinstance(named, str):
         marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, named) for id in points.ids)
         return marks, (*notes, f"No target has a name: {named}.")

@@ -2,10 +2,13 @@
 
 An approximate orientation predicts the targets with errors far larger than their distances: a degree of tilt shifts
 them all by hundreds of pixels, together. So first the pattern as a whole is laid on the marks found (pairs of targets
-suggest a similarity, all others test it), then the fit is tightened, and only then are names given, one to one.
+suggest a similarity, all others test it), then the fit is tightened, and only then are names given, one to one. What an
+orientation by these names explains is believed if marks that lie where they like would hardly agree as well (a
+contrario: Desolneux, Moisan and Morel 2008).
 """
 
 from dataclasses import dataclass
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +16,16 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from adjust.resection import MAX_TRIPLES
+from adjust.unnamed_marks import chance_of_a_mark, density_about, log10_of_agreement
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _PAIRS = 60  # long pairs of targets that suggest where the pattern lies
 _TESTED = 400  # suggestions that are tested on all targets
-_LEAST_SHARE = 0.4  # of the targets expected in the scan, found where the pattern says
+_OF_POSE = 3  # targets that can always be brought onto marks...
+_POSES = 4  # ...by so many poses
 
 
 @dataclass(frozen=True)
@@ -37,11 +44,22 @@ class PatternOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
 
 
-def recognise(predicted_px: Array, found_px: Array, options: PatternOptions | None = None) -> Array | None:
-    """The affine matrix (2, 3) that takes predicted places (n, 2) onto the marks found (m, 2).
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """matrix (2, 3): an affine map that takes predicted places onto marks; tried: of how many placements it is the one
+    that explains most."""
 
-    None where no placement explains enough of the pattern.
-    """
+    matrix: Array
+    tried: int
+
+    def places(self, predicted_px: Array) -> Array:
+        """(n, 2) px."""
+        return _mapped(self.matrix, predicted_px)
+
+
+def recognise(predicted_px: Array, found_px: Array, options: PatternOptions | None = None) -> Placement | None:
+    """The placement that brings most of the predicted places (n, 2) onto marks found (m, 2), be it by chance; None
+    where there are too few of either, or all are too far off."""
     options = options or PatternOptions()
     if len(predicted_px) < 3 or len(found_px) < 3:
         return None
@@ -51,10 +69,21 @@ def recognise(predicted_px: Array, found_px: Array, options: PatternOptions | No
     if not len(suggestions):
         return None
     counts = np.array([_support(s, predicted_px, tree, options.distortion * size).sum() for s in suggestions])
-    best = _tightened(suggestions[np.argsort(-counts, kind="stable")[:8]], predicted_px, found_px, tree, size, options)
-    expected = _inside(best, predicted_px, found_px)
-    agreeing = int(_support(best, predicted_px, tree, options.distortion * size / 3.0).sum())
-    return best if agreeing >= max(4, _LEAST_SHARE * expected) else None
+    best = suggestions[np.argsort(-counts, kind="stable")[:8]]
+    return Placement(_tightened(best, predicted_px, found_px, tree, size, options), len(suggestions))
+
+
+def log10_of_chance(places_px: Array, found_px: Array, gate_px: float, tried: int) -> float:
+    """The logarithm of the expected number of orientations by which so many marks (m, 2) would lie within the gate of
+    the places (n, 2) of targets by chance, marks being as dense as they are about these places; tried: placements, each
+    of which any three of its targets could orient."""
+    n = len(places_px)
+    if n <= _OF_POSE or not len(found_px):
+        return 0.0
+    chance = chance_of_a_mark(density_about(cKDTree(found_px), places_px), gate_px).mean()
+    agreeing = len(assign(places_px, found_px, gate_px))
+    tests = tried * _POSES * min(comb(agreeing, _OF_POSE), MAX_TRIPLES)
+    return log10_of_agreement(agreeing - _OF_POSE, n - _OF_POSE, float(chance)) + float(np.log10(max(tests, 1)))
 
 
 def assign(predicted_px: Array, found_px: Array, gate_px: float) -> list[tuple[int, int]]:
@@ -182,10 +211,3 @@ def _similarity(source: Array, target: Array) -> Array:
 def _mapped(matrix: Array, points: Array) -> Array:
     mapped: Array = points @ matrix[:, :2].T + matrix[:, 2]
     return mapped
-
-
-def _inside(matrix: Array, predicted: Array, found: Array) -> int:
-    """How many targets the placement puts into the region where marks were found."""
-    places = _mapped(matrix, predicted)
-    inside = (places >= found.min(axis=0)) & (places <= found.max(axis=0))
-    return int(inside.all(axis=1).sum())

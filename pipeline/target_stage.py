@@ -14,11 +14,11 @@ from measure.results import MarkMeasurement
 from measure.scan import Scan
 from measure.status import Status
 from measure.targets import TargetPrediction
-from pipeline.camera_model import camera_model, frame_mm
+from pipeline.camera_model import camera_model
 from pipeline.coded_field import measure_coded_field
 from pipeline.coded_sheet import CodedSheet, measure_sheet
 from pipeline.comparator_file import comparator_from_pixel
-from pipeline.identification import PatternOptions, assign, recognise
+from pipeline.identification import PatternOptions, assign, log10_of_chance, recognise
 from pipeline.measurement_file import MeasuredScan
 from pipeline.project_file import Project
 from pipeline.target_field import Field, measure_single_targets, target_candidates, target_field
@@ -32,6 +32,7 @@ _GATE_SHARE = 0.01  # of the scan's size: what tilt and relief leave between the
 _SLACK_PX = 3.0  # beyond what the resection's residuals say, within which a mark is the target predicted there
 _SLACK_SIGMAS = 6.0
 _LEAST_PAIRS = 4
+_MOST_LOG10_CHANCE = -1.0  # of agreements as good by chance: the project says that the pattern is in the scan
 _STRONGEST = 3  # patches a target, by contrast: dust and texture are weaker than what was painted to be seen
 _NEAR = 0.65  # of the scan's size from its middle: targets there may be in it
 _LEAST_DIAMETER_PX = 2.5
@@ -55,11 +56,11 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
         notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
         return with_targets(measured, board.marks, (*problems, *notes))
     field = target_field(project)
-    predictions = _predictions(project, settings, field, scan, measured)
+    predictions, notes = _predictions(project, settings, field, scan, measured)
     if isinstance(predictions, str):
         marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, predictions) for id in field.ids)
-        return with_targets(measured, marks, (f"No target has a name: {predictions}.",))
-    return with_targets(measured, measure_single_targets(scan, predictions, settings))
+        return with_targets(measured, marks, (*notes, f"No target has a name: {predictions}."))
+    return with_targets(measured, measure_single_targets(scan, predictions, settings), notes)
 
 
 def with_targets(
@@ -75,21 +76,25 @@ def with_targets(
 
 def _predictions(
     project: Project, settings: TargetSettings, field: Field, scan: Scan, measured: MeasuredScan
-) -> Sequence[TargetPrediction] | str:
-    """Where each target should be, by the approximate orientation or, without one, by the pattern alone; or why not."""
+) -> tuple[Sequence[TargetPrediction] | str, tuple[str, ...]]:
+    """Where each target should be, by the approximate orientation or, without one that fits, by the pattern alone; or
+    why not. And what is to be said of the image."""
     image = measured.frame.image
     camera = project.camera_of(image)
     model = camera_model(camera, measured)
     if isinstance(model, str):
-        return model
+        return model, ()
     exterior = project.given_images.exterior.get(image) if project.given_images else None
-    if exterior is None:
-        found = target_candidates(scan, settings, likely_diameters_px(field, measured))
-        named = name_field(field, model, measured, found, frame_mm(camera, model, measured))
-        return named if isinstance(named, str) else named.predictions(field, measured)
-    approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
-    oriented, why = _oriented(approximate, field, scan, measured, settings)
-    return why if oriented is None else field.predictions(oriented, measured, _SLACK_PX)
+    notes: tuple[str, ...] = ()
+    if exterior is not None and camera.principal_distance_mm is not None:
+        approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
+        oriented, why = _oriented(approximate, field, scan, measured, settings)
+        if oriented is not None:
+            return field.predictions(oriented, measured, _SLACK_PX), ()
+        notes = (f"Its orientation in images.csv was not used to name the targets: {why}.",)
+    found = target_candidates(scan, settings, likely_diameters_px(field, measured))
+    named = name_field(field, model, camera, measured, found)
+    return (named if isinstance(named, str) else named.predictions(field, measured)), notes
 
 
 def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredScan) -> tuple[float, float] | None:
@@ -115,20 +120,23 @@ def _oriented(
     strongest = target_candidates(scan, settings, diameters)[: _STRONGEST * len(predicted)]
     found = np.array([patch.center_px for patch in strongest]).reshape(-1, 2)
     placement = recognise(predicted, found, PatternOptions(shift_px=size / 2.0))
+    unlike = f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted"
     if placement is None:
-        return None, f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted"
+        return None, unlike
     gate_px = _GATE_SHARE * size
-    places = predicted @ placement[:, :2].T + placement[:, 2]
+    places = placement.places(predicted)
     ids = [prediction.point for prediction in predictions]
     for _ in range(2):
         pairs = assign(places, found, gate_px)
         resection = _resected(model, field, [(ids[i], found[j]) for i, j in pairs], measured)
         if resection is None:
-            return None, f"{len(pairs)} of the targets were recognised, but they do not orient the image"
+            return None, unlike
         model, gate_px = resection
         predictions = field.predictions(model, measured, gate_px)
         places, ids = np.array([p.center_px for p in predictions]), [p.point for p in predictions]
-    return model, ""
+    shown = ((places >= 0.0) & (places <= (measured.width_px - 1, measured.height_px - 1))).all(axis=1)
+    by_chance = log10_of_chance(places[shown], found, gate_px, placement.tried) > _MOST_LOG10_CHANCE
+    return (None, f"{unlike}, but for what chance explains") if by_chance else (model, "")
 
 
 def _resected(

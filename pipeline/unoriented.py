@@ -11,6 +11,8 @@ from adjust.naming import Names, name_coded, name_marks
 from adjust.projection import ImageModel
 from measure.disk_patches import Candidate
 from measure.targets import TargetPrediction
+from pipeline.camera_file import CameraFile
+from pipeline.camera_model import frame_mm
 from pipeline.comparator_file import comparator_from_pixel
 from pipeline.measurement_file import MeasuredScan
 from pipeline.target_field import Field
@@ -62,23 +64,23 @@ class NamedField:
 def name_field(
     field: Field,
     model: ImageModel,
+    camera: CameraFile,
     measured: MeasuredScan,
     candidates: Sequence[Candidate],
-    frame_mm: Array,
     codes: Mapping[int, int] | None = None,
 ) -> NamedField | str:
     """Name the candidates, which come in the order of their strength; or why they have no names.
 
-    model: the image's camera and film, its orientation not used; frame_mm (2, 2): the least and the greatest camera
-    coordinates of the exposed frame; codes: the point (by index) that a code says some candidates (by index) are.
+    model: the image's camera and film, its orientation not used, nor its principal distance where the camera's file
+    gives none; codes: the point (by index) that a code says some candidates (by index) are.
     """
     places = np.array([one.center_px for one in candidates]).reshape(-1, 2)
     ideal = _ideal(model, measured, places)
-    frame = np.stack([frame_mm.min(axis=0), frame_mm.max(axis=0)]) - model.interior[1:]
+    frame = frame_mm(camera, model, measured) - model.interior[1:]
     inside = np.flatnonzero(((ideal >= frame[0]) & (ideal <= frame[1])).all(axis=1))
     strongest = inside if codes else inside[: int(_STRAYS * len(field.ids)) + 1]
     normals = np.array([field.normals.get(id, np.full(3, np.nan)) for id in field.ids]).reshape(-1, 3)
-    c, pitch_mm = float(model.interior[0]), min(measured.pitch_um) / 1000.0
+    c, pitch_mm = camera.principal_distance_mm, min(measured.pitch_um) / 1000.0
     known = field.xyz, normals, ideal[strongest], (frame[0], frame[1]), c, _SIGMA_PX * pitch_mm
     if codes:
         row = {int(candidate): mark for mark, candidate in enumerate(strongest)}

@@ -1,8 +1,9 @@
 """The pattern of the targets is recognised under a wrong prediction, missing and false marks; noise is not."""
 
 import numpy as np
+import pytest
 
-from pipeline.identification import assign, recognise
+from pipeline.identification import assign, log10_of_chance, recognise
 
 
 def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -> None:
@@ -18,17 +19,30 @@ def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -
         kept = np.flatnonzero(rng.random(n) > 0.2)
         found = np.concatenate([true[kept], rng.uniform(0.0, size, (int(0.3 * n), 2))])
         order = rng.permutation(len(found))
-        matrix = recognise(predicted, found[order])
-        assert matrix is not None
-        pairs = assign(predicted @ matrix[:, :2].T + matrix[:, 2], found[order], 40.0)
+        placement = recognise(predicted, found[order])
+        assert placement is not None
+        pairs = assign(placement.places(predicted), found[order], 40.0)
         right = sum(order[j] < len(kept) and kept[order[j]] == i for i, j in pairs)
         assert right >= 0.8 * len(kept)
 
 
-def test_marks_of_another_field_are_not_recognised() -> None:
-    rng = np.random.default_rng(2)
-    for _ in range(10):
-        assert recognise(rng.uniform(0.0, 3000.0, (25, 2)), rng.uniform(0.0, 3000.0, (25, 2))) is None
+@pytest.mark.parametrize(("targets", "strays"), [(4, 0), (8, 16), (25, 0), (25, 50)])
+def test_agreement_by_chance_is_told_from_a_pattern(targets: int, strays: int) -> None:
+    """A fifth of the pattern's marks missing; the other marks are placed as well as chance allows."""
+    rng = np.random.default_rng([2, targets, strays])
+    for _ in range(2):
+        places = rng.uniform(0.0, 3000.0, (targets, 2))
+        seen = places[: max(round(0.8 * targets), 4)] + rng.normal(0.0, 1.0, (max(round(0.8 * targets), 4), 2))
+        marks = np.concatenate([seen, rng.uniform(0.0, 3000.0, (strays, 2))])
+        placement = recognise(places, marks)
+        assert placement is not None
+        assert log10_of_chance(places, marks, 6.0, placement.tried) < -1.0
+        other = rng.uniform(0.0, 3000.0, marks.shape)
+        placement = recognise(places, other)
+        for gate_px in (6.0, 30.0, 90.0):
+            assert placement is None or (
+                log10_of_chance(placement.places(places), other, gate_px, placement.tried) > -1.0
+            )
 
 
 def test_assignment_is_one_to_one_and_gated() -> None:

@@ -67,12 +67,26 @@ def error(mark: MarkMeasurement, place: Array) -> Array:
     return mark.center_px - place
 
 
-def test_crosses_in_space(tmp_path: Path) -> None:
+def test_crosses_in_space_with_no_principal_distance(tmp_path: Path) -> None:
     project, places = rendered(tmp_path, CROSSES)
+    camera = tmp_path / "camera.toml"
+    lines = camera.read_text(encoding="utf-8").splitlines()
+    camera.write_text("\n".join(line for line in lines if "principal_distance" not in line), encoding="utf-8")
     scan = measure_scan(read_project(project), "a")
     off = errors(scan, places)
     assert len(off) == len(places) > 12
     assert max(np.abs(one).max() for one in off.values()) < 0.03
+
+
+def test_an_orientation_that_does_not_fit_is_not_used(tmp_path: Path) -> None:
+    project, places = rendered(tmp_path, CROSSES)
+    turned = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,-1.2,0.9,2.0,-25.0,-30.0,-90.0\n"
+    (tmp_path / "images.csv").write_text(turned, encoding="utf-8")
+    text = project.read_text(encoding="utf-8")
+    project.write_text(text.replace("[object]", '[object]\nimages = "images.csv"'), encoding="utf-8")
+    scan = measure_scan(read_project(project), "a")
+    assert len(errors(scan, places)) == len(places)
+    assert any("orientation in images.csv was not used" in problem for problem in scan.frame.problems)
 
 
 def test_ring_codes_in_space_and_two_that_are_confused(tmp_path: Path) -> None:
