@@ -164,6 +164,10 @@ class _Reach:
         self.map, self.origin = _dilated(map_, radius_px), origin
         self.chance = max(float(np.percentile(self.map[::3, ::3], 95)), 0.0)
 
+    def share(self, height: float) -> float:
+        """Of all places, those that answer as strongly."""
+        return float(np.mean(self.map >= height))
+
     def strength(self, places: NDArray[np.int_]) -> tuple[Array, NDArray[np.bool_]]:
         """How much the places (n, 2) of the reduced scan answer beyond chance, and which of them lie in the map; those
         that do not have no answer."""

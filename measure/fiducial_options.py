@@ -14,7 +14,8 @@ class FiducialOptions:
     """How fiducial marks are measured.
 
     pose: "auto", or one of the eight where the user knows it. rotation_deg, scale_tolerance: how far the frame may be
-    turned and scaled against its pose and the pitch. misfit_mm, affinity: how far a mark may lie from its given place
+    turned and scaled against its pose and the pitch. pitch_is_right: whether a given pitch is right to some per cents
+    for sure; else the frame may also fill the scan. misfit_mm, affinity: how far a mark may lie from its given place
     when it is searched, plus what share of the constellation's span. gate_mm: how far a measured mark may lie from
     where the others put it. film_sigma_mm: scatter of marks by film and scanner. match: of the fit at full resolution;
     a polygon is matched with the rotation and scale of the frame.
@@ -23,6 +24,7 @@ class FiducialOptions:
     pose: str = "auto"
     rotation_deg: float = 6.0
     scale_tolerance: float = 0.04
+    pitch_is_right: bool = False
     misfit_mm: float = 0.15
     affinity: float = 0.003
     gate_mm: float = 0.3

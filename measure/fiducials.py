@@ -6,17 +6,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.candidates import Look, respond, respond_about
-from measure.centred_frame import centred_places_px, is_complete, is_worth_a_look, reach_mm
+from measure.centred_frame import is_complete, is_worth_a_look
 from measure.chance import doubt
-from measure.constellation import Bounds, Placement, PlacementSearch, same_picture, signs_of
+from measure.constellation import Placement
 from measure.edge_place import EdgePlace
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame, measure_frame
 from measure.frame_fit import AFFINITY_SIGMA
+from measure.frame_search import FrameSearch
 from measure.learned import honest_covariance
+from measure.pitches import PitchHypothesis, pitch_hypotheses
 from measure.pose_decision import decide_pose
-from measure.poses import POSES, up_from_camera
+from measure.poses import POSES
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scan import Scan
 from measure.shapes import FiducialLayout, LayoutMark, MarkTemplate
@@ -24,13 +25,10 @@ from measure.status import Status
 
 Array = NDArray[np.float64]
 
-_SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
-_STEP_TOLERANCE = 0.06
-_STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # each is within what a placement allows the frame of the next
-_FLAWLESS = Status.MEASURED
-_LEAST_FLAWLESS = 3
 _SET = ("set in the project.",)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
+_CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
+_HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
 
@@ -47,11 +45,17 @@ def measure_fiducials(
     picture shows: statuses, reasons and problems say it.
     """
     options = options or FiducialOptions()
-    found, frame = _in_the_middle(scan, layout, pitch_um, options)
+    search = FrameSearch(scan, layout, options)
+    hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
+    found, frame = _in_the_middle(search, hypotheses[0][0]) if pitch_um is not None else ([], None)
     if frame is None or not is_complete(frame):
-        found, frame = _anywhere(scan, layout, pitch_um, options)
-    if frame is not None and not frame.accepted and pitch_um is not None:
-        found, frame = _stretched(scan, layout, pitch_um, options, (found, frame))
+        found, frame = _anywhere(search, hypotheses[0])
+    tried = len(hypotheses[0])
+    for others in hypotheses[1:]:
+        if frame is not None and frame.accepted:
+            break
+        tried += len(others)
+        found, frame = _in_spite_of_pitch(search, others, tried) or (found, frame)
     if frame is None:
         return _nothing(scan, layout, "nothing in the scan looks like two or more of the camera's marks")
     if not frame.accepted:
@@ -66,39 +70,33 @@ def measure_fiducials(
     return _measurement(scan, layout, frame, pose, _rivals(found, frame.placement), doubt(scan, layout, frame, options))
 
 
-def _in_the_middle(
-    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> tuple[list[Placement], Frame | None]:
+def _in_the_middle(search: FrameSearch, given: PitchHypothesis) -> tuple[list[Placement], Frame | None]:
     """The placements, best first, of a frame in the middle of a large scan, and the frame in the best of them; none
     where they are not worth a look or there is none."""
-    if pitch_um is None or not is_worth_a_look(scan, layout, pitch_mm := (pitch_um[0] / 1000, pitch_um[1] / 1000)):
+    if not is_worth_a_look(search.scan, search.layout, given.mm):
         return [], None
-    found = _placements(scan, layout, pitch_mm, options.scale_tolerance, options, reach_mm(layout))
-    found.sort(key=lambda placement: -round(placement.score, 2))
-    return found, measure_frame(scan, layout, found[0], options) if found else None
+    found = search.in_the_middle(given)
+    return found, measure_frame(search.scan, search.layout, found[0], search.options) if found else None
 
 
-def _anywhere(
-    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> tuple[list[Placement], Frame | None]:
+def _anywhere(search: FrameSearch, hypotheses: Sequence[PitchHypothesis]) -> tuple[list[Placement], Frame | None]:
     """The placements, best first, in the whole scan, and the frame in the first of the best ones that is accepted, or
     else that of most marks; None where nothing looks like the marks."""
-    found = _found(scan, layout, pitch_um, options)
+    found = search.anywhere(hypotheses)
     if not found:
         return [], None
-    frames = [_as_its_pictures_say(scan, layout, found, found[0], options)]
+    frames = [_as_its_pictures_say(search, found, found[0])]
     for placement in _others(found):
         if frames[-1].accepted:
             break
-        frames.append(_as_its_pictures_say(scan, layout, found, placement, options))
+        frames.append(_as_its_pictures_say(search, found, placement))
     return found, max(frames, key=lambda frame: (frame.accepted, frame.belongs.sum()))
 
 
-def _as_its_pictures_say(
-    scan: Scan, layout: FiducialLayout, found: Sequence[Placement], placement: Placement, options: FiducialOptions
-) -> Frame:
+def _as_its_pictures_say(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> Frame:
     """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
     names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
+    scan, layout, options = search.scan, search.layout, search.options
     frame = measure_frame(scan, layout, placement, options)
     if frame.accepted or not frame.belongs.any() or options.pose != "auto":
         return frame
@@ -108,44 +106,16 @@ def _as_its_pictures_say(
     return measure_frame(scan, layout, _posed(found, placement, pose.name), options)
 
 
-def _stretched(
-    scan: Scan,
-    layout: FiducialLayout,
-    pitch_um: tuple[float, float],
-    options: FiducialOptions,
-    before: tuple[list[Placement], Frame],
-) -> tuple[list[Placement], Frame]:
-    """The same with pixels longer one way than the other, where two marks are clear and no third is found: an office
-    scanner's carriage may run by per cents too fast. So much freedom finds false marks too: here only marks without
-    any blemish count, and the best frame has most of them and the likest ones."""
-
-    def likeness(frame: Frame) -> list[float]:
-        verdicts = [frame.verdict(index)[0] if fit else None for index, fit in enumerate(frame.fits)]
-        return [fit.likeness for fit, status in zip(frame.fits, verdicts, strict=True) if fit and status is _FLAWLESS]
-
-    if len(likeness(before[1])) < 2:
-        return before
-    best, highest = before, 0.0
-    for stretch in _STRETCHES:
-        found, frame = _anywhere(
-            scan, layout, (pitch_um[0] * (1 + stretch / 2), pitch_um[1] * (1 - stretch / 2)), options
-        )
-        if frame is None or not frame.accepted or len(likeness(frame)) < _LEAST_FLAWLESS:
-            continue
-        if sum(likeness(frame)) > highest:
-            best, highest = (found, frame), sum(likeness(frame))
-    return best
-
-
-def _found(
-    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> list[Placement]:
-    """The placements of all poses asked for and all pitches possible, best first."""
-    found = []
-    for pitch_mm, tolerance in _pitches(scan, layout, pitch_um, options):
-        found += _placements(scan, layout, pitch_mm, tolerance, options)
-    # Poses that score alike keep their order: of a symmetric camera's eight, "0" comes first.
-    return sorted(found, key=lambda placement: -round(placement.score, 2))
+def _in_spite_of_pitch(
+    search: FrameSearch, hypotheses: Sequence[PitchHypothesis], tried: int
+) -> tuple[list[Placement], Frame] | None:
+    """The same where the pixels are not as given. So much freedom finds false marks too: only a frame counts that
+    chance would hardly make in all the hypotheses tried."""
+    found = search.anywhere(hypotheses)
+    hopeful = [place for place in (*found[:1], *_others(found)) if tried * search.expected_alike(place) <= _HOPELESS]
+    frames = [_as_its_pictures_say(search, found, place) for place in hopeful]
+    sure = [frame for frame in frames if frame.accepted and tried * search.expected_as_good(frame) <= _CHANCE]
+    return (found, min(sure, key=search.expected_as_good)) if sure else None
 
 
 def _others(found: Sequence[Placement]) -> list[Placement]:
@@ -158,49 +128,6 @@ def _others(found: Sequence[Placement]) -> list[Placement]:
         if len(others) == _TRIALS:
             break
     return others
-
-
-def _pitches(
-    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> list[tuple[tuple[float, float], float]]:
-    """Pitches (mm) to try, each with the relative tolerance of scale that goes with it."""
-    if pitch_um is not None:
-        return [((pitch_um[0] / 1000, pitch_um[1] / 1000), options.scale_tolerance)]
-    long_mm, short_mm = max(layout.frame_mm), min(layout.frame_mm)
-    long_px, short_px = max(scan.width_px, scan.height_px), min(scan.width_px, scan.height_px)
-    largest = min(long_px / long_mm, short_px / short_mm)
-    return [((1 / (step * largest),) * 2, _STEP_TOLERANCE) for step in _SCALE_STEPS]
-
-
-def _placements(
-    scan: Scan,
-    layout: FiducialLayout,
-    pitch_mm: tuple[float, float],
-    tolerance: float,
-    options: FiducialOptions,
-    centred_mm: float | None = None,
-) -> list[Placement]:
-    """Of all poses asked for. centred_mm: how far about their places in a centred frame marks are looked for; None:
-    everywhere."""
-    poses = POSES if options.pose == "auto" else (options.pose,)
-    flip = np.diag([1 / pitch_mm[0], -1 / pitch_mm[1]])
-    looks = [Look(mark.mark, flip @ up_from_camera(pose)) for pose in poses for mark in layout.marks]
-    signs = signs_of(layout.marks)
-    if centred_mm is None:
-        responses, index = respond(scan, looks, signs)
-    else:
-        places = [centred_places_px(scan, layout, flip @ up_from_camera(pose)) for pose in poses]
-        responses, index = respond_about(scan, looks, np.concatenate(places), centred_mm / max(pitch_mm), signs)
-    bounds = Bounds(tolerance, float(np.deg2rad(options.rotation_deg)), options.search_mm(layout))
-    search = PlacementSearch(layout.marks, responses, pitch_mm, bounds)
-    count = len(layout.marks)
-    searched: list[tuple[str, tuple[int, ...], list[Placement]]] = []
-    for number, pose in enumerate(poses):
-        own = index[number * count : (number + 1) * count]
-        twin = next((s for s in searched if same_picture(layout.marks, (s[0], s[1]), (pose, own), bounds)), None)
-        found = [placement.posed(pose) for placement in twin[2]] if twin else search.of_pose(pose, own)
-        searched.append((pose, own, found))
-    return [placement for _, _, found in searched for placement in found]
 
 
 def _posed(found: Sequence[Placement], best: Placement, pose: str) -> Placement:

@@ -127,7 +127,7 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
             sighter.glimpse_faint(sighter.gate_px)
             sighter.vouched[:] = False  # so far from its place a mark still has to agree with the others
         else:
-            sighter.look([index for index in everything if not sighter.clear(index)], sighter.gate_px)
+            sighter.look_astray([index for index in everything if not sighter.clear(index)])
         sighter.judge()
     for _ in range(_ROUNDS):
         if sighter.sure():
@@ -181,6 +181,26 @@ class _Sighter:
     def look(self, indices: Sequence[int], search_px: float) -> None:
         for index in indices:
             self.sightings[index] = self._sight(index, search_px, self.weights)
+
+    def look_astray(self, indices: Sequence[int]) -> None:
+        """Look at marks where the others put them, first near by, then as far off as one may lie that keeps the gate:
+        so far only what is plainly there counts."""
+        for index in indices:
+            self.look([index], self.gate_px)
+            near, far_px = self.sightings[index], self._astray_px(index)
+            if not self.clear(index) and far_px > self.gate_px:
+                self.look([index], far_px)
+                self.sightings[index] = self.sightings[index] if self.clear(index) else near
+
+    def _astray_px(self, index: int) -> float:
+        """A mark that is fitted pulls the frame to itself, and the more the fewer the others are: its distance from
+        where they alone put it is its residual times one more than their prediction's variance, a mark's being one."""
+        others = np.flatnonzero(self.belongs & (np.arange(len(self.belongs)) != index))
+        affine = np.column_stack([self.camera, np.ones(len(self.camera))])
+        if np.linalg.matrix_rank(affine[others]) < affine.shape[1]:
+            return self.gate_px
+        variance = float(affine[index] @ np.linalg.inv(affine[others].T @ affine[others]) @ affine[index])
+        return min((1 + variance) * self.gate_px, self.first_search_px)
 
     def judge(self) -> None:
         """Which marks found belong together, and the frame through them."""

@@ -15,11 +15,12 @@ from adjust.fiducial_fit import fit_transformation
 from adjust.transformation import film_kind
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
+from measure.frame_search import expected_alike
 from measure.results import FrameMeasurement
 from measure.scan import Scan, open_scan
 from measure.shapes import FiducialLayout, LayoutMark
 from pipeline.camera_file import CameraFile
-from pipeline.progress import Reporter
+from pipeline.progress import Count, Reporter
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -27,6 +28,8 @@ Json = dict[str, Any]
 _ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
 _STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is so deformed
 _OUTSTANDING = 2.0  # times what chance finds
+_CERTAIN = 0.01  # constellations expected by chance: no mark need be matched in wrong places to know better
+_BY_CHANCE = 1.0  # constellation expected: chance may have made it
 _CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
 _AFFINE = 6  # parameters
 
@@ -37,8 +40,9 @@ class Trial:
 
     found: marks that are observations, of drawn ones. likeness: their mean correlation with the drawing; snr: the
     median of contrast over noise. score: 0 to 1, as `_score` has it. chance: the score of the same marks in wrong
-    places, the layout stretched. residual_sigmas, residual_mm: what an affine transformation leaves, per axis, in
-    standard deviations of marks and given places; None where it leaves nothing over.
+    places, the layout stretched; None where no such comparison is needed. residual_sigmas, residual_mm: what an affine
+    transformation leaves, per axis, in standard deviations of marks and given places; None where it leaves nothing
+    over. expected: how many constellations that answer as well at reduced size chance makes in such a scan.
     """
 
     cameras: tuple[str, ...]
@@ -47,15 +51,22 @@ class Trial:
     likeness: float
     snr: float
     score: float
-    chance: float
+    chance: float | None
     residual_sigmas: float | None
     residual_mm: float | None
     reason: str
     seconds: float
+    expected: float
+
+    @property
+    def against_chance(self) -> str:
+        if self.chance is None:
+            return f"chance makes {self.expected:.1g} constellations that answer as well in such a scan"
+        return f"the same marks in wrong places score {self.chance:.2f}"
 
     @property
     def stands_out(self) -> bool:
-        return self.score > 0.0 and self.score >= _OUTSTANDING * self.chance
+        return self.score > 0.0 and (self.chance is None or self.score >= _OUTSTANDING * self.chance)
 
 
 @dataclass(frozen=True)
@@ -80,8 +91,7 @@ class Identification:
         first = self.best[0]
         told = (
             f"{self.scan.name}: {' or '.join(first.cameras)}, score {first.score:.2f}: {first.found} of {first.drawn} "
-            f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; the same marks in wrong places "
-            f"score {first.chance:.2f}."
+            f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; {first.against_chance}."
         )
         if len(self.best) > 1:
             told += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
@@ -102,25 +112,54 @@ def identify(
 
     Raises MeasurementError for a scan that cannot be read.
     """
-    groups = _alike(cameras)
-    trials = []
     with open_scan(path) as scan, reporter.stage("trying") as count:
         pitch = scan.pitch_um if pitch_um is None else (pitch_um, pitch_um)
-        for done, names in enumerate(groups):
-            count(", ".join(names), done, len(groups))
-            trials.append(_trial(scan, names, cameras[names[0]].layout(), pitch))
-    return Identification(path, tuple(sorted(trials, key=lambda trial: -trial.score)))
+        trials = _trials(scan, cameras, pitch, FiducialOptions(pitch_is_right=True), count)
+        if pitch is not None and not any(trial.stands_out for trial in trials):
+            trials = _trials(scan, cameras, pitch, FiducialOptions(), count)
+    return Identification(path, tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected))))
+
+
+def _trials(
+    scan: Scan,
+    cameras: Mapping[str, CameraFile],
+    pitch_um: tuple[float, float] | None,
+    options: FiducialOptions,
+    count: Count,
+) -> list[Trial]:
+    """Of every layout, those first that answer better than chance; the others are measured only where none of these
+    stands out."""
+    expected: dict[tuple[str, ...], float] = {}
+    groups = _alike(cameras)
+    for done, names in enumerate(groups):
+        count(f"the marks of {', '.join(names)}", done, 2 * len(groups))
+        expected[names] = expected_alike(scan, cameras[names[0]].layout(), pitch_um, options)
+    trials: list[Trial] = []
+    for done, names in enumerate(sorted(groups, key=lambda names: expected[names]), len(groups)):
+        layout = cameras[names[0]].layout()
+        if expected[names] > _BY_CHANCE and any(trial.stands_out for trial in trials):
+            trials.append(_not_measured(names, len(layout.marks), expected[names]))
+        else:
+            count(", ".join(names), done, 2 * len(groups))
+            trials.append(_trial(scan, names, layout, pitch_um, options, expected[names]))
+    return trials
+
+
+def _not_measured(names: tuple[str, ...], drawn: int, expected: float) -> Trial:
+    reason = f"not measured: chance makes {expected:.0f} constellations in such a scan that answer as well"
+    return Trial(names, 0, drawn, 0.0, 0.0, 0.0, None, None, None, reason, 0.0, expected)
 
 
 def print_identification(identification: Identification, console: Console) -> None:
     table = Table(box=None, pad_edge=False)
-    for heading in ("score", "chance", "marks", "likeness", "SNR", "residual", "cameras", "seconds"):
+    for heading in ("score", "wrong places", "by chance", "marks", "likeness", "SNR", "residual", "cameras", "seconds"):
         table.add_column(heading, overflow="fold")
     for trial in identification.trials:
         residual = "" if trial.residual_mm is None else f"{trial.residual_mm:.3f} mm, {trial.residual_sigmas:.0f} sigma"
         table.add_row(
             f"{trial.score:.2f}",
-            f"{trial.chance:.2f}" if trial.found else "",
+            "" if trial.chance is None else f"{trial.chance:.2f}",
+            f"{trial.expected:.1g}",
             f"{trial.found} of {trial.drawn}",
             f"{trial.likeness:.2f}" if trial.found else "",
             f"{trial.snr:.1f}" if trial.found else "",
@@ -155,13 +194,20 @@ def _kind(mark: LayoutMark) -> str:
     return repr(mark.mark)
 
 
-def _trial(scan: Scan, names: tuple[str, ...], layout: FiducialLayout, pitch_um: tuple[float, float] | None) -> Trial:
+def _trial(
+    scan: Scan,
+    names: tuple[str, ...],
+    layout: FiducialLayout,
+    pitch_um: tuple[float, float] | None,
+    options: FiducialOptions,
+    expected: float,
+) -> Trial:
     start = time.perf_counter()
-    frame = measure_fiducials(scan, layout, pitch_um)
+    frame = measure_fiducials(scan, layout, pitch_um, options)
     seen = [mark for mark in frame.marks if mark.status.is_observation]
     score = _score(frame)
-    # What is not found needs no comparison with chance.
-    chance = _score(measure_fiducials(scan, _stretched(layout), pitch_um)) if score else 0.0
+    doubtful = score > 0.0 and expected > _CERTAIN
+    chance = _score(measure_fiducials(scan, _stretched(layout), pitch_um, options)) if doubtful else None
     residual = _residual(frame, layout)
     return Trial(
         cameras=names,
@@ -175,6 +221,7 @@ def _trial(scan: Scan, names: tuple[str, ...], layout: FiducialLayout, pitch_um:
         residual_mm=None if residual is None else residual[1],
         reason="" if seen else frame.marks[0].reason,
         seconds=time.perf_counter() - start,
+        expected=expected,
     )
 
 

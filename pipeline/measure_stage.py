@@ -124,10 +124,6 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
     layout, options = camera.layout(), FiducialOptions(pose=pose_of(project, camera))
     measured = measure_fiducials(scan, layout, pitch, options)
     if pitch is not None:
-        if measured.pixel_from_camera is None:
-            # A pitch that is far off hides all marks; the frame's size tells it well enough to find them.
-            other = measure_fiducials(scan, layout, None, options)
-            measured = measured if other.pixel_from_camera is None else other
         source = "the project" if project.pitch_um is not None else "the scan's file"
         wrong = pitch_problem(measured, layout, pitch, source)
         measured = replace(measured, problems=(*measured.problems, wrong) if wrong else measured.problems)

@@ -11,6 +11,7 @@ from test_fiducials import CORNERS, NUMBERED, assert_right, frame_picture, layou
 from measure import fiducials
 from measure.centred_frame import is_lattice
 from measure.fiducials import measure_fiducials
+from measure.frame_search import FrameSearch
 from measure.results import FrameMeasurement
 from measure.scan import Scan
 from measure.shapes import FiducialLayout, MarkShape, ring_cross
@@ -28,12 +29,12 @@ def measured(
     grey: Array, layout: FiducialLayout, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[FrameMeasurement, bool]:
     """And whether the whole scan was searched."""
-    searches: list[Scan] = []
+    searches: list[FrameSearch] = []
     anywhere = fiducials._anywhere
 
-    def noted(scan: Scan, *given: Any) -> Any:
-        searches.append(scan)
-        return anywhere(scan, *given)
+    def noted(search: FrameSearch, *given: Any) -> Any:
+        searches.append(search)
+        return anywhere(search, *given)
 
     monkeypatch.setattr(fiducials, "_anywhere", noted)
     with scan_of(grey, folder) as scan:

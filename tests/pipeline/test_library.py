@@ -162,19 +162,20 @@ def test_the_frame_is_told_from_another_camera(frame: Path) -> None:
     assert [trial.cameras for trial in found.trials] == [(RENDERED,), ("wild-rc5-153", "wild-rc8-153")]
     assert [trial.cameras for trial in found.best] == [(RENDERED,)]
     best = found.trials[0]
-    assert (best.found, best.drawn, best.chance) == (4, 4, 0.0)
+    assert (best.found, best.drawn, best.chance) == (4, 4, None)
+    assert best.expected < 1e-4
     assert best.likeness > 0.8
     assert best.residual_sigmas is not None
     assert best.residual_sigmas < 2.0
     assert RENDERED in found.sentence()
 
 
-def trial(cameras: tuple[str, ...], score: float, chance: float = 0.0) -> Trial:
-    return Trial(cameras, 4, 4, 0.9, 10.0, score, chance, 1.0, 0.01, "", 2.0)
+def trial(cameras: tuple[str, ...], score: float, chance: float | None = 0.0) -> Trial:
+    return Trial(cameras, 4, 4, 0.9, 10.0, score, chance, 1.0, 0.01, "", 2.0, 1e-6)
 
 
 def test_what_chance_finds_as_well_does_not_stand_out() -> None:
-    found = Identification(Path("a.tif"), (trial(("a",), 0.5, 0.3), trial(("b",), 0.0)))
+    found = Identification(Path("a.tif"), (trial(("a",), 0.5, 0.3), trial(("b",), 0.0, None)))
     assert found.best == ()
     assert "no camera of the library stands out" in found.sentence()
     assert found.as_json()["best"] == []

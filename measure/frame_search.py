@@ -1,0 +1,160 @@
+"""The search for a camera's frame in a scan, under hypotheses about its pitch, and how often chance finds one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import comb
+
+from measure.candidates import Look, Responses, respond, respond_about
+from measure.centred_frame import centred_places_px, reach_mm
+from measure.constellation import Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
+from measure.fiducial_options import FiducialOptions
+from measure.frame import Frame
+from measure.pitches import PitchHypothesis, pitch_hypotheses
+from measure.poses import POSES, up_from_camera
+from measure.scan import Scan
+from measure.shapes import FiducialLayout
+from measure.status import Status
+
+Array = NDArray[np.float64]
+Pair = tuple[float, float]
+
+_COMPARED = 8  # best placements: the one that chance makes least is among them
+_ANSWER_PX = 2.0  # of the reduced scan: how far from a mark its answer may lie
+
+
+@dataclass(frozen=True, eq=False)
+class _Searched:
+    """One hypothesis searched. looks: by pose, the kind of response of every mark; differ: poses that are no twins."""
+
+    search: PlacementSearch
+    looks: dict[str, tuple[int, ...]]
+    differ: int
+
+
+def expected_alike(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> float:
+    """How many constellations that answer as well as the scan's best one chance would find in a scan like it without
+    any frame of this camera: the marks are looked for at reduced size only, so that cameras can be compared quickly."""
+    search, expected, tried = FrameSearch(scan, layout, options), np.inf, 0
+    for hypotheses in pitch_hypotheses(scan, layout, pitch_um, replace(options, pitch_is_right=True)):
+        tried += len(hypotheses)
+        found = search.anywhere(hypotheses)[:_COMPARED]
+        expected = min([expected, *(tried * search.expected_alike(placement) for placement in found)])
+    return expected
+
+
+class FrameSearch:
+    """The search in one scan; it draws and correlates the marks once for hypotheses that share a drawing."""
+
+    def __init__(self, scan: Scan, layout: FiducialLayout, options: FiducialOptions) -> None:
+        self.scan, self.layout, self.options = scan, layout, options
+        self.poses = POSES if options.pose == "auto" else (options.pose,)
+        self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
+        self._drawn: tuple[Pair, Responses, tuple[int, ...]] | None = None
+        self._searched: dict[Pair, _Searched] = {}
+
+    def anywhere(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
+        """The placements in the whole scan, of all poses asked for, best first."""
+        found: list[Placement] = []
+        for hypothesis in hypotheses:
+            if self._drawn is None or self._drawn[0] != hypothesis.drawn_mm:
+                self._drawn = (hypothesis.drawn_mm, *respond(self.scan, self._looks(hypothesis), self._signs))
+            found += self._placements(hypothesis, *self._drawn[1:])
+        return _best_first(found)
+
+    def in_the_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
+        """The same of a frame that lies about in the middle of the scan, of which only that is read."""
+        linear = _flip(hypothesis.mm)
+        places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
+        reach_px = reach_mm(self.layout) / max(hypothesis.mm)
+        about = respond_about(self.scan, self._looks(hypothesis), np.concatenate(places), reach_px, self._signs)
+        return _best_first(self._placements(hypothesis, *about))
+
+    def expected_alike(self, placement: Placement) -> float:
+        """How many placements that answer as well chance would find in a scan like this without any frame, by this
+        placement's hypothesis alone.
+
+        Of n marks in the scan k answer, the weakest of them as strongly as a share p of all places do: a frame at
+        random has so many with a probability of about (n over k) p^k. The frames that differ are all pairs of places,
+        one for each of two marks far apart, which the bounds of turn and scale allow.
+        """
+        search = self._searched[placement.pitch_mm].search
+        places = self._camera_mm @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        inside = np.all((places >= 0) & (places < (self.scan.width_px, self.scan.height_px)), axis=1)
+        seen = {index: places[index] for index in np.flatnonzero(inside).tolist()}
+        return self._expected(placement, seen, search.tolerance_px, len(seen))
+
+    def expected_as_good(self, frame: Frame) -> float:
+        """The same of a frame that was measured, only its marks without blemish counting as seen."""
+        verdicts = [frame.verdict(index)[0] if fit else None for index, fit in enumerate(frame.fits)]
+        seen = {
+            index: fit.center_px
+            for index, (fit, verdict) in enumerate(zip(frame.fits, verdicts, strict=True))
+            if fit is not None and verdict is Status.MEASURED
+        }
+        return self._expected(frame.placement, seen, _ANSWER_PX, sum(sighting.inside for sighting in frame.sightings))
+
+    def _expected(self, placement: Placement, seen_px: dict[int, Array], reach_px: float, inside: int) -> float:
+        """seen_px: by index, where marks were seen; their answers lie within reach_px (of the reduced scan)."""
+        searched = self._searched[placement.pitch_mm]
+        shares = []
+        for index, place in seen_px.items():
+            sign = sign_of(self.layout.marks[index].mark, placement.polarity)
+            layer = searched.search.layers[searched.looks[placement.pose][index], sign]
+            shares.append(layer.wide.share(layer.highest(searched.search.responses.reduced_px(place), reach_px)[1]))
+        counts = np.arange(min(3, inside), len(shares) + 1)
+        if len(counts) == 0:
+            return np.inf
+        likely = comb(inside, counts) * np.sort(shares)[counts - 1] ** counts
+        return float(len(counts) * likely.min() * self._different_frames(searched))
+
+    def _different_frames(self, searched: _Searched) -> float:
+        search = searched.search
+        span_px = (
+            float(np.hypot(*np.ptp(self._camera_mm, axis=0))) / float(search.pitch.mean()) / search.responses.reduction
+        )
+        places = self.scan.width_px * self.scan.height_px / search.responses.reduction**2
+        of_other = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
+        same = np.pi * search.tolerance_px**2
+        polarities = 2 if len(self._signs) > 1 else 1
+        return places / same * of_other / same * searched.differ * polarities
+
+    @property
+    def _signs(self) -> set[int]:
+        return signs_of(self.layout.marks)
+
+    def _looks(self, hypothesis: PitchHypothesis) -> list[Look]:
+        linear = _flip(hypothesis.drawn_mm)
+        return [Look(mark.mark, linear @ up_from_camera(pose)) for pose in self.poses for mark in self.layout.marks]
+
+    def _placements(
+        self, hypothesis: PitchHypothesis, responses: Responses, look_of: tuple[int, ...]
+    ) -> list[Placement]:
+        marks, options, count = self.layout.marks, self.options, len(self.layout.marks)
+        bounds = Bounds(hypothesis.tolerance, float(np.deg2rad(options.rotation_deg)), options.search_mm(self.layout))
+        search = PlacementSearch(marks, responses, hypothesis.mm, bounds)
+        looks: dict[str, tuple[int, ...]] = {}
+        found: dict[str, list[Placement]] = {}
+        differ = 0
+        for number, pose in enumerate(self.poses):
+            own = look_of[number * count : (number + 1) * count]
+            twin = next((name for name in found if same_picture(marks, (name, looks[name]), (pose, own), bounds)), "")
+            looks[pose] = own
+            found[pose] = [place.posed(pose) for place in found[twin]] if twin else search.of_pose(pose, own)
+            differ += not twin
+        self._searched[hypothesis.mm] = _Searched(search, looks, differ)
+        return [placement for of_pose in found.values() for placement in of_pose]
+
+
+def _flip(pitch_mm: Pair) -> Array:
+    """(2, 2) from mm right and up to pixels across and down."""
+    return np.diag([1 / pitch_mm[0], -1 / pitch_mm[1]])
+
+
+def _best_first(found: list[Placement]) -> list[Placement]:
+    """Poses that score alike keep their order: of a symmetric camera's eight, "0" comes first."""
+    return sorted(found, key=lambda placement: -round(placement.score, 2))
