@@ -22,6 +22,7 @@ from adjust.reliability import UNCHECKED, Misfits, statistics, unit_rows
 from adjust.result import Reliability, Suspect
 from adjust.reweighting import Weighting, robust_scale
 from adjust.small_matrices import applied, eigen
+from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -59,9 +60,24 @@ def search(
     probabilities: Probabilities,
 ) -> Search:
     """The tests of an adjustment with their critical values."""
-    sizes = statistics(found, weighting.weights).sizes
-    critical = probabilities.critical(sizes, int((sizes > 0).sum()))
-    return Search(numbering, end, factor, found, weighting, probabilities, np.where(sizes > 0, critical, np.inf))
+    tests = statistics(found, weighting.weights)
+    critical = probabilities.critical(tests.sizes, int((tests.sizes > 0).sum()))
+    tested = (tests.sizes > 0) & ~_impossible(numbering, end, tests.error)
+    return Search(numbering, end, factor, found, weighting, probabilities, np.where(tested, critical, np.inf))
+
+
+def _impossible(numbering: Numbering, end: Linearised, error: Array) -> NDArray[np.bool_]:
+    """Which units (N,) cannot have the gross errors (N, 2) that the others see in them: a given principal distance is
+    not wrong by more than itself.
+
+    Over flat ground v'Pv hardly changes with the principal distance, and what change there is need not come from it:
+    nearer stations let errors of given heights explain more of the image residuals. In the linear model that small
+    slope looks like a gross error of metres.
+    """
+    positions = TestedUnits(numbering.problem).positions[:, 0]
+    is_distance = np.isin(positions, [some[0] for some in numbering.problem.unknowns.camera.values()])
+    impossible = is_distance & (np.abs(error[len(end.v_mm) :, 0]) > np.abs(end.state.values[positions]))
+    return np.concatenate([np.zeros(len(end.v_mm), dtype=bool), impossible])
 
 
 @dataclass(frozen=True)

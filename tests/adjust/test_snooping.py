@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from simulated import field_points, simulated
+from simulated import Truth, field_points, simulated
 
 from adjust.adjustment import Options, adjust
 from adjust.network import Approximations, Fiducial, Network, Prior
@@ -153,3 +153,17 @@ def test_options_that_make_no_sense_are_refused() -> None:
         Options(variance_components=("bolts",))
     with pytest.raises(ValueError, match="huber, igg3"):
         Options(robust="tukey")  # type: ignore[arg-type]
+
+
+def test_over_flat_ground_of_known_height_no_principal_distance_is_wrong_by_metres() -> None:
+    """Parallel axes: the heights' errors alone pull at c, which no image point says anything about."""
+    rng = np.random.default_rng(6)
+    truth = Truth(attitudes=((0.004, -0.005, 0.1), (-0.005, 0.002, 1.6), (0.002, 0.007, 3.0), (0.001, -0.003, -1.5)))
+    network, start = simulated(rng, truth, points=field_points(rng, 100, relief=0.3), point_sigma=np.inf)
+    heights = tuple(replace(point, Z=Prior(0.0, 0.2)) for point in network.points)
+    flat = replace(network, points=tuple(replace(point, X=None, Y=None) for point in heights))
+    result = adjust(flat, start, Options(datum="minimal"))
+    assert result.reliability is not None
+    row = next(i for i, each in enumerate(result.reliability.tested) if each.name == "given c (camera K)")
+    assert result.reliability.w[row, 0] < -3.0
+    assert named(result) == []
