@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from measure.results import MarkMeasurement
 from measure.status import Status
-from measure.ties import TieFrame, TieOptions, Ties, measure_ties
+from measure.tie_frame import TieFrame
+from measure.ties import TieOptions, Ties, measure_ties
 from synthetic_images.film import FrameGeometry
 from synthetic_images.render import render_scene
 from synthetic_images.scene import DiskField, Distortion, Film, Scanner, Scene, SceneCamera, SceneImage
@@ -42,7 +43,8 @@ IMAGES = (
 
 
 HEADING = (
-    "condition            points in >= 3  images  rms an axis  largest  beyond 0.5  real/claimed  weak  refused  CPU s"
+    "condition            points in >= 3  images  rms an axis  a point  largest  beyond 0.5  real/claimed  weak"
+    "  refused  CPU s"
 )
 
 
@@ -122,7 +124,8 @@ def row(condition: Condition, made: Scene, folder: Path) -> str:
     beyond = int((np.hypot(*measured.T) > WRONG_PX).sum())
     return (
         f"{condition.name:20s} {len(sights):6d} {len(whole):8d} {np.mean(whole):7.2f} "
-        f"{np.sqrt(np.mean(measured**2)):12.3f} {np.hypot(*measured.T).max():8.3f} {beyond:11d} "
+        f"{np.sqrt(np.mean(measured**2)):12.3f} {np.sqrt(2.0 * np.mean(measured**2)):8.3f} "
+        f"{np.hypot(*measured.T).max():8.3f} {beyond:11d} "
         f"{np.sqrt(squares.mean() / 2):13.2f} {weak:5d} {refused:8d} {seconds:8.0f}"
     )
 

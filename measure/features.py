@@ -1,12 +1,13 @@
 """Natural features of a scan (SIFT), and which of them two scans share."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.multi_image import RADIUS_PX
 from measure.scan import Scan
 
 Array = NDArray[np.float64]
@@ -24,11 +25,16 @@ _STRETCH = (0.5, 99.5)  # percentiles of the grey values that become black and w
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """places_px (n, 2): column and row in the scan; descriptors (n, 128); strengths (n,): SIFT's contrast."""
+    """places_px (n, 2): column and row in the scan; descriptors (n, 128); strengths (n,): SIFT's contrast.
+    textures (n,): how well the picture about them fixes a place, in any unit."""
 
     places_px: Array
     descriptors: NDArray[np.float32]
     strengths: Array
+    textures: Array
+
+    def chosen(self, rows: Indices) -> "Features":
+        return Features(self.places_px[rows], self.descriptors[rows], self.strengths[rows], self.textures[rows])
 
 
 def reduction(scan: Scan) -> int:
@@ -46,13 +52,13 @@ def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, c
     picture = _eight_bit(scan.reduced(factor))
     if mirrored:
         picture = np.ascontiguousarray(picture[:, ::-1])
-    places, descriptors, strengths = _tiled(picture, _SURPLUS * count)
+    found = _tiled(picture, _SURPLUS * count, 2 * (RADIUS_PX // factor) + 1)
+    places = found.places_px
     if mirrored:
-        places[:, 0] = picture.shape[1] - 1 - places[:, 0]
-    places = places * factor + (factor - 1) / 2
-    kept = np.flatnonzero(usable(places))
-    kept = kept[_spread(places[kept], strengths[kept], np.array([scan.width_px, scan.height_px]), count)]
-    return Features(places[kept], descriptors[kept], strengths[kept])
+        places = np.array([picture.shape[1] - 1, 0]) + places * np.array([-1, 1])
+    found = replace(found, places_px=places * factor + (factor - 1) / 2)
+    found = found.chosen(np.flatnonzero(usable(found.places_px)))
+    return found.chosen(_spread(found, np.array([scan.width_px, scan.height_px]), count))
 
 
 def shared_features(first: Features, second: Features) -> Indices:
@@ -70,10 +76,14 @@ def _eight_bit(grey: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(np.clip((grey - black) * (255.0 / max(white - black, 1e-9)), 0.0, 255.0), np.uint8)
 
 
-def _tiled(picture: NDArray[np.uint8], count: int) -> tuple[Array, NDArray[np.float32], Array]:
-    """Places, descriptors and strengths of about `count` features, found tile by tile, the strongest of each."""
+def _tiled(picture: NDArray[np.uint8], count: int, patch_px: int) -> Features:
+    """About `count` features of a picture, found tile by tile, the strongest of each.
+
+    Texture is what the matching of a patch has to go by: the lesser eigenvalue of the grey values' gradients over it
+    (Förstner and Gülch 1987).
+    """
     places: list[Array] = [np.empty((0, 2))]
-    descriptors, strengths = [np.empty((0, 128), np.float32)], [np.empty(0)]
+    descriptors, strengths, textures = [np.empty((0, 128), np.float32)], [np.empty(0)], [np.empty(0)]
     height, width = picture.shape
     for row0 in range(0, height, _TILE_PX):
         for col0 in range(0, width, _TILE_PX):
@@ -93,7 +103,11 @@ def _tiled(picture: NDArray[np.uint8], count: int) -> tuple[Array, NDArray[np.fl
             places.append(found[own])
             descriptors.append(np.asarray(described, np.float32)[own])
             strengths.append(np.array([point.response for point in points])[own])
-    return np.concatenate(places), np.concatenate(descriptors), np.concatenate(strengths)
+            col, row = np.round(found[own] - (left, top)).astype(np.intp).T
+            textures.append(cv2.cornerMinEigenVal(tile, patch_px)[row, col].astype(np.float64))
+    return Features(
+        np.concatenate(places), np.concatenate(descriptors), np.concatenate(strengths), np.concatenate(textures)
+    )
 
 
 def _first_of_place(places: Array) -> Mask:
@@ -103,10 +117,10 @@ def _first_of_place(places: Array) -> Mask:
     return first
 
 
-def _spread(places: Array, strengths: Array, size_px: Array, count: int) -> Indices:
-    """Indices of the strongest places of every cell in turn, until there are enough."""
-    cell = np.floor(places / size_px * _CELLS).astype(np.intp) @ np.array([1, _CELLS])
-    return in_turn(cell, strengths)[:count]
+def _spread(features: Features, size_px: Array, count: int) -> Indices:
+    """Indices of the strongest features of every cell in turn, until there are enough."""
+    cell = np.floor(features.places_px / size_px * _CELLS).astype(np.intp) @ np.array([1, _CELLS])
+    return in_turn(cell, features.strengths)[:count]
 
 
 def in_turn(group: Indices, strengths: Array) -> Indices:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import chi2
 
+from measure.bending import Bending
 from measure.noise import NoiseModel, correlated, noise_model
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ class Matched:
 
     correlation: of the piece with the mean of the others; gain: its contrast over the mean one; variance: of its noise,
     in units of its own contrast; unevenness: the probability that quarters of the patch differ as much in their shifts
-    by chance.
+    by chance. bending: of the ground within the patch, None for the reference, which has none against itself.
     reason: why the point could not be matched, and then its pieces have no covariance.
     """
 
@@ -64,6 +65,7 @@ class Matched:
     gain: float
     variance: float
     unevenness: float
+    bending: Bending | None = None
     reason: str = ""
 
 
@@ -136,10 +138,8 @@ class _Fit:
         count as texture, which slows the steps and makes the covariance too small.
         """
         single = self._derivatives(self.values)
-        mean = single.mean(axis=0)
-        count = len(single)
-        self.normal = (count**2 * mean.T @ mean - np.einsum("nij,nik->jk", single, single)) / (count * (count - 1))
-        self.design[:, self.used] = mean.T
+        self.normal = _products(single, single)
+        self.design[:, self.used] = single.mean(axis=0).T
         size = np.sqrt(np.abs(np.diag(self.normal)))
         if not (size > 0.0).all() or np.linalg.eigvalsh(self.normal / np.outer(size, size))[0] < _LEAST_EIGENVALUE:
             self.reasons = ["the texture does not fix the place in both directions"] * len(self.pieces)
@@ -150,7 +150,17 @@ class _Fit:
         """(frames, pixels used, 6) of each patch, less what a gain and an offset would explain."""
         by_col, by_row = (_slope(patches, axis)[:, self.used] for axis in (2, 1))
         u, v = self.grid[self.used].T
-        design = np.stack([by_col, by_row, by_col * u, by_col * v, by_row * u, by_row * v], axis=2)
+        columns = [by_col, by_row, by_col * u, by_col * v, by_row * u, by_row * v]
+        return self._freed(np.stack(columns, axis=2), patches)
+
+    def _bent(self, patches: Array) -> Array:
+        """The same by the six coefficients of a bending."""
+        u, v = self.grid[self.used].T / RADIUS_PX
+        slopes = [_slope(patches, axis)[:, self.used] for axis in (2, 1)]
+        return self._freed(np.stack([slope * form for slope in slopes for form in (u * u, u * v, v * v)], 2), patches)
+
+    def _freed(self, design: Array, patches: Array) -> Array:
+        """Columns less what a gain and an offset would explain."""
         patch = patches.mean(axis=0)[self.used]
         grey = np.linalg.qr(np.stack([np.ones_like(patch), patch], axis=1))[0]
         return np.asarray(design - grey @ (grey.T @ design))
@@ -173,7 +183,7 @@ class _Fit:
         """The pieces with the reasons why they could not be matched, which is a reason against the others too."""
         nothing = np.full((2, 2), np.inf)
         return tuple(
-            Matched(matrix[:, 2].copy(), nothing, matrix, 0.0, 0.0, np.inf, 0.0, reason)
+            Matched(matrix[:, 2].copy(), nothing, matrix, 0.0, 0.0, np.inf, 0.0, reason=reason)
             for matrix, reason in zip(self.maps, self.reasons, strict=True)
         )
 
@@ -184,9 +194,10 @@ class _Fit:
         residuals = (self.values - self.values.mean(axis=0)) * self.used
         # Of a piece's own noise the mean has taken its share.
         residuals *= np.sqrt(count / (count - 1))
+        noises = [self._noise(each) for each in residuals]
+        bendings = self._bendings(noises)
         matched = []
-        for index in range(count):
-            noise = self._noise(residuals[index])
+        for index, noise in enumerate(noises):
             linear = self.maps[index][:, :2]
             own = self._covariance(noise)[:2, :2]
             others = (self.values.sum(axis=0) - self.values[index])[self.used]
@@ -199,6 +210,7 @@ class _Fit:
                     gain=float(self.gains[index] / self.gains.mean()),
                     variance=noise.variance_dn2,
                     unevenness=self._unevenness(residuals[index], noise),
+                    bending=bendings[index],
                 )
             )
         return tuple(matched)
@@ -221,6 +233,26 @@ class _Fit:
         spread = np.tensordot(correlated(self.design, noise), self.design, axes=([1, 2], [1, 2]))
         return np.asarray(inverse @ spread @ inverse)
 
+    def _bendings(self, noises: Sequence[NoiseModel]) -> list[Bending | None]:
+        """What the differences from the reference's piece show, the affine geometry taken off."""
+        single, bent = self._derivatives(self.values), self._bent(self.values)
+        through = np.asarray(np.linalg.solve(self.normal, _products(single, bent)), np.float64)
+        response = _products(bent, bent) - _products(single, bent).T @ through
+        columns = np.zeros((bent.shape[2], *self.used.shape))
+        columns[:, self.used] = (bent.mean(axis=0) - single.mean(axis=0) @ through).T
+        spreads = [np.tensordot(correlated(columns, each), columns, axes=([1, 2], [1, 2])) for each in noises]
+        return [
+            None
+            if index == self.reference
+            else Bending(
+                seen=np.tensordot(columns, values - self.values[self.reference], axes=2),
+                response=response,
+                noise=spreads[index] + spreads[self.reference],
+                on_place=np.negative(through[:2]),
+            )
+            for index, values in enumerate(self.values)
+        ]
+
     def _unevenness(self, residuals: Array, noise: NoiseModel) -> float:
         """Each quarter of the patch has a shift of its own: chi-squared of the four, which sum to nothing."""
         u, v = self.grid[..., 0], self.grid[..., 1]
@@ -236,6 +268,13 @@ class _Fit:
         values, vectors = np.linalg.eigh(spread)
         real = values > 1e-9 * values[-1]
         return float(chi2.sf(np.sum((vectors.T @ seen)[real] ** 2 / values[real]), real.sum())) if real.any() else 1.0
+
+
+def _products(first: Array, second: Array) -> Array:
+    """Mean products (j, k) of derivatives (frames, pixels, j) and (frames, pixels, k) of different frames."""
+    count = len(first)
+    own = np.einsum("nij,nik->jk", first, second)
+    return np.asarray((first.sum(axis=0).T @ second.sum(axis=0) - own) / (count * (count - 1)))
 
 
 def _spline(grey: NDArray[np.floating], smoothing_px: float) -> Array:

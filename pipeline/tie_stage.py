@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.ties import TieFrame, measure_ties
+from measure.tie_frame import TieFrame
+from measure.ties import measure_ties
 from pipeline.errors import InputError
 from pipeline.measurement_file import MeasuredScan
 from pipeline.network import given_points

@@ -21,12 +21,18 @@ def texture(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     return rng.uniform(-28.0, 28.0, (250, 2)), rng.uniform(1.5, 3.5, 250), rng.normal(0.0, 20.0, 250)
 
 
-def picture(spots: tuple[Array, Array, Array], scan_from_patch: Array) -> Array:
-    """The texture as it looks through a map; its point is where the map's shift puts it, about the middle."""
+def picture(spots: tuple[Array, Array, Array], scan_from_patch: Array, bending: Array | None = None) -> Array:
+    """The texture as it looks through a map; its point is where the map's shift puts it, about the middle.
+
+    bending (6,): coefficients of u², uv, v² for the columns and for the rows, px at the patch's rim.
+    """
     centers, widths, tones = spots
     edge = np.arange(-HALF, HALF + 1.0)
     pixels = np.stack(np.meshgrid(edge, edge), axis=-1).reshape(-1, 2)
     patch = (pixels - scan_from_patch[:, 2]) @ np.linalg.inv(scan_from_patch[:, :2]).T
+    if bending is not None:
+        u, v = patch.T / RADIUS_PX
+        patch = patch + np.stack([u * u, u * v, v * v], axis=1) @ bending.reshape(2, 3).T
     distance = ((patch[:, None, :] - centers) ** 2).sum(axis=2)
     grey = 500.0 + np.exp(-distance / (2 * widths**2)) @ tones
     return np.asarray(grey.reshape(len(edge), len(edge)))
@@ -69,6 +75,20 @@ def test_clean_pictures_leave_next_to_no_error() -> None:
     for each, matrix in zip(matched, MAPS, strict=True):
         assert np.abs(each.center_px - matrix[:, 2]).max() < 0.005
         assert np.abs(each.scan_from_patch[:, :2] - matrix[:, :2]).max() < 0.001
+
+
+def test_bent_ground_moves_the_place_as_its_bending_says() -> None:
+    spots = texture(np.random.default_rng(4))
+    bending = np.array([0.4, 0.1, 0.3, -0.2, 0.0, -0.1])
+    bent = Piece(picture(spots, MAPS[1], bending), (-HALF, -HALF), MAPS[1])
+    even = [Piece(picture(spots, matrix), (-HALF, -HALF), matrix) for matrix in (MAPS[0], MAPS[2])]
+    found = match_pieces([even[0], bent, even[1]], 0)[1]
+    assert found.bending is not None
+    off = np.linalg.solve(found.scan_from_patch[:, :2], found.center_px - MAPS[1][:, 2])
+    assert np.linalg.norm(off) > 0.05
+    assert off == pytest.approx(found.bending.on_place @ bending, abs=0.02)
+    shift, _ = found.bending.estimated(np.eye(6))
+    assert off == pytest.approx(shift, abs=0.02)
 
 
 def test_another_picture_stands_out_by_its_variance() -> None:

@@ -7,7 +7,8 @@ import pytest
 
 from adjust.network import Prior
 from measure.status import Status
-from measure.ties import TieFrame, TieOptions, measure_ties
+from measure.tie_frame import TieFrame
+from measure.ties import TieOptions, measure_ties
 from pipeline.comparator_file import read_comparator
 from pipeline.errors import InputError
 from pipeline.network import build_network
