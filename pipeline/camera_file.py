@@ -66,6 +66,10 @@ class LearnedFrom:
     pose: str
     clicked: bool
 
+    def shows_pose_of(self, scan: str) -> bool:
+        """Whether a scan lies like it: itself; and all, where the marks were found by recurring in one place."""
+        return scan == self.scan or not self.clicked
+
 
 @dataclass(frozen=True)
 class CameraFile:

@@ -19,6 +19,7 @@ from measure.frame_fit import fit_frame
 from measure.learned import Chip, cut, template_of
 from measure.poses import POSES, up_from_camera
 from measure.recurring import Recurrence, Window, about, recurrence
+from measure.results import FrameMeasurement
 from measure.scan import Scan, open_scan
 from pipeline.atomic import write_atomically
 from pipeline.camera_file import CameraFile, Clicks, GivenFiducial, LearnedFrom
@@ -223,10 +224,11 @@ def _chips_of(project: Project, camera: CameraFile, learned: Sequence[GivenFiduc
     """The pictures of learned marks in one scan, as far as they are found."""
     with open_scan(project.scans[name]) as scan:
         pitch = project.pitch_um or scan.pitch_um
-        frame = measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=pose_of(project, camera)))
+        options = FiducialOptions(pose=pose_of(project, camera, scan.name))
+        frame = measure_fiducials(scan, camera.layout(), pitch, options)
         matrix = frame.pixel_from_camera
         found = {mark.point: mark.center_px for mark in frame.marks if mark.status.is_observation}
-        if matrix is None:
+        if matrix is None or not _is_named(frame, camera):
             return {}
         return {
             one.id: cut(scan, np.column_stack([matrix[:, :2], center]), _size(one))
@@ -235,10 +237,19 @@ def _chips_of(project: Project, camera: CameraFile, learned: Sequence[GivenFiduc
         }
 
 
-def pose_of(project: Project, camera: CameraFile) -> str:
-    """As the project sets it; scans whose marks are learned are taken to lie as the one they were learned from."""
+def _is_named(frame: FrameMeasurement, start: CameraFile) -> bool:
+    """Whether the marks found are those of their names for sure, or at least if the scan lies as the one clicked in."""
+    pose, learned = frame.pose, start.learned_from
+    return pose is not None and learned is not None and (pose.decided or pose.name == learned.pose)
+
+
+def pose_of(project: Project, camera: CameraFile, scan: str) -> str:
+    """As the project sets it; a scan whose marks were clicked lies as these say, and what recurs in all scans, nobody
+    having clicked, was looked for in one pose."""
     learned = camera.learned_from
-    return learned.pose if learned is not None and project.pose == "auto" else project.pose
+    if learned is None or project.pose != "auto":
+        return project.pose
+    return learned.pose if learned.shows_pose_of(scan) else "auto"
 
 
 def _averaged(

@@ -121,19 +121,25 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
     if all(fiducial.passed_over for fiducial in camera.fiducials):
         return FrameMeasurement(name, ())
     pitch = project.pitch_um or scan.pitch_um
-    layout, options = camera.layout(), FiducialOptions(pose=pose_of(project, camera))
+    layout, options = camera.layout(), FiducialOptions(pose=pose_of(project, camera, scan.name))
     measured = measure_fiducials(scan, layout, pitch, options)
     if pitch is not None:
         source = "the project" if project.pitch_um is not None else "the scan's file"
         wrong = pitch_problem(measured, layout, pitch, source)
         measured = replace(measured, problems=(*measured.problems, wrong) if wrong else measured.problems)
-    if camera.learned_from is not None and project.pose == "auto" and measured.pose is not None:
-        measured = replace(measured, pose=_as_learned(camera.learned_from, scan))
+    learned = camera.learned_from
+    if (
+        learned is not None
+        and project.pose == "auto"
+        and learned.shows_pose_of(scan.name)
+        and measured.pose is not None
+    ):
+        measured = replace(measured, pose=_as_learned(learned, scan))
     return replace(measured, image=name, marks=_with_sizes(measured, camera, scan, pitch))
 
 
 def _as_learned(learned: LearnedFrom, scan: Scan) -> Pose:
-    if learned.clicked and learned.scan == scan.name:
+    if learned.clicked:
         return Pose(learned.pose, True, ("the clicks in it say so.",))
     like = f"it is taken to lie as {learned.scan}, from which its marks were learned: {learned.pose} is assumed."
     return Pose(learned.pose, False, (like,))

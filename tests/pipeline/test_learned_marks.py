@@ -4,9 +4,11 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from shutil import copy
 
 import numpy as np
 import pytest
+import tifffile
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -60,13 +62,13 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def project_of(folder: Path, camera: str, scans: str = '"scans/*.tif"') -> Project:
+def project_of(folder: Path, camera: str, scans: str = '"scans/*.tif"', pose: str = "0") -> Project:
     given = "".join(
         f'[[fiducial]]\nid = "{id}"\nxy_mm = [{x + 0.2}, {y - 0.3}]\nmark = "m"\n' for id, (x, y) in CORNERS.items()
     )
     (folder / "camera.toml").write_text(camera + given)
     (folder / "project.toml").write_text(
-        f'camera = "camera.toml"\nscans = [{scans}]\npitch_um = 50.0\n[measure]\npose = "0"\n'
+        f'camera = "camera.toml"\nscans = [{scans}]\npitch_um = 50.0\n[measure]\npose = "{pose}"\n'
     )
     return read_project(folder / "project.toml")
 
@@ -109,6 +111,26 @@ def test_learned_marks_lie_off_the_true_ones_alike_in_all_frames(rendered: Path,
     # What was learned is a camera file that can be used instead.
     again = read_camera(project.output / "learned" / "camera.toml")
     assert [one.id for one in again.drawn] == list(CORNERS)
+
+
+def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictures(
+    rendered: Path, tmp_path: Path
+) -> None:
+    """Turned by a quarter: the arrows point elsewhere."""
+    for folder in ("scans", "turned"):
+        (tmp_path / folder).mkdir()
+    copy(rendered / "scans" / "f1.tif", tmp_path / "scans")
+    copy(rendered / "truth.json", tmp_path)
+    upright = tifffile.imread(rendered / "scans" / "f2.tif")
+    tifffile.imwrite(tmp_path / "scans" / "f2.tif", np.rot90(upright))  # counter-clockwise
+    project = project_of(tmp_path, LEARNED + clicks(rendered), pose="auto")
+    first, turned = measured(project)
+    assert first.pose is not None
+    assert turned.pose is not None
+    assert (turned.pose.name, turned.pose.decided) == ("90", True), turned.pose.evidence
+    for mark, (col, row) in zip(turned.marks, truth(rendered)["f2"].tolist(), strict=True):
+        assert mark.center_px is not None
+        np.testing.assert_allclose(mark.center_px, (row, upright.shape[1] - 1 - col), atol=5.0)
 
 
 def test_one_scan_must_be_clicked_and_says_what_it_can_tell(rendered: Path) -> None:
