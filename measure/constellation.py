@@ -10,6 +10,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from measure.candidates import Map, Responses, peaks
 from measure.poses import up_from_camera
@@ -24,6 +25,9 @@ _CANDIDATES = 100  # of each look
 _PAIRS = 60  # of marks that hypotheses are made from
 _NARROWED = 0.7  # of the tolerance, once a placement is refined
 _KEPT = 12  # placements of a pose that are refined
+_SLID = 3  # of them, in a lattice, that are moved by its steps
+_NEIGHBOURS = 4  # of a mark of a lattice
+_ALIKE = 0.5  # of the marks that a step takes to others: they are a lattice
 _OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
 
 
@@ -194,8 +198,12 @@ class _Constellation:
         scores, _ = self._scores([layer.wide for layer in self.layers], scale, offset)
         near = [layer.near for layer in self.layers]
         result: list[Placement] = []
-        for index in np.argsort(-scores, kind="stable")[:_KEPT]:
-            a, b = self._refined(complex(scale[index]), complex(offset[index]))
+        kept = np.argsort(-scores, kind="stable")[:_KEPT]
+        for start in (
+            *zip(scale[kept], offset[kept], strict=True),
+            *self._slid(scale[kept[:_SLID]], offset[kept[:_SLID]]),
+        ):
+            a, b = self._refined(*map(complex, start))
             score, supported = self._scores(near, np.array([a]), np.array([b]))
             result.append(
                 Placement(
@@ -209,6 +217,31 @@ class _Constellation:
                 )
             )
         return result
+
+    def _slid(self, scale: Complex, offset: Complex) -> list[tuple[complex, complex]]:
+        """Of a lattice too large for all its marks to be candidates the best hypothesis may be many steps off: these,
+        moved step by step as long as more marks answer. None where the marks are no lattice."""
+        steps = np.concatenate([[0.0], self._steps()])
+        wide = [layer.wide for layer in self.layers]
+        moving = len(steps) > 1
+        while moving:
+            tried = offset[:, None] + scale[:, None] * steps
+            scores = self._scores(wide, np.repeat(scale, len(steps)), tried.ravel())[0].reshape(tried.shape)
+            best = scores.argmax(axis=1)
+            moving = bool(best.any())
+            offset = tried[np.arange(len(best)), best]
+        return list(zip(scale, offset, strict=True)) if len(steps) > 1 else []
+
+    def _steps(self) -> Complex:
+        """The steps (mm) from the middle mark to the nearest ones that take most marks to others."""
+        places = np.stack([self.camera.real, self.camera.imag], axis=1)
+        tree = cKDTree(places)
+        order = np.argsort(np.hypot(*(places - places.mean(axis=0)).T), kind="stable")
+        middle = places[order[0]]
+        _, near = tree.query(middle, k=min(len(places), _NEIGHBOURS + 1))
+        steps = places[np.ravel(near)[1:]] - middle
+        onto = [np.mean(tree.query(places + step)[0] < self.bounds.misfit_mm) for step in steps]
+        return np.asarray((steps @ [1.0, 1.0j])[np.array(onto) > _ALIKE])
 
     def _complex(self, scan_px: Array) -> Complex:
         scaled = scan_px * self.pitch

@@ -185,7 +185,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
 
 
 def _likeness(fit: PictureFit) -> float:
-    background, grey = fit.model.ground()[:, fit.used], fit.model.grey[fit.used]
+    background, grey = fit.model.ground[:, fit.used], fit.model.grey[fit.used]
     if len(grey) <= len(background):
         return 0.0
     without = grey - background.T @ np.linalg.lstsq(background.T, grey, rcond=None)[0]

@@ -61,7 +61,12 @@ def robust_scale(values: Array) -> float:
     """The standard deviation of normal values, from their median absolute deviation."""
     if values.size == 0:
         return 0.0
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    return 1.4826 * _median(np.abs(values - _median(values)))
+
+
+def _median(values: Array) -> float:
+    middle = (values.size - 1) // 2, values.size // 2  # numpy's own takes four times as long for a small window
+    return float(np.partition(values, middle, axis=None)[list(middle)].mean())
 
 
 def correlated(columns: Array, noise: NoiseModel) -> Array:

@@ -195,11 +195,10 @@ class PictureFit:
         """The step, None where it is not determined. A blur at its limit stays there instead of pulling the others."""
         model = self.model
         priors = model.prior_weights() * self.variance_dn2
-        seen = weights > 0
-        design = model.design[:, seen]
-        weighted = design * weights[seen]
+        design = model.design.reshape(len(priors), -1)
+        weighted = design * weights.ravel()
         normal = weighted @ design.T + np.diag(priors)
-        right = weighted @ model.residuals[seen] - priors * model.departures()
+        right = weighted @ model.residuals.ravel() - priors * model.departures()
         free = np.ones(len(right), dtype=bool)
         step = solution(normal, right, free)
         if step is not None and model.blur_is_held(step):

@@ -44,6 +44,7 @@ class PictureModel:
     """The model at its present state: design (unknowns, height, width) and residuals (height, width). The unknowns are
     column and row, the generators' parameters, the blur's variance if it is estimated, and the greys.
 
+    ground (3, height, width): offset and slopes of the background.
     clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
     values need; tells (height, width): False where a clipped one says nothing of it."""
 
@@ -70,26 +71,31 @@ class PictureModel:
         self.state = State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
         self.drawn = start[:, :2].copy()
         self.reach_px = float(np.hypot(*np.abs(np.array(extent_px(mark, start)) - start[:, 2]).max(axis=0)))
+        self.mark_from_start: Array = np.linalg.inv(start[:, :2]).astype(float)
+        self.ground = _planes(*grey.shape)
         self.residuals = np.zeros_like(grey)
-        self.design = np.zeros((0, *grey.shape))
+        self.design = np.zeros((2 + len(self.generators) + options.estimate_blur + GREY, *grey.shape))
 
     def linearise(self, used: Mask) -> None:
         """Design and residuals of the present state; the greys from a linear fit to what is used, at first."""
         height, width = self.grey.shape
         place, blur_px = self.state.pixel_from_mark, float(np.sqrt(self.state.variance_px2))
         shown = self._shown(width, height, blur_px)
-        greys = np.stack([self._detail(shown.value), *self.ground()])
+        greys = self.design[-GREY:]
+        greys[0], greys[1:] = self._detail(shown.value), self.ground
         if not self.state.greys.any():
             solved = np.linalg.lstsq(greys[:, used].T, self.grey[used], rcond=None)[0]
             self.state = State(place, self.state.variance_px2, np.asarray(solved, dtype=float))
-        gain = self.state.greys[0]
-        columns = [shown.by_col, shown.by_row]
+        columns = self.design[:-GREY]
+        columns[0], columns[1] = shown.by_col, shown.by_row
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
-        for (xx, xy), (yx, yy) in self.generators:
-            columns.append(shown.by_col * (xx * col + xy * row) + shown.by_row * (yx * col + yy * row))
+        moves = np.stack([slope * along for slope in columns[:2] for along in (col, row)])
+        columns[self.linear] = np.tensordot(self.generators.reshape(-1, 4), moves, axes=1)
         if self.blur is not None:
-            columns.append(-0.5 * shown.laplacian)
-        self.design = np.concatenate([[-gain * self._detail(column) for column in columns], greys])
+            columns[self.blur] = -0.5 * shown.laplacian
+        if self.background_px is not None:
+            columns[:] = [self._detail(column) for column in columns]
+        columns *= -self.state.greys[0]
         self.residuals = self.grey - np.tensordot(self.state.greys, greys, axes=1)
         self._censor()
 
@@ -147,9 +153,7 @@ class PictureModel:
     def departures(self) -> Array:
         """How far the parameters under a prior are from where they started."""
         departures = np.zeros(len(self.design))
-        distortion = self._distortion()
-        for index, generator in enumerate(self.generators):
-            departures[2 + index] = np.sum(distortion * generator) / np.sum(generator**2)
+        departures[self.linear] = np.tensordot(self.generators, self._distortion()) / 2  # of two ones each
         return departures
 
     def ran_away(self) -> str:
@@ -160,13 +164,6 @@ class PictureModel:
         if np.abs(self._distortion()).max() > self.options.max_distortion:
             return "the fit wants a mark of another size or direction than the one drawn"
         return ""
-
-    def ground(self) -> Array:
-        """(3, height, width) offset and slopes of the background."""
-        height, width = self.grey.shape
-        scale = max(height, width) / 2
-        row, col = np.mgrid[:height, :width].astype(float)
-        return np.stack([np.ones_like(col), (col - (width - 1) / 2) / scale, (row - (height - 1) / 2) / scale])
 
     def _detail(self, image: NDArray[np.floating]) -> Array:
         """Grey values, or their model, without what is coarser than the mark's lines."""
@@ -179,7 +176,16 @@ class PictureModel:
         return (0.0 if isinstance(self.mark, MarkTemplate) else low**2), high**2
 
     def _distortion(self) -> Array:
-        return np.asarray(self.state.pixel_from_mark[:, :2] @ np.linalg.inv(self.start[:, :2]) - np.eye(2))
+        return np.asarray(self.state.pixel_from_mark[:, :2] @ self.mark_from_start - np.eye(2))
+
+
+def _planes(height: int, width: int) -> Array:
+    """(3, height, width) offset and slopes of the background."""
+    scale = max(height, width) / 2
+    planes = np.ones((3, height, width))
+    planes[1] = (np.arange(width) - (width - 1) / 2) / scale
+    planes[2] = (np.arange(height)[:, None] - (height - 1) / 2) / scale
+    return planes
 
 
 def background_px(mark: Mark, pixel_from_mark: Array) -> float:
