@@ -1,0 +1,102 @@
+"""Frames that show three marks of four: plain ones are believed, and specks among specks are not."""
+
+from dataclasses import replace
+
+import numpy as np
+from brute_marks import Array, brute_picture
+from drawn import scan_of
+from numpy.typing import NDArray
+
+from measure.chance import doubt
+from measure.constellation import Placement
+from measure.fiducial_options import FiducialOptions
+from measure.frame import Frame, measure_frame
+from measure.pose_decision import decide_pose
+from measure.poses import POSES, up_from_camera
+from measure.scan import Scan
+from measure.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, dot
+
+PX_PER_MM = 20.0
+CONTRAST_DN = 8000.0
+CORNERS = ((7.0, -7.0), (-7.0, -7.0), (-7.0, 7.0), (7.0, 7.0))
+DOT = MarkShape(dot(0.2), "light")
+OPTIONS = FiducialOptions()
+
+
+def layout_of(*marks: MarkShape) -> FiducialLayout:
+    given = [
+        LayoutMark(str(k + 1), place, (0.01, 0.01), mark)
+        for k, (place, mark) in enumerate(zip(CORNERS, marks, strict=True))
+    ]
+    return FiducialLayout(tuple(given), (16.0, 16.0))
+
+
+def placement(pose: str) -> Placement:
+    linear = np.diag([PX_PER_MM, -PX_PER_MM]) @ up_from_camera(pose)
+    matrix = np.column_stack([linear, [190.3, 189.6]])
+    return Placement(pose, matrix, 1.0, 4, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
+
+
+def picture(layout: FiducialLayout, pose: str, hidden: int | None = None) -> Array:
+    """Marks on a plain ground, one of them under tape."""
+    grey = np.full((380, 380), 20000.0)
+    for index, (mark, center) in enumerate(zip(layout.marks, centers_px(layout, pose), strict=True)):
+        col0, row0 = np.rint(center).astype(int) - 24
+        if index != hidden:
+            assert isinstance(mark.mark, MarkShape)
+            place = np.column_stack([placement(pose).pixel_from_camera[:, :2], center - (col0, row0)])
+            grey[row0 : row0 + 49, col0 : col0 + 49] += CONTRAST_DN * brute_picture(mark.mark, place, 49, 49, 0.8)
+    return noisy(grey)
+
+
+def strewn(places_px: NDArray[np.int_]) -> Array:
+    """Specks: dots with a corner gone."""
+    place = np.column_stack([np.diag([PX_PER_MM, -PX_PER_MM]), [8.0, 8.0]])
+    speck = CONTRAST_DN * brute_picture(DOT, place, 17, 17, 0.8)
+    speck[:8, :8] = 0.0
+    grey = np.full((380, 380), 20000.0)
+    for col, row in places_px:
+        grey[row - 8 : row + 9, col - 8 : col + 9] = 20000.0 + speck
+    return noisy(grey)
+
+
+def noisy(grey: Array) -> Array:
+    return np.asarray(grey + np.random.default_rng(2).normal(0.0, 400.0, grey.shape))
+
+
+def centers_px(layout: FiducialLayout, pose: str) -> Array:
+    return np.array([placement(pose).pixel_from_camera @ (*mark.xy_mm, 1.0) for mark in layout.marks])
+
+
+def frame_of(scan: Scan, layout: FiducialLayout) -> Frame:
+    return measure_frame(scan, layout, placement("0"), OPTIONS)
+
+
+def test_three_plain_dots_of_four_are_no_chance() -> None:
+    layout = layout_of(DOT, DOT, DOT, DOT)
+    scan = scan_of(picture(layout, "0", hidden=1))
+    frame = frame_of(scan, layout)
+    assert frame.belongs.tolist() == [True, False, True, True]
+    assert doubt(scan, layout, frame, OPTIONS) == ""
+
+
+def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> None:
+    layout = layout_of(DOT, DOT, DOT, DOT)
+    as_marks = np.rint(centers_px(layout, "0")).astype(int)
+    elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
+    free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
+    scan = scan_of(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
+    frame = frame_of(scan, layout)
+    assert frame.belongs.tolist() == [False, True, True, True]
+    sentence = doubt(scan, layout, frame, OPTIONS)
+    assert "of 64 places beside them look as much like marks: chance finds as many with a probability of" in sentence
+
+
+def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
+    """Marks that differ by their identification dots are not found under one another's names."""
+    ids = [tuple(Disk((0.9, 0.4 * k - 0.4), 0.12) for k in range(count)) for count in range(4)]
+    layout = layout_of(*[MarkShape((*dot(0.2), *dots), "light") for dots in ids])
+    scan = scan_of(picture(layout, "90"))
+    frame = replace(frame_of(scan, layout), belongs=np.array([True, False, False, False]))
+    pose = decide_pose(scan, layout, [placement(pose) for pose in POSES], frame, OPTIONS)
+    assert (pose.name, pose.decided) == ("90", True)
