@@ -190,10 +190,10 @@ def _correlated(image: Map, template: Array, detail_px: float) -> Map:
 
 
 def _about(template: Array, detail_px: float) -> Map:
-    """1 on the drawing and as far about it as its finest detail is wide, 0 elsewhere."""
+    """1 on the drawing and twice as far about it as its finest detail is wide, 0 elsewhere."""
     rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
     beside = (np.abs(template - np.median(rim)) < _DRAWN).astype(np.uint8)
-    return np.asarray(cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= detail_px + 1, np.float32)
+    return np.asarray(cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= 2 * detail_px + 1, np.float32)
 
 
 def _within(response: Map, shape: tuple[int, ...]) -> Map:
