@@ -22,6 +22,6 @@ def test_a_faint_mark_beside_the_frames_edge_is_what_answers_most() -> None:
     row, col = np.unravel_index(int(response.argmax()), response.shape)
     assert abs(col + 12 - place[0]) <= 1
     assert abs(row + 12 - place[1]) <= 1
-    assert response.max() > 0.5
+    highest = response.max()
     response[row - 3 : row + 4, col - 3 : col + 4] = 0.0
-    assert response.max() < 0.45
+    assert response.max() < 0.6 * highest
