@@ -3,8 +3,8 @@
 PYTHONPATH=.:benchmarks python benchmarks/search.py OUT.jsonl [--frames 600] [--first 0] [--seed 1]
 
 One line a frame is added to OUT.jsonl, and frames that stand there already are left out, so that a run can be
-continued; then the tables of all its lines are printed. With --only INDEX one frame is told mark by mark, and its
-picture written beside OUT.jsonl.
+continued; two runs, each with frames of its own, may share the file. Then the tables of all its lines are printed. With
+--only INDEX one frame is told mark by mark, and its picture written beside OUT.jsonl.
 """
 
 import argparse
