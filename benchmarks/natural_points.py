@@ -110,7 +110,11 @@ def scene(condition: Condition, pitch_um: float) -> Scene:
 
 def row(condition: Condition, made: Scene, folder: Path) -> str:
     truth = render_scene(made, folder)
-    geometry = {frame.geometry.image.name: frame.geometry for frame in truth.frames}
+    return figures(condition.name, {frame.geometry.image.name: frame.geometry for frame in truth.frames}, folder)
+
+
+def figures(name: str, geometry: dict[str, FrameGeometry], folder: Path) -> str:
+    """A row of the table: natural points of the scans in a folder, measured and compared with the truth."""
     frames = [tie_frame(each, folder) for each in geometry.values()]
     begin = time.process_time()
     ties = measure_ties(frames, TieOptions(wanted=300))
@@ -123,7 +127,7 @@ def row(condition: Condition, made: Scene, folder: Path) -> str:
     weak, refused = (sum(status is each for status in errors.statuses) for each in (Status.WEAK, Status.REJECTED))
     beyond = int((np.hypot(*measured.T) > WRONG_PX).sum())
     return (
-        f"{condition.name:20s} {len(sights):6d} {len(whole):8d} {np.mean(whole):7.2f} "
+        f"{name:20s} {len(sights):6d} {len(whole):8d} {np.mean(whole):7.2f} "
         f"{np.sqrt(np.mean(measured**2)):12.3f} {np.sqrt(2.0 * np.mean(measured**2)):8.3f} "
         f"{np.hypot(*measured.T).max():8.3f} {beyond:11d} "
         f"{np.sqrt(squares.mean() / 2):13.2f} {weak:5d} {refused:8d} {seconds:8.0f}"

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _ISOTROPIC = np.array([[0.75, 0.0, 0.25], [0.0, 1.0, 0.0], [0.25, 0.0, 0.75]])
 _DIRECTIONS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
 _ROUNDS = 8
+_LEAST_EIGENVALUE = 1e-9  # of a covariance, over its largest
 _FEWEST = 20  # patches whose bendings have a variance worth the name
 
 
@@ -35,6 +36,12 @@ class Bending:
     response: Array
     noise: Array
     on_place: Array
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether the noise is a covariance that can be weighed by: pictures copied from one another have none."""
+        values = np.linalg.eigvalsh(self.noise)
+        return bool(values[0] > _LEAST_EIGENVALUE * values[-1])
 
     def estimated(self, variance: Array) -> tuple[Array, Array]:
         """The shift (2,) of the place, px of the patch, and the covariance (2, 2) that stays, where bendings have that

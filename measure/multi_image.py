@@ -54,7 +54,8 @@ class Matched:
 
     correlation: of the piece with the mean of the others; gain: its contrast over the mean one; variance: of its noise,
     in units of its own contrast; unevenness: the probability that quarters of the patch differ as much in their shifts
-    by chance. bending: of the ground within the patch, None for the reference, which has none against itself.
+    by chance. bending: of the ground within the patch, None for the reference, which has none against itself, and
+    where nothing but the ground differs, so that it cannot be weighed.
     reason: why the point could not be matched, and then its pieces have no covariance.
     """
 
@@ -241,17 +242,13 @@ class _Fit:
         columns = np.zeros((bent.shape[2], *self.used.shape))
         columns[:, self.used] = (bent.mean(axis=0) - single.mean(axis=0) @ through).T
         spreads = [np.tensordot(correlated(columns, each), columns, axes=([1, 2], [1, 2])) for each in noises]
-        return [
-            None
-            if index == self.reference
-            else Bending(
-                seen=np.tensordot(columns, values - self.values[self.reference], axes=2),
-                response=response,
-                noise=spreads[index] + spreads[self.reference],
-                on_place=np.negative(through[:2]),
-            )
-            for index, values in enumerate(self.values)
-        ]
+        bendings: list[Bending | None] = []
+        for values, spread in zip(self.values, spreads, strict=True):
+            seen = np.tensordot(columns, values - self.values[self.reference], axes=2)
+            bending = Bending(seen, response, spread + spreads[self.reference], np.negative(through[:2]))
+            bendings.append(bending if bending.has_noise else None)
+        bendings[self.reference] = None
+        return bendings
 
     def _unevenness(self, residuals: Array, noise: NoiseModel) -> float:
         """Each quarter of the patch has a shift of its own: chi-squared of the four, which sum to nothing."""

@@ -67,13 +67,14 @@ def measured_points(
     the last one wanted.
 
     No two patches overlap: the errors of neighbours would be correlated, and the adjustment takes them for independent.
-    A candidate beside a point that was refused still has its chance.
+    A candidate beside one that could not be matched still has its chance; not one beside a point that is refused by
+    comparison with others, for with more of these it may stand again.
     """
     points, matched = list[TiePoint](), list[TiePoint]()
     left, sharp = list(candidates), np.zeros(0, dtype=int)
     while left and sharp.sum() < wanted:
         missing = max(wanted - int(sharp.sum()), wanted // _LEAST_BATCH)
-        chosen, left = _apart(left, [point.candidate for point in points if len(point.standing) >= fewest], missing)
+        chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
         windows = _windows(frames, chosen)
         matched += mapped(workers, partial(_point, fewest), list(zip(chosen, windows, strict=True)), _CHUNK)
         points = _straightened(matched)
@@ -83,11 +84,11 @@ def measured_points(
 
 
 def _apart(
-    candidates: Sequence[TieCandidate], standing: Sequence[TieCandidate], most: int
+    candidates: Sequence[TieCandidate], measured: Sequence[TieCandidate], most: int
 ) -> tuple[list[TieCandidate], list[TieCandidate]]:
-    """The first candidates whose patches overlap in no frame, neither with each other nor with those of points that
-    stand; and the candidates left that may come later."""
-    taken, chosen = _Taken(standing), _Taken()
+    """The first candidates whose patches overlap in no frame, neither with each other nor with those that
+    are measured; and the candidates left that may come later."""
+    taken, chosen = _Taken(measured), _Taken()
     left = []
     for candidate in candidates:
         if taken.touches(candidate):

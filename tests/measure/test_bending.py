@@ -39,6 +39,12 @@ def test_places_are_freed_of_the_bending_and_what_stays_is_as_large_as_said() ->
     assert np.cov(left.T) == pytest.approx(np.mean([rest for _, rest in found], axis=0), abs=0.2 * np.var(left[:, 0]))
 
 
+def test_without_noise_there_is_nothing_to_weigh_by() -> None:
+    assert Bending(np.zeros(6), np.eye(6), np.eye(6), ON_PLACE).has_noise
+    assert not Bending(np.zeros(6), np.eye(6), np.zeros((6, 6)), ON_PLACE).has_noise
+    assert not Bending(np.zeros(6), np.eye(6), np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -0.1]), ON_PLACE).has_noise
+
+
 def test_flat_ground_and_few_patches_change_next_to_nothing() -> None:
     rng = np.random.default_rng(2)
     bendings, _ = patches(rng, np.zeros(2))

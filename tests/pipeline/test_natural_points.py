@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from adjust.network import Prior
 from measure.status import Status
@@ -66,6 +67,9 @@ def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
     assert np.sqrt(np.mean(np.square(errors))) < 1.3 * np.median(claimed)
     places = np.array([mark.center_px for mark in marks["a"].values()])
     assert np.ptp(places, axis=0).min() > 250.0
+    for own in marks.values():
+        observed = [mark.center_px for mark in own.values() if mark.status in (Status.MEASURED, Status.WEAK)]
+        assert pdist(np.array(observed)).min() > 26.0, "patches of 31 px overlap"
 
 
 PROJECT = """camera = "camera.toml"
