@@ -33,6 +33,7 @@ from true_marks import (
 
 from measure.disks import fit_disk
 from measure.fiducial_options import FiducialOptions
+from measure.quantisation import rounding_step_dn
 from measure.refinement import sight
 from synthetic_images.optics import seen_coverage
 
@@ -49,7 +50,7 @@ DUST, DUST_SNR = (0.01, 0.03, 0.05), 20.0
 BEYOND, CLIPPED_SNR = (0.0, 0.3), 20.0
 LARGE_PX = 0.3
 HIPP = ""  # the interpreter of an environment that has it
-QUALITIES, JPEG_SNR = (50, 75, 90, 95), 100.0
+QUALITIES, JPEG_CONTRASTS, JPEG_SNR = (50, 75, 90), (40.0, 120.0), 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +105,11 @@ def measured(
     rng: np.random.Generator,
     full_scale: int = 65535,
     exact: bool = False,
-    is_lossy: bool = False,
+    step_dn: float = 0.0,
 ) -> Found | None:
     """The mark as the program measures it, from a start off by some px, and by 0.3 % and 3 mrad or, exact, no more than
     0.001 % where the frame gives these."""
-    scan = scan_of(grey, full_scale, is_lossy)
+    scan = scan_of(grey, full_scale, step_dn)
     center = mark.place[:, 2] + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
     if mark.kind.name == "ellipse":
         disk = fit_disk(scan, mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1))
@@ -289,30 +290,37 @@ def clipping(kinds: Sequence[Kind], count: int) -> None:
 
 
 def jpeg(kinds: Sequence[Kind], count: int) -> None:
-    """JPEG of several qualities, 8 bit, contrast of 120 grey values."""
-    print("\nJPEG, SNR 100, blur 1: rms in px, rms / bound without compression, realised / claimed")
-    print(f"{'':14}" + "".join(f"{f'quality {quality}':>24}" for quality in QUALITIES))
+    """JPEG of several qualities, 8 bit."""
+    print(f"\nJPEG, SNR {JPEG_SNR:g}, blur 1: rms in px, and realised / claimed; contrast in grey values")
+    cells = [(contrast, quality) for contrast in JPEG_CONTRASTS for quality in QUALITIES]
+    print(f"{'':14}" + "".join(f"{f'{contrast:g}, quality {quality}':>20}" for contrast, quality in cells))
     for kind in kinds:
         words = []
-        for quality in QUALITIES:
+        for contrast, quality in cells:
             rng = np.random.default_rng([SEED, KINDS.index(kind), quality])
             marks = [some_mark(kind, 1.0, rng) for _ in range(min(POOL, count))]
-            cell = Cell()
+            errors, covariances = [], []
             for number in range(count):
                 mark = marks[number % len(marks)]
                 noise = rng.standard_normal((mark.size, mark.size)) / JPEG_SNR
-                grey, sign = drawn(mark, rng, 120.0, 60.0)
-                stored = np.clip(np.rint(grey + 120.0 * noise), 0, 255).astype(np.uint8)
-                found = measured(mark, decoded(stored, quality), rng, 255, is_lossy=True)
-                cell.add(mark, found, mark.best_errors(sign * noise, 1 / JPEG_SNR), mark.bound(1 / JPEG_SNR))
-            words.append(f"{np.sqrt(np.mean(np.square(cell.errors))):8.4f} {cell.words()}")
-        print(f"{kind.name:14}" + "".join(f"{each:>24}" for each in words), flush=True)
+                grey = drawn(mark, rng, contrast, 60.0)[0] + contrast * noise
+                shown, step_dn = compressed(grey, quality, rng)
+                found = measured(mark, shown, rng, 255, step_dn=step_dn)
+                if found is not None and not found.flagged:
+                    errors.append(found.center_px - mark.place[:, 2])
+                    covariances.append(found.covariance_px2)
+            rms = np.sqrt(np.mean(np.square(errors)))
+            words.append(f"{rms:8.4f} {whitened_rms(errors, covariances):6.2f}")
+        print(f"{kind.name:14}" + "".join(f"{each:>20}" for each in words), flush=True)
 
 
-def decoded(stored: NDArray[np.uint8], quality: int) -> Array:
-    """What JPEG makes of a picture."""
+def compressed(grey: Array, quality: int, rng: np.random.Generator) -> tuple[Array, float]:
+    """What JPEG makes of a picture, its blocks beginning anywhere, and the step to which the file rounds."""
+    top, left = rng.integers(0, 8, 2)
+    stored = np.pad(np.clip(np.rint(grey), 0, 255).astype(np.uint8), ((top, 8), (left, 8)), mode="edge")
     data = cv2.imencode(".jpg", stored, (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), float)
+    whole = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), float)
+    return whole[top : top + grey.shape[0], left : left + grey.shape[1]], rounding_step_dn(data.tobytes())
 
 
 def methods(kinds: Sequence[Kind], count: int) -> None:

@@ -1,8 +1,9 @@
 """What lossy compression takes from a mark's place.
 
 JPEG rounds the fine detail of every 8 x 8 pixels, a mark's edges and the grain alike. Residuals show most of it, so
-that a standard deviation from them is nearly right; what is lost of the edges themselves they do not show. The grain
-that is left is the compression's own making, and no weights are taken from it.
+that a standard deviation from them is right, where the mark's contrast is many of the file's rounding steps; what faint
+marks lose of their edges they do not show. The grain that is left is the compression's own making, and no weights are
+taken from it.
 """
 
 import numpy as np
@@ -12,9 +13,11 @@ from measure.scan import Scan
 
 Array = NDArray[np.float64]
 
-LOSSY_SIGMA_PX = 0.01  # rms of what the residuals do not show, of marks at quality 50 to 95 (benchmarks/marks.py)
+LOST_PX = 0.25  # times the square of step over contrast: rms of what residuals do not show (benchmarks/marks.py)
+MOST_LOST_PX = 1.0  # where the contrast is hardly two steps, there is nothing left to measure
 
 
-def with_loss(covariance_px2: Array, scan: Scan) -> Array:
-    """A mark's covariance (2, 2) and what the scan's compression adds to it."""
-    return covariance_px2 + LOSSY_SIGMA_PX**2 * np.eye(2) if scan.is_lossy else covariance_px2
+def with_loss(covariance_px2: Array, scan: Scan, contrast_dn: float) -> Array:
+    """The covariance (2, 2) of a mark of that contrast and what the scan's compression adds to it."""
+    lost = min(LOST_PX * (scan.rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, MOST_LOST_PX)
+    return covariance_px2 + lost**2 * np.eye(2)

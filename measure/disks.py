@@ -98,7 +98,7 @@ def fit_disk(
         fit = match(window, (col0, row0), shape, start, own, valid, clipped, scan.is_lossy)
         disk = FittedDisk(
             center_px=fit.center_px,
-            covariance_px2=with_loss(fit.covariance_px2, scan),
+            covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn),
             pixel_from_disk=fit.pixel_from_mark[:, :2],
             contrast_dn=fit.contrast_dn,
             noise_dn=fit.noise_dn,

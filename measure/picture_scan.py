@@ -9,6 +9,7 @@ import numpy as np
 from tifffile import TiffFile
 
 from measure.errors import MeasurementError
+from measure.quantisation import jpeg_headers, rounding_step_dn
 from measure.radiometry import Radiometry, Samples
 from measure.resolution import JFIF_UNIT, NO_TAGS, PNG_UNIT, Pitch, pitch_from_density
 from measure.segments import Segments
@@ -24,23 +25,23 @@ def open_picture(path: Path, start: bytes) -> tuple[Segments, Pitch, tuple[str, 
     """
     if start.startswith(JPEG_START):
         data = path.read_bytes()
-        samples, pitch = jpeg_samples(path, data), jpeg_pitch(data)
+        samples, pitch, step_dn = jpeg_samples(path, data), jpeg_pitch(data), rounding_step_dn(data)
     elif start.startswith(PNG_START):
         data = path.read_bytes()
-        samples, pitch = png_samples(path, data), png_pitch(data)
+        samples, pitch, step_dn = png_samples(path, data), png_pitch(data), 0.0
     else:
         raise MeasurementError(
             f"{path} is no TIFF, JPEG or PNG picture (it begins with {start[:8]!r}): "
             "give the scan itself, or convert it"
         )
-    return WholePicture(samples, start.startswith(JPEG_START)), pitch, ()
+    return WholePicture(samples, step_dn), pitch, ()
 
 
 class WholePicture:
     """A picture in memory: (height, width, channels) of 8 or 16 bits, one segment."""
 
-    def __init__(self, samples: Samples, is_lossy: bool = False) -> None:
-        self._samples, self.is_lossy = samples, is_lossy
+    def __init__(self, samples: Samples, rounding_step_dn: float = 0.0) -> None:
+        self._samples, self.rounding_step_dn = samples, rounding_step_dn
         self.height_px, self.width_px, self.channels = samples.shape
         self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
         self.sample_bytes = samples.itemsize
@@ -90,16 +91,6 @@ def jpeg_pitch(data: bytes) -> Pitch:
         elif marker == 0xE1 and body.startswith(b"Exif\0\0") and pitch.um is None:
             pitch = exif_pitch(body[6:], pitch)
     return pitch
-
-
-def jpeg_headers(data: bytes) -> list[tuple[int, bytes]]:
-    """Marker and body of the segments before the picture's data."""
-    headers, position = [], 2
-    while position + 4 <= len(data) and data[position] == 0xFF and data[position + 1] not in (0xDA, 0xD9):
-        length = int.from_bytes(data[position + 2 : position + 4], "big")
-        headers.append((data[position + 1], data[position + 4 : position + 2 + length]))
-        position += 2 + max(length, 2)
-    return headers
 
 
 def exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:

@@ -61,7 +61,7 @@ def sight(
         return Sighting(predicted, True, None, "there is no contrast at its place")
     if fit.contrast_dn * polarity <= 0:
         return Sighting(predicted, True, None, "what lies there has the other polarity")
-    return Sighting(predicted, True, replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan)))
+    return Sighting(predicted, True, replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn)))
 
 
 def _fitted(

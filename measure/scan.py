@@ -36,9 +36,9 @@ Result = TypeVar("Result")
 class Scan:
     """An opened scan: its size, its pitch, and windows of grey values that grow with light on the scanner's sensor.
 
-    width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows; is_lossy:
-    whether the file is compressed with loss; pitch_um:
-    (x, y) from the file's resolution tags, None where it has none that can be believed, and then pitch_note says why;
+    width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows;
+    rounding_step_dn: of a compression with loss, which is_lossy says that there is; pitch_um: (x, y) from the file's
+    resolution tags, None where it has none that can be believed, and then pitch_note says why;
     notes: what else is unusual about the file, a sentence each.
     The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
     """
@@ -57,7 +57,8 @@ class Scan:
         self.height_px = segments.height_px
         self.channels = segments.channels
         self.full_scale_dn = segments.full_scale_dn
-        self.is_lossy = segments.is_lossy
+        self.rounding_step_dn = segments.rounding_step_dn
+        self.is_lossy = self.rounding_step_dn > 0
         self.pitch_um = pitch.um
         self.pitch_note = pitch.note
         self.notes = notes
@@ -211,8 +212,8 @@ class ReducedSegments:
         self.segment_height_px = min(reduced_side(tall, factor), self.height_px)
         # Strips are wanted once, whole.
         self.segment_width_px = self.width_px if wide >= scan.width_px else reduced_side(wide, factor)
-        self.channels, self.full_scale_dn, self.is_lossy = 1, scan.full_scale_dn, scan.is_lossy
-        self.sample_bytes = 4
+        self.channels, self.full_scale_dn, self.sample_bytes = 1, scan.full_scale_dn, 4
+        self.rounding_step_dn = scan.rounding_step_dn
 
     def read(self, row: int, column: int) -> Array:
         """Segment (row, column) of the grid."""

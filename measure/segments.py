@@ -12,7 +12,8 @@ class Segments(Protocol):
 
     height_px, width_px: of the picture; segment_height_px, segment_width_px: of a segment, those at the right and lower
     border being smaller; channels: 1 (grey) or 3 (red, green, blue); full_scale_dn: the largest value;
-    sample_bytes: 1, 2, or 4 for means; is_lossy: whether the values were compressed with loss, as JPEG does.
+    sample_bytes: 1, 2, or 4 for means; rounding_step_dn: to which a compression with loss, as
+    JPEG, rounds coarse detail, 0 where there is none.
     """
 
     height_px: int
@@ -22,7 +23,7 @@ class Segments(Protocol):
     channels: int
     full_scale_dn: float
     sample_bytes: int
-    is_lossy: bool
+    rounding_step_dn: float
 
     def read(self, row: int, column: int) -> Samples:
         """Segment (row, column) of the grid: (height, width, channels), values that grow with light."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tifffile import TiffFile, TiffFileError, TiffPage
 
 from measure.errors import MeasurementError
+from measure.quantisation import rounding_step_dn
 from measure.radiometry import Radiometry, Samples
 from measure.resolution import NO_TAGS, TIFF_UNIT, Pitch, pitch_from_density
 from measure.segments import BAND_ROWS, Segments
@@ -18,6 +19,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds
 
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
+JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
 REDUCED_IMAGE, TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
 DECODING_ERRORS = (RuntimeError, ValueError, OSError, IndexError, TypeError, struct.error, TiffFileError)
 
@@ -119,6 +121,18 @@ def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
     return Radiometry(3 if is_colour else 1, float(2**bits - 1), inverted=kind == WHITE_IS_ZERO)
 
 
+def page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
+    """Of a page compressed as JPEG: its tables stand in a tag, or else at the beginning of every tile or strip."""
+    if page.compression not in JPEG_COMPRESSIONS:
+        return 0.0
+    start = page.jpegtables or page.jpegheader
+    if start is None:
+        first = next(index for index, count in enumerate(page.databytecounts) if count)
+        file.filehandle.seek(page.dataoffsets[first])
+        start = file.filehandle.read(min(page.databytecounts[first], JPEG_HEADERS_BYTES))
+    return rounding_step_dn(start)
+
+
 def unsupported(path: Path, what: str) -> MeasurementError:
     return MeasurementError(
         f"{path} is a TIFF of a kind that is not read ({what}): save it as grey or RGB with 8 or 16 bits a sample"
@@ -132,7 +146,7 @@ class TiffSegments:
         self._file, self._page, self._path = file, page, path
         self._reading = Lock()  # the file has one position for all threads
         self._radiometry = page_radiometry(page, path)
-        self.is_lossy = page.compression in JPEG_COMPRESSIONS
+        self.rounding_step_dn = page_rounding_step_dn(file, page)
         self.channels, self.full_scale_dn = self._radiometry.channels, self._radiometry.full_scale_dn
         self.sample_bytes = self._radiometry.sample_bytes
         self.height_px, self.width_px = page.imagelength, page.imagewidth

@@ -208,11 +208,11 @@ def _matrix(correlation: Array, seen: Mask) -> Array:
     return np.where(far, 0.0, correlation[tuple(np.moveaxis(np.clip(lag, -reach, reach) + reach, -1, 0))])
 
 
-def scan_of(grey: Array, full_scale: int = 65535, is_lossy: bool = False) -> Scan:
+def scan_of(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0) -> Scan:
     """Grey values as a scan of 16 or 8 bits in memory."""
     rounded = np.clip(np.rint(grey), 0, full_scale)[..., None]
     stored: Samples = rounded.astype(np.uint16) if full_scale > 255 else rounded.astype(np.uint8)
-    return Scan(Path("true.tif"), WholePicture(stored, is_lossy), NO_TAGS)
+    return Scan(Path("true.tif"), WholePicture(stored, rounding_step_dn), NO_TAGS)
 
 
 def grainy(size: int, grain_px: float, rng: np.random.Generator) -> Array:
