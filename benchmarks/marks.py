@@ -1,9 +1,12 @@
 """Marks measured against their truth: the Cramér-Rao bound, honesty of the standard deviations, other methods.
 
-PYTHONPATH=.:tests/measure python benchmarks/marks.py [MARKS] [STUDY ...] [--kind KIND ...] [--hipp PYTHON]
+PYTHONPATH=.:tests/measure python benchmarks/marks.py [MARKS] [STUDY ...] [--kind KIND ...] [--keep FILE]
+    [--hipp PYTHON]
 
 MARKS: of every cell; 100 where none is given, 2000 for a full run. STUDY: one or more of the names below; all where
-none is given. --hipp: the interpreter of an environment with hipp 0.2, measured beside the others.
+none is given. --keep: rows of the tables are written there, and those that stand in it are not made anew, so that a
+run may be stopped and go on, or be shared out by --kind among processes. --hipp: the interpreter of an environment
+with hipp 0.2, measured beside the others.
 
 The pictures are drawn by `synthetic_images` (exact areas, blurred before they are averaged over pixels); the bounds are
 from differences of the same pictures. What is measured with is what `reseau measure` calls: `measure.refinement.sight`,
@@ -13,10 +16,14 @@ and `measure.disks.fit_disk` for the ellipse.
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
+from kept_rows import KeptRows
+from measured_marks import CONTRAST, DUST_SNR, GROUND, Cell, drawn, dusty, measured, told
 from numpy.typing import NDArray
 from other_methods import METHODS, Template, hipp
 from true_marks import (
@@ -26,141 +33,55 @@ from true_marks import (
     TrueMark,
     grain_correlation,
     grainy,
-    scan_of,
     some_mark,
     whitened_rms,
 )
 
-from measure.disks import fit_disk
-from measure.fiducial_options import FiducialOptions
 from measure.quantisation import rounding_step_dn
-from measure.refinement import sight
-from synthetic_images.optics import seen_coverage
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
-GROUND, CONTRAST = 25000.0, 15000.0
 SNRS, BLURS_PX = (5.0, 10.0, 20.0, 50.0, 100.0), (0.6, 1.0, 1.6, 2.5)
 SEED = 20
-SHIFT_PX, SEARCH_PX = 1.5, 3.0  # of the start, and the radius of the search
-POOL, FEW = 10, 3  # different marks in a cell; where the bound of each takes seconds
+POOL, FEW = 50, 3  # different marks in a cell; where the bound of each takes seconds
 GRAINS_PX, GRAIN_SNR = (0.7, 1.0, 1.5), 20.0
-DUST, DUST_SNR = (0.01, 0.03, 0.05), 20.0
+DUST = (0.01, 0.03, 0.05)
 BEYOND, CLIPPED_SNR = (0.0, 0.3), 20.0
 LARGE_PX = 0.3
+ROWS = KeptRows(None)
 HIPP = ""  # the interpreter of an environment that has it
 QUALITIES, JPEG_CONTRASTS, JPEG_SNR = (50, 75, 90), (40.0, 120.0), 100.0
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A place with its covariance; flagged: `weak`, or not measured at all."""
-
-    center_px: Array
-    covariance_px2: Array
-    flagged: str = ""
-
-
-@dataclass
-class Cell:
-    """What became of the marks of one cell: errors (2,) with the covariances claimed, and beside each the error of the
-    best linear estimate in the very same noise with its bound."""
-
-    errors: list[Array] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    best: list[Array] = field(default_factory=list)
-    bounds: list[Array] = field(default_factory=list)
-    lost: int = 0
-
-    def add(self, mark: TrueMark, found: Found | None, best: Array, bound: Array) -> None:
-        if found is None or found.flagged:
-            self.lost += 1
-            return
-        self.errors.append(found.center_px - mark.place[:, 2])
-        self.covariances.append(found.covariance_px2)
-        self.best.append(best)
-        self.bounds.append(bound)
-
-    @property
-    def to_bound(self) -> float:
-        """rms over that of the best estimates: over the bound, freed of most of chance."""
-        return float(np.sqrt(np.mean(np.square(self.errors)) / np.mean(np.square(self.best))))
-
-    @property
-    def to_claimed(self) -> float:
-        """rms in units of the standard deviations claimed, less what chance made of the best estimates too."""
-        return whitened_rms(self.errors, self.covariances) / whitened_rms(self.best, self.bounds)
-
-    def words(self) -> str:
-        if not self.errors:
-            return f"{'all lost':>14}"
-        lost = f"-{self.lost}" if self.lost else ""
-        return f"{self.to_bound:7.3f} {self.to_claimed:5.3f}{lost:<4}"
-
-
-def measured(
-    mark: TrueMark,
-    grey: Array,
-    rng: np.random.Generator,
-    full_scale: int = 65535,
-    exact: bool = False,
-    step_dn: float = 0.0,
-) -> Found | None:
-    """The mark as the program measures it, from a start off by some px, and by 0.3 % and 3 mrad or, exact, no more than
-    0.001 % where the frame gives these."""
-    scan = scan_of(grey, full_scale, step_dn)
-    center = mark.place[:, 2] + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
-    if mark.kind.name == "ellipse":
-        disk = fit_disk(scan, mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1))
-        return None if disk.reason else Found(disk.center_px, disk.covariance_px2, disk.weakness)
-    scale, turn = rng.normal(0, min(mark.kind.known * (0.1 if exact else 1), 0.003), 2)
-    start = np.column_stack([np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ mark.place[:, :2], center])
-    polarity = 1 if grey_is_light(mark, grey) else -1
-    frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
-    options = FiducialOptions().match
-    fit = sight(scan, mark.kind.shape, start, SEARCH_PX, polarity, None, options, frame_sigma).fit
-    return None if fit is None else Found(fit.center_px, fit.covariance_px2)
-
-
-def grey_is_light(mark: TrueMark, grey: Array) -> bool:
-    return float((grey * (mark.picture - mark.picture.mean())).sum()) > 0
 
 
 def accuracy(kinds: Sequence[Kind], count: int) -> None:
     """White noise: every kind, blur and SNR."""
     print("\nwhite noise: rms / bound, realised / claimed; -n: lost")
     print(f"{'':14}{'blur':>5}" + "".join(f"{f'SNR {snr:g}':>17}" for snr in SNRS))
+
+    def row(kind: Kind, blur: float) -> str:
+        rng = np.random.default_rng([SEED, KINDS.index(kind), int(10 * blur)])
+        marks = [some_mark(kind, blur, rng) for _ in range(min(POOL, count))]
+        cells = [Cell() for _ in SNRS]
+        for snr, cell in zip(SNRS, cells, strict=True):
+            for number in range(count):
+                mark = marks[number % len(marks)]
+                noise = rng.standard_normal((mark.size, mark.size)) / snr
+                grey, sign = drawn(mark, rng)
+                found = measured(mark, grey + CONTRAST * noise, rng)
+                cell.add(mark, found, mark.best_errors(sign * noise, 1 / snr), mark.bound(1 / snr))
+        return f"{kind.name:14}{blur:5.1f}" + "".join(f"{cell.words():>17}" for cell in cells)
+
     for kind in kinds:
         for blur in BLURS_PX:
-            rng = np.random.default_rng([SEED, KINDS.index(kind), int(10 * blur)])
-            marks = [some_mark(kind, blur, rng) for _ in range(min(POOL, count))]
-            cells = [Cell() for _ in SNRS]
-            for snr, cell in zip(SNRS, cells, strict=True):
-                for number in range(count):
-                    mark = marks[number % len(marks)]
-                    noise = rng.standard_normal((mark.size, mark.size)) / snr
-                    grey, sign = drawn(mark, rng)
-                    found = measured(mark, grey + CONTRAST * noise, rng)
-                    cell.add(mark, found, mark.best_errors(sign * noise, 1 / snr), mark.bound(1 / snr))
-            print(f"{kind.name:14}{blur:5.1f}" + "".join(f"{cell.words():>17}" for cell in cells), flush=True)
-
-
-def drawn(
-    mark: TrueMark, rng: np.random.Generator, contrast: float = CONTRAST, ground: float = GROUND
-) -> tuple[Array, int]:
-    """The mark, light (1) or dark (-1), on a ground with a gradient of up to a third of its contrast."""
-    sign, direction = int(rng.choice((-1, 1))), rng.uniform(0, 2 * np.pi)
-    row, col = np.mgrid[: mark.size, : mark.size] / mark.size - 0.5
-    slope = contrast / 3 * rng.uniform() * (np.cos(direction) * col + np.sin(direction) * row)
-    return ground + (1 - sign) / 2 * contrast + slope + sign * contrast * mark.picture, sign
+            ROWS.print(f"accuracy {count} {kind.name} {blur}", partial(row, kind, blur))
 
 
 def grain(kinds: Sequence[Kind], count: int) -> None:
     """Grain with a tenth of white noise in its variance: the bound is that of noise so correlated."""
     print(f"\ngrain at SNR {GRAIN_SNR:g}, blur 1: rms / coloured bound, realised / claimed")
     print(f"{'':14}" + "".join(f"{f'grain {grain_px:g} px':>17}" for grain_px in GRAINS_PX))
-    for kind in kinds:
+
+    def row(kind: Kind) -> str:
         rng = np.random.default_rng([SEED, KINDS.index(kind)])
         marks = [some_mark(kind, 1.0, rng) for _ in range(FEW)]
         words = []
@@ -174,14 +95,18 @@ def grain(kinds: Sequence[Kind], count: int) -> None:
                 bound = mark.bound(1 / GRAIN_SNR, None, correlation)
                 cell.add(mark, measured(mark, grey + CONTRAST * noise, rng), best, bound)
             words.append(cell.words())
-        print(f"{kind.name:14}" + "".join(f"{each:>17}" for each in words), flush=True)
+        return f"{kind.name:14}" + "".join(f"{each:>17}" for each in words)
+
+    for kind in kinds:
+        ROWS.print(f"grain {count} {kind.name}", partial(row, kind))
 
 
 def dust(kinds: Sequence[Kind], count: int) -> None:
-    """Specks of up to 4 px on a part of the mark's window: the bound is that of the pixels without dust."""
-    print(f"\ndust at SNR {DUST_SNR:g}, blur 1: rms / bound of what the dust leaves, realised / claimed; -n: flagged")
+    """Specks of up to 4 px on a part of the mark's window, against the same match with the dust known."""
+    print(f"\ndust at SNR {DUST_SNR:g}, blur 1: rms / that with the dust known, realised / claimed; -n: flagged")
     print(f"{'':14}" + "".join(f"{f'{100 * share:g} %':>17}" for share in DUST))
-    for kind in kinds:
+
+    def row(kind: Kind) -> str:
         rng = np.random.default_rng([SEED, KINDS.index(kind)])
         marks = [some_mark(kind, 1.0, rng) for _ in range(min(POOL, count))]
         words = []
@@ -190,27 +115,16 @@ def dust(kinds: Sequence[Kind], count: int) -> None:
             for number in range(count):
                 mark = marks[number % len(marks)]
                 noise = rng.standard_normal((mark.size, mark.size)) / DUST_SNR
-                grey, sign = drawn(mark, rng)
-                speckled, seen = dusty(mark, grey + CONTRAST * noise, share, rng)
-                best = mark.best_errors(sign * noise, 1 / DUST_SNR, seen)
-                cell.add(mark, measured(mark, speckled, rng), best, mark.bound(1 / DUST_SNR, seen))
+                speckled, seen = dusty(mark, drawn(mark, rng)[0] + CONTRAST * noise, share, rng)
+                known = told(mark, speckled, seen)
+                if known is not None:
+                    error = known.center_px - mark.place[:, 2]
+                    cell.add(mark, measured(mark, speckled, rng), error, known.covariance_px2)
             words.append(cell.words())
-        print(f"{kind.name:14}" + "".join(f"{each:>17}" for each in words), flush=True)
+        return f"{kind.name:14}" + "".join(f"{each:>17}" for each in words)
 
-
-def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> tuple[Array, Mask]:
-    """The picture with dark specks on so much of the pixels near the mark, and which pixels they leave."""
-    speckled, seen = grey.copy(), np.ones(grey.shape, dtype=bool)
-    rows, cols = np.nonzero(mark.near)
-    while (mark.near & ~seen).sum() < share * mark.near.sum():
-        radius = min(float(rng.lognormal(0.3, 0.5)), 4.0) * rng.uniform(0.7, 1.3, 12)
-        angle = np.arange(12) * (2 * np.pi / 12)
-        pixel = rng.integers(len(rows))
-        outline = np.array([cols[pixel], rows[pixel]]) + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-        cover = seen_coverage(((outline,),), 0, 0, mark.size, mark.size, mark.blur_px)
-        speckled = speckled * (1 - cover) + (GROUND - CONTRAST) * cover
-        seen &= cover < 0.5 / DUST_SNR
-    return speckled, seen
+    for kind in kinds:
+        ROWS.print(f"dust {count} {kind.name}", partial(row, kind))
 
 
 def small_disks(kinds: Sequence[Kind], count: int) -> None:
@@ -242,7 +156,8 @@ def bias(kinds: Sequence[Kind], count: int) -> None:
     """Pictures without noise: what is left is the program's own error, and rounding."""
     print("\nno noise; largest error of a coordinate in px (phase, rotation, scale, gradient, polarity at random)")
     print(f"{'':14}" + "".join(f"{f'16 bit, {blur:g}':>12}" for blur in BLURS_PX) + f"{'8 bit, 1':>12}{'rms':>9}")
-    for kind in kinds:
+
+    def row(kind: Kind) -> str:
         words = []
         for blur in BLURS_PX:
             rng = np.random.default_rng([SEED, KINDS.index(kind), int(10 * blur)])
@@ -251,7 +166,10 @@ def bias(kinds: Sequence[Kind], count: int) -> None:
             if blur == 1.0:
                 eight = [clean_error(mark, rng, 255) for mark in marks]
         words.append(f"{np.abs(eight).max():12.4f}{np.sqrt(np.mean(np.square(eight))):9.4f}")
-        print(f"{kind.name:14}" + "".join(words), flush=True)
+        return f"{kind.name:14}" + "".join(words)
+
+    for kind in kinds:
+        ROWS.print(f"bias {count} {kind.name}", partial(row, kind))
 
 
 def clean_error(mark: TrueMark, rng: np.random.Generator, full_scale: int) -> Array:
@@ -269,7 +187,8 @@ def clipping(kinds: Sequence[Kind], count: int) -> None:
     print(f"at SNR {CLIPPED_SNR:g} rms / bound of the same mark whole, realised / claimed; -n: lost")
     names = [f"{'ground' if sign < 0 else 'mark'} {beyond:g}" for sign in (-1, 1) for beyond in BEYOND]
     print(f"{'':14}" + "".join(f"{name:>24}" for name in names))
-    for kind in kinds:
+
+    def row(kind: Kind) -> str:
         rng = np.random.default_rng([SEED, KINDS.index(kind), 7])
         marks = [some_mark(kind, 1.0, rng) for _ in range(min(POOL, count))]
         words = []
@@ -286,7 +205,10 @@ def clipping(kinds: Sequence[Kind], count: int) -> None:
                     best, bound = mark.best_errors(sign * noise, 1 / CLIPPED_SNR), mark.bound(1 / CLIPPED_SNR)
                     cell.add(mark, measured(mark, grey + CONTRAST * noise, rng), best, bound)
                 words.append(f"{max(off):8.4f} {cell.words()}")
-        print(f"{kind.name:14}" + "".join(f"{each:>24}" for each in words), flush=True)
+        return f"{kind.name:14}" + "".join(f"{each:>24}" for each in words)
+
+    for kind in kinds:
+        ROWS.print(f"clipping {count} {kind.name}", partial(row, kind))
 
 
 def jpeg(kinds: Sequence[Kind], count: int) -> None:
@@ -294,7 +216,8 @@ def jpeg(kinds: Sequence[Kind], count: int) -> None:
     print(f"\nJPEG, SNR {JPEG_SNR:g}, blur 1: rms in px, and realised / claimed; contrast in grey values")
     cells = [(contrast, quality) for contrast in JPEG_CONTRASTS for quality in QUALITIES]
     print(f"{'':14}" + "".join(f"{f'{contrast:g}, quality {quality}':>20}" for contrast, quality in cells))
-    for kind in kinds:
+
+    def row(kind: Kind) -> str:
         words = []
         for contrast, quality in cells:
             rng = np.random.default_rng([SEED, KINDS.index(kind), quality])
@@ -311,7 +234,10 @@ def jpeg(kinds: Sequence[Kind], count: int) -> None:
                     covariances.append(found.covariance_px2)
             rms = np.sqrt(np.mean(np.square(errors)))
             words.append(f"{rms:8.4f} {whitened_rms(errors, covariances):6.2f}")
-        print(f"{kind.name:14}" + "".join(f"{each:>20}" for each in words), flush=True)
+        return f"{kind.name:14}" + "".join(f"{each:>20}" for each in words)
+
+    for kind in kinds:
+        ROWS.print(f"jpeg {count} {kind.name}", partial(row, kind))
 
 
 def compressed(grey: Array, quality: int, rng: np.random.Generator) -> tuple[Array, float]:
@@ -384,10 +310,11 @@ def main() -> None:
     parser.add_argument("marks", type=int, nargs="?", default=100)
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []])
     parser.add_argument("--hipp", default="")
+    parser.add_argument("--keep", type=Path)
     parser.add_argument("--kind", action="append", choices=list(KIND))
     arguments = parser.parse_args()
-    global HIPP
-    HIPP = arguments.hipp
+    global HIPP, ROWS
+    HIPP, ROWS = arguments.hipp, KeptRows(arguments.keep)
     kinds = [KIND[name] for name in arguments.kind] if arguments.kind else KINDS
     print(f"{arguments.marks} marks a cell, seed {SEED}")
     for name in arguments.studies or STUDIES:
