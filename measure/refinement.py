@@ -18,6 +18,7 @@ from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
 
 Array = NDArray[np.float64]
 
+_LEANING_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
 _LEAST_RESPONSE = 0.15  # correlation below it is not worth a fit: bare texture answers as well
 
 
@@ -120,6 +121,7 @@ def _options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -
     """Where the mark leans on the frame, its rotation and scale stay as predicted, or near it."""
     if not leans_on_frame(mark):
         return options
+    options = replace(options, margin_blurs=max(options.margin_blurs, _LEANING_MARGIN_BLURS))
     if frame_sigma is None:
         return replace(options, freedom="shift")
     return replace(options, freedom="similarity", linear_sigma=frame_sigma)

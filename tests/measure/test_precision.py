@@ -95,3 +95,13 @@ def test_what_compression_hides_of_a_faint_mark_is_added_to_its_sigma() -> None:
     assert np.trace(film.covariance_px2) / 2 < 0.006**2
     assert np.trace(fine.covariance_px2) / 2 < 0.012**2
     assert 0.02**2 < np.trace(coarse.covariance_px2) / 2 < 0.03**2
+
+
+def test_a_notch_in_a_soft_scan_is_matched_with_enough_of_its_ground() -> None:
+    rng = np.random.default_rng(6)
+    shares = []
+    for _ in range(3):
+        mark = some_mark(KIND["notch"], 1.6, rng)
+        fit = sighted(mark, GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / SNR), rng)
+        shares.append(np.trace(fit.covariance_px2) / np.trace(mark.bound(1 / SNR)))
+    assert np.sqrt(np.mean(shares)) < 1.08  # with four standard deviations of the blur: 1.11 and more
