@@ -15,6 +15,7 @@ _LARGE_PX = 1 << 24  # a smaller scan is read whole in no time
 _REACH = 0.025  # of the frame's side: laid by hand it is off by some millimetres and a degree
 _LARGEST_SHARE = 0.25  # of the scan: where windows hold more, the whole of it tells more
 _LEAST_MARKS = 4  # that agree: an affine transformation through them has a check
+_FINE = 0.05  # of how near steps are alike
 _ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step aside could be one step off
 
 
@@ -33,11 +34,14 @@ def is_worth_a_look(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, f
 
 def is_lattice(layout: FiducialLayout) -> bool:
     """Whether one step takes more than half of the marks to others."""
-    xy = np.array([mark.xy_mm for mark in layout.marks])
+    xy, near = np.array([mark.xy_mm for mark in layout.marks]), reach_mm(layout) / 2
     steps = (xy[:, None] - xy[None]).reshape(-1, 2)
-    steps = steps[np.hypot(*steps.T) > reach_mm(layout) / 2]
-    alike = cKDTree(steps).query_ball_point(steps, reach_mm(layout) / 2, return_length=True)
-    return bool(alike.max(initial=0) > _ALIKE * len(xy))
+    # Of a large lattice there are a million steps, and few that differ.
+    rounded = np.round(steps[np.hypot(*steps.T) > near] / (_FINE * near))
+    fine, times = np.unique(rounded @ [1, 1j], return_counts=True)
+    places = _FINE * near * np.stack([fine.real, fine.imag], axis=1)
+    alike = [times[others].sum() for others in cKDTree(places).query_ball_point(places, near)] if len(places) else []
+    return max(alike, default=0) > _ALIKE * len(xy)
 
 
 def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Array) -> Array:
