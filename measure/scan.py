@@ -229,7 +229,7 @@ class ReducedSegments:
 def reduced_side(fine_px: int, factor: int) -> int:
     """The side of a reduced segment: whole segments of the scan, if these are no larger than it is to be."""
     unit = lcm(fine_px, factor)
-    return max((unit * max(SEGMENT_PX // unit, 1) if unit <= 2 * SEGMENT_PX else SEGMENT_PX) // factor, 1)
+    return max((unit * max(SEGMENT_PX // unit, 1) if unit <= 4 * SEGMENT_PX else SEGMENT_PX) // factor, 1)
 
 
 def reduced_rows(width: int, factor: int) -> int:

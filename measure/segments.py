@@ -4,8 +4,6 @@ from typing import Protocol
 
 from measure.radiometry import Samples
 
-BAND_ROWS = 256  # rows taken at a time where the file leaves the choice
-
 
 class Segments(Protocol):
     """A picture as its file stores it: a grid of tiles or strips, each decoded on its own.

@@ -2,6 +2,7 @@
 
 import logging
 import struct
+from mmap import ACCESS_READ, ALLOCATIONGRANULARITY, mmap
 from pathlib import Path
 from threading import Lock
 
@@ -13,13 +14,14 @@ from measure.errors import MeasurementError
 from measure.quantisation import rounding_step_dn
 from measure.radiometry import Radiometry, Samples
 from measure.resolution import NO_TAGS, TIFF_UNIT, Pitch, pitch_from_density
-from measure.segments import BAND_ROWS, Segments
+from measure.segments import Segments
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
 
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
 JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
+RAW_HEIGHT_PX, RAW_WIDTH_PX = 128, 2048  # of an uncompressed file, taken at a time
 REDUCED_IMAGE, TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
 DECODING_ERRORS = (RuntimeError, ValueError, OSError, IndexError, TypeError, struct.error, TiffFileError)
 
@@ -194,23 +196,29 @@ class TiffSegments:
 
 
 class RawRows(TiffSegments):
-    """An uncompressed file whose rows stand one after the other: any band of rows can be read, whatever its strips."""
+    """An uncompressed file whose rows stand one after the other: any part can be read, whatever its strips."""
 
     def __init__(self, file: TiffFile, page: TiffPage, path: Path) -> None:
         super().__init__(file, page, path)
-        self.segment_height_px = min(BAND_ROWS, self.height_px)
-        self._row_samples = self.width_px * page.samplesperpixel
+        self.segment_height_px = min(RAW_HEIGHT_PX, self.height_px)
+        self.segment_width_px = min(RAW_WIDTH_PX, self.width_px)
         self._dtype = np.dtype(page.dtype).newbyteorder(file.byteorder)
 
     def read(self, row: int, column: int) -> Samples:
-        """The band of rows `row`."""
-        first = row * self.segment_height_px
+        """The part of RAW_HEIGHT_PX x RAW_WIDTH_PX pixels in row `row` and column `column` of such parts."""
+        first, left = row * self.segment_height_px, column * self.segment_width_px
         height = min(self.segment_height_px, self.height_px - first)
-        handle = self._file.filehandle
-        with self._reading:
-            handle.seek(self._page.dataoffsets[0] + first * self._row_samples * self._dtype.itemsize)
-            data = handle.read(height * self._row_samples * self._dtype.itemsize)
-        if len(data) < height * self._row_samples * self._dtype.itemsize:
-            raise broken(self._path, f"rows {first} to {first + height - 1} lie beyond its end")
-        stored = np.frombuffer(data, self._dtype).astype(self._dtype.newbyteorder("="))
-        return self._radiometry.apply(stored.reshape(height, self.width_px, -1))
+        samples = self._page.samplesperpixel
+        row_bytes = self.width_px * samples * self._dtype.itemsize
+        start = int(self._page.dataoffsets[0]) + first * row_bytes
+        before = start % ALLOCATIONGRANULARITY
+        size = before + height * row_bytes
+        try:
+            # Of the rows only the part's own pages are read, and none of them is held afterwards.
+            with mmap(self._file.filehandle.fileno(), size, access=ACCESS_READ, offset=start - before) as mapped:
+                rows = np.ndarray((height, self.width_px, samples), self._dtype, mapped, before)
+                stored = rows[:, left : left + self.segment_width_px].astype(self._dtype.newbyteorder("="))
+                del rows
+        except (ValueError, OSError) as error:
+            raise broken(self._path, f"rows {first} to {first + height - 1} lie beyond its end") from error
+        return self._radiometry.apply(stored)
