@@ -2,8 +2,8 @@
 
 One frame with eight fiducials and 210 disks is rendered, stored in every way, and read by turns, in one process:
 whole by tifffile, in eight windows about the marks, reduced to a quarter of its side or 3000 px, searched for disks,
-and measured as `reseau measure` does. Memory is the peak of a process of its own. Seconds are of the clock, and in
-brackets of the processor: on a busy machine only those compare.
+and measured as `reseau measure` does; figures are medians over the rounds. Memory is the peak of a process of its own.
+Seconds are of the clock, and in brackets of the processor: on a busy machine only those compare.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from measure.disk_patches import DiskSearch
 from measure.disk_search import disk_candidates
+from measure.disks import fit_disk
 from measure.fiducials import measure_fiducials
 from measure.scan import open_scan
 from measure.shapes import FiducialLayout
@@ -154,13 +155,45 @@ def reduced(path: Path) -> None:
         scan.reduced(max(4, -(-scan.width_px // REDUCED_PX)))
 
 
-def disks_seen(path: Path, disks_px: NDArray[np.float64]) -> int:
-    """How many of the disks are among the patches found."""
+class Found(NamedTuple):
+    """Disks of the frame that were found within 3 px, how many other patches were, and the found ones' rms error of a
+    coordinate, px."""
+
+    seen: int
+    others: int
+    rms_px: float
+
+
+def disk_search(width_px: int) -> DiskSearch:
+    return DiskSearch((DISK_MM[0] * width_px / FRAME_MM, DISK_MM[1] * width_px / FRAME_MM), "light")
+
+
+def disks_seen(path: Path, disks_px: NDArray[np.float64], frame_px: int) -> Found:
+    """The disks found in the whole scan; frame_px: width of the frame that shows them."""
     with open_scan(path) as scan:
-        px_per_mm = scan.width_px / FRAME_MM
-        found = disk_candidates(scan, DiskSearch((DISK_MM[0] * px_per_mm, DISK_MM[1] * px_per_mm), "light"))
-    centers = np.array([patch.center_px for patch in found]).reshape(-1, 2)
-    return int((np.hypot(*np.moveaxis(disks_px[:, None] - centers, -1, 0)).min(axis=1, initial=np.inf) < 3.0).sum())
+        found = disk_candidates(scan, disk_search(frame_px))
+    return compared(np.array([patch.center_px for patch in found]).reshape(-1, 2), disks_px)
+
+
+def compared(centers: NDArray[np.float64], disks_px: NDArray[np.float64]) -> Found:
+    apart = np.hypot(*np.moveaxis(disks_px[:, None] - centers, -1, 0))
+    near = apart.min(axis=1, initial=np.inf)
+    seen = near < 3.0
+    return Found(int(seen.sum()), int((apart.min(axis=0) >= 3.0).sum()), float(np.sqrt(np.mean(near[seen] ** 2) / 2)))
+
+
+def fitted(frame: Frame, folder: Path) -> None:
+    """What measuring every disk to the bound takes, after they were found."""
+    path = folder / "scan.tif"
+    Storage(16, "lzw", "tiles").write(frame.grey, path)
+    with open_scan(path) as scan:
+        patches = disk_candidates(scan, disk_search(len(frame.grey)))
+        spent = timed(lambda: [fit_disk(scan, patch.center_px, patch.pixel_from_disk) for patch in patches])
+    assert isinstance(spent.result, list)
+    kept = np.array([disk.center_px for disk in spent.result if not disk.reason]).reshape(-1, 2)
+    each = both(1e3 * np.array(spent[:2]) / max(len(patches), 1))
+    print(f"{len(patches)} patches fitted: ms each {each}; {compared(kept, frame.disks_px)}", flush=True)
+    path.unlink()
 
 
 def marks_measured(path: Path, frame: Frame) -> int:
@@ -172,7 +205,10 @@ def marks_measured(path: Path, frame: Frame) -> int:
 
 
 def compare(frame: Frame, folder: Path, rounds: int) -> None:
-    print("storage | tifffile, s | windows | reduced | disks, s above | fiducials, s | disks, fiducials seen")
+    print(
+        "storage | tifffile, s | windows, of it | reduced, of it | disks, of it | disks, s above it | fiducials, s | "
+        "disks seen, others, fiducials"
+    )
     for storage in Storage.all():
         path = folder / "scan.tif"
         storage.write(frame.grey, path)
@@ -180,16 +216,18 @@ def compare(frame: Frame, folder: Path, rounds: int) -> None:
             partial(tifffile.imread, path),
             partial(windows, path, frame.marks_px),
             partial(reduced, path),
-            partial(disks_seen, path, frame.disks_px),
+            partial(disks_seen, path, frame.disks_px, len(frame.grey)),
             partial(marks_measured, path, frame),
         )
         by_round = [[timed(function) for function in work] for _ in range(rounds)]
         spent = np.median([[each[:2] for each in one] for one in by_round], axis=0)
         decode, *others = spent
-        ratios = [both(each / decode) for each in others[:2]]
+        ratios = [both(each / decode) for each in others[:3]]
+        disks, marks = by_round[0][3].result, by_round[0][4].result
+        assert isinstance(disks, Found)
         print(
             f"{storage.bits} bit {storage.compression}, {storage.segments} | {both(decode)} | {' | '.join(ratios)} | "
-            f"{both(others[2] - decode)} | {both(others[3])} | {by_round[0][3].result}, {by_round[0][4].result}",
+            f"{both(others[2] - decode)} | {both(others[3])} | {disks.seen}, {disks.others}, {marks}",
             flush=True,
         )
         path.unlink()
@@ -233,7 +271,7 @@ def memory(frame: Frame, folder: Path, sizes: list[int]) -> None:
         peaks = [
             peak_mib(windows, path, frame.marks_px * size / len(frame.grey)),
             peak_mib(reduced, path),
-            peak_mib(disks_seen, path, frame.disks_px),
+            peak_mib(disks_seen, path, frame.disks_px, len(frame.grey)),
             2 * size * size >> 20,
         ]
         print(f"{size} px | {' | '.join(map(str, peaks[:3]))} | more than {peaks[3]}", flush=True)
@@ -249,4 +287,5 @@ if __name__ == "__main__":
     with TemporaryDirectory() as temporary:
         one = rendered(Path(temporary), arguments.size)
         compare(one, Path(temporary), arguments.rounds)
+        fitted(one, Path(temporary))
         memory(one, Path(temporary), arguments.memory)

@@ -1,6 +1,6 @@
 """Patches found in the whole frame in one pass over it, its blocks looked at side by side in several reductions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import lcm
 from typing import Protocol
 
@@ -8,13 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from measure.disk_patches import Candidate
+from measure.disk_patches import Candidate, strength
 from measure.scan import Scan
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 BLOCK_PX = 1536
+
+Confirmed = Callable[[list[Candidate]], list[Candidate]]
 
 
 class Octave(Protocol):
@@ -29,14 +31,16 @@ class Octave(Protocol):
         """In a reduced picture, in its pixels."""
 
 
-def search_blocks(scan: Scan, octaves: Sequence[Octave]) -> list[Candidate]:
+def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | None = None) -> list[Candidate]:
     """The patches of all octaves in pixels of the scan, the strongest first, none within another.
 
-    The scan is taken in bands of rows, no higher than its reductions keep: a band is reduced first, by all threads,
-    then its blocks are looked at side by side.
+    confirmed: which of them are right, and where exactly, asked while the rows about them are still decoded.
+
+    The scan is taken in bands of rows, no higher than what stays decoded: a band is decoded and reduced first, by all
+    threads, then its blocks are looked at side by side.
     """
     unit = lcm(*(octave.factor for octave in octaves))
-    reductions = reductions_of(scan, {octave.factor for octave in octaves})
+    reductions = reductions_of(scan, {1, *(octave.factor for octave in octaves)})
     margin = max(octave.margin_px for octave in octaves)
     kept = min(factor * reduction.rows_kept for factor, reduction in reductions.items())
     width, height = (max(size // unit, 1) * unit for size in (BLOCK_PX, min(BLOCK_PX, kept - 2 * margin)))
@@ -59,8 +63,8 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave]) -> list[Candidate]:
         for factor in sorted(reductions):
             reductions[factor].decode((row0 - margin) // factor, (row0 + height + margin) // factor)
         blocks = [(octave, col0, row0) for octave in octaves for col0 in range(0, scan.width_px, width)]
-        found += [patch for own in scan.each(in_block, blocks) for patch in own]
-    found.sort(key=lambda patch: (-abs(patch.contrast_dn), *patch.center_px))
+        in_band = separate([patch for own in scan.each(in_block, blocks) for patch in own])
+        found += confirmed(in_band) if confirmed else in_band
     return separate(found)
 
 
@@ -74,7 +78,8 @@ def reductions_of(scan: Scan, factors: set[int]) -> dict[int, Scan]:
 
 
 def separate(found: list[Candidate]) -> list[Candidate]:
-    """The strongest of candidates that lie within one another."""
+    """The strongest of candidates that lie within one another, the strongest first."""
+    found = sorted(found, key=strength)
     centers = np.array([patch.center_px for patch in found]).reshape(-1, 2)
     radii = np.array([patch.radius_px for patch in found])
     kept = np.zeros(len(found), bool)

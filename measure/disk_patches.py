@@ -4,6 +4,7 @@ their height."""
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
+from math import sqrt
 from typing import Literal
 
 import cv2
@@ -58,7 +59,13 @@ class Candidate:
     @property
     def radius_px(self) -> float:
         """Of the circle of the same area."""
-        return float(np.sqrt(abs(np.linalg.det(self.pixel_from_disk))))
+        (a, b), (c, d) = self.pixel_from_disk.tolist()
+        return sqrt(abs(a * d - b * c))
+
+
+def strength(patch: Candidate) -> tuple[float, ...]:
+    """Sorts the strongest first, whatever the order in which they were found."""
+    return -abs(patch.contrast_dn), *patch.center_px.tolist()
 
 
 def margin_px(radii: list[float]) -> int:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.block_search import search_blocks
+from measure.disk_batch import disks_among
 from measure.disk_patches import Candidate, DiskSearch, margin_px, patches
 from measure.disks import FittedDisk, fit_disk
 from measure.scan import Scan
@@ -15,6 +16,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk stands out by a tenth less
+SIZE_TOLERANCE = 1.4  # of what is found, to the sizes that are looked for
 SEARCH_RADIUS_PX = 2.2  # reduced so far that the smallest disk of an octave has at least this radius
 
 
@@ -37,8 +39,19 @@ def without_doubles(disks: list[FittedDisk]) -> list[FittedDisk]:
 
 
 def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
-    """Patches of a disk's shape, the strongest first, none within another."""
-    return search_blocks(scan, octaves_of(search, scan.full_scale_dn))
+    """What a disk explains, to a tenth of a pixel or so, the strongest first, none within another."""
+    smallest, largest = search.diameter_px[0] / SIZE_TOLERANCE, search.diameter_px[1] * SIZE_TOLERANCE
+
+    def disks(patches: list[Candidate]) -> list[Candidate]:
+        return [disk for disk in disks_among(scan, patches) if is_between(smallest, largest, disk)]
+
+    return search_blocks(scan, octaves_of(search, scan.full_scale_dn), disks)
+
+
+def is_between(smallest_px: float, largest_px: float, disk: Candidate) -> bool:
+    """Whether the diameters of an ellipse can be those of a disk seen obliquely."""
+    longer, shorter = 2 * np.linalg.svd(disk.pixel_from_disk, compute_uv=False)
+    return bool(longer >= smallest_px and shorter <= largest_px)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from measure.blank_film import BESIDE_PX
 from measure.clipping import clipped_sides
 from measure.compression import with_loss
+from measure.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
 from measure.disk_patches import LEAST_SNR
 from measure.matching import MatchOptions, match, window_about
 from measure.scan import Scan
@@ -16,16 +17,13 @@ from measure.shapes import Disk, MarkShape
 Array = NDArray[np.float64]
 
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
-SHORTEST_MARGIN_PX, LONGEST_MARGIN_PX = 2.5, 10.0
-MARGIN = 0.3  # of the radius: the ground is not plain for long, where the pad ends that a target is painted on, say
+LONGEST_MARGIN_PX = 10.0
 PLAIN_MARGIN_PX = 7.0  # where it is plain, for a tenth less noise than with the shortest margin
 LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
 SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
 SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from the disk
 WEAK_DAMAGE, MOST_DAMAGE = 0.1, 0.35
 MOST_BLUR = 0.7  # of the shorter half axis
-WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast: texture and stains are no disks
-SMOOTH = 0.5  # correlation of neighbouring residuals, from which on they are no noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +77,7 @@ def fit_disk(
     """
     start = np.column_stack([pixel_from_disk, center_px])
     radius = float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
-    sure = max(MARGIN * radius, SHORTEST_MARGIN_PX, LEAST_REACH_PX - radius)
+    sure = max(MARGIN * radius, LEAST_MARGIN_PX, LEAST_REACH_PX - radius)
     sure = max(min(sure, longest_margin_px, LONGEST_MARGIN_PX), 1.5)
     wide = max(sure, min(PLAIN_MARGIN_PX, longest_margin_px))
     options = MatchOptions(

@@ -26,7 +26,8 @@ Array = NDArray[np.float32]
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
 GREEN = (0.0, 1.0, 0.0)
 BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
-SEGMENT_PX = 512  # of the scan, that a segment of its reduction holds along a side, about
+SEGMENT_PX = 256  # of the scan, that a segment of its reduction holds along a side, about
+LARGEST_SEGMENT_PX = 2048
 REDUCED_SHARE = 0.25  # of a scan's cache, for a reduction of it
 
 Item = TypeVar("Item")
@@ -229,7 +230,7 @@ class ReducedSegments:
 def reduced_side(fine_px: int, factor: int) -> int:
     """The side of a reduced segment: whole segments of the scan, if these are no larger than it is to be."""
     unit = lcm(fine_px, factor)
-    return max((unit * max(SEGMENT_PX // unit, 1) if unit <= 4 * SEGMENT_PX else SEGMENT_PX) // factor, 1)
+    return max((unit * max(SEGMENT_PX // unit, 1) if unit <= LARGEST_SEGMENT_PX else SEGMENT_PX) // factor, 1)
 
 
 def reduced_rows(width: int, factor: int) -> int:

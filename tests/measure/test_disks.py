@@ -6,8 +6,9 @@ from drawn import drawn, ellipse, scan_of, whitened
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from measure.block_search import search_blocks
 from measure.disk_patches import DiskSearch
-from measure.disk_search import disk_candidates, find_disks
+from measure.disk_search import disk_candidates, find_disks, octaves_of
 from measure.disks import fit_disk
 
 Array = NDArray[np.float64]
@@ -94,9 +95,32 @@ def test_texture_holds_hardly_any_disks() -> None:
     rng = np.random.default_rng(5)
     picture = GROUND + 30000 * gaussian_filter(rng.normal(size=(160, 180)), 2) + rng.normal(0, NOISE, (160, 180))
     scan, search = scan_of(picture), DiskSearch((6.0, 30.0))
-    patches = disk_candidates(scan, search)
+    patches = search_blocks(scan, octaves_of(search, scan.full_scale_dn))
+    disks = disk_candidates(scan, search)
     assert len(patches) > 20
+    assert len(disks) <= len(patches) / 2
     assert len(find_disks(scan, search)) <= len(patches) / 5
+
+
+@pytest.mark.parametrize(("snr", "blur_px"), [(10.0, 0.7), (50.0, 1.5)])
+def test_disks_of_all_sizes_are_found_nearly_where_they_are(snr: float, blur_px: float) -> None:
+    """From every reduction of the scan, also beside its edge; 0.15 px, or three times the best there is."""
+    rng = np.random.default_rng(6)
+    picture, true = GROUND + rng.normal(0, CONTRAST / snr, (300, 700)), []
+    for number, radius in enumerate([2.6, 4.0, 6.0, 9.0, 14.0, 21.0, 30.0]):
+        for row in (60, 220):
+            place = np.array([30 + 100 * number - (number == 0) * 22, row]) + rng.uniform(-0.5, 0.5, 2)
+            shape = some_ellipse(rng, radius, rng.uniform(0.6, 1.0) if radius > 3 else 1.0)
+            corner = np.maximum(np.round(place).astype(int) - 48, 0)
+            window = picture[corner[1] : corner[1] + 97, corner[0] : corner[0] + 97]
+            window += CONTRAST * drawn(ellipse(place - corner, shape), window.shape[1], window.shape[0], blur_px, 5)
+            true.append(place)
+    found = disk_candidates(scan_of(picture), DiskSearch((5.0, 70.0), "light"))
+    assert len(found) == len(true)
+    for place in true:
+        nearest = min(found, key=lambda disk: float(np.hypot(*(disk.center_px - place))))
+        best = 1.5 / snr / np.sqrt(nearest.radius_px)  # of a circle: an edge of 2 pi r pixels, about a pixel wide
+        assert np.abs(nearest.center_px - place).max() < max(0.15, 3 * best)
 
 
 @pytest.mark.parametrize("diameter_px", [(1.0, 5.0), (9.0, 5.0)])
