@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.disk_patches import Candidate, strength
-from measure.scan import Scan
+from measure.scan import SEGMENT_PX, Scan
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -40,10 +40,13 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
     threads, then its blocks are looked at side by side.
     """
     unit = lcm(*(octave.factor for octave in octaves))
-    reductions = reductions_of(scan, {1, *(octave.factor for octave in octaves)})
+    reductions = reductions_of(scan, {octave.factor for octave in octaves})
     margin = max(octave.margin_px for octave in octaves)
     kept = min(factor * reduction.rows_kept for factor, reduction in reductions.items())
-    width, height = (max(size // unit, 1) * unit for size in (BLOCK_PX, min(BLOCK_PX, kept - 2 * margin)))
+    # Of a very wide scan tiles are rather decoded again for what is to be confirmed than rows reduced again as margins.
+    decoded = scan.rows_kept - SEGMENT_PX  # which a reduction may read beyond its rows
+    most = min(kept, max(decoded, 6 * margin)) - 2 * margin
+    width, height = (max(size // unit, 1) * unit for size in (BLOCK_PX, min(BLOCK_PX, most)))
 
     def in_block(block: tuple[Octave, int, int]) -> list[Candidate]:
         octave, col0, row0 = block
@@ -60,6 +63,8 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
 
     found: list[Candidate] = []
     for row0 in range(0, scan.height_px, height):
+        if height + 2 * margin <= decoded:
+            scan.decode(row0 - margin, row0 + height + margin)
         for factor in sorted(reductions):
             reductions[factor].decode((row0 - margin) // factor, (row0 + height + margin) // factor)
         blocks = [(octave, col0, row0) for octave in octaves for col0 in range(0, scan.width_px, width)]

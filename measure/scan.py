@@ -66,6 +66,7 @@ class Scan:
         self._segments = segments
         self._cache = cache or SegmentCache(segments)
         self._reduced: dict[int, Array] = {}
+        self._segment_px = SEGMENT_PX
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
     @property
@@ -120,14 +121,20 @@ class Scan:
         pitch = self.pitch_um and (self.pitch_um[0] * factor, self.pitch_um[1] * factor)
         segments = ReducedSegments(self, factor)
         cache = SegmentCache(segments, share=REDUCED_SHARE)
-        return Scan(self.path, segments, Pitch(pitch, self.pitch_note), self.notes, cache)
+        reduction = Scan(self.path, segments, Pitch(pitch, self.pitch_note), self.notes, cache)
+        reduction._segment_px = max(self._segment_px // factor, 1)
+        return reduction
 
     def decode(self, row0: int, row1: int) -> None:
         """Decode what the rows row0 to row1 (exclusive) need, side by side: windows side by side would wait for the
         strips that they share."""
         tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
         rows = range(max(row0, 0) // tall, (min(row1, self.height_px) - 1) // tall + 1)
-        self.each(lambda key: self._cache.read(*key), product(rows, range(-(-self.width_px // wide))))
+
+        def read(key: tuple[int, int]) -> None:
+            self._cache.read(*key)  # what is returned would be held until all is read
+
+        self.each(read, product(rows, range(-(-self.width_px // wide))))
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """What the function makes of each item, in their order, by as many threads as OpenCV may use: decoders and
@@ -210,9 +217,9 @@ class ReducedSegments:
         self._scan, self._factor = scan, factor
         self.height_px, self.width_px = scan.height_px // factor, scan.width_px // factor
         tall, wide = scan._segments.segment_height_px, scan._segments.segment_width_px
-        self.segment_height_px = min(reduced_side(tall, factor), self.height_px)
+        self.segment_height_px = min(reduced_side(tall, factor, scan._segment_px), self.height_px)
         # Strips are wanted once, whole.
-        self.segment_width_px = self.width_px if wide >= scan.width_px else reduced_side(wide, factor)
+        self.segment_width_px = self.width_px if wide >= scan.width_px else reduced_side(wide, factor, scan._segment_px)
         self.channels, self.full_scale_dn, self.sample_bytes = 1, scan.full_scale_dn, 4
         self.rounding_step_dn = scan.rounding_step_dn
 
@@ -227,10 +234,10 @@ class ReducedSegments:
         """The scan stays open."""
 
 
-def reduced_side(fine_px: int, factor: int) -> int:
-    """The side of a reduced segment: whole segments of the scan, if these are no larger than it is to be."""
+def reduced_side(fine_px: int, factor: int, most_px: int) -> int:
+    """The side of a reduced segment: about most_px of the scan, in whole segments if these are not much larger."""
     unit = lcm(fine_px, factor)
-    return max((unit * max(SEGMENT_PX // unit, 1) if unit <= LARGEST_SEGMENT_PX else SEGMENT_PX) // factor, 1)
+    return max((unit * max(most_px // unit, 1) if unit <= LARGEST_SEGMENT_PX else most_px) // factor, 1)
 
 
 def reduced_rows(width: int, factor: int) -> int:

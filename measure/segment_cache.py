@@ -7,7 +7,7 @@ from threading import Lock
 from measure.radiometry import Samples
 from measure.segments import Segments
 
-CACHE_BYTES = 48 << 20
+CACHE_BYTES = 40 << 20
 
 
 class SegmentCache:
