@@ -9,6 +9,8 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.spelling import did_you_mean
 
+SEPARATORS = {";": "semicolons", "\t": "tabs"}
+
 
 @dataclass(frozen=True)
 class Row:
@@ -68,6 +70,11 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
                 f"{path}, line {number}: has {len(cells)} values, but the header names {len(header)} columns. "
                 "Decimal commas must be points; text with a comma stands in quotes."
             )
+        if len(cells) < len(header):
+            raise InputError(
+                f"{path}, line {number}: is cut short: it has {len(cells)} of the {len(header)} values that the header "
+                "names. Complete it; a value that is not given is left blank between its commas."
+            )
         rows.append(Row(path, number, dict(zip(header, cells, strict=False))))
     return tuple(rows)
 
@@ -78,7 +85,9 @@ def _content_lines(path: Path) -> Iterator[tuple[int, str]]:
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: is not a text file (UTF-8); a CSV file is needed here.") from None
+        raise InputError(
+            f"{path}: is not text in UTF-8. Save it as such: in a spreadsheet as CSV UTF-8, separated by commas."
+        ) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
     for number, line in enumerate(text.splitlines(), 1):
@@ -90,6 +99,12 @@ def _check_header(
     path: Path, line: int, header: Sequence[str], required: Sequence[str], optional: Sequence[str]
 ) -> None:
     known = [*required, *optional]
+    other = next((name for mark, name in SEPARATORS.items() if len(header) == 1 and mark in header[0]), None)
+    if other:
+        raise InputError(
+            f"{path}, line {line}: its columns are separated by {other}; commas are needed, with decimal points. Save "
+            "the file so, or replace them in an editor."
+        )
     missing = [column for column in required if column not in header]
     if missing:
         raise InputError(

@@ -19,10 +19,11 @@ from adjust.network import (
     Transformation,
 )
 from adjust.transformation import marks_needed
+from pipeline.adjust_table import AdjustSettings
 from pipeline.camera_file import CameraFile
 from pipeline.comparator_file import ComparatorPoint
 from pipeline.errors import InputError
-from pipeline.project_file import UNITS_MM, AdjustSettings, Project
+from pipeline.project_file import UNITS_MM, Project
 from pipeline.spelling import did_you_mean
 
 Array = NDArray[np.float64]

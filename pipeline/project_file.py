@@ -2,17 +2,12 @@
 
 import glob
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, cast, get_args
 
-from adjust.network import Transformation
-from adjust.options import MEASURED_KINDS
-from adjust.reweighting import WeightFunction
-from adjust.tested import PRIOR_GROUPS
-from adjust.transformation import film_kind
+from pipeline.adjust_table import AdjustSettings, read_adjust
 from pipeline.camera_file import CameraFile, read_camera
 from pipeline.distances_file import GivenDistance, read_distances
 from pipeline.errors import InputError
@@ -25,31 +20,6 @@ from pipeline.tie_table import TieSettings, read_ties
 
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
-
-Datum = Literal["control", "minimal", "free"]
-Method = Literal["combined", "elements"]
-
-
-@dataclass(frozen=True)
-class AdjustSettings:
-    """The table [adjust]: a-priori standard deviations in um at the film.
-
-    transformation None: affine for a camera with fiducials, none for one without.
-    """
-
-    transformation: Transformation | None
-    datum: Datum
-    datum_coordinates: tuple[str, ...]
-    datum_points: tuple[str, ...]
-    sigma_target_um: float
-    sigma_fiducial_um: float
-    film_sigma_um: float
-    refraction: bool
-    earth_curvature: bool
-    robust: bool | WeightFunction
-    variance_components: bool | tuple[str, ...]
-    snooping: bool
-    method: Method
 
 
 @dataclass(frozen=True)
@@ -117,32 +87,44 @@ class Project:
 
 
 def read_project(path: Path) -> Project:
-    """Read project.toml and the camera, points and images files it names. Raises InputError with file, line and key."""
+    """Read project.toml and the camera, points, images and distances files it names.
+
+    Raises InputError with file, line and key: for what is wrong in the project file itself before any other file.
+    """
     table = read_toml(path)
-    folder = path.parent
-    objects = table.table("object")
-    given_images = _given_images(objects, folder)
-    measure = table.table("measure")
+    objects, measure = table.table("object"), table.table("measure")
+    camera = table.text("camera")
+    patterns = table.texts("scans") if "scans" in table else None
+    named = {key: objects.path_of(key) for key in ("points", "images", "distances") if key in objects}
+    antenna = _antenna(objects)
     project = Project(
         path=path,
-        cameras=_cameras(table, folder, given_images),
-        scans=_scans(table, folder),
-        comparator=folder / table.text("comparator", "comparator.csv"),
+        cameras={},
+        scans={},
+        comparator=table.path_of("comparator", "comparator.csv"),
         pitch_um=_pitch(table),
-        output=folder / table.text("output", "out"),
+        output=table.path_of("output", "out"),
         pose=measure.text("pose", "auto", ("auto", *POSES)),
         targets=read_targets(table.table("targets")) if "targets" in table else None,
         ties=read_ties(table.table("ties")) if "ties" in table else None,
-        given_points=read_points(folder / objects.text("points")) if "points" in objects else None,
-        given_images=given_images,
-        given_distances=read_distances(folder / objects.text("distances")) if "distances" in objects else (),
+        given_points=None,
+        given_images=None,
+        given_distances=(),
         unit_mm=UNITS_MM[objects.text("unit", "m", tuple(UNITS_MM))],
-        adjust=_adjust_settings(table.table("adjust")),
+        adjust=read_adjust(table.table("adjust")),
     )
-    objects.text("images", "")
-    measure.done()
-    objects.done()
-    table.done()
+    for each in (table, measure, objects):
+        each.done()
+    _check_named(table, objects, camera, named)
+    images = read_images(named["images"], antenna) if "images" in named else None
+    project = replace(
+        project,
+        cameras=_cameras(table, camera, images),
+        scans={} if patterns is None else _scans(table, patterns),
+        given_points=read_points(named["points"]) if "points" in named else None,
+        given_images=images,
+        given_distances=read_distances(named["distances"]) if "distances" in named else (),
+    )
     if not project.scans and not project.comparator.exists():
         raise InputError(
             f"{path}: there are no scans and no comparator coordinates. Give scans = [...] to measure, or comparator = "
@@ -151,19 +133,31 @@ def read_project(path: Path) -> Project:
     return project
 
 
-def _given_images(objects: Table, folder: Path) -> GivenImages | None:
+def _antenna(objects: Table) -> tuple[float, float, float]:
     antenna = objects.triple("antenna_offset", (0.0, 0.0, 0.0))
     if any(antenna) and "images" not in objects:
         raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
-    return read_images(folder / objects.text("images"), antenna) if "images" in objects else None
+    return antenna
 
 
-def _cameras(table: Table, folder: Path, images: GivenImages | None) -> Mapping[str, CameraFile]:
-    default = table.text("camera")
+def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, Path]) -> None:
+    """Name every file that is not there, not just the first."""
     try:
-        camera_path(default, folder)
+        keys = {"camera": (table, camera_path(camera, table.file.parent))}
     except InputError as error:
         raise table.error("camera", str(error)) from None
+    keys |= {key: (objects, path) for key, path in named.items()}
+    missing = [
+        str(where.error(key, f"there is no such file. Looked for {path.resolve()}."))
+        for key, (where, path) in keys.items()
+        if not path.exists()
+    ]
+    if missing:
+        raise InputError("\n".join(missing))
+
+
+def _cameras(table: Table, default: str, images: GivenImages | None) -> Mapping[str, CameraFile]:
+    folder = table.file.parent
     names = [default, *sorted({name for name in images.camera.values() if name} if images else set())]
     cameras = {name: read_camera(camera_path(name, folder)) for name in dict.fromkeys(names)}
     titles: dict[str, str] = {}
@@ -177,16 +171,14 @@ def _cameras(table: Table, folder: Path, images: GivenImages | None) -> Mapping[
     return cameras
 
 
-def _scans(table: Table, folder: Path) -> Mapping[str, Path]:
+def _scans(table: Table, patterns: Sequence[str]) -> Mapping[str, Path]:
     """The scan files that the patterns find, by image name."""
-    if "scans" not in table:
-        return {}
+    folder = table.file.parent
     scans: dict[str, Path] = {}
-    for pattern in table.texts("scans"):
-        whole = folder / pattern
-        found = sorted(Path(name) for name in glob.glob(str(whole)) if Path(name).is_file())
+    for pattern in patterns:
+        found = _found(pattern, folder)
         if not found:
-            raise table.error("scans", _nothing_found(pattern, whole))
+            raise table.error("scans", _nothing_found(pattern, folder / pattern))
         for file in found:
             name = image_name(file.name)
             if scans.get(name, file) != file:
@@ -197,14 +189,22 @@ def _scans(table: Table, folder: Path) -> Mapping[str, Path]:
     return scans
 
 
+def _found(pattern: str, folder: Path) -> list[Path]:
+    """The file of that very name, brackets and all, or those that the pattern finds in the folder."""
+    if (folder / pattern).is_file():
+        return [folder / pattern]
+    names = glob.glob(pattern, root_dir=folder)
+    return [path for path in (folder / name for name in sorted(names)) if path.is_file()]
+
+
 def _nothing_found(pattern: str, whole: Path) -> str:
     folder = whole.parent
-    if glob.has_magic(str(folder)):
+    if glob.has_magic(str(Path(pattern).parent)):
         return f"{pattern!r} finds no file. Looked for {whole}."
     if not folder.is_dir():
         return f"{pattern!r} finds no file: there is no folder {folder.resolve()}."
     endings = sorted({file.suffix for file in folder.iterdir() if file.is_file() and file.suffix})
-    holds = f"It holds files that end in {', '.join(endings)}." if endings else "It is empty."
+    holds = f"It holds files that end in {', '.join(endings)}." if endings else "It holds no files."
     return f"{pattern!r} finds no file in {folder.resolve()}. {holds}"
 
 
@@ -215,71 +215,3 @@ def _pitch(table: Table) -> tuple[float, float] | None:
     if not all(0.0 < value < math.inf for value in pitch):
         raise table.error("pitch_um", f"must be positive, not {list(pitch)}.")
     return pitch
-
-
-def _adjust_settings(table: Table) -> AdjustSettings:
-    datum = cast(Datum, table.text("datum", "control", get_args(Datum)))
-    settings = AdjustSettings(
-        transformation=read_transformation(table),
-        datum=datum,
-        datum_coordinates=_datum_choice(table, "datum_coordinates", datum, "minimal"),
-        datum_points=_datum_choice(table, "datum_points", datum, "free"),
-        sigma_target_um=table.number("sigma_target_um", 5.0, above=0.0),
-        sigma_fiducial_um=table.number("sigma_fiducial_um", 5.0, above=0.0),
-        film_sigma_um=table.number("film_sigma_um", 0.0, least=0.0),
-        refraction=table.flag("refraction", False),
-        earth_curvature=table.flag("earth_curvature", False),
-        robust=_robust(table),
-        variance_components=_variance_components(table),
-        snooping=table.flag("snooping", False),
-        method=cast(Method, table.text("method", "combined", get_args(Method))),
-    )
-    table.done()
-    if settings.robust and settings.snooping:
-        raise table.error("snooping", "and robust both take out gross errors. Set one of the two to false.")
-    return settings
-
-
-def _robust(table: Table) -> bool | WeightFunction:
-    """Huber's weights are those of `true`."""
-    if "robust" not in table or table.is_flag("robust"):
-        return table.flag("robust", False)
-    return cast(WeightFunction, table.text("robust", choices=get_args(WeightFunction)))
-
-
-def _variance_components(table: Table) -> bool | tuple[str, ...]:
-    if "variance_components" not in table or table.is_flag("variance_components"):
-        return table.flag("variance_components", False)
-    names = table.texts("variance_components")
-    known = (*MEASURED_KINDS, *PRIOR_GROUPS)
-    strangers = [name for name in names if name not in known]
-    if strangers:
-        raise table.error("variance_components", f"names {strangers[0]!r}; possible are {', '.join(known)}.")
-    return names
-
-
-def _datum_choice(table: Table, key: str, datum: Datum, wanted: Datum) -> tuple[str, ...]:
-    """The coordinates or points that a datum names; none where the program is to choose."""
-    if key not in table:
-        return ()
-    if datum != wanted:
-        raise table.error(key, f'goes with datum = "{wanted}", and the datum here is "{datum}". Change one of the two.')
-    names = table.texts(key)
-    if not names:
-        raise table.error(key, "is an empty list. Leave it out where the program is to choose.")
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise table.error(key, f"names {twice[0]!r} twice.")
-    return names
-
-
-def read_transformation(table: Table) -> Transformation | None:
-    """The key `transformation`; None where it is absent. Raises InputError."""
-    if "transformation" not in table:
-        return None
-    spelling = table.text("transformation")
-    try:
-        film_kind(spelling)
-    except ValueError as error:
-        raise table.error("transformation", f"{error}.") from None
-    return spelling

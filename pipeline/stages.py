@@ -11,7 +11,7 @@ from pipeline.adjust_stage import adjust_marks
 from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
 from pipeline.atomic import check_writable, write_atomically
 from pipeline.check import check_against_opencv
-from pipeline.comparator_file import read_comparator, write_comparator
+from pipeline.comparator_file import ComparatorPoint, read_comparator, write_comparator
 from pipeline.errors import InputError
 from pipeline.measure_stage import measure_scans
 from pipeline.measurement_file import MeasuredScan, read_measurement, write_measurement
@@ -59,7 +59,7 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
     """comparator.csv to adjustment.json."""
     with reporter.stage("adjusting") as count:
         count(project.comparator.name, 0, 1)
-        adjustment = adjust_marks(project, read_comparator(project.comparator))
+        adjustment = adjust_marks(project, _given_marks(project))
     write_adjustment(adjustment, project.adjustment_path)
     project.check_path.unlink(missing_ok=True)  # it belongs to an earlier adjustment
     covariance = covariance_path(project.adjustment_path)
@@ -70,7 +70,7 @@ def run_check(project: Project, reporter: Reporter) -> Summary:
     """The adjustment, made anew from comparator.csv, against OpenCV's calibration."""
     with reporter.stage("checking") as count:
         count(project.comparator.name, 0, 1)
-        adjustment = adjust_marks(project, read_comparator(project.comparator))
+        adjustment = adjust_marks(project, _given_marks(project))
         write_adjustment(adjustment, project.adjustment_path)
         _write_check(project, adjustment)
     return summarise(_adjusted(project), {"check": project.check_path})
@@ -78,13 +78,19 @@ def run_check(project: Project, reporter: Reporter) -> Summary:
 
 def run_report(project: Project, reporter: Reporter) -> Summary:
     """What the earlier stages left, in report.html."""
-    if not project.comparator.exists():
-        raise InputError(
-            f"{project.comparator}: there is no such file, and so nothing to report. Run `reseau run` first."
-        )
+    _given_marks(project)
     with reporter.stage("reporting") as count:
         count(project.report_path.name, 0, 1)
         return _reported(project, _adjusted(project))
+
+
+def _given_marks(project: Project) -> tuple[ComparatorPoint, ...]:
+    """The marks that an earlier stage, or the user, has left. Raises InputError where there are none."""
+    if not project.comparator.exists():
+        raise InputError(
+            f"{project.comparator}: there is no such file. Run `reseau measure` first, or put the coordinates there."
+        )
+    return read_comparator(project.comparator)
 
 
 def _write_marks(project: Project, scans: Sequence[MeasuredScan]) -> None:

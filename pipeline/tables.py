@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.spelling import did_you_mean
+from pipeline.spelling import did_you_mean, nearest
 
 FREE = "free"
 
@@ -50,7 +50,7 @@ class Table:
         return key in self.values
 
     def error(self, key: str, message: str) -> InputError:
-        """An InputError that names the file, the line and the key."""
+        """An InputError that names the file, the line (of the table where the key is missing) and the key."""
         line = self._line_of(key)
         at = f"{self.file}, line {line}" if line else f"{self.file}"
         table = f"[{self.place}] " if self.place else ""
@@ -63,6 +63,10 @@ class Table:
         if choices and value not in choices:
             raise self.error(key, f"is {value!r}; possible are {_listed(choices)}.{did_you_mean(value, choices)}")
         return value
+
+    def path_of(self, key: str, default: str | None = None) -> Path:
+        """A file's or folder's name, relative to the folder of this file."""
+        return self.file.parent / self.text(key, default)
 
     def is_flag(self, key: str) -> bool:
         """Whether a key that is there holds true or false."""
@@ -161,20 +165,23 @@ class Table:
         return tuple(self.values)
 
     def done(self) -> None:
-        """Refuse every key that nothing has asked for."""
-        for key in self.values:
-            if key not in self._known:
-                known = sorted(set(self._known))
-                raise self.error(
-                    key, f"is no key of this table.{did_you_mean(key, known)} Known here: {_listed(known)}."
-                )
+        """Refuse every key that nothing has asked for, all of them in one message."""
+        known = sorted(set(self._known))
+        strangers = [
+            str(self.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {_listed(known)}."))
+            for key in self.values
+            if key not in known
+        ]
+        if strangers:
+            raise InputError("\n".join(strangers))
 
     def _get(self, key: str, default: Any) -> Any:
         self._known.append(key)
         value = self.values.get(key, default)
         if value is None:
             strangers = [name for name in self.values if name not in self._known]
-            raise self.error(key, f"is missing. Add it.{did_you_mean(key, strangers)}")
+            near = nearest(key, strangers)
+            raise self.error(key, "is missing. Add it" + (f", or rename {near!r} to it." if near else "."))
         return value
 
     def _number(self, key: str, value: Any) -> float:
@@ -198,22 +205,25 @@ class Table:
         return f"{self.place}.{key}" if self.place else key
 
     def _line_of(self, key: str) -> int | None:
-        """The line where the key stands: the first one with that key behind this table's own header."""
+        """The line where the key, or the table of that name, stands inside this table; this table's own if nowhere."""
         try:
             lines = self.file.read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError):
             return None
         name, _, count = self.place.partition("[")
-        header = re.compile(rf"^\s*\[+\s*{re.escape(name)}\s*\]+")
-        starts = [number for number, line in enumerate(lines) if header.match(line)] if name else [-1]
+        own = re.compile(rf"^\s*\[+\s*{re.escape(name)}\s*\]+")
+        starts = [number for number, line in enumerate(lines) if own.match(line)] if name else [-1]
         which = int(count.rstrip("]")) - 1 if count.rstrip("]").isdigit() else 0
         if which >= len(starts):
             return None
-        key_line = re.compile(rf'^\s*(\[+[^\]]*\b)?"?{re.escape(key)}"?\s*(=|\])')
-        for number in range(starts[which] + 1, len(lines)):
-            if key_line.match(lines[number]):
+        key_line = re.compile(rf'^\s*"?{re.escape(key)}"?\s*[=.]')
+        inside = re.compile(rf"^\s*\[+\s*{re.escape(f'{name}.' if name else '')}{re.escape(key)}\s*[\].]")
+        own_keys = True
+        for number in range(starts[which] + 1, starts[which + 1] if which + 1 < len(starts) else len(lines)):
+            if inside.match(lines[number]) or (own_keys and key_line.match(lines[number])):
                 return number + 1
-        return None
+            own_keys = own_keys and not lines[number].lstrip().startswith("[")
+        return starts[which] + 1 or None
 
 
 def _listed(words: Sequence[str]) -> str:

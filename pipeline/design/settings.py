@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import cast, get_args
 
 from adjust.network import Transformation
-from pipeline.project_file import Datum, read_transformation
+from pipeline.adjust_table import Datum, read_transformation
 from pipeline.tables import Table
 
 Values = tuple[float, ...] | tuple[str, ...]

@@ -61,6 +61,16 @@ def misspelt_key(folder: Path) -> None:
     replaced(folder / "project.toml", "diameter_mm", "diametre_mm")
 
 
+def misspelt_key_and_no_file(folder: Path) -> None:
+    replaced(folder / "project.toml", "comparator =", "comparater =")
+    (folder / "points.csv").unlink()
+
+
+def two_files_missing(folder: Path) -> None:
+    for name in ("camera.toml", "points.csv"):
+        (folder / name).unlink()
+
+
 def duplicated_point(folder: Path) -> None:
     path = folder / "points.csv"
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -76,11 +86,13 @@ def no_folder_for_results(folder: Path) -> None:
     [
         (no_project, ["project.toml", "no such file"]),
         (no_camera, ["camera.toml", "no such file"]),
-        (no_scans, ["scans/frame1.tif", "finds no file", "It is empty"]),
+        (no_scans, ["scans/frame1.tif", "finds no file", "It holds no files"]),
         (text_named_tif, ["frame2.tif"]),
         (truncated_tiff, ["frame3.tif"]),
         (toml_typo, ["project.toml", "not valid TOML", "line 2"]),
         (misspelt_key, ["project.toml", "diametre_mm", "diameter_mm"]),
+        (misspelt_key_and_no_file, ["project.toml, line 4", "comparater", "Did you mean 'comparator'?"]),
+        (two_files_missing, ["line 2: camera: there is no such file", "line 12: [object] points: there is no such"]),
         (duplicated_point, ["points.csv", "'103'", "line 4"]),
         (no_folder_for_results, ["cannot be written"]),
     ],

@@ -169,6 +169,8 @@ def test_points_file_fixed_free_and_unknown(tmp_path: Path) -> None:
         ("point,X,Y,Z\n1,1,5,2,0,3,0\n", ["line 2", "7 values", "4 columns", "commas"]),
         ("point,X,Y,Z,sX,sY,sZ\n1,1,2,3,-1,0,0\n", ["negative"]),
         ("point,X,Y,Z,sX,sY,sZ\n1,,2,3,1,0,0\n", ["X", "blank"]),
+        ("point,X,Y,Z\n1,1,2,3\n2,4,5", ["line 3", "cut short", "3 of the 4 values"]),
+        ("point;X;Y;Z\n1;1;2;3\n", ["line 1", "semicolons", "commas are needed"]),
         ("point,X,Y,Z\n", ["no point"]),
         ("", ["is empty"]),
     ],
