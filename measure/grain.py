@@ -16,7 +16,7 @@ from scipy import fft
 from scipy.optimize import nnls
 
 from measure.blank_film import PATCH_PX, PLANE
-from measure.noise import NoiseModel
+from measure.noise import NoiseModel, padded
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -76,7 +76,7 @@ class _Window:
 
     def products(self, images: Array) -> Array:
         """(distances,) sums over the images of the products of their pixels so far apart."""
-        shape = _padded(images.shape[1:])
+        shape = padded(images.shape[1:], REACH_PX)
         lags = fft.irfft2((np.abs(fft.rfft2(images, s=shape)) ** 2).sum(axis=0), s=shape)
         return np.array([lags[ring.index].sum() for ring in self.rings])
 
@@ -88,7 +88,7 @@ class _Window:
         is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
         times the autocorrelation at that lag, whatever it is.
         """
-        shape = _padded(self.used.shape)
+        shape = padded(self.used.shape, REACH_PX)
         spectra = np.conj(fft.rfft2(self.taken, s=shape))
         index = np.arange(-REACH_PX, REACH_PX + 1)
         left = []
@@ -131,11 +131,6 @@ def _rings(farthest_px: float) -> list[_Ring]:
         if down**2 + right**2 <= farthest_px**2:
             by_square.setdefault(down**2 + right**2, []).append((down, right))
     return [_Ring(tuple(lags)) for _, lags in sorted(by_square.items())]
-
-
-def _padded(shape: tuple[int, ...]) -> list[int]:
-    """The size of a transform in which lags up to the reach do not run into one another."""
-    return [fft.next_fast_len(size + REACH_PX, real=True) for size in shape]
 
 
 @cache

@@ -8,6 +8,7 @@ last steps and gives the covariance (generalised least squares).
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from measure.grain import grain_model
 from measure.match_options import MatchOptions
 from measure.noise import is_textured, noise_model
 from measure.picture_fit import PictureFit
-from measure.picture_model import GREY, PictureModel, background_px
+from measure.picture_model import GREY, PictureModel, State, background_px
 from measure.rendering import extent_px
 from measure.shapes import Mark
 
@@ -91,46 +92,78 @@ def match(
     blank = np.zeros_like(usable) if is_lossy else usable & (sides == 0)
     start = np.array(pixel_from_mark, dtype=float)
     start[:, 2] -= origin_px
-    result = _matched(np.where(usable, grey, 0.0), usable, sides, blank, mark, start, options)
-    if result.converged and options.margin_blurs * result.blur_px > options.margin_px:
-        # The blur spreads the mark beyond its margin.
-        wide = replace(options, blur_px=result.blur_px, margin_px=options.margin_blurs * result.blur_px)
-        result = _matched(np.where(usable, grey, 0.0), usable, sides, blank, mark, start, wide)
-    moved = np.array(result.pixel_from_mark)
-    moved[:, 2] += origin_px
-    return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
-
-
-def _matched(
-    window: Array, usable: Mask, sides: Sides, blank: Mask, mark: Mark, start: Array, options: MatchOptions
-) -> Match:
-    """The match in the whole window's own pixels: fitted in the part about the mark, its noise told by the rest too,
-    where that may be blank film."""
-    rows, cols = _cropped(window.shape, mark, start, options)
-    grey, seen, ends, near = window[rows, cols], usable[rows, cols], sides[rows, cols], start.copy()
-    near[:, 2] -= cols.start, rows.start
-    fit = _fitted(PictureModel(grey, ends, mark, near, options), seen)
+    given = _Window(np.where(usable, grey, 0.0), usable, sides, mark, start)
+    part, fit = _fitted(given, options)
     if fit.reason or is_textured(fit.model.residuals, fit.telling):
-        # What is left of a clipped grey value without its surroundings is no limit of anything.
-        whole, coarse_px = np.zeros_like(ends), background_px(mark, near)
-        detail = _fitted(PictureModel(grey, whole, mark, near, options, coarse_px), seen & (ends == 0))
-        fit = fit if detail.reason else detail
+        detail_part, detail = _fitted(given, options, background_px(mark, start))
+        part, fit = (part, fit) if detail.reason else (detail_part, detail)
     free = blank.copy()
-    free[rows, cols] &= ~fit.area
-    result = _result(fit, window, free)
+    free[part.rows, part.cols] &= ~fit.area
+    result = _result(fit, given.grey, free)
     moved = np.array(result.pixel_from_mark)
-    moved[:, 2] += cols.start, rows.start
+    moved[:, 2] += part.corner_px + origin_px
     return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
 
 
-def _cropped(shape: tuple[int, ...], mark: Mark, start: Array, options: MatchOptions) -> tuple[slice, slice]:
-    """The rows and columns of a window that the fit can use."""
-    col0, row0, width, height = window_about(mark, start, options.margin_px + _SPARE_PX)
-    rows, cols = (
-        slice(min(max(first, 0), size - 1), max(first + count, 1))
-        for first, count, size in ((row0, height, shape[0]), (col0, width, shape[1]))
+class _Window(NamedTuple):
+    """What is given of the scan about a mark, which is expected at start (2, 3)."""
+
+    grey: Array
+    usable: Mask
+    sides: Sides
+    mark: Mark
+    start: Array
+
+
+class _Part(NamedTuple):
+    """The rows and columns of a window that a fit uses."""
+
+    rows: slice
+    cols: slice
+
+    @property
+    def corner_px(self) -> Array:
+        return np.array([self.cols.start, self.rows.start], dtype=float)
+
+
+def _fitted(window: _Window, options: MatchOptions, coarse_px: float | None = None) -> tuple[_Part, PictureFit]:
+    """The mark fitted, in the part of the window about it, in that part's pixels. coarse_px: of a background that does
+    not count, if one does not."""
+    part = _part(window, options)
+    fit = _begun(window, part, options, coarse_px)
+    fit.approach()
+    reach_px = options.margin_blurs * fit.model.blur_px
+    if not fit.reason and reach_px > options.margin_px:  # the blur spreads the mark beyond its margin
+        wide = replace(options, margin_px=reach_px)
+        narrow, part = part, _part(window, wide)
+        fit = _begun(window, part, wide, coarse_px, fit.model.state.moved(narrow.corner_px - part.corner_px))
+        fit.hold()
+    fit.refine()
+    return part, fit
+
+
+def _begun(
+    window: _Window, part: _Part, options: MatchOptions, coarse_px: float | None, state: State | None = None
+) -> PictureFit:
+    rows, cols = part
+    start, ends, usable = window.start.copy(), window.sides[rows, cols], window.usable[rows, cols]
+    start[:, 2] -= part.corner_px
+    if coarse_px is not None:
+        # What is left of a clipped grey value without its surroundings is no limit of anything.
+        usable, ends = usable & (ends == 0), np.zeros_like(ends)
+    return PictureFit(
+        PictureModel(window.grey[rows, cols], ends, window.mark, start, options, coarse_px, state), usable
     )
-    return rows, cols
+
+
+def _part(window: _Window, options: MatchOptions) -> _Part:
+    col0, row0, width, height = window_about(window.mark, window.start, options.margin_px + _SPARE_PX)
+    return _Part(
+        *(
+            slice(min(max(first, 0), size - 1), max(first + count, 1))
+            for first, count, size in zip((row0, col0), (height, width), window.grey.shape, strict=True)
+        )
+    )
 
 
 def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
@@ -139,12 +172,6 @@ def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[
     col0, row0 = np.floor(least - margin_px).astype(int)
     col1, row1 = np.ceil(greatest + margin_px).astype(int)
     return int(col0), int(row0), int(col1 - col0 + 1), int(row1 - row0 + 1)
-
-
-def _fitted(model: PictureModel, usable: Mask) -> PictureFit:
-    fit = PictureFit(model, usable)
-    fit.run()
-    return fit
 
 
 def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
@@ -160,9 +187,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         full, by_grey = fit.weigh(noise)
         covariance = full[:2, :2]
         gain_sigma = float(np.sqrt(max(full[-GREY, -GREY], 1e-12)))
-        edges = edge_place(
-            model.residuals, used, model.design, by_grey, noise, float(np.sqrt(model.state.variance_px2))
-        )
+        edges = edge_place(model.residuals, used, model.design, by_grey, noise, model.blur_px)
     state = model.state
     return Match(
         converged=not fit.reason,
@@ -172,7 +197,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         pixel_from_mark=state.pixel_from_mark,
         contrast_dn=float(state.greys[0]),
         noise_dn=float(np.sqrt(noise.variance_dn2)),
-        blur_px=float(np.sqrt(state.variance_px2)),
+        blur_px=model.blur_px,
         damaged_fraction=fit.damaged_fraction,
         redundancy=int(used.sum()) - len(model.design),
         neighbour_correlation=noise.neighbour_correlation,

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,10 +40,11 @@ def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
     variance = float((kept**2).sum() / max(count - unknowns, 1))
     if variance == 0.0:
         return NoiseModel(0.0, np.zeros((1, 1)), 0.0)
-    lags = _autocovariance(kept, used, REACH_PX) * (variance / max(float((kept**2).sum() / count), 1e-300))
-    correlation = float(lags[REACH_PX, REACH_PX + 1] + lags[REACH_PX + 1, REACH_PX]) / (2 * variance)
+    by_residuals = float((kept**2).sum() / count)
+    correlation = _covariance_along(kept, used, 1) / by_residuals
     if abs(correlation) < 3 / np.sqrt(2 * count):
         return NoiseModel(variance, np.array([[variance]]), correlation)
+    lags = _autocovariance(kept, used, REACH_PX) * (variance / by_residuals)
     return NoiseModel(variance, lags * _taper(REACH_PX), correlation)
 
 
@@ -52,9 +53,7 @@ def is_textured(residuals: Array, used: Mask) -> bool:
     kept = np.where(used, residuals, 0.0)
     if not kept.any():
         return False
-    lags = _autocovariance(kept, used, REACH_PX)
-    far = (lags[REACH_PX, 2 * REACH_PX] + lags[2 * REACH_PX, REACH_PX]) / 2
-    return bool(far > _TEXTURE * lags[REACH_PX, REACH_PX])
+    return bool(_covariance_along(kept, used, REACH_PX) > _TEXTURE * (kept**2).sum() / used.sum())
 
 
 def robust_scale(values: Array) -> float:
@@ -71,17 +70,32 @@ def _median(values: Array) -> float:
 
 def correlated(columns: Array, noise: NoiseModel) -> Array:
     """The noise's covariance matrix times images (n, height, width), without ever forming it."""
-    return np.stack(
-        [cv2.filter2D(image, cv2.CV_64F, noise.autocovariance_dn2, borderType=cv2.BORDER_CONSTANT) for image in columns]
-    )
+    height, width = columns.shape[1:]
+    reach = len(noise.autocovariance_dn2) // 2
+    shape = padded((height, width), reach)
+    kernel, index = np.zeros(shape), np.arange(-reach, reach + 1)
+    kernel[np.ix_(index, index)] = noise.autocovariance_dn2
+    smeared = fft.irfft2(fft.rfft2(columns, s=shape) * fft.rfft2(kernel).real, s=shape)
+    return np.asarray(smeared[:, :height, :width])
+
+
+def padded(shape: tuple[int, ...], reach: int) -> list[int]:
+    """The size of a transform in which lags up to the reach do not run into one another."""
+    return [fft.next_fast_len(size + reach, real=True) for size in shape]
+
+
+def _covariance_along(kept: Array, used: Mask, lag: int) -> float:
+    """The mean product at a lag along a row or a column."""
+    products = (kept[:, lag:] * kept[:, :-lag]).sum(), (kept[lag:] * kept[:-lag]).sum()
+    pairs = (used[:, lag:] & used[:, :-lag]).sum(), (used[lag:] & used[:-lag]).sum()
+    return float(sum(product / max(count, 1) for product, count in zip(products, pairs, strict=True)) / 2)
 
 
 def _autocovariance(kept: Array, used: Mask, reach: int) -> Array:
     """Mean products at all lags up to reach, averaged over opposite and mirrored lags: grain has no direction."""
-    pad = [(0, reach), (0, reach)]
-    values, ones = np.pad(kept, pad), np.pad(used.astype(float), pad)
-    products = np.fft.irfft2(np.abs(np.fft.rfft2(values)) ** 2, s=values.shape)
-    pairs = np.fft.irfft2(np.abs(np.fft.rfft2(ones)) ** 2, s=ones.shape)
+    shape = padded(kept.shape, reach)
+    spectra = np.abs(fft.rfft2(np.stack([kept, used]), s=shape)) ** 2
+    products, pairs = fft.irfft2(spectra, s=shape)
     index = np.arange(-reach, reach + 1)
     lags = (products / np.maximum(pairs, 1.0))[np.ix_(index, index)]
     lags = (lags + lags[:, ::-1]) / 2

@@ -37,8 +37,8 @@ class PictureFit:
         self.variance_dn2 = 1.0
         self.reason = ""
 
-    def run(self) -> None:
-        """Plain, then robust, then on what is undamaged; stops with a reason where something gives way."""
+    def approach(self) -> None:
+        """Plain, then robust; stops with a reason where something gives way."""
         self._choose_area()
         if not self.reason and np.ptp(self.model.grey[self.area]) == 0.0:
             self.reason = "the picture is even there: nothing stands out"
@@ -47,9 +47,16 @@ class PictureFit:
         if self.reason == _UNSETTLED:  # dust may keep squares from settling, and not what holds against it
             self.reason = ""
         if not self.reason:
-            self._choose_area()
+            self.hold()
+
+    def hold(self) -> None:
+        """Robust, from a state near the mark's."""
+        self._choose_area()
         if not self.reason:
             self._adjust(robust=True, tolerance_px=0.005)
+
+    def refine(self) -> None:
+        """On what is undamaged."""
         for round_ in range(self.options.damage_rounds):
             if self.reason:
                 return
@@ -167,10 +174,9 @@ class PictureFit:
                 return
             before, cost = model.state, self._cost(scale_dn)
             moved = model.step(step)
-            if moved < tolerance_px:
-                model.residuals = model.residuals - np.tensordot(step, model.design, axes=1)
-                return
             model.linearise(self.used)
+            if moved < tolerance_px:
+                return
             for _ in range(_HALVINGS):
                 if self._cost(scale_dn) <= cost:
                     break

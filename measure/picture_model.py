@@ -29,6 +29,7 @@ _BLUR_RANGE_PX = (0.3, 6.0)
 _BENT_PX = 0.05  # of the mark's outline: so far a series replaces a new drawing
 _PIXEL_VARIANCE_PX2 = 1 / 12
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
+_LINEAR_PX = 0.005  # within it a linearisation is as good as a new one: half its square is 1e-5 px
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +40,18 @@ class State:
     variance_px2: float
     greys: Array
 
+    def moved(self, shift_px: Array) -> "State":
+        """The same state where all places are (2,) px farther on; the greys are still to be fitted there."""
+        place = self.pixel_from_mark.copy()
+        place[:, 2] += shift_px
+        return State(place, self.variance_px2, np.zeros(GREY))
+
 
 class PictureModel:
     """The model at its present state: design (unknowns, height, width) and residuals (height, width). The unknowns are
     column and row, the generators' parameters, the blur's variance if it is estimated, and the greys.
 
+    start: where the mark is expected, and state, if given, what an earlier fit made of it.
     ground (3, height, width): offset and slopes of the background.
     clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
     values need; tells (height, width): False where a clipped one says nothing of it."""
@@ -56,6 +64,7 @@ class PictureModel:
         start: Array,
         options: MatchOptions,
         background_px: float | None = None,
+        state: State | None = None,
     ) -> None:
         self.mark, self.start, self.options = mark, start, options
         self.background_px = background_px
@@ -68,7 +77,8 @@ class PictureModel:
         self.blur = 2 + len(self.generators) if options.estimate_blur else None
         # A chip already has its scan's blur: where none is estimated, none is added.
         sharp = isinstance(mark, MarkTemplate) and not options.estimate_blur
-        self.state = State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
+        self.state = state or State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
+        self._linearised: tuple[State, Array] | None = None  # the state of the design, and its residuals
         self.drawn = start[:, :2].copy()
         self.reach_px = float(np.hypot(*np.abs(np.array(extent_px(mark, start)) - start[:, 2]).max(axis=0)))
         self.mark_from_start: Array = np.linalg.inv(start[:, :2]).astype(float)
@@ -77,10 +87,17 @@ class PictureModel:
         self.design = np.zeros((2 + len(self.generators) + options.estimate_blur + GREY, *grey.shape))
 
     def linearise(self, used: Mask) -> None:
-        """Design and residuals of the present state; the greys from a linear fit to what is used, at first."""
+        """Design and residuals of the present state; the greys from a linear fit to what is used, at first. Close to
+        where the design was last computed it stays, and the residuals follow from it."""
+        if self._linearised is not None:
+            at, residuals = self._linearised
+            change = self._change(at)
+            if self._length_px(change) < _LINEAR_PX:
+                self.residuals = residuals - np.tensordot(change, self.design, axes=1)
+                return
         height, width = self.grey.shape
-        place, blur_px = self.state.pixel_from_mark, float(np.sqrt(self.state.variance_px2))
-        shown = self._shown(width, height, blur_px)
+        place = self.state.pixel_from_mark
+        shown = self._shown(width, height)
         greys = self.design[-GREY:]
         greys[0], greys[1:] = self._detail(shown.value), self.ground
         if not self.state.greys.any():
@@ -98,6 +115,31 @@ class PictureModel:
         columns *= -self.state.greys[0]
         self.residuals = self.grey - np.tensordot(self.state.greys, greys, axes=1)
         self._censor()
+        # What is clipped depends on the noise as well.
+        self._linearised = None if self.clipped.any() else (self.state, self.residuals)
+
+    def _change(self, before: State) -> Array:
+        """(unknowns,) from a state before to the present one, both alike."""
+        change = np.zeros(len(self.design))
+        place, linear = self.state.pixel_from_mark, before.pixel_from_mark[:, :2]
+        change[:2] = place[:, 2] - before.pixel_from_mark[:, 2]
+        change[self.linear] = self._parameters(place[:, :2] @ np.linalg.inv(linear) - np.eye(2))
+        if self.blur is not None:
+            change[self.blur] = self.state.variance_px2 - before.variance_px2
+        change[-GREY:] = self.state.greys - before.greys
+        return change
+
+    def _length_px(self, change: Array) -> float:
+        """How far a change moves the mark's outline, or blurs it."""
+        length = float(np.hypot(*change[:2])) + self.reach_px * float(np.abs(change[self.linear]).max(initial=0.0))
+        if self.blur is None:
+            return length
+        variance = self.state.variance_px2
+        return length + abs(float(np.sqrt(variance) - np.sqrt(variance - change[self.blur])))
+
+    def _parameters(self, change: Array) -> Array:
+        """The generators' parameters of a change (2, 2) of the linear part."""
+        return np.asarray(np.tensordot(self.generators, change) / 2)  # of two ones each
 
     def _censor(self) -> None:
         """Clipped grey values hold the model on their side of the limit only."""
@@ -107,6 +149,10 @@ class PictureModel:
             self.design[:, at] *= slopes
             self.tells[at] = tells(slopes)
 
+    @property
+    def blur_px(self) -> float:
+        return float(np.sqrt(self.state.variance_px2))
+
     def place_drawn(self) -> Array:
         """(2, 3) the present place of the mark as it was last drawn: its linear part is close to the present one."""
         place = self.state.pixel_from_mark
@@ -115,9 +161,9 @@ class PictureModel:
             self.drawn = place[:, :2].copy()
         return np.column_stack([self.drawn, place[:, 2]])
 
-    def _shown(self, width: int, height: int, blur_px: float) -> Rendering:
+    def _shown(self, width: int, height: int) -> Rendering:
         place = self.place_drawn()
-        shown = render(self.mark, place, width, height, blur_px)
+        shown = render(self.mark, place, width, height, self.blur_px)
         change = self.state.pixel_from_mark[:, :2] @ np.linalg.inv(self.drawn) - np.eye(2)
         return shown.bent(change, place[:, 2], self.state.variance_px2 + _PIXEL_VARIANCE_PX2) if change.any() else shown
 
@@ -153,7 +199,7 @@ class PictureModel:
     def departures(self) -> Array:
         """How far the parameters under a prior are from where they started."""
         departures = np.zeros(len(self.design))
-        departures[self.linear] = np.tensordot(self.generators, self._distortion()) / 2  # of two ones each
+        departures[self.linear] = self._parameters(self._distortion())
         return departures
 
     def ran_away(self) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from measure.noise import NoiseModel
+from measure.noise import NoiseModel, padded
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -54,11 +54,10 @@ class _Covariance:
         reach = noise.autocovariance_dn2.shape[0] // 2
         self.used = used.astype(np.float32)
         self.scale_dn2 = noise.variance_dn2
-        self.shape = tuple(fft.next_fast_len(size + reach, real=True) for size in used.shape)
-        padded = np.zeros(self.shape, np.float32)
-        index = np.arange(-reach, reach + 1)
-        padded[np.ix_(index, index)] = noise.autocovariance_dn2 / self.scale_dn2
-        spectrum = np.asarray(fft.rfft2(padded).real, np.float32)
+        self.shape = padded(used.shape, reach)
+        kernel, index = np.zeros(self.shape, np.float32), np.arange(-reach, reach + 1)
+        kernel[np.ix_(index, index)] = noise.autocovariance_dn2 / self.scale_dn2
+        spectrum = np.asarray(fft.rfft2(kernel).real, np.float32)
         self.spectrum: Single = np.asarray(np.maximum(spectrum, white_dn2 / self.scale_dn2), np.float32)
 
     def times(self, images: Single) -> Single:
