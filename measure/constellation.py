@@ -5,25 +5,21 @@ Places are complex numbers here, x + iy in mm of the scan's own axes (right, up)
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from measure.candidates import Map, Responses, peaks
+from measure.candidates import Responses
 from measure.poses import up_from_camera
+from measure.response_layers import Layer, Reach, narrowed
 from measure.shapes import LayoutMark, Mark
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_LEAST_RESPONSE = 0.2  # of a candidate
 _LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
-_CANDIDATES = 100  # of each look
 _PAIRS = 60  # of marks that hypotheses are made from
-_NARROWED = 0.7  # of the tolerance, once a placement is refined
 _KEPT = 12  # placements of a pose that are refined
 _SLID = 3  # of them, in a lattice, that are moved by its steps
 _NEIGHBOURS = 4  # of a mark of a lattice
@@ -117,7 +113,7 @@ class PlacementSearch:
         self.pitch = np.asarray(pitch_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, 1.5)
         self.layers = {
-            key: _Layer(map_, responses.origin(key[0]), self.tolerance_px) for key, map_ in responses.maps.items()
+            key: Layer(map_, responses.origin(key[0]), self.tolerance_px) for key, map_ in responses.maps.items()
         }
 
     def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:
@@ -135,57 +131,10 @@ class PlacementSearch:
         return _different(found, self.marks, self.bounds.misfit_mm / float(self.pitch[0]))
 
 
-class _Layer:
-    """The responses to one look, and what is asked of them in every pose."""
-
-    def __init__(self, map_: Map, origin: NDArray[np.int_], tolerance_px: float) -> None:
-        self.map, self.origin, self.tolerance_px = map_, origin, tolerance_px
-
-    @cached_property
-    def candidates(self) -> Array:
-        """(n, 2) px of the reduced scan."""
-        return peaks(self.map, _CANDIDATES, _LEAST_RESPONSE)[0] + self.origin
-
-    @cached_property
-    def wide(self) -> "_Reach":
-        return _Reach(self.map, self.origin, self.tolerance_px)
-
-    @cached_property
-    def near(self) -> "_Reach":
-        return _Reach(self.map, self.origin, max(_NARROWED * self.tolerance_px, 1.5))
-
-    def highest(self, place: Array, radius_px: float) -> tuple[Array, float]:
-        """The highest response about a place (2,) of the reduced scan, and how high; 0 outside of the map."""
-        top, height = _highest(self.map, place - self.origin, radius_px)
-        return top + self.origin, height
-
-
-class _Reach:
-    """The highest response within a radius of every place, and what chance places answer: nineteen in twenty of them
-    stay below it."""
-
-    def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float) -> None:
-        self.map, self.origin = _dilated(map_, radius_px), origin
-        self.chance = max(float(np.percentile(self.map[::3, ::3], 95)), 0.0)
-
-    def share(self, height: float) -> float:
-        """Of all places, those that answer as strongly."""
-        return float(np.mean(self.map >= height))
-
-    def strength(self, places: NDArray[np.int_]) -> tuple[Array, NDArray[np.bool_]]:
-        """How much the places (n, 2) of the reduced scan answer beyond chance, and which of them lie in the map; those
-        that do not have no answer."""
-        rows, cols = self.map.shape
-        col, row = (places - self.origin).T
-        inside = (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
-        response = np.where(inside, self.map[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0.0).astype(float)
-        return np.maximum(np.maximum(response, 0.0) ** 2 - self.chance**2, 0.0), inside
-
-
 class _Constellation:
     """The marks as one pose names them, each with the layer that answers to it."""
 
-    def __init__(self, search: PlacementSearch, pose: str, layers: Sequence[_Layer]) -> None:
+    def __init__(self, search: PlacementSearch, pose: str, layers: Sequence[Layer]) -> None:
         self.search, self.pose, self.layers = search, pose, layers
         self.responses, self.bounds, self.pitch = search.responses, search.bounds, search.pitch
         turned = np.array([mark.xy_mm for mark in search.marks]) @ up_from_camera(pose).T
@@ -196,29 +145,27 @@ class _Constellation:
         if len(scale) == 0:
             return []
         scores, _ = self._scores([layer.wide for layer in self.layers], scale, offset)
-        near = [layer.near for layer in self.layers]
-        result: list[Placement] = []
         kept = np.argsort(-scores, kind="stable")[:_KEPT]
-        for start in (
-            *zip(scale[kept], offset[kept], strict=True),
-            *self._slid(scale[kept[:_SLID]], offset[kept[:_SLID]]),
-        ):
-            a, b = self._refined(*map(complex, start))
-            score, supported = self._scores(near, np.array([a]), np.array([b]))
-            result.append(
-                Placement(
-                    self.pose,
-                    self._pixel_from_camera(a, b),
-                    float(score[0]),
-                    int(supported[0]),
-                    polarity,
-                    self.responses.reduction,
-                    (float(self.pitch[0]), float(self.pitch[1])),
-                )
+        slid = self._slid(scale[kept[:_SLID]], offset[kept[:_SLID]])
+        starts = (np.concatenate(each) for each in zip((scale[kept], offset[kept]), slid, strict=True))
+        scale, offset = self._refined(*starts)
+        scores, supported = self._scores([layer.near for layer in self.layers], scale, offset)
+        return [
+            Placement(
+                self.pose,
+                self._pixel_from_camera(a, b),
+                score,
+                count,
+                polarity,
+                self.responses.reduction,
+                (float(self.pitch[0]), float(self.pitch[1])),
             )
-        return result
+            for a, b, score, count in zip(
+                scale.tolist(), offset.tolist(), scores.tolist(), supported.tolist(), strict=True
+            )
+        ]
 
-    def _slid(self, scale: Complex, offset: Complex) -> list[tuple[complex, complex]]:
+    def _slid(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
         """Of a lattice too large for all its marks to be candidates the best hypothesis may be many steps off: these,
         moved step by step as long as more marks answer. None where the marks are no lattice."""
         steps = np.concatenate([[0.0], self._steps()])
@@ -230,7 +177,7 @@ class _Constellation:
             best = scores.argmax(axis=1)
             moving = bool(best.any())
             offset = tried[np.arange(len(best)), best]
-        return list(zip(scale, offset, strict=True)) if len(steps) > 1 else []
+        return (scale, offset) if len(steps) > 1 else (scale[:0], offset[:0])
 
     def _steps(self) -> Complex:
         """The steps (mm) from the middle mark to the nearest ones that take most marks to others."""
@@ -254,13 +201,13 @@ class _Constellation:
         """Every similarity within bounds that takes two marks to two of their candidates."""
         candidates = {layer: self._complex(self.responses.scan_px(layer.candidates)) for layer in set(self.layers)}
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
+        upright = np.cos(self.bounds.rotation_rad)
         for first, second in self._pairs():
             of_first, of_second = candidates[self.layers[first]], candidates[self.layers[second]]
             base = self.camera[second] - self.camera[first]
             scale = (of_second[None, :] - of_first[:, None]) / base
-            allowed = (np.abs(np.abs(scale) - 1) < self.bounds.scale_tolerance) & (
-                np.abs(np.angle(scale)) < self.bounds.rotation_rad
-            )
+            size = np.abs(scale)
+            allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (scale.real > upright * size)
             i, j = np.nonzero(allowed)
             scales.append(scale[i, j])
             offsets.append(of_first[i] - scale[i, j] * self.camera[first])
@@ -275,7 +222,7 @@ class _Constellation:
         chosen = far[(np.arange(min(len(far), _PAIRS)) * step).astype(int)]
         return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
 
-    def _scores(self, reached: Sequence[_Reach], scale: Complex, offset: Complex) -> tuple[Array, Array]:
+    def _scores(self, reached: Sequence[Reach], scale: Complex, offset: Complex) -> tuple[Array, Array]:
         """Scores and numbers of supporting marks of many placements at once."""
         places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
         nearest = np.rint(places).astype(int)
@@ -284,50 +231,26 @@ class _Constellation:
         score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
         return score, (strength > 0).sum(axis=1)
 
-    def _refined(self, scale: complex, offset: complex) -> tuple[complex, complex]:
-        """The similarity through the responses about its predictions, each weighed by its strength."""
+    def _refined(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
+        """The similarities (n,) through the responses about their predictions, each weighed by its strength."""
         widest = self.search.tolerance_px
-        for tolerance_px in (widest, max(_NARROWED * widest, 1.5)):
-            predicted = self.responses.reduced_px(self._scan_px(scale * self.camera + offset))
-            found = [layer.highest(place, tolerance_px) for layer, place in zip(self.layers, predicted, strict=True)]
-            weight = np.array([max(height - _LEAST_WEIGHED, 0.0) for _, height in found])
-            if (weight > 0).sum() < 2:
-                break
-            places = self._complex(self.responses.scan_px(np.array([place for place, _ in found])))
-            mean_from, mean_to = (np.sum(weight * p) / weight.sum() for p in (self.camera, places))
-            from_, to = self.camera - mean_from, places - mean_to
-            scale = complex(np.sum(weight * np.conj(from_) * to) / np.sum(weight * np.abs(from_) ** 2))
-            offset = complex(mean_to - scale * mean_from)
+        scale, offset = scale.copy(), offset.copy()
+        moving = np.ones(len(scale), dtype=bool)
+        for tolerance_px in (widest, narrowed(widest)):
+            predicted = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
+            found = [layer.highest(predicted[:, k], tolerance_px) for k, layer in enumerate(self.layers)]
+            tops, heights = (np.stack(each, axis=1) for each in zip(*found, strict=True))
+            weight = np.maximum(heights - _LEAST_WEIGHED, 0.0)
+            moving &= (weight > 0).sum(axis=1) >= 2
+            weight, places = weight[moving], self._complex(self.responses.scan_px(tops[moving]))
+            total = weight.sum(axis=1)
+            mean_from, mean_to = ((weight * p).sum(axis=1) / total for p in (self.camera, places))
+            from_, to = self.camera - mean_from[:, None], places - mean_to[:, None]
+            scale[moving] = (weight * np.conj(from_) * to).sum(axis=1) / (weight * np.abs(from_) ** 2).sum(axis=1)
+            offset[moving] = mean_to - scale[moving] * mean_from
         return scale, offset
 
     def _pixel_from_camera(self, scale: complex, offset: complex) -> Array:
         turn = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ up_from_camera(self.pose)
         up = np.column_stack([turn, [offset.real, offset.imag]])
         return np.asarray(np.diag([1.0, -1.0]) @ up / self.pitch[:, None])
-
-
-def _dilated(map_: Map, radius_px: float) -> Map:
-    size = 2 * round(radius_px) + 1
-    return np.asarray(cv2.dilate(map_, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))))
-
-
-def _highest(map_: Map, place: Array, radius_px: float) -> tuple[Array, float]:
-    """The highest response about a place, refined by a parabola; height 0 outside of the map."""
-    rows, cols = map_.shape
-    col0, row0 = np.clip(np.floor(place - radius_px).astype(int), 0, None)
-    col1, row1 = np.clip(np.ceil(place + radius_px).astype(int) + 1, None, (cols, rows))
-    if col0 >= col1 or row0 >= row1:
-        return place, 0.0
-    part = map_[row0:row1, col0:col1]
-    best = divmod(int(part.argmax()), part.shape[1])
-    row, col = best[0] + int(row0), best[1] + int(col0)
-    top = np.array([col, row], dtype=float)
-    if 0 < col < cols - 1 and 0 < row < rows - 1:
-        top += [_vertex(map_[row, col - 1 : col + 2]), _vertex(map_[row - 1 : row + 2, col])]
-    return top, float(map_[row, col])
-
-
-def _vertex(three: Map) -> float:
-    """Where the parabola through three values, the middle one the highest, has its top: -0.5 to 0.5."""
-    bend = float(three[0] - 2 * three[1] + three[2])
-    return float(np.clip((three[0] - three[2]) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0

@@ -105,7 +105,8 @@ class FrameSearch:
         for index, place in seen_px.items():
             sign = sign_of(self.layout.marks[index].mark, placement.polarity)
             layer = searched.search.layers[searched.looks[placement.pose][index], sign]
-            shares.append(layer.wide.share(layer.highest(searched.search.responses.reduced_px(place), reach_px)[1]))
+            _, heights = layer.highest(searched.search.responses.reduced_px(place)[None], reach_px)
+            shares.append(layer.wide.share(float(heights[0])))
         counts = np.arange(min(3, inside), len(shares) + 1)
         if len(counts) == 0:
             return np.inf

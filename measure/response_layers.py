@@ -1,0 +1,106 @@
+"""The responses to one look of a mark, and what a constellation asks of them: their highest places, and how strongly
+they answer about any place."""
+
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.candidates import Map, peaks
+
+Array = NDArray[np.float64]
+
+_LEAST_RESPONSE = 0.2  # of a candidate
+_CANDIDATES = 100  # of each look
+_NARROWED = 0.7  # of the tolerance, once a placement is refined
+
+
+def narrowed(tolerance_px: float) -> float:
+    """The tolerance of a refined placement."""
+    return max(_NARROWED * tolerance_px, 1.5)
+
+
+class Layer:
+    """The responses to one look, and what is asked of them in every pose."""
+
+    def __init__(self, map_: Map, origin: NDArray[np.int_], tolerance_px: float) -> None:
+        self.map, self.origin, self.tolerance_px = map_, origin, tolerance_px
+
+    @cached_property
+    def candidates(self) -> Array:
+        """(n, 2) px of the reduced scan."""
+        return peaks(self.map, _CANDIDATES, _LEAST_RESPONSE)[0] + self.origin
+
+    @cached_property
+    def wide(self) -> "Reach":
+        return Reach(self.map, self.origin, self.tolerance_px)
+
+    @cached_property
+    def near(self) -> "Reach":
+        return Reach(self.map, self.origin, narrowed(self.tolerance_px))
+
+    def highest(self, places: Array, radius_px: float) -> tuple[Array, Array]:
+        """The highest responses about places (n, 2) of the reduced scan, and (n,) how high; 0 outside of the map."""
+        tops, heights = _highest(self.map, places - self.origin, radius_px)
+        return tops + self.origin, heights
+
+
+class Reach:
+    """The highest response within a radius of every place, and what chance places answer: nineteen in twenty of them
+    stay below it."""
+
+    def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float) -> None:
+        self.map, self.origin = _dilated(map_, radius_px), origin
+        self.chance = max(float(np.percentile(self.map[::3, ::3], 95)), 0.0)
+
+    def share(self, height: float) -> float:
+        """Of all places, those that answer as strongly."""
+        return float(np.mean(self.map >= height))
+
+    def strength(self, places: NDArray[np.int_]) -> tuple[Array, NDArray[np.bool_]]:
+        """How much the places (n, 2) of the reduced scan answer beyond chance, and which of them lie in the map; those
+        that do not have no answer."""
+        rows, cols = self.map.shape
+        col, row = (places - self.origin).T
+        inside = (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
+        response = np.where(inside, self.map[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0.0).astype(float)
+        return np.maximum(np.maximum(response, 0.0) ** 2 - self.chance**2, 0.0), inside
+
+
+def _dilated(map_: Map, radius_px: float) -> Map:
+    size = 2 * round(radius_px) + 1
+    return np.asarray(cv2.dilate(map_, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))))
+
+
+def _highest(map_: Map, places: Array, radius_px: float) -> tuple[Array, Array]:
+    """The highest responses within a square about places (n, 2), refined by parabolas, and (n,) how high; 0 outside of
+    the map."""
+    size = np.array(map_.shape[::-1])
+    low = np.clip(np.floor(places - radius_px).astype(int), 0, None)
+    high = np.clip(np.ceil(places + radius_px).astype(int) + 1, None, size)
+    within = (low < high).all(axis=1)
+    tops, heights = places.astype(float), np.zeros(len(places))
+    if not within.any():
+        return tops, heights
+    low, high = low[within], high[within]
+    col, row = (low[:, axis, None] + np.arange((high - low)[:, axis].max()) for axis in (0, 1))
+    part = map_[np.minimum(row, size[1] - 1)[:, :, None], np.minimum(col, size[0] - 1)[:, None, :]]
+    part = np.where((row < high[:, 1, None])[:, :, None] & (col < high[:, 0, None])[:, None, :], part, -np.inf)
+    best_row, best_col = np.divmod(part.reshape(len(part), -1).argmax(axis=1), part.shape[2])
+    top = low + np.column_stack([best_col, best_row])
+    heights[within] = map_[top[:, 1], top[:, 0]]
+    inner = ((top > 0) & (top < size - 1)).all(axis=1)
+    col, row = top[inner].T
+    off = np.zeros(top.shape)
+    off[inner, 0] = _vertex(map_[row, col - 1], map_[row, col], map_[row, col + 1])
+    off[inner, 1] = _vertex(map_[row - 1, col], map_[row, col], map_[row + 1, col])
+    tops[within] = top + off
+    return tops, heights
+
+
+def _vertex(before: Map, middle: Map, after: Map) -> Array:
+    """Where parabolas through three values each, the middle one the highest, have their tops: -0.5 to 0.5."""
+    bend = before - 2 * middle + after
+    at = np.divide(before - after, 2 * bend, out=np.zeros(len(bend)), where=bend < 0)
+    return np.asarray(np.clip(at, -0.5, 0.5))
