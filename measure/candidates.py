@@ -82,7 +82,7 @@ def respond(scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1))
         for detail in sorted(set(details)):
             image = flattened(around, detail, scan.full_scale_dn * FAINT)
             for kind in (kind for kind, own in enumerate(details) if own == detail):
-                _strongest(maps, kind, signs, _within(_correlated(image, kinds[kind], detail), grey.shape))
+                _strongest(maps, kind, signs, _within(correlated(image, kinds[kind], detail), grey.shape))
     return Responses(maps, reduction), index
 
 
@@ -107,7 +107,7 @@ def respond_about(
             grey = scan.reduced_window(reduction, col0, row0, size + 2 * half, size + 2 * half, weights)
             image = flattened(grey, detail, scan.full_scale_dn * FAINT)
             for kind, shape in ((kind, shape) for kind, (own, shape) in enumerate(kinds) if own == corner):
-                _strongest(maps, kind, signs, _within(_correlated(image, shapes[shape], detail), (size, size)))
+                _strongest(maps, kind, signs, _within(correlated(image, shapes[shape], detail), (size, size)))
         return maps
 
     every = {key: map_ for maps in scan.each(at_corner, range(len(corners))) for key, map_ in maps.items()}
@@ -137,18 +137,9 @@ def detail_px(mark: Mark, linear: Array) -> float:
     return max(float(np.sqrt(abs(np.linalg.det(linear)))) * thinnest_mm(mark), 1.0)
 
 
-def correlate(grey: NDArray[np.floating], template: Array, detail_px: float, faint_dn: float) -> Map:
-    """Normalised correlation of the template with grey values, where it lies wholly inside.
-
-    Both are freed of everything much coarser than the mark's finest detail (detail_px), and strong contrasts are
-    clipped, so that a thin cross on a landscape answers as on an even ground. Contrasts of faint_dn or below count for
-    less. Only pixels about the drawing count: beside it may lie the frame's edge, or writing.
-    """
-    return _correlated(flattened(np.asarray(grey, np.float32), detail_px, faint_dn), template, detail_px)
-
-
 def flattened(image: Map, detail_px: float, faint_dn: float) -> Map:
-    """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel.
+    """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel: a thin
+    cross on a landscape answers as on an even ground. Contrasts of faint_dn or below count for less.
 
     The ground is a median, which keeps the frame's edge: a mean would spread it over the marks beside it, and drown
     those that are faint.
@@ -183,20 +174,26 @@ def _enlarged(small: NDArray[np.integer | np.floating], image: Map) -> Map:
     return np.asarray(cv2.resize(small, image.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _correlated(image: Map, template: Array, detail_px: float) -> Map:
-    """The normalised correlation with a flattened picture, wherever the template lies inside of it.
+def correlated(image: Map, template: Array, detail_px: float) -> Map:
+    """The normalised correlation with a flattened picture, wherever the template lies inside of it. Only pixels about
+    the drawing count: beside it may lie the frame's edge, or writing.
 
     OpenCV's own correlation under a mask gives the same for three times the price.
     """
-    about = _about(template, detail_px)
-    chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), _COARSE * detail_px), np.float32)
-    chip = about * (chip - np.average(chip, weights=about))
+    chip, about = pattern(template, detail_px)
     sums, squares, products = (
         cv2.matchTemplate(each, part, cv2.TM_CCORR) for each, part in ((image, about), (image**2, about), (image, chip))
     )
     spread = (squares - sums**2 / about.sum()) * np.sum(chip**2)
     least = _EVEN * about.sum() * np.sum(chip**2)  # nothing but even ground is no answer
     return np.asarray(np.where(spread > least, products / np.sqrt(np.maximum(spread, least)), 0.0), np.float32)
+
+
+def pattern(template: Array, detail_px: float) -> tuple[Map, Map]:
+    """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts."""
+    about = _about(template, detail_px)
+    chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), _COARSE * detail_px), np.float32)
+    return about * (chip - np.average(chip, weights=about)), about
 
 
 def _about(template: Array, detail_px: float) -> Map:

@@ -13,8 +13,8 @@ from scipy import stats
 
 from measure.constellation import sign_of
 from measure.fiducial_options import FiducialOptions
+from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, REDUCED_PX, Frame
-from measure.refinement import strongest
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
 

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from measure.channels import best_weights
 from measure.constellation import Placement, sign_of
 from measure.fiducial_options import FiducialOptions
+from measure.first_look import strongest
 from measure.frame_fit import fit_frame, strangers
 from measure.glimpse import Glimpse, glimpse
 from measure.matching import Match
 from measure.poses import up_from_camera
-from measure.refinement import Sighting, leans_on_frame, sight, strongest
+from measure.refinement import Sighting, leans_on_frame, sight
 from measure.rendering import extent_px
 from measure.scan import LUMINANCE, Scan
 from measure.shapes import FiducialLayout, FrameCorner, Mark

@@ -7,19 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.blank_film import BESIDE_PX
-from measure.candidates import FAINT, correlate, detail_px
+from measure.candidates import FAINT
 from measure.clipping import clipped_sides
 from measure.compression import with_loss
+from measure.first_look import seen
 from measure.frame_corner import corner_of_edges
 from measure.matching import Match, MatchOptions, match, window_about
-from measure.rendering import extent_px, picture
 from measure.scan import Scan
 from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
 
 Array = NDArray[np.float64]
 
 _LEANING_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
-_LEAST_RESPONSE = 0.15  # correlation below it is not worth a fit: bare texture answers as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,37 +77,16 @@ def _fitted(
     """The mark matched where it looks most like itself; None where nothing looks like it."""
     if isinstance(mark, FrameCorner):
         return corner_of_edges(scan, mark, pixel_from_mark, search_px, polarity, weights)
-    start = np.array(pixel_from_mark)
-    start[:, 2], height = strongest(scan, mark, pixel_from_mark, search_px, polarity, weights)
-    if height < _LEAST_RESPONSE:
+    center_px = seen(scan, mark, pixel_from_mark, search_px, polarity, weights)
+    if center_px is None:
         return None
+    start = np.column_stack([pixel_from_mark[:, :2], center_px])
     col0, row0, width, tall = window_about(mark, start, options.margin_px + BESIDE_PX)
     window = scan.window(col0, row0, width, tall, weights).astype(float)
     valid = _inside_scan(scan, col0, row0, width, tall)
     clipped = clipped_sides(scan, col0, row0, width, tall, weights)
     own = _options_for(mark, options, frame_sigma)
     return match(window, (col0, row0), mark, start, own, valid, clipped, scan.is_lossy)
-
-
-def strongest(
-    scan: Scan, mark: Mark, pixel_from_mark: Array, search_px: float, polarity: int, weights: Sequence[float] | None
-) -> tuple[Array, float]:
-    """The scan's pixel (col, row) within the search radius where the mark correlates best, and how well."""
-    col0, row0, width, tall = window_about(mark, pixel_from_mark, search_px + 4)
-    window = scan.window(col0, row0, width, tall, weights)
-    centred = np.column_stack([pixel_from_mark[:, :2], np.zeros(2)])
-    least, greatest = extent_px(mark, centred)
-    low, high = np.floor(least).astype(int) - 2, np.ceil(greatest).astype(int) + 2
-    centred[:, 2] = -low
-    size = high - low + 1
-    template = picture(mark, centred, int(size[0]), int(size[1]), 1.0)
-    faint_dn = scan.full_scale_dn * FAINT
-    response = polarity * correlate(window, template, detail_px(mark, pixel_from_mark[:, :2]), faint_dn)
-    place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)
-    place += np.array([col0, row0]) - low
-    near = np.hypot(*np.moveaxis(place - pixel_from_mark[:, 2], -1, 0)) <= search_px
-    best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
-    return np.asarray(place[best]), float(response[best])
 
 
 def _inside_scan(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:

@@ -1,0 +1,97 @@
+"""Where near its predicted place a mark looks most like itself, at full resolution, and whether noise would look so."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from measure.candidates import FAINT, correlated, detail_px, flattened, pattern
+from measure.matching import window_about
+from measure.rendering import extent_px, picture
+from measure.scan import Scan
+from measure.shapes import Mark
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+
+_CHANCE = 0.05  # of noise as coarse as the window's: what is likelier is not worth a fit
+_SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
+
+
+def seen(
+    scan: Scan, mark: Mark, pixel_from_mark: Array, search_px: float, polarity: int, weights: Sequence[float] | None
+) -> Array | None:
+    """The scan's pixel (col, row) within the search radius where the mark correlates best, drawn sharp or else soft;
+    None where noise would do so as well."""
+    for blur_px in (_SHARP_PX, _SOFT_PX):
+        look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, blur_px)
+        if look.chance() <= _CHANCE:
+            return look.center_px
+    return None
+
+
+def strongest(
+    scan: Scan, mark: Mark, pixel_from_mark: Array, search_px: float, polarity: int, weights: Sequence[float] | None
+) -> tuple[Array, float]:
+    """The scan's pixel (col, row) within the search radius where the mark correlates best, and how well."""
+    look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, _SHARP_PX)
+    return look.center_px, look.height
+
+
+@dataclass(init=False, eq=False)
+class _Look:
+    """center_px (2,): where the mark, drawn with that blur, correlates best; height: how well."""
+
+    center_px: Array
+    height: float
+
+    def __init__(
+        self,
+        scan: Scan,
+        mark: Mark,
+        pixel_from_mark: Array,
+        search_px: float,
+        polarity: int,
+        weights: Sequence[float] | None,
+        blur_px: float,
+    ) -> None:
+        spare = int(np.ceil(2 * blur_px))
+        col0, row0, width, tall = window_about(mark, pixel_from_mark, search_px + spare + 2)
+        centred = np.column_stack([pixel_from_mark[:, :2], np.zeros(2)])
+        least, greatest = extent_px(mark, centred)
+        low, high = np.floor(least).astype(int) - spare, np.ceil(greatest).astype(int) + spare
+        centred[:, 2] = -low
+        size = high - low + 1
+        finest_px = max(detail_px(mark, pixel_from_mark[:, :2]), blur_px)
+        template = picture(mark, centred, int(size[0]), int(size[1]), blur_px)
+        window = np.asarray(scan.window(col0, row0, width, tall, weights), np.float32)
+        self._flat = polarity * flattened(window, finest_px, scan.full_scale_dn * FAINT)
+        self._pattern, self._counts = pattern(template, finest_px)
+        response = correlated(self._flat, template, finest_px)
+        place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)
+        place += np.array([col0, row0]) - low
+        near = np.hypot(*np.moveaxis(place - pixel_from_mark[:, 2], -1, 0)) <= search_px
+        self._best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
+        self._places = int(near.sum())
+        self.center_px, self.height = np.asarray(place[self._best]), float(response[self._best])
+
+    def chance(self) -> float:
+        """The expected number of places that noise makes answer so well. The correlation of two rows of numbers, each
+        with its own autocorrelation, varies by the sum of the products of these over how many they are (Bartlett,
+        1935); that sum is what one answers to the other at all offsets."""
+        if self.height <= 0:
+            return float(self._places)
+        chip = self._pattern
+        noise = self._flat - self._flat.mean()
+        here = noise[self._best[0] :, self._best[1] :][: chip.shape[0], : chip.shape[1]]
+        here -= chip * np.float32((here * chip).sum() / (chip**2).sum())
+        rows, cols = chip.shape
+        beyond = np.pad(noise, ((rows - 1, rows - 1), (cols - 1, cols - 1)))
+        answers = cv2.matchTemplate(beyond, chip, cv2.TM_CCORR).astype(float)
+        energy = max(float((noise**2).sum() * (chip**2).sum()), 1e-12)
+        variance = max((answers**2).sum() / energy, 1e-12) / float(self._counts.sum())
+        unlike = max(1 - self.height**2, 1e-12)
+        return float(self._places * stats.norm.sf(self.height / np.sqrt(unlike * variance)))

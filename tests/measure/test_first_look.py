@@ -1,0 +1,38 @@
+"""What is worth a fit: marks in noise, and noise alone."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from true_marks import KIND, scan_of, some_mark
+
+from measure.fiducial_options import FiducialOptions
+from measure.first_look import seen
+from measure.refinement import sight
+
+GROUND, CONTRAST = 25000.0, 15000.0
+
+
+@pytest.mark.parametrize("texture_px", [0.0, 1.0, 3.0])
+def test_noise_is_rarely_worth_a_fit_however_coarse_it_is(texture_px: float) -> None:
+    rng = np.random.default_rng(1)
+    marks = [some_mark(KIND[name], 1.0, rng) for name in ("cross", "ring-dot", "dot")]
+    tries, answers = 20, 0
+    for mark in marks * tries:
+        noise = rng.standard_normal((mark.size, mark.size))
+        if texture_px:
+            noise = gaussian_filter(noise, texture_px) * texture_px * 3
+        answers += seen(scan_of(GROUND + 3000 * noise), mark.kind.shape, mark.place, 3.0, 1, None) is not None
+    assert answers <= 13  # of sixty at a twentieth, sharp or soft: more in one run of a thousand
+
+
+def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        mark = some_mark(KIND["gap cross"], 2.5, rng)
+        grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 5)
+        start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
+        fit = sight(scan_of(grey), mark.kind.shape, start, 3.0, 1, None, FiducialOptions().match).fit
+        assert fit is not None
+        error = fit.center_px - mark.place[:, 2]
+        assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
+        assert np.trace(fit.covariance_px2) < 1.5**2 * np.trace(mark.bound(0.2))
