@@ -1,22 +1,27 @@
 """Patches found in the whole frame in one pass over it, its blocks looked at side by side in several reductions."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 from math import lcm
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from measure.block import Block
 from measure.disk_patches import Candidate, strength
-from measure.scan import SEGMENT_PX, Scan
+from measure.radiometry import Samples
+from measure.scan import Scan
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-BLOCK_PX = 1536
+WIDEST_PX, TALLEST_PX = 8192, 1024  # of a block
+CELL_PX = 1536  # side of what is compared with its own texture, about
 
-Confirmed = Callable[[list[Candidate]], list[Candidate]]
+Confirmed = Callable[[Block, list[Candidate]], list[Candidate]]
 
 
 class Octave(Protocol):
@@ -34,52 +39,61 @@ class Octave(Protocol):
 def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | None = None) -> list[Candidate]:
     """The patches of all octaves in pixels of the scan, the strongest first, none within another.
 
-    confirmed: which of them are right, and where exactly, asked while the rows about them are still decoded.
-
-    The scan is taken in bands of rows, no higher than what stays decoded: a band is decoded and reduced first, by all
-    threads, then its blocks are looked at side by side.
+    confirmed: which of them are right, and where exactly, asked while the block about them is still decoded.
     """
     unit = lcm(*(octave.factor for octave in octaves))
-    reductions = reductions_of(scan, {octave.factor for octave in octaves})
-    margin = max(octave.margin_px for octave in octaves)
-    kept = min(factor * reduction.rows_kept for factor, reduction in reductions.items())
-    # Of a very wide scan tiles are rather decoded again for what is to be confirmed than rows reduced again as margins.
-    decoded = scan.rows_kept - SEGMENT_PX  # which a reduction may read beyond its rows
-    most = min(kept, max(decoded, 6 * margin)) - 2 * margin
-    width, height = (max(size // unit, 1) * unit for size in (BLOCK_PX, min(BLOCK_PX, most)))
+    margin = whole(max(octave.margin_px for octave in octaves), unit)
+    width, height = block_px(scan, unit, margin)
 
-    def in_block(block: tuple[Octave, int, int]) -> list[Candidate]:
-        octave, col0, row0 = block
-        factor, spare = octave.factor, octave.margin_px // octave.factor
-        col, row, cols, rows = (size // factor for size in (col0, row0, width, height))
-        small = reductions[factor].window(col - spare, row - spare, cols + 2 * spare, rows + 2 * spare)
-        found = []
-        for patch in octave.patches(small):
-            own = (patch.center_px - spare + 0.5) * factor
-            place = own + np.array([col0, row0])
-            if np.all((own >= 0) & (own < (width, height)) & (place <= (scan.width_px, scan.height_px))):
-                found.append(Candidate(place - 0.5, patch.pixel_from_disk * factor, patch.contrast_dn))
+    rows, cols = height + 2 * margin, width + 2 * margin
+    spare: list[Samples] = []  # new memory for every block would take longer than what is done in it
+
+    def in_block(corner: tuple[int, int]) -> list[Candidate]:
+        row0, col0 = (place - margin for place in corner)
+        memory = spare.pop() if spare else np.empty((rows, cols, scan.channels), scan.samples_dtype)
+        block = Block(scan, col0, row0, margin, scan.samples(col0, row0, cols, rows, memory))
+        found = separate(list(patches_in(block, octaves)))
+        found = confirmed(block, found) if confirmed else found
+        spare.append(memory)
         return found
 
-    found: list[Candidate] = []
-    for row0 in range(0, scan.height_px, height):
-        if height + 2 * margin <= decoded:
-            scan.decode(row0 - margin, row0 + height + margin)
-        for factor in sorted(reductions):
-            reductions[factor].decode((row0 - margin) // factor, (row0 + height + margin) // factor)
-        blocks = [(octave, col0, row0) for octave in octaves for col0 in range(0, scan.width_px, width)]
-        in_band = separate([patch for own in scan.each(in_block, blocks) for patch in own])
-        found += confirmed(in_band) if confirmed else in_band
-    return separate(found)
+    corners = product(range(0, scan.height_px, height), range(0, scan.width_px, width))
+    return separate([patch for own in scan.each(in_block, corners) for patch in own])
 
 
-def reductions_of(scan: Scan, factors: set[int]) -> dict[int, Scan]:
-    """The scan reduced by each factor, from the coarsest of the others that it divides."""
-    reductions = {1: scan}
-    for factor in sorted(factors):
-        finer = max(known for known in reductions if factor % known == 0)
-        reductions[factor] = reductions[finer].reduction(factor // finer)
-    return {factor: reductions[factor] for factor in factors}
+def block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:
+    """Width and height of blocks, in whole units. What all threads have in work stays decoded, so that neighbours
+    decode no more than their share; strips are taken whole."""
+    tall, wide = scan.segment_px
+    width = scan.width_px if wide >= scan.width_px else even_part(scan.width_px, WIDEST_PX, unit)
+    kept = scan.rows_kept * scan.width_px // width // max(cv2.getNumThreads(), 1) - 2 * margin - tall
+    return width, even_part(scan.height_px, min(max(kept, 2 * margin), TALLEST_PX), unit)
+
+
+def even_part(size: int, most: int, unit: int) -> int:
+    """Of parts of one size, in whole units, that are hardly longer than most."""
+    return whole(-(-size // -(-size // most)), unit)
+
+
+def whole(size: int, unit: int) -> int:
+    return -(-size // unit) * unit
+
+
+def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Candidate]:
+    """Those whose middles lie in the block, in pixels of the scan."""
+    reductions = block.reductions({octave.factor for octave in octaves})
+    width, height = (size - 2 * block.margin_px for size in block.size_px)
+    cell = even_part(width, CELL_PX, lcm(*reductions))
+    for octave, col0 in product(octaves, range(0, width, cell)):
+        factor, margin = octave.factor, octave.margin_px // octave.factor
+        size = np.array([min(cell, width - col0), height])
+        first = block.margin_px // factor - margin
+        left, cols, rows = first + col0 // factor, size[0] // factor + 2 * margin, size[1] // factor + 2 * margin
+        for patch in octave.patches(reductions[factor][first : first + rows, left : left + cols]):
+            own = (patch.center_px - margin + 0.5) * factor
+            place = own + np.array([block.col0 + block.margin_px + col0, block.row0 + block.margin_px])
+            if np.all((own >= 0) & (own < size) & (place <= (block.scan.width_px, block.scan.height_px))):
+                yield Candidate(place - 0.5, patch.pixel_from_disk * factor, patch.contrast_dn)
 
 
 def separate(found: list[Candidate]) -> list[Candidate]:

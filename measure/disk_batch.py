@@ -7,12 +7,12 @@ its place by nothing. Disks of about one size are adjusted together, pixel by pi
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from measure.block import Block
 from measure.disk_patches import Candidate, strength
 from measure.robust import tukey_weights
 from measure.scan import Scan
@@ -51,12 +51,10 @@ class _State:
         return _radius_px(self.shapes)
 
 
-def disks_among(scan: Scan, patches: Sequence[Candidate]) -> list[Candidate]:
+def disks_among(block: Block, patches: Sequence[Candidate]) -> list[Candidate]:
     """Those patches that a disk explains, in their order, as fitted: a place within a tenth of a pixel or so."""
-    hopeful = [
-        patches[index] for group in scan.each(partial(_hopeful, scan, patches), _alike(patches)) for index in group
-    ]
-    fitted = [patch for group in scan.each(partial(_fitted, scan, hopeful), _alike(hopeful)) for patch in group]
+    hopeful = [patches[index] for group in _alike(patches) for index in _hopeful(block, patches, group)]
+    fitted = [patch for group in _alike(hopeful) for patch in _fitted(block, hopeful, group)]
     return sorted(fitted, key=strength)
 
 
@@ -90,18 +88,18 @@ def _radius_px(shapes: Array) -> Array:
     return np.asarray(np.sqrt(np.abs(shapes[:, 0, 0] * shapes[:, 1, 1] - shapes[:, 0, 1] * shapes[:, 1, 0])))
 
 
-def _hopeful(scan: Scan, patches: Sequence[Candidate], chosen: list[int]) -> list[int]:
+def _hopeful(block: Block, patches: Sequence[Candidate], chosen: list[int]) -> list[int]:
     """Those of the chosen patches, of about one size, that already look like disks as their outlines have them."""
-    group = _Group.of(scan, [patches[index] for index in chosen], COARSE_PX)
+    group = _Group.of(block, [patches[index] for index in chosen], COARSE_PX)
     misfit = _misfit(
         _residuals(group.grey, _Model(group.grey, group.start).design, group.start), group.used, group.start
     )
     return [chosen[index] for index in np.flatnonzero(misfit < HOPELESS)]
 
 
-def _fitted(scan: Scan, patches: Sequence[Candidate], chosen: list[int]) -> list[Candidate]:
+def _fitted(block: Block, patches: Sequence[Candidate], chosen: list[int]) -> list[Candidate]:
     """The disks among the chosen patches, of about one size."""
-    group = _Group.of(scan, [patches[index] for index in chosen])
+    group = _Group.of(block, [patches[index] for index in chosen])
     state = _adjusted(group.grey, group.start, group.used)
     residuals = _residuals(group.grey, _Model(group.grey, state).design, state)
     is_disk = (_misfit(residuals, group.used, state) < 1.0) & _is_sane(state, group.start)
@@ -124,19 +122,20 @@ class _Group:
     start: _State
 
     @classmethod
-    def of(cls, scan: Scan, patches: list[Candidate], coarse_px: float = np.inf) -> "_Group":
+    def of(cls, block: Block, patches: list[Candidate], coarse_px: float = np.inf) -> "_Group":
         """With patches whose radii are all so large, only every other column and row."""
         shapes = _shapes(patches)
         half = int(np.ceil(_reach_px(shapes).max()))
         side, every = 2 * half + 1, 2 if _radius_px(shapes).min() >= coarse_px else 1
         places = np.array([patch.center_px for patch in patches])
-        corners = np.rint(places).astype(np.int64) - half
-        windows = [scan.window(col, row, side, side)[::every, ::every] for col, row in corners.tolist()]
+        inside = np.array(block.size_px) - side
+        corners = np.clip(np.rint(places).astype(np.int64) - half - block.place_px, 0, inside) + block.place_px
+        windows = [block.window(col, row, side, side)[::every, ::every] for col, row in corners.tolist()]
         grey, blur = np.stack(windows), np.full(len(patches), FIRST_BLUR_PX / every)
         state = _State((places - corners) / every, shapes / every, blur, np.zeros((len(patches), GREYS)))
         model = _Model(grey, state)
         used = model.distance > -_margin_px(shapes)[:, None, None] / every
-        used &= _in_scan(scan, corners, side)[:, ::every, ::every]
+        used &= _in_scan(block.scan, corners, side)[:, ::every, ::every]
         greys = _solved(model.design[:, -GREYS:], grey, used.astype(np.float32))
         return cls(corners, grey, used, replace(state, greys=greys))
 

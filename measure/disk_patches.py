@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 PEAK_OF_DISK = 2 / np.e  # of the scale-normalised Laplacian of a disk, in units of its contrast, at sigma = r / sqrt(2)
-RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale
+RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale...
+TEXTURE_PX = 1024  # ...where it is so large, px of the scan along a side: a smaller one may be full of disks
 WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, beside what noise makes of it
 NOISE_SIGMAS = 1.5  # by which that may exceed its expectation: it is that of many rays
 EDGE_PX = 2.5  # of an edge with a blur of a pixel: its whole height over its steepest slope
@@ -78,19 +79,22 @@ def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn:
     noise = fine_noise(small)
     return [
         Candidate(center, shape, sign * height)
-        for sign, own in blobs(small, radii, search, full_scale_dn)
+        for sign, own in blobs(small, radii, search, full_scale_dn, small.size * factor**2 >= TEXTURE_PX**2)
         for center, shape, height in round_ones(outlines_about(small if sign > 0 else -small, own), noise, factor)
     ]
 
 
-def blobs(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float) -> Iterator[tuple[int, Blobs]]:
-    """1 with the light ones and -1 with the dark ones, none so near to the border that its outline could be cut."""
+def blobs(
+    small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, is_textured: bool
+) -> Iterator[tuple[int, Blobs]]:
+    """1 with the light ones and -1 with the dark ones, none so near to the border that its outline could be cut.
+    is_textured: whether they have to stand out of the picture's own texture."""
     contrasts, levels = [], []
     for radius in radii:
         sigma = radius / np.sqrt(2)
         smooth = cv2.GaussianBlur(small, 2 * (2 * int(3 * sigma + 0.5) + 1,), sigma)
         contrasts.append(cv2.Laplacian(smooth, cv2.CV_32F, ksize=1, scale=-(sigma**2) / PEAK_OF_DISK))
-        texture = robust_scale(contrasts[-1][::8, ::8].astype(np.float64))
+        texture = robust_scale(contrasts[-1][::8, ::8].astype(np.float64)) if is_textured else 0.0
         levels.append(max(RESPONSE_SIGMAS * texture, search.least_contrast * full_scale_dn))
     neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * max(int(radii[0]), 1) + 1,))
     border = int(np.ceil(3 * radii[-1])) + 2

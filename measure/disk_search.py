@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.block import Block
 from measure.block_search import search_blocks
 from measure.disk_batch import disks_among
 from measure.disk_patches import Candidate, DiskSearch, margin_px, patches
@@ -42,8 +43,8 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
     """What a disk explains, to a tenth of a pixel or so, the strongest first, none within another."""
     smallest, largest = search.diameter_px[0] / SIZE_TOLERANCE, search.diameter_px[1] * SIZE_TOLERANCE
 
-    def disks(patches: list[Candidate]) -> list[Candidate]:
-        return [disk for disk in disks_among(scan, patches) if is_between(smallest, largest, disk)]
+    def disks(block: Block, patches: list[Candidate]) -> list[Candidate]:
+        return [disk for disk in disks_among(block, patches) if is_between(smallest, largest, disk)]
 
     return search_blocks(scan, octaves_of(search, scan.full_scale_dn), disks)
 

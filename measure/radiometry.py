@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Samples = NDArray[np.uint8 | np.uint16 | np.float32]  # means are the last
+Samples = NDArray[np.uint8 | np.uint16]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,6 @@
 """A scan file, opened by windows."""
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from itertools import product
 from math import lcm
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
+from measure.parallel import side_by_side
 from measure.picture_scan import open_picture
 from measure.radiometry import Samples
 from measure.resolution import Pitch
@@ -26,9 +26,8 @@ Array = NDArray[np.float32]
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
 GREEN = (0.0, 1.0, 0.0)
 BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
-SEGMENT_PX = 256  # of the scan, that a segment of its reduction holds along a side, about
-LARGEST_SEGMENT_PX = 2048
-REDUCED_SHARE = 0.25  # of a scan's cache, for a reduction of it
+PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, about
+LARGEST_PART_PX = 2048
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -50,7 +49,6 @@ class Scan:
         segments: Segments,
         pitch: Pitch,
         notes: tuple[str, ...] = (),
-        cache: SegmentCache | None = None,
     ) -> None:
         self.path = path
         self.name = path.stem
@@ -64,15 +62,28 @@ class Scan:
         self.pitch_note = pitch.note
         self.notes = notes
         self._segments = segments
-        self._cache = cache or SegmentCache(segments)
+        self._cache = SegmentCache(segments)
         self._reduced: dict[int, Array] = {}
-        self._segment_px = SEGMENT_PX
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
     @property
+    def weights(self) -> Sequence[float]:
+        """What each channel counts in the grey values, (channels,)."""
+        return self._grey_weights
+
+    @property
+    def samples_dtype(self) -> type[np.uint8] | type[np.uint16]:
+        return np.uint8 if self._segments.sample_bytes == 1 else np.uint16
+
+    @property
     def rows_kept(self) -> int:
-        """How many rows of the scan stay decoded for the next windows, however they lie to its segments."""
+        """How many rows of the scan stay decoded for the next windows."""
         return self._cache.rows_kept
+
+    @property
+    def segment_px(self) -> tuple[int, int]:
+        """Height and width of what the file has in one piece."""
+        return self._segments.segment_height_px, self._segments.segment_width_px
 
     def green(self) -> "Scan":
         """The same scan with its green for grey value, if it has colours. A lens draws red and blue at scales of their
@@ -89,14 +100,30 @@ class Scan:
         """
         if width < 1 or height < 1:
             raise ValueError(f"a window has at least one pixel, not {width} x {height}")
-        return np.asarray(self._planes(col0, row0, width, height, self._weights(weights)[None])[0])
+        return weighted(self.samples(col0, row0, width, height), self._weights(weights))
+
+    def samples(self, col0: int, row0: int, width: int, height: int, out: Samples | None = None) -> Samples:
+        """(height, width, channels) values as the file stores them; parts outside of the scan repeat its edge.
+
+        out: an array of that shape and of samples_dtype that is filled, in place of a new one.
+        """
+        samples = np.empty((height, width, self.channels), self.samples_dtype) if out is None else out
+        top, bottom = (min(max(row, 0), self.height_px - 1) for row in (row0, row0 + height - 1))
+        left, right = (min(max(col, 0), self.width_px - 1) for col in (col0, col0 + width - 1))
+        above, before = min(max(-row0, 0), height - 1), min(max(-col0, 0), width - 1)
+        rows = samples[above : above + bottom + 1 - top]
+        inside = rows[:, before : before + right + 1 - left]
+        self._fill(inside, top, left)
+        rows[:, :before], rows[:, before + inside.shape[1] :] = inside[:, :1], inside[:, -1:]
+        samples[:above], samples[above + len(rows) :] = rows[0], rows[-1]
+        return samples
 
     def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
         """The whole scan, area-averaged by an integer factor: pixel (i, j) is the mean over factor x factor pixels,
         its centre at column factor * j + (factor - 1) / 2. The last partial row and column are dropped.
 
-        The scan is streamed in bands of rows: memory holds the result, all its channels for the next call, and a band
-        for each thread.
+        The scan is streamed by its segments: memory holds the result, all its channels for the next call, and some
+        segments for each thread.
         """
         height, width = self.height_px // factor, self.width_px // factor
         if factor < 1 or height < 1 or width < 1:
@@ -111,36 +138,13 @@ class Scan:
     ) -> Array:
         """(height, width) pixels of the reduced scan from its column col0 and row row0 on, read from the file by
         themselves; parts outside of the scan repeat its edge."""
-        return np.asarray(self._reduced_planes(factor, col0, row0, width, height, self._weights(weights)[None])[0])
-
-    def reduction(self, factor: int) -> "Scan":
-        """The grey values area-averaged by an integer factor, as `reduced` gives them, as a scan of its own: parts of
-        this one are read as its windows ask for them, and the last of them kept."""
-        if factor == 1:
-            return self
-        pitch = self.pitch_um and (self.pitch_um[0] * factor, self.pitch_um[1] * factor)
-        segments = ReducedSegments(self, factor)
-        cache = SegmentCache(segments, share=REDUCED_SHARE)
-        reduction = Scan(self.path, segments, Pitch(pitch, self.pitch_note), self.notes, cache)
-        reduction._segment_px = max(self._segment_px // factor, 1)
-        return reduction
-
-    def decode(self, row0: int, row1: int) -> None:
-        """Decode what the rows row0 to row1 (exclusive) need, side by side: windows side by side would wait for the
-        strips that they share."""
-        tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
-        rows = range(max(row0, 0) // tall, (min(row1, self.height_px) - 1) // tall + 1)
-
-        def read(key: tuple[int, int]) -> None:
-            self._cache.read(*key)  # what is returned would be held until all is read
-
-        self.each(read, product(rows, range(-(-self.width_px // wide))))
+        fine = self.samples(col0 * factor, row0 * factor, width * factor, height * factor)
+        return weighted(means(fine, factor), self._weights(weights))
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         """What the function makes of each item, in their order, by as many threads as OpenCV may use: decoders and
         filters run side by side."""
-        with ThreadPoolExecutor(max(cv2.getNumThreads(), 1)) as threads:
-            return list(threads.map(function, items))
+        return side_by_side(function, items)
 
     def close(self) -> None:
         self._segments.close()
@@ -156,93 +160,65 @@ class Scan:
     def _reduced_channels(self, factor: int, width: int, height: int) -> Array:
         """(height, width, channels): every segment is decoded once."""
         result = np.empty((height, width, self.channels), np.float32)
-        single = np.eye(self.channels, dtype=np.float32)
-        band = reduced_rows(width, factor)
+        tall, wide = self.segment_px
+        cols = width if wide >= self.width_px else reduced_side(wide, factor, PART_PX)
+        rows = reduced_side(tall, factor, max(PART_PX**2 // (cols * factor), 1))
 
-        def fill(row0: int) -> None:
-            rows = min(band, height - row0)
-            planes = self._reduced_planes(factor, 0, row0, width, rows, single)
-            result[row0 : row0 + rows] = np.moveaxis(planes, 0, -1)
+        def fill(part: tuple[int, int]) -> None:
+            row0, col0 = part
+            own = result[row0 : row0 + rows, col0 : col0 + cols]
+            own_rows, own_cols = own.shape[:2]
+            own[:] = means(self.samples(col0 * factor, row0 * factor, own_cols * factor, own_rows * factor), factor)
 
-        self.each(fill, range(0, height, band))
+        self.each(fill, product(range(0, height, rows), range(0, width, cols)))
         return result
 
-    def _reduced_planes(self, factor: int, col0: int, row0: int, width: int, height: int, weights: Array) -> Array:
-        """(n, height, width) of the reduced scan, for weights (n, channels)."""
-        result, band = np.empty((len(weights), height, width), np.float32), reduced_rows(width, factor)
-        for first in range(0, height, band):
-            rows = min(band, height - first)
-            fine = self._planes(col0 * factor, (row0 + first) * factor, width * factor, rows * factor, weights)
-            for plane, each in zip(result, fine, strict=True):
-                plane[first : first + rows] = cv2.resize(each, (width, rows), interpolation=cv2.INTER_AREA)
-        return result
-
-    def _weights(self, weights: Sequence[float] | None) -> Array:
+    def _weights(self, weights: Sequence[float] | None) -> Sequence[float]:
         if weights is None:
             weights = self._grey_weights
         if len(weights) != self.channels:
             raise ValueError(f"{self.name}: {len(weights)} weights for {self.channels} channels")
-        return np.asarray(weights, np.float32)
+        return weights
 
-    def _planes(self, col0: int, row0: int, width: int, height: int, weights: Array) -> Array:
-        """(n, height, width) for weights (n, channels); parts outside of the scan repeat its edge."""
-        top, bottom = (min(max(row, 0), self.height_px - 1) for row in (row0, row0 + height - 1))
-        left, right = (min(max(col, 0), self.width_px - 1) for col in (col0, col0 + width - 1))
-        inner = self._inside(top, bottom + 1, left, right + 1, weights)
-        if inner.shape[1:] == (height, width):
-            return inner
-        above, before = min(max(-row0, 0), height - 1), min(max(-col0, 0), width - 1)
-        below, after = height - above - inner.shape[1], width - before - inner.shape[2]
-        return np.stack([cv2.copyMakeBorder(each, above, below, before, after, cv2.BORDER_REPLICATE) for each in inner])
-
-    def _inside(self, row0: int, row1: int, col0: int, col1: int, weights: Array) -> Array:
-        """Rows row0 to row1 and columns col0 to col1 (exclusive), all inside the scan, from the segments they touch."""
-        tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
-        result = np.empty((len(weights), row1 - row0, col1 - col0), np.float32)
-        for i in range(row0 // tall, (row1 - 1) // tall + 1):
-            top, bottom = max(row0, i * tall), min(row1, (i + 1) * tall)
-            for j in range(col0 // wide, (col1 - 1) // wide + 1):
-                left, right = max(col0, j * wide), min(col1, (j + 1) * wide)
-                part = self._cache.read(i, j)[top - i * tall : bottom - i * tall, left - j * wide : right - j * wide]
-                for plane, each in zip(result, weights, strict=True):
-                    plane[top - row0 : bottom - row0, left - col0 : right - col0] = grey(part, each)
-        return result
-
-
-class ReducedSegments:
-    """A scan's grey values area-averaged by a factor, in segments that hold whole ones of the scan where these are not
-    too large."""
-
-    def __init__(self, scan: Scan, factor: int) -> None:
-        self._scan, self._factor = scan, factor
-        self.height_px, self.width_px = scan.height_px // factor, scan.width_px // factor
-        tall, wide = scan._segments.segment_height_px, scan._segments.segment_width_px
-        self.segment_height_px = min(reduced_side(tall, factor, scan._segment_px), self.height_px)
-        # Strips are wanted once, whole.
-        self.segment_width_px = self.width_px if wide >= scan.width_px else reduced_side(wide, factor, scan._segment_px)
-        self.channels, self.full_scale_dn, self.sample_bytes = 1, scan.full_scale_dn, 4
-        self.rounding_step_dn = scan.rounding_step_dn
-
-    def read(self, row: int, column: int) -> Array:
-        """Segment (row, column) of the grid."""
-        row0, col0 = row * self.segment_height_px, column * self.segment_width_px
-        height = min(self.segment_height_px, self.height_px - row0)
-        width = min(self.segment_width_px, self.width_px - col0)
-        return self._scan.reduced_window(self._factor, col0, row0, width, height)[..., None]
-
-    def close(self) -> None:
-        """The scan stays open."""
+    def _fill(self, samples: Samples, row0: int, col0: int) -> None:
+        """Samples (height, width, channels) of the scan from a row and column on, from the segments they touch."""
+        tall, wide = self.segment_px
+        height, width, _ = samples.shape
+        for i in range(row0 // tall, (row0 + height - 1) // tall + 1):
+            for j in range(col0 // wide, (col0 + width - 1) // wide + 1):
+                row, col = i * tall - row0, j * wide - col0
+                part = self._cache.read(i, j)[max(-row, 0) : height - row, max(-col, 0) : width - col]
+                row, col = max(row, 0), max(col, 0)
+                samples[row : row + part.shape[0], col : col + part.shape[1]] = part
 
 
 def reduced_side(fine_px: int, factor: int, most_px: int) -> int:
-    """The side of a reduced segment: about most_px of the scan, in whole segments if these are not much larger."""
+    """The side of a part of a reduced scan: about most_px of the scan, in whole segments if these are not much
+    larger."""
     unit = lcm(fine_px, factor)
-    return max((unit * max(most_px // unit, 1) if unit <= LARGEST_SEGMENT_PX else most_px) // factor, 1)
+    return max((unit * max(most_px // unit, 1) if unit <= LARGEST_PART_PX else most_px) // factor, 1)
 
 
-def reduced_rows(width: int, factor: int) -> int:
-    """How many rows of a reduced picture are averaged at a time."""
-    return max(BAND_PIXELS // (width * factor * factor), 1)
+def means(samples: Samples | Array, factor: int) -> Array:
+    """(height / factor, width / factor, channels) means of samples (height, width, channels), over squares of factor
+    x factor of them."""
+    height, width, channels = samples.shape
+    result = np.empty((height // factor, width // factor, channels), np.float32)
+    rows = max(BAND_PIXELS // (width * factor), 1)
+    for row in range(0, len(result), rows):
+        band = samples[row * factor : (row + rows) * factor].astype(np.float32)
+        for step in steps_of(factor):
+            size = band.shape[1] // step, band.shape[0] // step
+            band = np.asarray(cv2.resize(band, size, interpolation=cv2.INTER_AREA), np.float32)
+        result[row : row + rows] = band.reshape(-1, width // factor, channels)
+    return result
+
+
+def steps_of(factor: int) -> tuple[int, ...]:
+    """Twos, which OpenCV averages fastest, and what is left."""
+    if factor % 2 == 0:
+        return 2, *steps_of(factor // 2)
+    return (factor,) if factor > 1 else ()
 
 
 def open_scan(path: Path) -> Scan:
@@ -278,12 +254,7 @@ def first_bytes(path: Path) -> bytes:
     return start
 
 
-def grey(samples: Samples, weights: Array) -> Samples:
-    """(height, width) grey values of (height, width, channels) samples, as they are where there is one channel."""
-    return samples[..., 0] if len(weights) == 1 and weights[0] == 1.0 else weighted(samples, weights)
-
-
-def weighted(samples: Samples | Array, weights: Array) -> Array:
+def weighted(samples: Samples | Array, weights: Sequence[float]) -> Array:
     """(height, width) float32 grey values of (height, width, channels) samples."""
     grey = samples[..., 0].astype(np.float32)
     if weights[0] != 1.0:

@@ -11,25 +11,23 @@ CACHE_BYTES = 40 << 20
 
 
 class SegmentCache:
-    """As many segments as a memory limit (or a share of it) allows, and at least two rows of the grid: reading a scan
+    """As many segments as a memory limit allows, and at least two rows of the grid: reading a scan
     from top to bottom decodes each once, wherever its bands begin. A thread that wants what another is decoding waits
     for it."""
 
-    def __init__(self, segments: Segments, share: float = 1.0) -> None:
+    def __init__(self, segments: Segments) -> None:
         self._segments = segments
         self._row_bytes = segments.width_px * segments.channels * segments.sample_bytes
         tall = min(2 * segments.segment_height_px, segments.height_px)
-        self._limit = max(round(share * CACHE_BYTES), tall * self._row_bytes)
+        self._limit = max(CACHE_BYTES, tall * self._row_bytes)
         self._held = 0
         self._decoded: OrderedDict[tuple[int, int], Future[Samples]] = OrderedDict()
         self._lock = Lock()
 
     @property
     def rows_kept(self) -> int:
-        """How many rows of the picture have room, wherever they begin, with the rest of the segments they touch."""
-        rows = self._limit // self._row_bytes
-        in_one = self._segments.segment_height_px >= self._segments.height_px
-        return rows if in_one else rows - self._segments.segment_height_px
+        """How many rows of the picture have room."""
+        return self._limit // self._row_bytes
 
     def read(self, row: int, column: int) -> Samples:
         """Segment (row, column) of the grid."""

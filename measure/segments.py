@@ -10,8 +10,8 @@ class Segments(Protocol):
 
     height_px, width_px: of the picture; segment_height_px, segment_width_px: of a segment, those at the right and lower
     border being smaller; channels: 1 (grey) or 3 (red, green, blue); full_scale_dn: the largest value;
-    sample_bytes: 1, 2, or 4 for means; rounding_step_dn: to which a compression with loss, as
-    JPEG, rounds coarse detail, 0 where there is none.
+    sample_bytes: 1 or 2; rounding_step_dn: to which a compression with loss, as JPEG, rounds coarse detail, 0 where
+    there is none.
     """
 
     height_px: int

@@ -12,6 +12,9 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from measure.block import Block
+from measure.block_search import search_blocks
+from measure.disk_patches import Candidate
 from measure.errors import MeasurementError
 from measure.scan import open_scan
 from measure.segment_cache import SegmentCache
@@ -297,12 +300,33 @@ def test_a_window_of_the_reduced_scan_is_that_part_of_it(tmp_path: Path) -> None
         np.testing.assert_allclose(scan.reduced_window(3, 20, 11, 31, 27), whole[11:38, 20:51], rtol=1e-5)
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_block_is_a_part_of_the_scan_and_of_its_reductions(tmp_path: Path, channels: int) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture(np.uint16, channels), tile=(32, 48), compression="lzw")
+    with open_scan(tmp_path / "s.tif") as scan:
+        block = Block(scan, 12, 0, 12, scan.samples(12, 0, 72, 60))
+        np.testing.assert_array_equal(block.window(20, 3, 40, 50), scan.window(20, 3, 40, 50))
+        for factor, small in block.reductions({2, 3, 4}).items():
+            row, col, height, width = 0, 12 // factor, 60 // factor, 72 // factor
+            part = scan.reduced(factor)[row : row + height, col : col + width]
+            np.testing.assert_allclose(small, part, rtol=2e-6)
+
+
+class Watched:
+    """An octave that finds nothing."""
+
+    factor, margin_px = 4, 8
+
+    def patches(self, small: NDArray[np.float32]) -> list[Candidate]:
+        return []
+
+
 @pytest.mark.parametrize("layout", [{"tile": (32, 48)}, {"rowsperstrip": 7}, {"rowsperstrip": HEIGHT}])
-@pytest.mark.parametrize("segment_px", [16, 96])
-def test_a_reduction_is_a_scan_of_the_means_and_decodes_each_segment_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: dict[str, Any], segment_px: int
+def test_a_search_by_blocks_decodes_each_segment_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr("measure.scan.SEGMENT_PX", segment_px)
+    monkeypatch.setattr("measure.block_search.TALLEST_PX", 40)
+    monkeypatch.setattr("measure.block_search.WIDEST_PX", 50)
     tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", compression="lzw", **layout)
     with open_scan(tmp_path / "s.tif") as scan:
         reads: list[tuple[int, ...]] = []
@@ -313,12 +337,9 @@ def test_a_reduction_is_a_scan_of_the_means_and_decodes_each_segment_once(
             return original(*key)
 
         monkeypatch.setattr(scan._segments, "read", read)
-        twice, third = scan.reduction(2), scan.reduction(3)
-        four = twice.reduction(2)
-        four.decode(-5, 1000)
-        np.testing.assert_allclose(four.window(0, 0, four.width_px, four.height_px), scan.reduced(4), rtol=2e-6)
-        np.testing.assert_allclose(third.window(11, 9, 30, 40), scan.reduced(3)[9:49, 11:41], rtol=2e-6)
-        assert len(reads) == len(set(reads))
+        search_blocks(scan, [Watched()])
+        tall, wide = scan.segment_px
+        assert len(reads) == len(set(reads)) == -(-HEIGHT // tall) * -(-WIDTH // wide)
 
 
 def test_the_cache_keeps_to_its_limit_and_holds_two_rows_of_tiles(

@@ -1,0 +1,50 @@
+"""A part of a scan that one thread looks at: its grey values at full resolution and reduced, with a margin about it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.radiometry import Samples
+from measure.scan import Scan, means, weighted
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """col0, row0: the scan's place of its first pixel; samples (height, width, channels), margin_px of them on every
+    side being the neighbours', or repeating the scan's edge."""
+
+    scan: Scan
+    col0: int
+    row0: int
+    margin_px: int
+    samples: Samples
+
+    @property
+    def place_px(self) -> tuple[int, int]:
+        """Column and row of the scan where it begins, its margin included."""
+        return self.col0, self.row0
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height, its margin included."""
+        return self.samples.shape[1], self.samples.shape[0]
+
+    def window(self, col0: int, row0: int, width: int, height: int) -> Image:
+        """(height, width) grey values from a column and row of the scan on, all of them in the block."""
+        left, top = col0 - self.col0, row0 - self.row0
+        return weighted(self.samples[top : top + height, left : left + width], self.scan.weights)
+
+    def reductions(self, factors: Iterable[int]) -> dict[int, Image]:
+        """Its grey values area-averaged by each factor, from the coarsest of the others that it divides."""
+        known: dict[int, Image] = {}
+        for factor in sorted(factors):
+            finer = [other for other in known if factor % other == 0]
+            if finer:
+                known[factor] = means(known[finer[-1]][..., None], factor // finer[-1])[..., 0]
+            else:
+                known[factor] = weighted(means(self.samples, factor), self.scan.weights)
+        return known
