@@ -56,7 +56,7 @@ def print_table(comparison: Comparison, summary: Summary) -> None:
         print(f"{name:34} {value:16.8g} {sigma:12.3g} {truth:16.8g} {off}")
     if summary.adjustment:
         print(f"sigma0 {summary.adjustment['sigma0']:.4f}, redundancy {summary.adjustment['redundancy']}")
-    print(summary.sentence)
+    print(summary.verdict.sentence)
 
 
 if __name__ == "__main__":

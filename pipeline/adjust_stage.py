@@ -14,8 +14,9 @@ from adjust.projection import adjusted_image
 from adjust.result import Adjustment
 from pipeline.comparator_file import ComparatorPoint
 from pipeline.disks import across, disk_normals, eccentricity_mm, plane_normal
-from pipeline.network import build_network, listed, unmeasured_points
+from pipeline.network import build_network, unmeasured_points
 from pipeline.project_file import Project
+from pipeline.wording import listed
 
 Array = NDArray[np.float64]
 
@@ -35,7 +36,12 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
-    warnings = (*left_out, *_unmeasured(project, network), *_not_corrected(network, uncorrected))
+    warnings = (
+        *left_out,
+        *_misnamed(project, marks),
+        *_unmeasured(project, network),
+        *_not_corrected(network, uncorrected),
+    )
     return replace(adjustment, remarks=(*adjustment.remarks, *warnings))
 
 
@@ -116,6 +122,20 @@ def _in_sigmas(network: Network, change_mm: Array) -> float:
     """The largest change of an observation, in its standard deviations."""
     sigmas = np.sqrt(np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2))
     return float(np.max(np.abs(change_mm) / sigmas, initial=0.0))
+
+
+def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
+    """Where some images have no line in images.csv and some lines no image, a name is probably misspelt."""
+    if project.given_images is None:
+        return ()
+    images, given = {mark.image for mark in marks}, set(project.given_images.exterior)
+    without_line, without_marks = listed(sorted(images - given)), listed(sorted(given - images))
+    if not without_line or not without_marks:
+        return ()
+    return (
+        f"The file of images says nothing of {without_line}, and names {without_marks}, of which there are no marks. "
+        "Look for a misspelt name.",
+    )
 
 
 def _unmeasured(project: Project, network: Network) -> tuple[str, ...]:

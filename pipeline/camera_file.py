@@ -19,6 +19,7 @@ from pipeline.tables import Table, read_toml
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
 LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
 CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
+FIELD_RATIO = 50.0  # of principal distance and half the diagonal, either way: 2.3 degrees of field to 178
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
 
 
@@ -162,6 +163,8 @@ def parse_camera(table: Table) -> CameraFile:
     frame = table.pair("frame_mm") if "frame_mm" in table else None
     if frame is not None and min(frame) <= 0.0:
         raise table.error("frame_mm", f"must be two positive lengths, [width, height], not {list(frame)}.")
+    if frame is not None:
+        _check_units(table, frame, distance, fiducials)
     camera = CameraFile(
         path=table.file,
         name=table.text("name", table.file.stem),
@@ -178,6 +181,24 @@ def parse_camera(table: Table) -> CameraFile:
     camera = replace(camera, calibration=read_calibration(sigma, camera.camera()))
     sigma.done()
     return camera
+
+
+def _check_units(
+    table: Table, frame_mm: tuple[float, float], distance_mm: float | None, fiducials: Sequence[GivenFiducial]
+) -> None:
+    """Refuse lengths that beside the frame's cannot be mm: metres or um taken for them are off by a thousand."""
+    half_diagonal = math.hypot(*frame_mm) / 2
+    if distance_mm is not None and not 1 / FIELD_RATIO < distance_mm / half_diagonal < FIELD_RATIO:
+        raise table.error(
+            "principal_distance_mm",
+            f"{distance_mm:g} mm is impossible for a frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm. Give both in mm.",
+        )
+    for entry, fiducial in zip(table.tables("fiducial"), fiducials, strict=True):
+        if max(map(abs, fiducial.xy_mm)) > 2 * max(frame_mm):
+            raise entry.error(
+                "xy_mm",
+                f"lies far outside of the frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm. Give mm from its middle.",
+            )
 
 
 def _source(table: Table) -> Source:

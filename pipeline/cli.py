@@ -213,7 +213,7 @@ def _finish(summary: Summary, as_json: bool) -> int:
         typer.echo(json.dumps(summary.as_json(), indent=1, ensure_ascii=False))
     else:
         print_summary(summary, Console())
-    return LOOK if summary.problems else DONE
+    return summary.verdict.exit_code
 
 
 def _message(text: str, code: int) -> int:

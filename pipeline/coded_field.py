@@ -13,10 +13,10 @@ from measure.targets import TargetOptions, TargetPrediction, measure_disks
 from pipeline.camera_model import camera_model
 from pipeline.coded_sheet import CodedSheet, coded_candidates, coded_points, none_coded, read_numbers
 from pipeline.measurement_file import MeasuredScan
-from pipeline.network import listed
 from pipeline.project_file import Project
 from pipeline.target_field import Field, target_field
 from pipeline.unoriented import NamedField, name_field
+from pipeline.wording import listed
 
 
 def measure_coded_field(

@@ -16,10 +16,11 @@ from measure.sheet_naming import Dots, Naming, name_dots
 from measure.status import Status
 from measure.targets import TargetOptions, TargetPrediction, measure_disks
 from pipeline.errors import InputError
-from pipeline.network import given_points, listed
+from pipeline.network import given_points
 from pipeline.project_file import Project
 from pipeline.spelling import did_you_mean
 from pipeline.target_table import TargetSettings
+from pipeline.wording import listed
 
 Array = NDArray[np.float64]
 

@@ -111,9 +111,10 @@ def measure_scan(project: Project, name: str) -> MeasuredScan:
 def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
     camera = project.camera_of(name)
     frame = _fiducials(project, name, scan, camera)
-    pitch, notes = _pitch(project, scan, camera, frame)
-    frame = replace(frame, problems=(*frame.problems, *notes))
-    measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame)
+    pitch, problems, notes = _pitch(project, scan, camera, frame)
+    frame = replace(frame, problems=(*frame.problems, *problems))
+    notes = (*(f"{note[0].upper()}{note[1:]}." for note in scan.notes), *notes)
+    measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame, notes)
     return measure_targets(project, scan, measured)
 
 
@@ -164,19 +165,21 @@ def _with_sizes(
 
 def _pitch(
     project: Project, scan: Scan, camera: CameraFile, frame: FrameMeasurement
-) -> tuple[tuple[float, float], tuple[str, ...]]:
-    """The pitch of a scan in um, as the project, the file or the marks say it, and what is to be said of it."""
+) -> tuple[tuple[float, float], tuple[str, ...], tuple[str, ...]]:
+    """The pitch of a scan in um, as the project, the file or the marks say it; what needs a look in it, and what is
+    only worth knowing."""
     if project.pitch_um is not None:
-        return project.pitch_um, ()
+        return project.pitch_um, (), ()
     if scan.pitch_um is not None:
-        return scan.pitch_um, ()
+        return scan.pitch_um, (), ()
     if frame.pixel_from_camera is not None:
         pitch = 1000.0 / float(np.sqrt(abs(np.linalg.det(frame.pixel_from_camera[:, :2]))))
-        return (pitch, pitch), ()
+        note = f"The pitch of {pitch:.2f} um is from the marks' separations, for {scan.pitch_note}."
+        return (pitch, pitch), (), (note,)
     if camera.frame_mm is not None:
         pitch = 1000.0 * max(camera.frame_mm) / max(scan.width_px, scan.height_px)
         note = f"The pitch is not known ({scan.pitch_note}); {pitch:.1f} um is taken, as if the frame filled the scan."
-        return (pitch, pitch), (note,)
+        return (pitch, pitch), (note,), ()
     raise InputError(
         f"{project.path}: pitch_um is missing, and {scan.path.name} does not say it ({scan.pitch_note}). Give the size "
         "of a pixel in um; for a digital camera that of the sensor's, or any, with the principal distance to match."

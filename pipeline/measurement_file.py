@@ -18,13 +18,14 @@ from pipeline.errors import InputError
 
 @dataclass(frozen=True)
 class MeasuredScan:
-    """A scan and what was measured in it."""
+    """A scan and what was measured in it. notes: what is worth knowing of its file, and needs no action."""
 
     scan: Path
     width_px: int
     height_px: int
     pitch_um: tuple[float, float]
     frame: FrameMeasurement
+    notes: tuple[str, ...] = ()
 
 
 def write_measurement(path: Path, scans: Sequence[MeasuredScan]) -> None:
@@ -54,6 +55,7 @@ def _image(measured: MeasuredScan, folder: Path) -> dict[str, Any]:
         "pose": None if frame.pose is None else _pose(frame.pose),
         "pixel_from_camera": None if matrix is None else matrix.tolist(),
         "problems": list(frame.problems),
+        "notes": list(measured.notes),
         "marks": [_mark(mark) for mark in frame.marks],
     }
 
@@ -91,7 +93,8 @@ def _measured(name: str, image: Mapping[str, Any], folder: Path) -> MeasuredScan
         problems=tuple(image["problems"]),
     )
     pitch = image["pitch_um"]
-    return MeasuredScan(folder / image["scan"], image["width_px"], image["height_px"], (pitch[0], pitch[1]), frame)
+    size = (image["width_px"], image["height_px"])
+    return MeasuredScan(folder / image["scan"], *size, (pitch[0], pitch[1]), frame, tuple(image.get("notes", ())))
 
 
 def _read_mark(mark: Mapping[str, Any]) -> MarkMeasurement:

@@ -25,11 +25,11 @@ from pipeline.comparator_file import ComparatorPoint
 from pipeline.errors import InputError
 from pipeline.project_file import UNITS_MM, Project
 from pipeline.spelling import did_you_mean
+from pipeline.wording import listed
 
 Array = NDArray[np.float64]
 
 
-LISTED = 8
 FEWEST_TARGETS = 3  # in an image whose exterior orientation nobody has observed
 
 
@@ -91,12 +91,6 @@ def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list
     )
     kept = [mark for mark in marks if mark.kind == "fiducial" or mark.point not in lonely]
     return kept, (sentence,) if lonely else ()
-
-
-def listed(names: Sequence[str]) -> str:
-    """The first names, and how many there are beyond them."""
-    more = len(names) - LISTED
-    return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:

@@ -12,9 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from measure.status import Status
-from pipeline.report.data import Problem, ReportData
+from pipeline.report.data import ReportData
 from pipeline.report.numbers import value_and_sigma
-from pipeline.report.verdict import camera_is_calibrated, judge
+from pipeline.report.verdict import Verdict, camera_is_calibrated, judge
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
 Json = dict[str, Any]
@@ -25,9 +25,7 @@ class Summary:
     """The end of a command. poses: of the scans, each with its evidence, as measurement.json has them. files: what was
     written, by a word for it."""
 
-    level: str
-    sentence: str
-    problems: tuple[Problem, ...]
+    verdict: Verdict
     frames: Mapping[str, Mapping[str, int]]
     poses: Mapping[str, Json]
     adjustment: Json | None
@@ -37,9 +35,10 @@ class Summary:
     def as_json(self) -> Json:
         return {
             "reseau": version("reseau"),
-            "verdict": self.level,
-            "sentence": self.sentence,
-            "problems": [{"what": problem.what, "next_step": problem.next_step} for problem in self.problems],
+            "verdict": self.verdict.level,
+            "sentence": self.verdict.sentence,
+            "problems": [{"what": problem.what, "next_step": problem.next_step} for problem in self.verdict.problems],
+            "notes": list(self.verdict.notes),
             "frames": {name: dict(counts) for name, counts in self.frames.items()},
             "poses": dict(self.poses),
             "adjustment": self.adjustment and _main_numbers(self.adjustment),
@@ -50,20 +49,19 @@ class Summary:
 
 def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     """Judge the data as the report does, and add where everything stands."""
-    verdict = judge(data)
     frames: dict[str, dict[str, int]] = {}
     for mark in data.comparator:
         counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
         counts[mark.status] += 1
     scans = data.measurement["images"] if data.measurement else {}
     poses = {name: scan["pose"] for name, scan in scans.items() if scan.get("pose")}
-    return Summary(verdict.level, verdict.sentence, verdict.problems, frames, poses, data.adjustment, data.check, files)
+    return Summary(judge(data), frames, poses, data.adjustment, data.check, files)
 
 
 def print_summary(summary: Summary, console: Console) -> None:
     """The summary for a person; file paths are never folded."""
-    console.print(Text(summary.sentence, style=STYLES[summary.level]))
-    for problem in summary.problems:
+    console.print(Text(summary.verdict.sentence, style=STYLES[summary.verdict.level]))
+    for problem in summary.verdict.problems:
         console.print(Text(f"- {problem.what}"))
         if problem.next_step:
             console.print(Text(f"  {problem.next_step}", style="dim"))
@@ -75,6 +73,8 @@ def print_summary(summary: Summary, console: Console) -> None:
     if summary.adjustment:
         calibrated = any(camera_is_calibrated(camera) for camera in summary.adjustment["cameras"].values())
         console.print((_camera_table if calibrated else _film_table)(summary.adjustment))
+    for note in summary.verdict.notes:
+        console.print(Text(note, style="dim"))
     for word, path in summary.files.items():
         console.print(f"{word}: {path}", soft_wrap=True, markup=False, highlight=False)
 

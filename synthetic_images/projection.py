@@ -106,15 +106,20 @@ def _observed(distortion: Distortion, ideal: Array, point: Array) -> Array:
         if not open_.any():
             return observed
         start = observed[open_]
-        jacobian = np.empty((len(start), 2, 2))
-        for axis in (0, 1):
-            moved = start.astype(np.complex128)
-            moved[:, axis] += 1e-30j
-            jacobian[:, :, axis] = -correction(distortion, moved, point).imag / 1e-30
-        jacobian += np.eye(2)
-        miss = start - correction(distortion, start.astype(np.complex128), point).real - ideal[open_]
-        step = np.linalg.solve(jacobian, miss[:, :, None])[:, :, 0]
-        observed[open_] = start - step
-        open_[open_] = np.hypot(step[:, 0], step[:, 1]) > INVERSION_MM * (1 + np.hypot(start[:, 0], start[:, 1]))
+        ideal_of, by_x, by_y = _corrected(distortion, start, point)
+        miss = ideal_of - ideal[open_]
+        # Cramer's rule, a point a row.
+        determinant = by_x[:, 0] * by_y[:, 1] - by_y[:, 0] * by_x[:, 1]
+        along_x = (miss[:, 0] * by_y[:, 1] - by_y[:, 0] * miss[:, 1]) / determinant
+        along_y = (by_x[:, 0] * miss[:, 1] - miss[:, 0] * by_x[:, 1]) / determinant
+        observed[open_] = start - np.column_stack([along_x, along_y])
+        open_[open_] = np.hypot(along_x, along_y) > INVERSION_MM * (1 + np.hypot(start[:, 0], start[:, 1]))
     observed[open_] = np.nan
     return observed
+
+
+def _corrected(distortion: Distortion, observed: Array, point: Array) -> tuple[Array, Array, Array]:
+    """Observed points (n, 2) less their correction, and the derivatives of that by x and by y, (n, 2) each."""
+    steps = np.concatenate([observed + step for step in 1e-30j * np.eye(2)])
+    by_x, by_y = np.split(steps - correction(distortion, steps, point), 2)
+    return by_x.real, by_x.imag / 1e-30, by_y.imag / 1e-30

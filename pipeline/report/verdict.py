@@ -9,14 +9,14 @@ from scipy import stats
 
 from measure.status import Status
 from pipeline.report.data import Json, Problem, ReportData
-from pipeline.report.fractions import fraction_test
+from pipeline.report.frame_problems import frame_problems, pixel_locking, said_by
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
+from pipeline.wording import counted, listed
 
 Level = Literal["good", "look", "failed"]
 
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
-MANY = 8  # so many names are listed; the rest are counted
 
 # Observations other than marks, by their key in adjustment.json: what is said of one and of many, and what to do.
 FURTHER = (
@@ -63,8 +63,8 @@ def judge(data: ReportData) -> Verdict:
     problems = (
         *fatal,
         *data.problems,
-        *_frame_problems(shots),
-        *_locking(shots),
+        *frame_problems(shots),
+        *pixel_locking(shots),
         *(Problem(warning) for warning in (data.adjustment["warnings"] if data.adjustment else ())),
         *(_adjustment_problems(data.adjustment) if data.adjustment and not fatal else ()),
         *(_check_problems(data.check) if data.check else ()),
@@ -98,61 +98,14 @@ def suspect_rows(adjustment: Json) -> list[Json]:
 
 def _no_solution(adjustment: Json) -> Iterator[Problem]:
     for null in adjustment["singular"]:
-        together = _listed(null["parameters"])
+        together = listed(null["parameters"])
         yield Problem(f"{null['cause']} The observations do not see it (together move {together}).", null["remedy"])
     if not adjustment["converged"] and not adjustment["singular"]:
         yield Problem(
             f"The iteration did not come to rest ({adjustment['termination']}, {adjustment['iterations']} iterations).",
-            "Look for wrong point numbers and gross errors among the largest residuals, and at the approximate "
-            "orientations.",
+            "Look for wrong point numbers and gross errors among the largest residuals, at the approximate "
+            "orientations, and at the units: [object] unit of points and stations, mm in the camera's file.",
         )
-
-
-def _frame_problems(shots: list[Frame]) -> Iterator[Problem]:
-    """What the frames have to say, said once where several frames say the same."""
-    images: dict[Problem, list[str]] = {}
-    for frame in shots:
-        for problem in _problems_of(frame):
-            images.setdefault(problem, []).append(frame.image)
-    for problem, names in images.items():
-        yield Problem(f"{_listed(names)}: {problem.what}", problem.next_step)
-
-
-def _problems_of(frame: Frame) -> Iterator[Problem]:
-    pose = frame.scan.get("pose")
-    if pose and not pose["decided"]:
-        reason = " ".join(pose.get("evidence", ()))
-        yield Problem(
-            f"pose assumed ({pose['name']}). {reason}",
-            'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
-        )
-    yield from (Problem(problem) for problem in frame.scan.get("problems", ()))
-    lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
-    if lost:
-        names = "; ".join(f"{mark.point} {mark.status}: {mark.reason.rstrip('.')}" for mark in lost[:MANY])
-        found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
-        yield Problem(
-            f"{_count(len(lost), 'fiducial mark')} not measured, {found} measured ({names}).",
-            "Look at their pictures in the report. The frame is used; its film transformation is less certain.",
-        )
-    targets = [mark for mark in frame.marks if not mark.is_fiducial]
-    if targets and not any(mark.status.is_observation for mark in targets):
-        yield Problem(
-            f"none of its {len(targets)} targets was measured.",
-            "Look at their reasons in comparator.csv: a wrong pose, diameter or orientation misses them all.",
-        )
-
-
-def _locking(shots: list[Frame]) -> Iterator[Problem]:
-    centers = [m.center_px for f in shots for m in f.marks if m.status.is_observation and m.center_px is not None]
-    for axis, positions in zip(("column", "row"), np.reshape(centers, (-1, 2)).T, strict=True):
-        test = fraction_test(positions)
-        if test.is_locked:
-            yield Problem(
-                f"The {axis} positions of the marks prefer parts of a pixel (pixel locking): they are biased by up to "
-                f"{fixed(test.bias_px)} px.",
-                "Look at the histogram of fractional parts in the report; scan with a finer pitch or in 16 bit.",
-            )
 
 
 def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
@@ -171,14 +124,14 @@ def _suspects(rows: list[Json]) -> Iterator[Problem]:
     kept, removed = ([row for row in rows if row["removed"] is removed] for removed in (False, True))
     if kept:
         yield Problem(
-            f"{_count(len(kept), 'observation')} beyond chance: {_listed([_told(row) for row in kept])}.",
+            f"{counted(len(kept), 'observation')} beyond chance: {listed([_told(row) for row in kept])}.",
             "Look at the picture or the records: a wrong point number or a disturbed mark is rejected in "
             "comparator.csv (status rejected), a wrong given coordinate corrected, and the adjustment run again; "
             "snooping = true under [adjust] leaves them out.",
         )
     if removed:
         yield Problem(
-            f"Left out, for beyond chance: {_listed([_told(row) for row in removed])}.",
+            f"Left out, for beyond chance: {listed([_told(row) for row in removed])}.",
             "The adjustment does without them. Look at the picture or the records, and reject or correct them there.",
         )
 
@@ -194,7 +147,7 @@ def _further_problems(adjustment: Json) -> Iterator[Problem]:
         bad = _beyond_chance(adjustment, adjustment[group])
         if bad:
             heading = (one if len(bad) == 1 else many).format(len(bad))
-            yield Problem(f"{heading}: {_listed([_with_residual(row) for row in bad])}.", remedy)
+            yield Problem(f"{heading}: {listed([_with_residual(row) for row in bad])}.", remedy)
 
 
 def _with_residual(row: Json) -> str:
@@ -248,11 +201,13 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield f"OpenCV cannot check this calibration. {data.check['reason']}"
     if data.adjustment:
         yield from _weight_notes(data.adjustment)
+    for note, images in said_by(shots, lambda frame: frame.scan.get("notes", ())).items():
+        yield f"{listed(images)}: {note}"
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
         for kind, word in (("target", "target"), ("tie", "sight of a natural point")):
             number = sum(mark.status is status and mark.kind == kind for frame in shots for mark in frame.marks)
             if number:
-                yield f"{_count(number, word)} {status} (their reasons stand with the marks)."
+                yield f"{counted(number, word)} {status} (their reasons stand with the marks)."
 
 
 def _weight_notes(adjustment: Json) -> Iterator[str]:
@@ -261,7 +216,7 @@ def _weight_notes(adjustment: Json) -> Iterator[str]:
     if lowered:
         least = min(lowered, key=lambda row: row["weight"])
         yield (
-            f"Robust estimation lowered the weight of {_count(len(lowered), 'observation')}, most that of "
+            f"Robust estimation lowered the weight of {counted(len(lowered), 'observation')}, most that of "
             f"{least['image']}/{least['point']}, to {least['weight']:.2f} of what was given."
         )
     for group, factor in adjustment["variance_factors"].items():
@@ -275,8 +230,8 @@ def _weight_notes(adjustment: Json) -> Iterator[str]:
 
 def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int) -> str:
     marks = _observed(data, shots)
-    found = f"{_count(marks, 'mark')} in {_count(len(shots), 'frame')}"
-    ending = f", but {_count(problems, 'thing needs', 'things need')} a look." if level == "look" else "."
+    found = f"{counted(marks, 'mark')} in {counted(len(shots), 'frame')}"
+    ending = f", but {counted(problems, 'thing needs', 'things need')} a look." if level == "look" else "."
     if not marks:
         return "No mark was measured."
     if not data.adjustment:
@@ -299,12 +254,3 @@ def _observed(data: ReportData, shots: list[Frame]) -> int:
     """How many marks are observations; those of the adjustment where the comparator file is not at hand."""
     marks = sum(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
     return marks or (len(data.adjustment["residuals"]) if data.adjustment else 0)
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - MANY} more" if len(names) > MANY else ""
-    return ", ".join(names[:MANY]) + more
-
-
-def _count(number: int, one: str, many: str = "") -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"

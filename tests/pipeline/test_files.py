@@ -115,6 +115,8 @@ def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
         ("frame_mm = [228.0, 228.0]", "frame_mm = [228.0, 228.0", ["not valid TOML", "line"]),
         ("principal_distance_mm = 153.0", 'principal_distance_mm = "153,0"', ["must be a number"]),
         ("principal_distance_mm = 153.0", "principal_distance_mm = -153.0", ["greater than 0"]),
+        ("principal_distance_mm = 153.0", "principal_distance_mm = 0.153", ["line 4", "impossible", "Give both in mm"]),
+        ("xy_mm = [0.0, 106.0]", "xy_mm = [0.0, 106000.0]", ["line 14", "far outside of the frame"]),
         ('mark = "side"', 'mark = "sid"', ["Did you mean 'side'"]),
         ("arm_mm = 1.0", "arm_m = 1.0", ["arm_mm", "'arm_m'"]),
         ("gap_mm = 0.5", "gap_mm = 1.5", ["smaller than arm_mm"]),

@@ -116,6 +116,25 @@ def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured: ReportDat
     assert "99 was not measured" in told(data)
 
 
+def test_what_a_scans_file_does_unusually_is_noted_once(measured: ReportData) -> None:
+    assert measured.measurement is not None
+    note = "The file's orientation tag (6) is not applied."
+    images = {name: {**scan, "notes": [note]} for name, scan in measured.measurement["images"].items()}
+    verdict = judge(replace(measured, measurement={"images": images}))
+    assert verdict.level == "good"
+    assert f"f1, f2, f3, f4, f5: {note}" in verdict.notes
+
+
+def test_marks_lost_for_one_reason_are_told_it_once(measured: ReportData) -> None:
+    rows = [
+        replace(row, status=Status.ABSENT, reason="Nothing there.")
+        if (row.image, row.kind) == ("f2", "fiducial")
+        else row
+        for row in measured.comparator
+    ]
+    assert told(replace(measured, comparator=rows)).count("Nothing there") == 1
+
+
 def test_a_frame_without_any_target_needs_a_look(measured: ReportData) -> None:
     rows = [
         replace(row, status=Status.ABSENT, reason="Outside the scan.")

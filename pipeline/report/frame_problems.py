@@ -1,0 +1,73 @@
+"""What of the frames' measurement needs a look, before any adjustment."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
+
+import numpy as np
+
+from pipeline.report.data import Problem
+from pipeline.report.fractions import fraction_test
+from pipeline.report.marks import Frame, Mark
+from pipeline.report.numbers import fixed
+from pipeline.wording import LISTED, counted, listed
+
+Sentence = TypeVar("Sentence", Problem, str)
+
+
+def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
+    """What the frames have to say, said once where several frames say the same."""
+    for problem, images in said_by(shots, _problems_of).items():
+        yield Problem(f"{listed(images)}: {problem.what}", problem.next_step)
+
+
+def said_by(shots: list[Frame], said: Callable[[Frame], Iterable[Sentence]]) -> dict[Sentence, list[str]]:
+    """The frames' names by what they say."""
+    images: dict[Sentence, list[str]] = {}
+    for frame in shots:
+        for sentence in said(frame):
+            images.setdefault(sentence, []).append(frame.image)
+    return images
+
+
+def _problems_of(frame: Frame) -> Iterator[Problem]:
+    pose = frame.scan.get("pose")
+    if pose and not pose["decided"]:
+        reason = " ".join(pose.get("evidence", ()))
+        yield Problem(
+            f"pose assumed ({pose['name']}). {reason}",
+            'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
+        )
+    yield from (Problem(problem) for problem in frame.scan.get("problems", ()))
+    lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
+    if lost:
+        found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
+        yield Problem(
+            f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured ({_reasons(lost)}).",
+            "Look at their pictures in the report. The frame is used; its film transformation is less certain.",
+        )
+    targets = [mark for mark in frame.marks if not mark.is_fiducial]
+    if targets and not any(mark.status.is_observation for mark in targets):
+        yield Problem(
+            f"none of its {len(targets)} targets was measured.",
+            "Look at their reasons in comparator.csv: a wrong pose, diameter or orientation misses them all.",
+        )
+
+
+def _reasons(lost: list[Mark]) -> str:
+    """What became of marks, said once where several of them say the same."""
+    points: dict[str, list[str]] = {}
+    for mark in lost:
+        points.setdefault(f"{mark.status}: {mark.reason.rstrip('.')}", []).append(mark.point)
+    return "; ".join(f"{listed(names)} {reason}" for reason, names in list(points.items())[:LISTED])
+
+
+def pixel_locking(shots: list[Frame]) -> Iterator[Problem]:
+    centers = [m.center_px for f in shots for m in f.marks if m.status.is_observation and m.center_px is not None]
+    for axis, positions in zip(("column", "row"), np.reshape(centers, (-1, 2)).T, strict=True):
+        test = fraction_test(positions)
+        if test.is_locked:
+            yield Problem(
+                f"The {axis} positions of the marks prefer parts of a pixel (pixel locking): they are biased by up to "
+                f"{fixed(test.bias_px)} px.",
+                "Look at the histogram of fractional parts in the report; scan with a finer pitch or in 16 bit.",
+            )
