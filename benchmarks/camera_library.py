@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-# Numbered as in the reports of the US Geological Survey, x' to the right and y' up, the data strip to the left.
+# Numbered as in the reports of the US Geological Survey, x' to the right and y' up. Their form, as in OSL/1785, has the
+# data strip to the left; what forms of other makers and of before 1960 have is not known.
 PLACES = {"ll": "1", "ur": "2", "ul": "3", "lr": "4", "ml": "5", "mr": "6", "mt": "7", "mb": "8"}
 CORNERS, SIDES = ("ll", "ur", "ul", "lr"), ("ml", "mr", "mt", "mb")
 DIRECTIONS = {"ll": (-1, -1), "ur": (1, 1), "ul": (-1, 1), "lr": (1, -1)} | {
@@ -60,7 +61,8 @@ class Kind:
 
     cones_mm: nominal focal lengths. gate_mm: farther from the median is another kind of mark, or a typing error.
     separated: take the marks' places from their separations. sigma_mm: of coordinates with too few reports for a
-    spread. drawn: places whose marks are drawn, by the drawing `mark`, which `shape` tells about.
+    spread. strip: the reports are of the form that has the data strip to the left. drawn: places whose marks are drawn,
+    by the drawing `mark`, which `shape` tells about.
     """
 
     file: str
@@ -76,6 +78,7 @@ class Kind:
     drawn: tuple[str, ...] = ()
     mark: str = ""
     notes: tuple[str, ...] = field(default=())
+    strip: bool = False
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,7 @@ class TypicalMark:
         ]
 
 
+DATA_STRIP = 'data_strip = "left"                     # as the form of the reports has it (OSL/1785)'
 LEARNED_NOTE = (
     " They are learned from the scans, from what recurs in all of them or from clicks in one; or\n"
     "# draw them. A learned mark lies off the reported one by as much as its template does, and its sigma grows by\n"
@@ -143,22 +147,23 @@ NEW_WILD = "the corners: from three Wild frames of 1985 to 1997 that do not name
 UNKNOWN = "not known"
 KINDS = (
     Kind("wild-rc5", "Wild RC5", ("RC5", "RC5A", "RC5/8"), (153,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False,
-         CORNERS, PLAIN_CROSS),
+         CORNERS, PLAIN_CROSS, strip=True),
     Kind("wild-rc8", "Wild RC8", ("RC8",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, OLD_WILD, False,
-         CORNERS, PLAIN_CROSS),
-    Kind("wild-rc9", "Wild RC9", ("RC9",), (88,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False, CORNERS, PLAIN_CROSS),
+         CORNERS, PLAIN_CROSS, strip=True),
+    Kind("wild-rc9", "Wild RC9", ("RC9",), (88,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False, CORNERS, PLAIN_CROSS,
+         strip=True),
     Kind("wild-rc10", "Wild RC10", ("RC10", "RC10A", "RC10A*"), (88, 153, 214, 305), 228.0, CORNERS + SIDES, 0.3,
          0.01, NEW_WILD, False, CORNERS, RING_CROSS,
-         ("Eleven reports, rejected here, have the side marks at 112.5 mm.",)),
+         ("Eleven reports, rejected here, have the side marks at 112.5 mm.",), strip=True),
     Kind("wild-rc30", "Wild RC30", ("RC30",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, NEW_WILD, False,
          CORNERS, RING_CROSS),
     Kind("zeiss-rmk-a", "Zeiss RMK A",
          ("RMK A 8.5/23", "RMK A 15/23", "RMK 15/23", "RMK AR 15/23", "RMK A 21/23", "RMK A 30/23", "RMK 30/23",
           "RMK AR 30/23"), (86, 153, 209, 305), 230.0, CORNERS + SIDES, 0.5, 0.02,
          "the sides: from a frame of 1978 with four notches 226 mm apart", False, SIDES, RMK_NOTCH,
-         ("Many cameras have no corner marks; seven reports, rejected here, have them at 105.0 mm.",)),
+         ("Many cameras have no corner marks; seven reports, rejected here, have them at 105.0 mm.",), strip=True),
     Kind("zeiss-rmk-top", "Zeiss RMK TOP", ("RMK TOP",), (153, 305), 230.0, CORNERS + SIDES, 0.3, 0.02, UNKNOWN),
-    Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, UNKNOWN),
+    Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, UNKNOWN, strip=True),
     Kind("fairchild-k17", "Fairchild K-17", ("K-17", "K-17 (modified)", "K-17B", "K-17B (modified)",
          "K-17C (modified)"), (153, 210, 305), 228.6, SIDES, 2.0, 0.2, UNKNOWN, True),
     Kind("fairchild-t11", "Fairchild T-11", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, UNKNOWN),
@@ -254,13 +259,19 @@ def _camera(
     point_sigma = max(PRINCIPAL_POINT_MM, float(np.median([mark.sigma_mm for mark in marks])))
     lines = [
         f"# {kind.title}, the {cone_mm} mm cone. From the library of reseau: typical values, not those of one camera.",
-        "# Sigmas are the spread over the reports about their median. Seen with the data strip to the left.",
+        "# Sigmas are the spread over the reports about their median."
+        + (" Seen with the data strip to the left." if kind.strip else ""),
         *(f"# {note}" for note in kind.notes),
         *_separation_lines(kind, own),
         f"# Shape of the marks: {kind.shape}." + ("" if kind.mark else LEARNED_NOTE),
         "",
         f'name = "{kind.title}, {cone_mm} mm"',
         f"frame_mm = [{kind.frame_mm}, {kind.frame_mm}]",
+        *(
+            ['data_strip = "left"                     # as the form of the reports has it (OSL/1785)']
+            if kind.strip
+            else []
+        ),
         f"principal_distance_mm = {c_mm:.3f}",
         "principal_point_mm = [0.0, 0.0]         # the reports count from it",
         "",

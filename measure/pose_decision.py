@@ -1,26 +1,28 @@
 """Which of the eight poses a frame has: decided by what breaks its symmetry, or said to be undecided.
 
-Every pose gives the marks found other names. Under the right one their pictures fit (identification dots, unlike marks)
-and their coordinates fit (asymmetries larger than their standard deviations). Both are summed as log-likelihoods; a
-pose is decided only where it beats every other by odds of a thousand to one.
+Every pose gives the marks found other names. Under the right one their pictures fit (identification dots, unlike
+marks), their coordinates fit (asymmetries larger than their standard deviations), and what is written beside the frame
+stands on the side of the camera's data strip. All are summed as log-likelihoods; a pose is decided only where it beats
+every other by odds of a thousand to one.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from measure.constellation import Placement
+from measure.data_strip import Beside, beside_frame, side_in_scan, strip_likelihoods
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
 from measure.frame_fit import FrameFit, fit_frame
 from measure.matching import Match
-from measure.pose_pictures import Shown, Site
+from measure.pose_pictures import SPOILT, Shown, Site
 from measure.poses import up_from_camera
 from measure.results import Pose
 from measure.scan import Scan
-from measure.shapes import Disk, FiducialLayout, Mark, MarkShape
+from measure.shapes import Disk, FiducialLayout, Mark, MarkShape, Side
 
 Array = NDArray[np.float64]
 
@@ -31,18 +33,19 @@ _FILM_DEGREES = 4.0  # of freedom that the standard deviations of film and given
 
 @dataclass(frozen=True, eq=False)
 class _Verdict:
-    """One pose's log-likelihoods, of the pictures (sites,) and of the coordinates; names: of each site's mark, -1 for
-    none; chi_square: of the coordinates."""
+    """One pose's log-likelihoods, of the pictures (sites,), of the coordinates and of the data strip's side; names: of
+    each site's mark, -1 for none; chi_square: of the coordinates."""
 
     pose: str
     names: tuple[int, ...]
     pictures: Array
     coordinates: float
     chi_square: float
+    strip: float = 0.0
 
     @property
     def total(self) -> float:
-        return float(self.pictures.sum()) + self.coordinates
+        return float(self.pictures.sum()) + self.coordinates + self.strip
 
 
 def decide_pose(
@@ -66,7 +69,29 @@ def decide_pose(
         [site.likelihoods([each.shown(index, layout) for each in named]) for index, site in enumerate(sites)]
     ).reshape(len(sites), len(named))
     verdicts = [each.verdict(pictures[:, index]) for index, each in enumerate(named)]
-    return _decision(verdicts, layout)
+    if layout.data_strip is None or not frame.accepted:
+        return _decision(verdicts, layout)
+    beside = beside_frame(scan, layout, frame.pixel_from_camera, frame.placement.pose)
+    likelihoods = strip_likelihoods(beside, layout.data_strip, [verdict.pose for verdict in verdicts], SPOILT)
+    verdicts = [replace(each, strip=own) for each, own in zip(verdicts, likelihoods.tolist(), strict=True)]
+    pose = _decision(verdicts, layout)
+    return replace(pose, evidence=(*pose.evidence, *_of_strip(verdicts, pose.name, beside, layout.data_strip)))
+
+
+def _of_strip(verdicts: Sequence[_Verdict], pose: str, beside: Mapping[Side, Beside], strip: Side) -> tuple[str, ...]:
+    """What the data strip says of the pose."""
+    own = next(verdict.strip for verdict in verdicts if verdict.pose == pose)
+    others = [verdict.strip for verdict in verdicts]
+    lead = max(own - min(others), own - max(others), key=abs)
+    if abs(lead) <= _TOLD:
+        return ()
+    side = side_in_scan(strip, pose)
+    counts = ", ".join(f"{name} {each.written} of {each.seen}" for name, each in beside.items() if each.seen)
+    return (
+        f"the camera's data strip would lie on the {side} of the scan, where film is written on in so many places "
+        f"beside the frame: {counts}. That speaks {'for' if lead > 0 else 'against'} the pose with log-odds "
+        f"{abs(lead):.1f}.",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,12 +162,14 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout) -> Pose:
     names = ", ".join(verdict.pose for verdict in alike)
     lead = best.total - alike[0].total
     if lead > _TOLD:
+        equal = [verdict.pose for verdict in alike if verdict is not best and best.total - verdict.total < _TOLD]
+        as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
         return Pose(
             best.pose,
             False,
             (
                 f"the {seen} marks found do not tell the poses {names} apart with certainty: {best.pose} is assumed, "
-                f"likelier than {alike[0].pose} by log-odds of only {lead:.1f}.",
+                f"{as_likely}likelier than {alike[0].pose} by log-odds of only {lead:.1f}.",
                 *against,
             ),
         )

@@ -24,7 +24,7 @@ _ABOUT_PX = 3.0  # how far about the drawings the ground tells of its grey value
 _PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
 _OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
 _ROUNDS = 4  # of robust weights
-_SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark feigns or hides what tells marks apart
+SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark feigns or hides what tells marks apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Site:
         scale = max(self.like.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
         misfits = np.array([np.sum(np.minimum(np.abs(each) / scale, _OUTLIER) ** 2) for each in residuals])
         relative = np.exp(-(misfits - misfits.min()) / 2 / _PIXELS_PER_DEGREE)
-        return np.asarray(np.log((1 - _SPOILT) * relative + _SPOILT))[picture_of]
+        return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[picture_of]
 
     def _picture(self, shown: Shown, center: Array, size: int) -> Array:
         if shown.mark is None:

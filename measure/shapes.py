@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 Point = tuple[float, float]
 Polarity = Literal["light", "dark", "auto"]
+Side = Literal["left", "right", "top", "bottom"]
 Array = NDArray[np.float64]
 
 _SEARCHED = 0.3  # of a frame corner's reach: the square that it is searched by
@@ -122,10 +123,12 @@ class LayoutMark:
 
 @dataclass(frozen=True)
 class FiducialLayout:
-    """The camera's marks and the size of its exposed frame (width, height)."""
+    """The camera's marks and the size of its exposed frame (width, height). data_strip: the side of the frame, x' to
+    the right and y' up, beside which its instruments and text stand; None where nobody says."""
 
     marks: tuple[LayoutMark, ...]
     frame_mm: Point
+    data_strip: Side | None = None
 
 
 def cross(arm_mm: float, line_mm: float, gap_mm: float = 0.0, angle_deg: float = 0.0) -> tuple[Part, ...]:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import cast, get_args
 
 from adjust import network
 from adjust.families import FAMILY_NAMES, family, parameter_names
@@ -76,9 +76,10 @@ class LearnedFrom:
 class CameraFile:
     """A camera file as read: mm, a standard deviation of 0 fixes, inf frees.
 
-    principal_distance_mm and principal_point_mm are None where the file leaves them to the points. calibration: an
-    earlier one, which takes the place of the standard deviations of all that it gives. clicks: None where nobody has
-    shown the learned marks; learned_from: None before they are learned.
+    principal_distance_mm and principal_point_mm are None where the file leaves them to the points. data_strip: beside
+    which side of the frame instruments and text stand, None where the file does not say. calibration: an earlier one,
+    which takes the place of the standard deviations of all that it gives. clicks: None where nobody has shown the
+    learned marks; learned_from: None before they are learned.
     """
 
     path: Path
@@ -90,6 +91,7 @@ class CameraFile:
     principal_point_sigma_mm: tuple[float, float]
     distortion: network.Distortion
     fiducials: tuple[GivenFiducial, ...]
+    data_strip: shapes.Side | None = None
     calibration: EarlierCalibration | None = None
     source: Source | None = None
     clicks: Clicks | None = None
@@ -121,7 +123,7 @@ class CameraFile:
                     'Add mark = "NAME" to it and a table [mark.NAME] that draws it, or mark = "none" to pass it over; '
                     "a camera of the library is copied with `reseau cameras NAME` for that."
                 )
-        return shapes.FiducialLayout(self.drawn, self.frame_mm)
+        return shapes.FiducialLayout(self.drawn, self.frame_mm, self.data_strip)
 
     def camera(self, center_mm: tuple[float, float] = (0.0, 0.0)) -> network.Camera:
         """The camera for the adjustment. center_mm: where the principal point is sought when the file has none."""
@@ -175,6 +177,7 @@ def parse_camera(table: Table) -> CameraFile:
         principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (default_sigma, default_sigma)),
         distortion=_distortion(table.table("distortion"), frame),
         fiducials=fiducials,
+        data_strip=_side(table, "data_strip"),
         source=_source(table.table("source")) if "source" in table else None,
         clicks=_clicks(table.table("clicks"), fiducials) if "clicks" in table else None,
     )
@@ -199,6 +202,10 @@ def _check_units(
                 "xy_mm",
                 f"lies far outside of the frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm. Give mm from its middle.",
             )
+
+
+def _side(table: Table, key: str) -> shapes.Side | None:
+    return cast(shapes.Side, table.text(key, choices=get_args(shapes.Side))) if key in table else None
 
 
 def _source(table: Table) -> Source:

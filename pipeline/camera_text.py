@@ -17,6 +17,8 @@ def camera_text(camera: CameraFile, save_chip: SaveChip) -> str:
     lines = [f"name = {_quoted(camera.name)}"]
     if camera.frame_mm is not None:
         lines.append(f"frame_mm = {_list(camera.frame_mm)}")
+    if camera.data_strip is not None:
+        lines.append(f"data_strip = {_quoted(camera.data_strip)}")
     if camera.principal_distance_mm is not None:
         lines.append(f"principal_distance_mm = {camera.principal_distance_mm!r}")
     if camera.principal_point_mm is not None:

@@ -84,6 +84,7 @@ def _entry(name: str, camera: CameraFile) -> Json:
         "name": name,
         "title": camera.name,
         "frame_mm": list(camera.frame_mm or ()),
+        "data_strip": camera.data_strip,
         "principal_distance_mm": {
             "value": camera.principal_distance_mm,
             "sigma": camera.principal_distance_sigma_mm,
