@@ -19,6 +19,7 @@ from measure.rendering import extent_px
 from measure.scan import LUMINANCE, Scan
 from measure.shapes import FiducialLayout, FrameCorner, Mark
 from measure.status import Status
+from measure.unseen import reason_unseen
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,7 +37,6 @@ _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
 REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
 _CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
 _FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
-_SHOWS = 1 / 3  # of the others' contrast: ground that leaves less to a mark hides it
 _FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
 _LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
 _SAME_PX = 1.0
@@ -274,26 +274,19 @@ class _Sighter:
                 blur_px,
                 self.weights,
             )
-            certain = seen if seen is not None and self._certain(seen) else None
-            self._take(index, sighting, certain, self._unseen(index, sign, extreme_dn, usual_dn, reach_px))
+            known = seen is not None and seen.sigma_px <= _FAINT_SIGMA_PX
+            certain = seen is not None and self._certain(seen)
+            ground = self._ground(index)
+            room_dn = max(sign * (extreme_dn - float(np.median(ground))), 0.0)
+            unseen = reason_unseen(sign > 0, room_dn, usual_dn, float(ground.std()), reach_px, seen, certain)
+            self._take(index, sighting, seen if certain and known else None, unseen)
 
-    def _unseen(self, index: int, sign: int, extreme_dn: float, usual_dn: float, reach_px: float) -> str:
-        """Why a mark may not be seen: on ground as dark as anything in the scan no dark mark can show; on other ground
-        its texture hides it."""
+    def _ground(self, index: int) -> Array:
+        """The grey values about a mark's place."""
         least, greatest = extent_px(self.layout.marks[index].mark, self._start(index))
         low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
-        ground = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
-        room_dn = max(sign * (extreme_dn - float(np.median(ground))), 0.0)
-        shade = "dark" if sign < 0 else "light"
-        if room_dn < _SHOWS * usual_dn:
-            return (
-                f"the ground at its place is so {shade} that the mark could change it by {room_dn:.0f} grey values "
-                f"only, the others by {usual_dn:.0f}"
-            )
-        return (
-            f"nothing within {reach_px:.0f} px of its place stands out of the texture like it: the ground there varies "
-            f"by {float(ground.std()):.0f} grey values, and a mark could change it by {min(room_dn, usual_dn):.0f}"
-        )
+        window = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
+        return np.asarray(window, dtype=float)
 
     def _take(self, index: int, sighting: Sighting, seen: Glimpse | None, unseen: str) -> None:
         """Keep a clear fit where the glimpse is of the same; else the glimpse counts, or that there was none."""
@@ -310,9 +303,9 @@ class _Sighter:
                 self.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
 
     def _certain(self, seen: Glimpse) -> bool:
-        sigma_px = float(np.sqrt(np.linalg.eigvalsh(seen.fit.covariance_px2)[-1]))
+        """Whether neither texture nor rounding feigns it."""
         strong = abs(seen.fit.contrast_dn) >= _FAINT_CONTRAST * self.scan.full_scale_dn
-        return seen.chance <= _CHANCE and sigma_px <= _FAINT_SIGMA_PX and strong
+        return seen.chance <= _CHANCE and strong
 
     def clear(self, index: int) -> bool:
         """Whether a mark needs no second look: it is plainly there, be it where the others put it or not."""

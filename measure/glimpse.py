@@ -42,6 +42,11 @@ class Glimpse:
     fit: Match
     chance: float
 
+    @property
+    def sigma_px(self) -> float:
+        """The standard deviation of its place, in the direction in which it is known least."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.fit.covariance_px2)[-1]))
+
 
 def glimpse(
     scan: Scan,
