@@ -5,7 +5,7 @@ pixels (col right, row down). Every part is an outline, a circle one of so many 
 theorem the area of a part in each pixel follows from the piece of outline in it and in the pixels left of it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -38,7 +38,7 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     cell_from_mark[:, 2] += 0.5
     cell_from_mark *= cells  # corners of cells are whole numbers
     covered = np.zeros((height * cells, width * cells), np.float32)
-    for pieces in _pieces_of(shape.parts, cell_from_mark):
+    for pieces in _pieces_of(shape, cell_from_mark):
         _add(covered, pieces)
     return covered
 
@@ -74,14 +74,17 @@ class _Pieces:
     middle: Array
 
 
-def _pieces_of(parts: Sequence[Part], cell_from_mark: Array) -> Iterator[_Pieces]:
+def _pieces_of(shape: MarkShape, cell_from_mark: Array) -> Iterator[_Pieces]:
     """The outlines of all parts are cut at once."""
+    parts = shape.parts
     outlines = [_outlines(part, cell_from_mark) for part in parts]
     corners = np.concatenate([outline for own in outlines for outline in own])
     ends = np.concatenate([np.roll(outline, -1, axis=0) for own in outlines for outline in own])
     part_of = np.repeat(np.arange(len(parts)), [sum(map(len, own)) for own in outlines])
     linear, shift = cell_from_mark[:, :2].T, cell_from_mark[:, 2]
-    start, end, part_of = _split(corners @ linear + shift, ends @ linear + shift, part_of, axis=1)
+    start, end, part_of = _split(
+        shape.drawn_at(corners) @ linear + shift, shape.drawn_at(ends) @ linear + shift, part_of, axis=1
+    )
     start, end, part_of = _split(start, end, part_of, axis=0)
     tall, middle = end[:, 1] - start[:, 1], (start + end) / 2
     col, row = np.floor(middle).astype(np.intp).T

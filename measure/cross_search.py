@@ -139,12 +139,12 @@ def _cross_of(patch: NDArray[np.floating], line: float) -> tuple[Array, Array] |
     apart = np.abs((np.arange(len(directions)) - first + len(directions) / 2) % len(directions) - len(directions) / 2)
     others = np.where(apart * STEPS_DEG >= LEAST_ANGLE_DEG, (on_bar & ~on_bar[:, [first]]).sum(axis=0), -1)
     second = int(np.argmax(others))
-    bars = np.stack([_bar(off[on_bar[:, k]], units[:, k]) for k in (first, second)], axis=1)
     explained = (on_bar[:, first] | on_bar[:, second]).mean()
-    filled = min(_filled(patch, center, bar) for bar in (*bars.T, *-bars.T))
-    if explained < LEAST_EXPLAINED or filled < LEAST_FILLED or abs(np.linalg.det(bars)) < 1.0:
+    if explained < LEAST_EXPLAINED or others[second] == 0:
         return None
-    return center, bars
+    bars = np.stack([_bar(off[on_bar[:, k]], units[:, k]) for k in (first, second)], axis=1)
+    filled = min(_filled(patch, center, bar) for bar in (*bars.T, *-bars.T))
+    return (center, bars) if filled >= LEAST_FILLED and abs(np.linalg.det(bars)) >= 1.0 else None
 
 
 def _bar(off: Array, unit: Array) -> Array:

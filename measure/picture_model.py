@@ -244,4 +244,5 @@ def is_round(mark: Mark) -> bool:
     """Whether every rotation leaves the mark as it is."""
     if isinstance(mark, MarkTemplate):
         return False
-    return all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in mark.parts)
+    centred = all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in mark.parts)
+    return centred and not any(mark.perspective)

@@ -79,7 +79,7 @@ def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
         chip_from_mark = _chip_from_mark(mark)
         outline = (corners - chip_from_mark[:, 2]) @ np.linalg.inv(chip_from_mark[:, :2]).T
     else:
-        outline = np.concatenate([outline_mm(part) for part in mark.parts])
+        outline = mark.drawn_at(np.concatenate([outline_mm(part) for part in mark.parts]))
     points = outline @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
     return points.min(axis=0), points.max(axis=0)
 

@@ -56,14 +56,22 @@ Part = Disk | Ring | Bar | Polygon
 
 @dataclass(frozen=True)
 class MarkShape:
-    """A mark that is drawn. Overlapping parts count once."""
+    """A mark that is drawn. Overlapping parts count once.
+
+    perspective: of a plane seen obliquely, per mm: a point u of the parts is drawn at u / (1 + perspective u).
+    """
 
     parts: tuple[Part, ...]
     polarity: Polarity = "auto"
+    perspective: Point = field(default=(0.0, 0.0), kw_only=True)
 
     def __post_init__(self) -> None:
         if not self.parts:
             raise ValueError("a mark needs at least one part")
+
+    def drawn_at(self, places_mm: Array) -> Array:
+        """Where points (n, 2) of the parts are drawn."""
+        return np.asarray(places_mm / (1.0 + places_mm @ self.perspective)[:, None])
 
 
 @dataclass(frozen=True)
@@ -187,25 +195,30 @@ def turned(mark: Mark, angle_deg: float) -> Mark:
     """The mark turned counter-clockwise about its origin."""
     if isinstance(mark, MarkTemplate):
         return replace(mark, turn_deg=mark.turn_deg + angle_deg)
-    return replace(mark, parts=tuple(turned_part(part, angle_deg) for part in mark.parts))
+    parts = tuple(turned_part(part, angle_deg) for part in mark.parts)
+    return replace(mark, parts=parts, perspective=_turned_point(mark.perspective, angle_deg))
 
 
 def turned_part(part: Part, angle_deg: float) -> Part:
     """The part turned counter-clockwise about the mark's origin; quarter turns are exact."""
-    quarter, rest = divmod(angle_deg, 90.0)
-    if rest == 0.0:
-        c, s = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarter) % 4]
-    else:
-        c, s = float(np.cos(np.deg2rad(angle_deg))), float(np.sin(np.deg2rad(angle_deg)))
 
     def turn(point: Point) -> Point:
-        return (c * point[0] - s * point[1], s * point[0] + c * point[1])
+        return _turned_point(point, angle_deg)
 
     if isinstance(part, Polygon):
         return Polygon(tuple(turn(vertex) for vertex in part.vertices_mm))
     if isinstance(part, Bar):
         return Bar(turn(part.from_mm), turn(part.to_mm), part.line_mm)
     return replace(part, center_mm=turn(part.center_mm))
+
+
+def _turned_point(point: Point, angle_deg: float) -> Point:
+    quarter, rest = divmod(angle_deg, 90.0)
+    if rest == 0.0:
+        c, s = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarter) % 4]
+    else:
+        c, s = float(np.cos(np.deg2rad(angle_deg))), float(np.sin(np.deg2rad(angle_deg)))
+    return (c * point[0] - s * point[1], s * point[0] + c * point[1])
 
 
 def thinnest_mm(mark: Mark) -> float:

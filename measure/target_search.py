@@ -1,14 +1,14 @@
 """Disks near the places where targets are predicted: by correlation with their predicted picture, then fitted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.disks import FittedDisk, fit_disk
+from measure.disks import UNIT_DISK, FittedDisk, fit_disk
 from measure.rendering import extent_px, picture
 from measure.scan import Scan
 from measure.shapes import MarkShape, thinnest_mm
@@ -31,6 +31,8 @@ class Prediction(Protocol):
     def pixel_from_disk(self) -> Array: ...
     @property
     def search_px(self) -> float: ...
+    @property
+    def perspective(self) -> Array: ...
 
 
 @dataclass
@@ -104,7 +106,7 @@ def fitted_at(
     if index is not None:
         disk = result.disks[index]
     else:
-        disk = fit_disk(scan, spot, prediction.pixel_from_disk, shape=shape)
+        disk = fit_disk(scan, spot, prediction.pixel_from_disk, shape=_in_perspective(shape, prediction))
         if disk.reason:
             return None, disk.reason
         if np.hypot(*(disk.center_px - prediction.center_px)) > prediction.search_px + 1:
@@ -115,6 +117,14 @@ def fitted_at(
     if not 1 / size_tolerance < ratio < size_tolerance:
         return None, f"what was found there has {ratio:.2f} times its radius"
     return index, ""
+
+
+def _in_perspective(shape: MarkShape, prediction: Prediction) -> MarkShape:
+    """The shape as it is seen but for an affinity. A disk is an ellipse all the same."""
+    if shape is UNIT_DISK:
+        return shape
+    x, y = (prediction.perspective @ prediction.pixel_from_disk).tolist()
+    return replace(shape, perspective=(x, y))
 
 
 def known_disk(disks: list[FittedDisk], spot: Array) -> int | None:

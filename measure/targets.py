@@ -24,13 +24,15 @@ class TargetPrediction:
     """Where a target should be, and how its shape is sheared there.
 
     center_px (2,): column and row; pixel_from_disk (2, 2): the target's circle of radius 1 to px, its columns the
-    images of two radius vectors at right angles; search_px: how far off the prediction may be.
+    images of two radius vectors at right angles; search_px: how far off the prediction may be. perspective (2,), per
+    px: what an affinity puts d px off the centre lies d / (1 + perspective d) off it.
     """
 
     point: str
     center_px: Array
     pixel_from_disk: Array
     search_px: float
+    perspective: Array = field(default_factory=lambda: np.zeros(2))
 
     def __post_init__(self) -> None:
         if np.shape(self.center_px) != (2,) or np.shape(self.pixel_from_disk) != (2, 2):

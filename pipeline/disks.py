@@ -60,8 +60,9 @@ def _centre_of_gravity(outline: Array) -> Array:
 
 def disk_images(
     model: ImageModel, pitch_um: tuple[float, float], centers: Array, normals: Array, radius: float
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Predicted centres (n, 2) px, maps (n, 2, 2) from each disk's two radius vectors to pixels, what is visible."""
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Predicted centres (n, 2) px, maps (n, 2, 2) from each disk's two radius vectors to pixels, perspective (n, 2) per
+    px, by which what is nearer to the camera is larger, and what is visible."""
     first, second = across(normals)
     place, visible = model.comparator_from_object(centers)
     columns = []
@@ -70,7 +71,11 @@ def disk_images(
         behind, seen_behind = model.comparator_from_object(centers - radius * direction)
         columns.append(pixel_from_comparator((ahead - behind) / 2.0, pitch_um))
         visible = visible & seen_ahead & seen_behind
-    return pixel_from_comparator(place, pitch_um), np.stack(columns, axis=-1), visible
+    maps = np.stack(columns, axis=-1)
+    depth = (model.station - centers) @ model.rotation[2]
+    deeper = -np.stack([first, second], axis=1) @ model.rotation[2] * radius / depth[:, None]
+    perspective = np.einsum("ni,nij->nj", deeper, np.linalg.inv(maps))
+    return pixel_from_comparator(place, pitch_um), maps, perspective, visible
 
 
 def disk_normals(

@@ -38,9 +38,10 @@ class Field:
         """Where and how every target before the camera should be seen; crosses upright, their arms along the horizontal
         and at right angles to it."""
         normals, _ = disk_normals(self.ids, self.xyz, self.normals, plane_normal(self.xyz), model.station)
-        centers, maps, visible = disk_images(model, scan.pitch_um, self.xyz, normals, self.radius)
+        centers, maps, perspective, visible = disk_images(model, scan.pitch_um, self.xyz, normals, self.radius)
         return tuple(
-            TargetPrediction(self.ids[i], centers[i], maps[i], search_px) for i in np.flatnonzero(visible)
+            TargetPrediction(self.ids[i], centers[i], maps[i], search_px, perspective[i])
+            for i in np.flatnonzero(visible)
         )  # fmt: skip
 
 

@@ -58,7 +58,12 @@ class NamedField:
 
     def _as_found(self, predicted: TargetPrediction) -> TargetPrediction:
         found = self.candidates[predicted.point]
-        return TargetPrediction(predicted.point, found.center_px, found.pixel_from_disk, _FOUND_WITHIN_PX)
+        return replace(
+            predicted,
+            center_px=found.center_px,
+            pixel_from_disk=found.pixel_from_disk,
+            search_px=_FOUND_WITHIN_PX,
+        )
 
 
 def name_field(

@@ -30,8 +30,14 @@ def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered
         centers = np.array([[point[axis]["value"] for axis in "XYZ"] for point in points])
         normals = np.array([point["normal"] for point in points])
         pitch = tuple(frame["pitch_um"])
-        place_px, _, visible = disk_images(model, pitch, centers, normals, radius)
+        place_px, maps, perspective, visible = disk_images(model, pitch, centers, normals, radius)
         assert visible.all()
+        # A point of the plane ten radii off, moved by perspective by up to 0.8 px: film and lens hardly bend here.
+        off_px = maps @ (6.0, 8.0)
+        first, second = across(normals)
+        far, _ = model.comparator_from_object(centers + radius * (6.0 * first + 8.0 * second))
+        seen_px = place_px + off_px / (1.0 + np.sum(perspective * off_px, axis=1))[:, None]
+        np.testing.assert_allclose(pixel_from_comparator(far, pitch), seen_px, atol=0.03)
         true_px = np.array([(place["col_px"], place["row_px"]) for place in shown.values()])
         ellipse_px = np.array([(place["ellipse_col_px"], place["ellipse_row_px"]) for place in shown.values()])
         np.testing.assert_allclose(place_px, true_px, atol=1e-6)
