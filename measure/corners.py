@@ -17,6 +17,7 @@ from scipy.special import erf, ndtr, owens_t
 
 from measure.junction import junction
 from measure.noise import NoiseModel, correlated, noise_model, robust_scale
+from measure.pixel_sums import products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -147,8 +148,8 @@ class _CornerFit:
             model = noise_model(residuals, used, self.unknowns)
             noise = float(np.sqrt(model.variance_dn2))
             weighted = design * self.weights
-            inverse = np.linalg.pinv(_products(weighted, design), hermitian=True)
-            covariance = (inverse @ _products(weighted, correlated(weighted, model)) @ inverse)[:2, :2]
+            inverse = np.linalg.pinv(products(weighted, design), hermitian=True)
+            covariance = (inverse @ products(weighted, correlated(weighted, model)) @ inverse)[:2, :2]
             if not 2 * abs(self.linear[0]) > 4 * noise:
                 self.reason = "no edges stand out from the noise"
             elif self.bends:
@@ -173,7 +174,7 @@ class _CornerFit:
         meeting, by_grey = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, window_px, area)
         if not np.hypot(*(meeting - self.center)) < window_px:
             return None, None
-        return meeting, _products(by_grey, correlated(by_grey, noise))
+        return meeting, products(by_grey, correlated(by_grey, noise))
 
     def _adjust(self, tolerance_px: float) -> None:
         for _ in range(MAX_ITERATIONS):
@@ -222,14 +223,14 @@ class _CornerFit:
         return np.concatenate([slope * np.stack(shape), grey]), self.grey - np.tensordot(self.linear, grey, axes=1)
 
     def _best_linear(self, grey: Array) -> Array:
-        normal = _products(grey * self.weights, grey)
+        normal = products(grey * self.weights, grey)
         right = np.tensordot(grey * self.weights, self.grey, axes=2)
         return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0])
 
     def _step(self, design: Array, residuals: Array) -> float:
         """A Gauss-Newton step, shortened to what a linearisation can bear; its length in px."""
         weighted = design * self.weights
-        normal = _products(weighted, design)
+        normal = products(weighted, design)
         size = np.sqrt(np.diag(normal))
         if not np.all(size > 0):
             self.reason = "nothing here shows where the edges meet"
@@ -246,7 +247,3 @@ class _CornerFit:
         elif np.abs(self.edges - self.start_edges).max() > self.max_turn_rad:
             self.reason = "the edges here run otherwise than they should"
         return float(np.hypot(*step[:2]))
-
-
-def _products(first: Array, second: Array) -> Array:
-    return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)

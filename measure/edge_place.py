@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from measure.noise import NoiseModel, correlated
+from measure.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -50,19 +51,19 @@ def edge_place(
     the first two by column and row; by_grey, alike: derivatives of the unknowns by the grey values.
     """
     weights = _weights(design[:2] * used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * used
-    response = np.tensordot(weights, design, axes=((1, 2), (1, 2)))
+    response = products(weights, design)
     turned = response[:, :2]
     if not np.linalg.cond(turned) < 1e6:
         return None
     # What noise the match has taken up already has left the residuals.
-    left = weights - np.tensordot(response, by_grey, axes=1)
-    by_noise = np.tensordot(np.linalg.inv(turned), left, axes=1)
+    left = weights - combined(response, by_grey)
+    by_noise = combined(np.asarray(np.linalg.inv(turned)), left)
     smeared = noise.variance_dn2 * by_noise if noise.is_white else correlated(by_noise, noise)
-    covariance = np.tensordot(by_noise, smeared, axes=((1, 2), (1, 2)))
+    covariance = products(by_noise, smeared)
     covariance = (covariance + covariance.T) / 2
     if not np.all(np.linalg.eigvalsh(covariance) > 0):
         return None
-    offset = np.linalg.solve(turned, np.tensordot(weights, residuals, axes=2))
+    offset = np.linalg.solve(turned, products(weights, residuals[None])[:, 0])
     return EdgePlace(np.asarray(offset), np.asarray(covariance))
 
 

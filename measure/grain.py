@@ -17,10 +17,11 @@ from scipy.optimize import nnls
 
 from measure.blank_film import PATCH_PX, PLANE
 from measure.noise import NoiseModel, padded
+from measure.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Images = NDArray[np.float64] | NDArray[np.float32]
+Single = NDArray[np.float32]
 
 # Standard deviations of the Gaussian that smears white noise into grain, and the coarsest that is still film's.
 GRAIN_PX = (0.4, 0.5, 0.6, 0.7, 0.8, 0.95, 1.1, 1.3, 1.5, 1.8, 2.2)
@@ -28,6 +29,7 @@ _COARSEST_PX = 1.8
 REACH_PX = 8  # grain of 1.5 px is correlated by one in a thousand there
 _FARTHEST_PX = 3.0  # lags that are compared: beyond it the residuals hold the fit's marks rather than the noise's
 _FARTHEST_BLANK_PX = 5.0
+_ALIKE = 1e-10  # of the largest eigenvalue: what unknowns tell apart by less is no direction of its own
 
 
 def grain_model(
@@ -66,18 +68,18 @@ class _Window:
     """The pixels of a fit and what it takes out of the noise there; sums over all pairs of pixels so far apart."""
 
     def __init__(self, used: Mask, design: Array, farthest_px: float) -> None:
-        self.used = used
+        """used (height, width); design (unknowns, height, width): derivatives, 0 where not used."""
         self.rings = _rings(farthest_px)
-        directions, _ = np.linalg.qr(design[:, used].T)
-        self.taken = np.zeros((directions.shape[1], *used.shape), np.float32)
-        self.taken[:, used] = directions.T
-        self.pairs = self.products(used[None].astype(float))
+        border = int(farthest_px)
+        self.used = np.pad(used, border)
+        self.taken = np.pad(_orthonormal(design).astype(np.float32), [(0, 0), (border, border), (border, border)])
+        self.pairs = self.products(self.used[None])
         self.weights = 1.0 / np.sqrt(np.maximum(self.pairs, 1.0))
 
-    def products(self, images: Array) -> Array:
+    def products(self, images: Array | Mask) -> Array:
         """(distances,) sums over the images of the products of their pixels so far apart."""
         shape = padded(images.shape[1:], REACH_PX)
-        lags = fft.irfft2((np.abs(fft.rfft2(images, s=shape)) ** 2).sum(axis=0), s=shape)
+        lags = fft.irfft2((np.abs(fft.rfft2(images.astype(np.float32), s=shape)) ** 2).sum(axis=0), s=shape)
         return np.array([lags[ring.index].sum() for ring in self.rings])
 
     @cached_property
@@ -91,15 +93,24 @@ class _Window:
         shape = padded(self.used.shape, REACH_PX)
         spectra = np.conj(fft.rfft2(self.taken, s=shape))
         index = np.arange(-REACH_PX, REACH_PX + 1)
+        taken, used = self.taken.reshape(len(self.taken), -1), self.used.ravel().astype(np.float32)
         left = []
         for ring, pairs in zip(self.rings, self.pairs, strict=True):
-            beside = ring.sums(self.taken) * self.used
-            among = np.tensordot(self.taken, beside, axes=((1, 2), (1, 2)))
-            beside = np.tensordot(among, self.taken, axes=1) - 2 * beside
-            lags = fft.irfft2((spectra * fft.rfft2(beside, s=shape)).sum(axis=0), s=shape)
-            taken = _KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel()
-            left.append(pairs * _KERNELS[:, REACH_PX + ring.lags[0][0], REACH_PX + ring.lags[0][1]] + taken)
+            beside = ring.sums(taken, self.used.shape[1]) * used
+            beside = (taken @ beside.T) @ taken - 2 * beside
+            lags = fft.irfft2((spectra * fft.rfft2(beside.reshape(self.taken.shape), s=shape)).sum(axis=0), s=shape)
+            less = _KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel()
+            left.append(pairs * _KERNELS[:, REACH_PX + ring.lags[0][0], REACH_PX + ring.lags[0][1]] + less)
         return np.stack(left, axis=1)
+
+
+def _orthonormal(design: Array) -> Array:
+    """(n, height, width) a base of the space of images (unknowns, height, width)."""
+    size = np.sqrt(np.maximum((design**2).sum(axis=(1, 2)), 1e-300))
+    unit = design / size[:, None, None]
+    values, vectors = np.linalg.eigh(products(unit, unit))
+    told = values > _ALIKE * values[-1]
+    return combined((vectors[:, told] / np.sqrt(values[told])).T, unit)
 
 
 @dataclass(frozen=True)
@@ -113,14 +124,14 @@ class _Ring:
         """Of these lags in a picture of all of them that begins with none, negative ones at its end."""
         return [down for down, _ in self.lags], [right for _, right in self.lags]
 
-    def sums(self, images: Images) -> Images:
-        """Of the pixels at these lags from each pixel of images (n, height, width)."""
+    def sums(self, images: Single, width: int) -> Single:
+        """Of the pixels at these lags from each pixel of images (n, pixels), row after row of that width, which are 0
+        in a border as wide as the lags."""
         total = np.zeros_like(images)
-        height, width = images.shape[1:]
+        most = max(max(abs(down), abs(right)) for down, right in self.lags) * (width + 1)
         for down, right in self.lags:
-            total[:, max(-down, 0) : height - max(down, 0), max(-right, 0) : width - max(right, 0)] += images[
-                :, max(down, 0) : height + min(down, 0), max(right, 0) : width + min(right, 0)
-            ]
+            lag = down * width + right
+            total[:, most : total.shape[1] - most] += images[:, most + lag : total.shape[1] - most + lag]
         return total
 
 

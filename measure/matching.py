@@ -137,7 +137,7 @@ def _fitted(window: _Window, options: MatchOptions, coarse_px: float | None = No
         wide = replace(options, margin_px=reach_px)
         narrow, part = part, _part(window, wide)
         fit = _begun(window, part, wide, coarse_px, fit.model.state.moved(narrow.corner_px - part.corner_px))
-        fit.hold()
+        fit.choose_area()
     fit.refine()
     return part, fit
 

@@ -5,7 +5,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.noise import NoiseModel, correlated, robust_scale
-from measure.picture_model import ROUNDING_DN, PictureModel
+from measure.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
+from measure.pixel_sums import combined, products
 from measure.rendering import chip_mask, picture
 from measure.robust import damage, solution, tukey_loss, tukey_weights
 from measure.shapes import MarkTemplate
@@ -38,25 +39,25 @@ class PictureFit:
         self.reason = ""
 
     def approach(self) -> None:
-        """Plain, then robust; stops with a reason where something gives way."""
-        self._choose_area()
+        """Plain, then roughly robust; stops with a reason where something gives way."""
+        self.choose_area()
         if not self.reason and np.ptp(self.model.grey[self.area]) == 0.0:
             self.reason = "the picture is even there: nothing stands out"
         if not self.reason:
-            self._adjust(robust=False, tolerance_px=0.05)
+            self.model.bent = ROUGHLY_BENT
+            self._adjust(robust=False, tolerance_px=0.1)
         if self.reason == _UNSETTLED:  # dust may keep squares from settling, and not what holds against it
             self.reason = ""
         if not self.reason:
-            self.hold()
-
-    def hold(self) -> None:
-        """Robust, from a state near the mark's."""
-        self._choose_area()
+            self.choose_area()
         if not self.reason:
-            self._adjust(robust=True, tolerance_px=0.005)
+            self._adjust(robust=True, tolerance_px=0.05)
 
     def refine(self) -> None:
-        """On what is undamaged."""
+        """Robust from there, then on what is undamaged."""
+        self.model.bent = BENT
+        if not self.reason:
+            self._adjust(robust=True, tolerance_px=0.005)
         for round_ in range(self.options.damage_rounds):
             if self.reason:
                 return
@@ -105,18 +106,18 @@ class PictureFit:
     def _covariance(self, weights: Array, smeared: Array) -> tuple[Array, Array]:
         """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these."""
         priors = np.diag(self.model.prior_weights())
-        inverse = np.linalg.inv(_products(weights, self.model.design) + priors)
-        covariance = np.asarray(inverse @ (_products(weights, smeared) + priors) @ inverse.T)
+        inverse: Array = np.asarray(np.linalg.inv(products(weights, self.model.design) + priors))
+        covariance = np.asarray(inverse @ (products(weights, smeared) + priors) @ inverse.T)
         if not np.all(np.linalg.eigvalsh(covariance[:2, :2] + covariance[:2, :2].T) > 0):
             covariance = inverse  # lags that are noise themselves: as if it were white
-        return np.asarray((covariance + covariance.T) / 2), np.tensordot(inverse, weights, axes=1)
+        return np.asarray((covariance + covariance.T) / 2), combined(inverse, weights)
 
     def _step_by(self, weights: Array) -> Array | None:
         """Gauss-Newton with weighted derivatives: how far the mark moved, (2,) px; None where it does not settle."""
         model, priors, start = self.model, self.model.prior_weights(), self.model.state.pixel_from_mark[:, 2]
         for _ in range(_WEIGHTED_STEPS):
-            normal = _products(weights, model.design) + np.diag(priors)
-            right = np.tensordot(weights, model.residuals, axes=2) - priors * model.departures()
+            normal = products(weights, model.design) + np.diag(priors)
+            right = products(weights, model.residuals[None])[:, 0] - priors * model.departures()
             step: Array = np.asarray(np.linalg.solve(normal, right), float)
             if model.blur_is_held(step):
                 free = np.arange(len(step)) != model.blur
@@ -144,7 +145,7 @@ class PictureFit:
         near = self.area & ~self.far
         return 1.0 - float((near & self.used).sum() / max(near.sum(), 1))
 
-    def _choose_area(self) -> None:
+    def choose_area(self) -> None:
         """The pixels within margin_px of the mark: beyond it the background only disturbs."""
         height, width = self.model.grey.shape
         mark, place = self.model.mark, self.model.place_drawn()
@@ -165,8 +166,9 @@ class PictureFit:
         model = self.model
         model.noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
         model.linearise(self.used)
-        self.variance_dn2 = self._tukey_scale() ** 2
-        scale_dn = self._tukey_scale() if robust else np.inf
+        tukey_dn = self._tukey_scale()
+        self.variance_dn2 = tukey_dn**2
+        scale_dn = tukey_dn if robust else np.inf
         for _ in range(self.options.max_iterations):
             step = self._solve(self.used * tukey_weights(model.residuals, scale_dn))
             if step is None:
@@ -192,7 +194,7 @@ class PictureFit:
     def _cost(self, scale_dn: float) -> float:
         """What the adjustment makes small: Tukey's loss, squares where the scale is infinite, and the priors'."""
         priors = np.sum(self.model.prior_weights() * self.model.departures() ** 2)
-        return float(tukey_loss(self.model.residuals[self.used], scale_dn) + self.variance_dn2 * priors)
+        return float(tukey_loss(self.model.residuals * self.used, scale_dn) + self.variance_dn2 * priors)
 
     def _tukey_scale(self) -> float:
         return max(robust_scale(self.model.residuals[self.telling]), _SCALE_FLOOR * self.contrast_dn, 1e-9)
@@ -201,17 +203,12 @@ class PictureFit:
         """The step, None where it is not determined. A blur at its limit stays there instead of pulling the others."""
         model = self.model
         priors = model.prior_weights() * self.variance_dn2
-        design = model.design.reshape(len(priors), -1)
-        weighted = design * weights.ravel()
-        normal = weighted @ design.T + np.diag(priors)
-        right = weighted @ model.residuals.ravel() - priors * model.departures()
+        weighted = model.design * weights
+        normal = products(weighted, model.design) + np.diag(priors)
+        right = products(weighted, model.residuals[None])[:, 0] - priors * model.departures()
         free = np.ones(len(right), dtype=bool)
         step = solution(normal, right, free)
         if step is not None and model.blur_is_held(step):
             free[model.blur] = False
             step = solution(normal, right, free)
         return step
-
-
-def _products(first: Array, second: Array) -> Array:
-    return np.asarray(np.tensordot(first, second, axes=((1, 2), (1, 2))))

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from measure.clipping import Sides, censored, tells
 from measure.match_options import Freedom, MatchOptions
-from measure.rendering import Rendering, extent_px, render
+from measure.pixel_sums import combined
+from measure.rendering import Rendering, reach_px, render
 from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
 
 Array = NDArray[np.float64]
@@ -26,10 +27,11 @@ _GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]]
 }
 ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values adds
 _BLUR_RANGE_PX = (0.3, 6.0)
-_BENT_PX = 0.05  # of the mark's outline: so far a series replaces a new drawing
+BENT, ROUGHLY_BENT = 0.075, 0.4  # of the mark's outline, times the blur: so far a series replaces a new drawing
 _PIXEL_VARIANCE_PX2 = 1 / 12
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
-_LINEAR_PX = 0.005  # within it a linearisation is as good as a new one: half its square is 1e-5 px
+_MOST_BLURRED = 2.0  # times the blur, likewise
+_LINEAR = 0.015  # times the blur: within it a linearisation is as good as a new one, to 1e-4 of the blur
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,7 @@ class PictureModel:
     """The model at its present state: design (unknowns, height, width) and residuals (height, width). The unknowns are
     column and row, the generators' parameters, the blur's variance if it is estimated, and the greys.
 
+    bent: how far, in units of the blur, a series may bend the drawing before it is drawn anew.
     start: where the mark is expected, and state, if given, what an earlier fit made of it.
     ground (3, height, width): offset and slopes of the background.
     clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
@@ -79,8 +82,9 @@ class PictureModel:
         sharp = isinstance(mark, MarkTemplate) and not options.estimate_blur
         self.state = state or State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
         self._linearised: tuple[State, Array] | None = None  # the state of the design, and its residuals
-        self.drawn = start[:, :2].copy()
-        self.reach_px = float(np.hypot(*np.abs(np.array(extent_px(mark, start)) - start[:, 2]).max(axis=0)))
+        self.bent = BENT
+        self._draw(start[:, :2])
+        self.reach_px = reach_px(mark, start[:, :2])
         self.mark_from_start: Array = np.linalg.inv(start[:, :2]).astype(float)
         self.ground = _planes(*grey.shape)
         self.residuals = np.zeros_like(grey)
@@ -92,8 +96,8 @@ class PictureModel:
         if self._linearised is not None:
             at, residuals = self._linearised
             change = self._change(at)
-            if self._length_px(change) < _LINEAR_PX:
-                self.residuals = residuals - np.tensordot(change, self.design, axes=1)
+            if self._length_px(change) < _LINEAR * self.seen_blur_px and not self._is_bent():
+                self.residuals = residuals - combined(change, self.design)
                 return
         height, width = self.grey.shape
         place = self.state.pixel_from_mark
@@ -107,13 +111,13 @@ class PictureModel:
         columns[0], columns[1] = shown.by_col, shown.by_row
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
         moves = np.stack([slope * along for slope in columns[:2] for along in (col, row)])
-        columns[self.linear] = np.tensordot(self.generators.reshape(-1, 4), moves, axes=1)
+        columns[self.linear] = combined(self.generators.reshape(-1, 4), moves)
         if self.blur is not None:
             columns[self.blur] = -0.5 * shown.laplacian
         if self.background_px is not None:
             columns[:] = [self._detail(column) for column in columns]
         columns *= -self.state.greys[0]
-        self.residuals = self.grey - np.tensordot(self.state.greys, greys, axes=1)
+        self.residuals = self.grey - combined(self.state.greys, greys)
         self._censor()
         # What is clipped depends on the noise as well.
         self._linearised = None if self.clipped.any() else (self.state, self.residuals)
@@ -130,16 +134,16 @@ class PictureModel:
         return change
 
     def _length_px(self, change: Array) -> float:
-        """How far a change moves the mark's outline, or blurs it."""
+        """How far a change moves the mark's outline; blurring counts double, for the standard deviations' sake."""
         length = float(np.hypot(*change[:2])) + self.reach_px * float(np.abs(change[self.linear]).max(initial=0.0))
         if self.blur is None:
             return length
         variance = self.state.variance_px2
-        return length + abs(float(np.sqrt(variance) - np.sqrt(variance - change[self.blur])))
+        return length + 2 * abs(float(np.sqrt(variance) - np.sqrt(variance - change[self.blur])))
 
     def _parameters(self, change: Array) -> Array:
         """The generators' parameters of a change (2, 2) of the linear part."""
-        return np.asarray(np.tensordot(self.generators, change) / 2)  # of two ones each
+        return np.asarray(self.generators.reshape(-1, 4) @ change.ravel() / 2)  # of two ones each
 
     def _censor(self) -> None:
         """Clipped grey values hold the model on their side of the limit only."""
@@ -153,18 +157,34 @@ class PictureModel:
     def blur_px(self) -> float:
         return float(np.sqrt(self.state.variance_px2))
 
+    @property
+    def seen_blur_px(self) -> float:
+        """The standard deviation of blur and pixel."""
+        return float(np.sqrt(self.state.variance_px2 + _PIXEL_VARIANCE_PX2))
+
     def place_drawn(self) -> Array:
         """(2, 3) the present place of the mark as it was last drawn: its linear part is close to the present one."""
         place = self.state.pixel_from_mark
-        change = place[:, :2] @ np.linalg.inv(self.drawn) - np.eye(2)
-        if float(np.sqrt(np.sum(change**2))) * self.reach_px > _BENT_PX:
-            self.drawn = place[:, :2].copy()
-        return np.column_stack([self.drawn, place[:, 2]])
+        if self._is_bent():
+            self._draw(place[:, :2])
+        return np.column_stack([self._drawn, place[:, 2]])
+
+    def _is_bent(self) -> bool:
+        """Whether the present mark is bent farther than a series reaches; column by column of the linear part."""
+        most = float(np.hypot(*self._bent()).max()) * self.reach_px
+        return most > self.bent * self.seen_blur_px
+
+    def _draw(self, linear: Array) -> None:
+        self._drawn, self._mark_from_drawn = linear.copy(), np.linalg.inv(linear)
+
+    def _bent(self) -> Array:
+        """(2, 2) how far the present mark is bent from the one drawn."""
+        return np.asarray(self.state.pixel_from_mark[:, :2] @ self._mark_from_drawn - np.eye(2))
 
     def _shown(self, width: int, height: int) -> Rendering:
         place = self.place_drawn()
         shown = render(self.mark, place, width, height, self.blur_px)
-        change = self.state.pixel_from_mark[:, :2] @ np.linalg.inv(self.drawn) - np.eye(2)
+        change = self._bent()
         return shown.bent(change, place[:, 2], self.state.variance_px2 + _PIXEL_VARIANCE_PX2) if change.any() else shown
 
     def step(self, step: Array) -> float:
@@ -173,11 +193,13 @@ class PictureModel:
         longest = max(np.hypot(*shift) / _LONGEST_SHIFT_PX, np.abs(linear).max(initial=0.0) / _LONGEST_CHANGE, 1.0)
         place = self.state.pixel_from_mark.copy()
         place[:, 2] += shift / longest
-        place[:, :2] += np.tensordot(linear / longest, self.generators, axes=1) @ place[:, :2]
+        place[:, :2] += combined(linear / longest, self.generators) @ place[:, :2]
         variance = self.state.variance_px2
         if self.blur is not None:
-            near = np.clip(variance + step[self.blur] / longest, variance / 2 - 0.05, variance * 2 + 0.3)
-            variance = float(np.clip(near, *self._variance_range()))
+            # As a change of the standard deviation, the pixel's share included: so a blur far off is near in a step.
+            seen = self.seen_blur_px
+            ratio = np.clip(1 + step[self.blur] / longest / (2 * seen**2), 1 / _MOST_BLURRED, _MOST_BLURRED)
+            variance = float(np.clip((seen * ratio) ** 2 - _PIXEL_VARIANCE_PX2, *self._variance_range()))
         self.state = State(place, variance, self.state.greys + step[-GREY:] / longest)
         reach = max(self.grey.shape) / 4
         return float(np.hypot(*shift) + reach * _LONGEST_CHANGE * np.abs(linear).max(initial=0.0))

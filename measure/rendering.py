@@ -18,7 +18,7 @@ Single = NDArray[np.float32]
 Integers = NDArray[np.int_]
 
 _DRAWINGS = 16  # kept: more than a camera has kinds of marks
-_BLOCK = 16  # pixels that are averaged at once
+_BLOCK = 4  # pixels that are averaged at once: of a matrix for more, too much would be empty
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,15 +73,23 @@ def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px
 
 def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
     """(2,) least and (2,) greatest column and row that the mark reaches."""
+    points = _outline_mm(mark) @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
+    return points.min(axis=0), points.max(axis=0)
+
+
+def reach_px(mark: Mark, linear: Array) -> float:
+    """How far from its origin the mark reaches; linear (2, 2): px from mm."""
+    return float(np.hypot(*(linear @ _outline_mm(mark).T)).max())
+
+
+def _outline_mm(mark: Mark) -> Array:
+    """(n, 2) corners of a region that holds the mark."""
     if isinstance(mark, MarkTemplate):
         rows, cols = mark.image.shape
         corners = np.array([(0, 0), (cols - 1, 0), (cols - 1, rows - 1), (0, rows - 1)], dtype=float)
         chip_from_mark = _chip_from_mark(mark)
-        outline = (corners - chip_from_mark[:, 2]) @ np.linalg.inv(chip_from_mark[:, :2]).T
-    else:
-        outline = mark.drawn_at(np.concatenate([outline_mm(part) for part in mark.parts]))
-    points = outline @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
-    return points.min(axis=0), points.max(axis=0)
+        return np.asarray((corners - chip_from_mark[:, 2]) @ np.linalg.inv(chip_from_mark[:, :2]).T)
+    return mark.drawn_at(np.concatenate([outline_mm(part) for part in mark.parts]))
 
 
 def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> NDArray[np.bool_]:
@@ -190,8 +198,7 @@ class _Average:
     def of(self, sharp: Single, first: int, count: int) -> Single:
         """(orders, count, columns) of the pixels from the first one on, of cells (rows, columns).
 
-        Pixels are taken in blocks: a matrix for all of one is a small part of that for all pixels, which would be
-        nearly empty.
+        Pixels are taken in blocks: a matrix for all of them would be nearly empty.
         """
         orders, taps = self.taps.shape
         blocks = -(-count // _BLOCK)

@@ -14,6 +14,8 @@ _TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 
 def tukey_weights(residuals: Array, scale_dn: float) -> Array:
     """Weights between 0 and 1, all 1 where the scale is infinite."""
+    if not np.isfinite(scale_dn):
+        return np.ones_like(residuals)
     return np.asarray((1 - np.clip(np.abs(residuals) / (_TUKEY * scale_dn), 0.0, 1.0) ** 2) ** 2)
 
 
@@ -30,11 +32,11 @@ def solution(normal: Array, right: Array, free: Mask) -> Array | None:
     size = np.sqrt(np.diag(normal))[free]
     if not np.all(size > 0) or not np.all(np.isfinite(size)):
         return None
-    scaled = normal[np.ix_(free, free)] / np.outer(size, size)
-    if np.linalg.cond(scaled) > 1e10:
+    values, vectors = np.linalg.eigh(normal[np.ix_(free, free)] / np.outer(size, size))
+    if not values[-1] < 1e10 * values[0]:
         return None
     result = np.zeros(len(right))
-    result[free] = np.linalg.solve(scaled, right[free] / size) / size
+    result[free] = vectors @ (right[free] / size @ vectors / values) / size
     return result
 
 
