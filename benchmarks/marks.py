@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from kept_rows import KeptRows
-from measured_marks import CONTRAST, DUST_SNR, GROUND, Cell, drawn, dusty, measured, told
+from measured_marks import CONTRAST, DUST_SNR, GROUND, Cell, drawn, dusty, dusty_frame, measured, told
 from numpy.typing import NDArray
 from other_methods import METHODS, Template, hipp
 from true_marks import (
@@ -128,27 +128,18 @@ def dust(kinds: Sequence[Kind], count: int) -> None:
 
 
 def small_disks(kinds: Sequence[Kind], count: int) -> None:
-    """Disks of 2 to 4 px among dust: are large errors flagged?"""
+    """Disks of 2 to 4 px among dust, in frames: are large errors flagged?"""
     print(f"\nsmall disks with dust on 0 to 5 % of their windows, SNR 10 to 50: errors above {LARGE_PX:g} px")
     rng = np.random.default_rng([SEED, 99])
-    large = unflagged = flagged = 0
-    worst = 0.0
-    for _ in range(20 * count):
-        radius = rng.uniform(2.0, 4.0)
-        mark = some_mark(KIND["ellipse"], rng.uniform(0.6, 1.4), rng, 81, 10 * radius / 6)
-        grey = drawn(mark, rng)[0] + CONTRAST / rng.uniform(10, 50) * rng.standard_normal((mark.size, mark.size))
-        grey, _ = dusty(mark, grey, rng.choice((0.0, 0.01, 0.03, 0.05)), rng)
-        found = measured(mark, grey, rng)
-        flagged += found is None or bool(found.flagged)
-        if found is not None:
-            error = float(np.hypot(*(found.center_px - mark.place[:, 2])))
-            large += error > LARGE_PX
-            missed = error > LARGE_PX and not found.flagged
-            unflagged += missed
-            worst = max(worst, error if missed else 0.0)
+    frames = (dusty_frame(rng) for _ in range(count))
+    errors, flagged, dusts = (np.concatenate(each) for each in zip(*frames, strict=True))
+    seen, large = np.isfinite(errors), np.nan_to_num(errors) > LARGE_PX
+    missed = errors[large & ~flagged]
+    clean = dusts == 0
     print(
-        f"{20 * count} disks, {flagged} flagged or refused; {large} measured with large errors, {unflagged} of them "
-        f"not flagged, the worst {worst:.2f} px"
+        f"{len(errors)} disks, {(~seen).sum()} refused, {(seen & flagged).sum()} weak; of {clean.sum()} without dust "
+        f"{(~seen & clean).sum()} and {(seen & flagged & clean).sum()}; {large.sum()} with large errors, {len(missed)} "
+        f"of them not flagged, the worst {missed.max(initial=0.0):.2f} px"
     )
 
 

@@ -4,12 +4,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from true_marks import TrueMark, scan_of
+from true_marks import KIND, TrueMark, scan_of, some_mark
 
 from measure.disks import PLAIN_MARGIN_PX, fit_disk
 from measure.fiducial_options import FiducialOptions
 from measure.matching import match
 from measure.refinement import sight
+from measure.status import Status
+from measure.targets import TargetPrediction, measure_disks
 from synthetic_images.optics import reach_px, seen_coverage
 
 Array = NDArray[np.float64]
@@ -143,3 +145,27 @@ def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -
         speckled[near] = speckled[near] * (1 - cover) + (GROUND - CONTRAST) * cover
         seen[near] &= cover < 0.5 / DUST_SNR
     return speckled, seen
+
+
+def dusty_frame(rng: np.random.Generator) -> tuple[Array, Mask, Array]:
+    """A frame of 25 disks, all light or all dark, their contrasts alike to 5 % and their forms predicted to 2 % but for
+    a common scale: errors in px, nan where one was refused, which are flagged, and how much dust is on each."""
+    tile, snr, sign, scale = 81, rng.uniform(10, 50), rng.choice((-1, 1)), rng.uniform(0.9, 1.1)
+    ground = GROUND + (1 - sign) / 2 * CONTRAST
+    frame, places, predictions = np.empty((5 * tile, 5 * tile)), [], []
+    dusts = rng.choice((0.0, 0.01, 0.03, 0.05), 25)
+    for number, share in enumerate(dusts):
+        mark = some_mark(KIND["ellipse"], rng.uniform(0.6, 1.4), rng, tile, 10 * rng.uniform(2.0, 4.0) / 6)
+        contrast = CONTRAST * np.exp(rng.normal(0, 0.05))
+        grey = ground + sign * contrast * mark.picture + CONTRAST / snr * rng.standard_normal((tile, tile))
+        corner = tile * np.array(divmod(number, 5)[::-1])
+        frame[corner[1] :, corner[0] :][:tile, :tile] = dusty(mark, grey, float(share), rng)[0]
+        form = scale * (np.eye(2) + rng.normal(0, 0.02, (2, 2))) @ mark.place[:, :2]
+        places.append(corner + mark.place[:, 2])
+        predictions.append(TargetPrediction(str(number), places[-1] + rng.normal(0, 0.4, 2), form, 3.0))
+    marks = measure_disks(scan_of(frame), predictions)
+    offs = [
+        np.hypot(*(np.asarray(mark.center_px) - place)) if mark.status.is_observation else np.nan
+        for mark, place in zip(marks, places, strict=True)
+    ]
+    return np.array(offs), np.array([mark.status is not Status.MEASURED for mark in marks]), dusts

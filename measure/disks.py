@@ -10,7 +10,8 @@ from measure.clipping import clipped_sides
 from measure.compression import with_loss
 from measure.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
 from measure.disk_patches import LEAST_SNR
-from measure.matching import MatchOptions, match, window_about
+from measure.matching import Match, MatchOptions, match, window_about
+from measure.picture_model import GREY
 from measure.scan import Scan
 from measure.shapes import Disk, MarkShape
 
@@ -19,18 +20,20 @@ Array = NDArray[np.float64]
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
 LONGEST_MARGIN_PX = 10.0
 PLAIN_MARGIN_PX = 7.0  # where it is plain, for a tenth less noise than with the shortest margin
+MARGIN_BLURS = 4.0  # in a soft scan so many standard deviations of its blur, as other marks get
 LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
 SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
-SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from the disk
-WEAK_DAMAGE, MOST_DAMAGE = 0.1, 0.35
+SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
+WEAK_DAMAGE, MOST_DAMAGE = 0.2, 0.35
 MOST_BLUR = 0.7  # of the shorter half axis
 
 
 @dataclass(frozen=True, eq=False)
 class FittedDisk:
     """An ellipse as fitted. center_px (2,), covariance_px2 (2, 2); pixel_from_disk (2, 2): the unit disk's image, its
-    columns two radius vectors, px; contrast_dn: positive for a light disk. weakness: why it is doubtful; reason: why it
-    is no disk, and then the numbers are the fit's last."""
+    columns two radius vectors, px; contrast_dn: positive for a light disk; look_covariance (4, 4): of the relative
+    changes of its size, its stretch along the columns, its shear and its contrast. weakness: why it is doubtful;
+    reason: why it is no disk, and then the numbers are the fit's last."""
 
     center_px: Array
     covariance_px2: Array
@@ -39,6 +42,7 @@ class FittedDisk:
     noise_dn: float
     blur_px: float
     damaged_fraction: float
+    look_covariance: Array
     weakness: str = ""
     reason: str = ""
 
@@ -46,6 +50,18 @@ class FittedDisk:
     def half_axes_px(self) -> Array:
         """(2,) the longer and the shorter."""
         return np.asarray(np.linalg.svd(self.pixel_from_disk, compute_uv=False))
+
+    @property
+    def is_soft(self) -> bool:
+        """Whether it was fitted, and its edge is as soft as that of a spot, which has none."""
+        return bool(np.all(np.isfinite(self.covariance_px2)) and self.blur_px > MOST_BLUR * self.half_axes_px[1])
+
+    @property
+    def smallness(self) -> str:
+        """Why a disk that cannot be compared with others is doubtful, for its size; empty where it is not."""
+        shorter = self.half_axes_px[1]
+        small = shorter < SMALL_RADIUS_PX
+        return f"small: half axis {shorter:.1f} px, dust of its size would look the same" if small else ""
 
     @property
     def quality(self) -> dict[str, float]:
@@ -102,13 +118,27 @@ def fit_disk(
             noise_dn=fit.noise_dn,
             blur_px=fit.blur_px,
             damaged_fraction=fit.damaged_fraction,
+            look_covariance=look_covariance(fit),
             reason="" if fit.converged else fit.reason,
         )
         return judged(disk, fit.neighbour_correlation)
 
     disk = fitted(wide)
-    # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better.
-    return fitted(sure) if sure < wide and disk.reason else disk
+    soft = min(MARGIN_BLURS * disk.blur_px, longest_margin_px)
+    if soft > wide and not disk.reason:
+        softer = fitted(soft)
+        return disk if softer.reason else softer
+    # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
+    # it does how soft an edge is.
+    return fitted(sure) if sure < wide and disk.reason and not disk.is_soft else disk
+
+
+def look_covariance(fit: Match) -> Array:
+    """(4, 4) as a fitted disk has it."""
+    assert fit.covariance is not None
+    look = [2, 3, 4, len(fit.covariance) - GREY]
+    per = np.array([1.0, 1.0, 1.0, fit.contrast_dn or 1.0])
+    return np.asarray(fit.covariance[np.ix_(look, look)] / np.outer(per, per))
 
 
 def inside(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
@@ -129,14 +159,12 @@ def judged(disk: FittedDisk, residual_correlation: float) -> FittedDisk:
         reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
     elif disk.noise_dn > (WORST_SMOOTH_MISFIT if residual_correlation > SMOOTH else WORST_MISFIT) * contrast:
         reason = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
-    elif disk.blur_px > MOST_BLUR * shorter:
+    elif disk.is_soft:
         reason = f"no disk: its edge is as soft as a spot's, blur {disk.blur_px:.1f} px, half axis {shorter:.1f} px"
     elif disk.damaged_fraction > MOST_DAMAGE:
         reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
     elif shorter < SMALLEST_RADIUS_PX:
         reason = f"too small: half axis {shorter:.1f} px"
-    elif shorter < SMALL_RADIUS_PX:
-        weakness = f"small: half axis {shorter:.1f} px, dust of its size would look the same"
     elif disk.damaged_fraction > WEAK_DAMAGE:
         weakness = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
     return FittedDisk(**{**vars(disk), "reason": reason, "weakness": weakness})

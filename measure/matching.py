@@ -36,7 +36,8 @@ _SPARE_PX = 2.0  # beyond the margin: room for the mark to move
 class Match:
     """A mark as fitted. Where converged is false, reason says why and the numbers are the last approximations.
 
-    center_px (2,), covariance_px2 (2, 2), pixel_from_mark (2, 3): of the scan, not of the window.
+    center_px (2,), covariance_px2 (2, 2), pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
+    unknowns of the `PictureModel`, None where another model was fitted.
     contrast_dn: the mark's grey value less the background's, negative for a dark mark. noise_dn: standard deviation of
     one pixel. damaged_fraction: share of the pixels about the mark, within plain_px of it, that were cut out.
     redundancy: pixels used less unknowns. neighbour_correlation: of the residuals; they were taken as white where
@@ -61,6 +62,7 @@ class Match:
     significance: float
     residuals_dn: Array
     edges: EdgePlace | None = None
+    covariance: Array | None = None
 
     @property
     def snr(self) -> float:
@@ -178,22 +180,21 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
     """The match in the pixels of the fit's own window; free: which pixels of the whole window may be blank film."""
     model, used = fit.model, fit.telling
     noise = noise_model(model.residuals, used, len(model.design))
-    covariance, gain_sigma = np.full((2, 2), np.inf), np.inf
+    covariance, gain_sigma = np.full((len(model.design),) * 2, np.inf), np.inf
     edges: EdgePlace | None = None
     if not fit.reason:
         patches = blank_patches(window, free, noise.variance_dn2)
         if not noise.is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
-        full, by_grey = fit.weigh(noise)
-        covariance = full[:2, :2]
-        gain_sigma = float(np.sqrt(max(full[-GREY, -GREY], 1e-12)))
+        covariance, by_grey = fit.weigh(noise)
+        gain_sigma = float(np.sqrt(max(covariance[-GREY, -GREY], 1e-12)))
         edges = edge_place(model.residuals, used, model.design, by_grey, noise, model.blur_px)
     state = model.state
     return Match(
         converged=not fit.reason,
         reason=fit.reason,
         center_px=state.pixel_from_mark[:, 2],
-        covariance_px2=covariance,
+        covariance_px2=covariance[:2, :2],
         pixel_from_mark=state.pixel_from_mark,
         contrast_dn=float(state.greys[0]),
         noise_dn=float(np.sqrt(noise.variance_dn2)),
@@ -206,6 +207,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         significance=fit.contrast_dn / gain_sigma,
         residuals_dn=np.where(fit.area, model.residuals, np.nan),
         edges=edges,
+        covariance=covariance,
     )
 
 

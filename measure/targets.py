@@ -1,7 +1,7 @@
 """Targets of a test field, measured where an approximate orientation says that they are."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ from measure.scan import Scan
 from measure.shapes import MarkShape, cross
 from measure.status import Status
 from measure.target_search import search_targets
+from measure.unlike import doubts
 
 Array = NDArray[np.float64]
 Polarity = Literal["light", "dark", "auto"]
@@ -144,7 +145,20 @@ def _identified(
         else:
             status = Status.WEAK if disk.weakness else Status.MEASURED
             rows.append(_Row(prediction, disk, status, disk.weakness))
-    return rows
+    return _compared(rows)
+
+
+def _compared(rows: list[_Row]) -> list[_Row]:
+    """Those that are unlike the others of the frame are weak."""
+    seen = [(row, row.disk) for row in rows if row.disk is not None and row.status.is_observation]
+    reasons = doubts([disk for _, disk in seen], [row.prediction.pixel_from_disk for row, _ in seen])
+    doubt = {id(row): reason for (row, _), reason in zip(seen, reasons, strict=True) if reason}
+    return [
+        replace(row, status=Status.WEAK, reason="; ".join(filter(None, (row.reason, doubt[id(row)]))))
+        if id(row) in doubt
+        else row
+        for row in rows
+    ]
 
 
 def _mark(row: _Row) -> MarkMeasurement:
