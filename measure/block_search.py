@@ -19,21 +19,22 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 WIDEST_PX, TALLEST_PX = 8192, 1024  # of a block
-CELL_PX = 1536  # side of what is compared with its own texture, about
 
 Confirmed = Callable[[Block, list[Candidate]], list[Candidate]]
 
 
 class Octave(Protocol):
     """What is looked for in one reduction of the scan, by factor; margin_px: of the scan, a multiple of the factor,
-    about a part that is looked at."""
+    about a part that is looked at; widest_px: of the scan, that a part may be at most."""
 
     @property
     def factor(self) -> int: ...
     @property
     def margin_px(self) -> int: ...
+    @property
+    def widest_px(self) -> int: ...
     def patches(self, small: Image) -> list[Candidate]:
-        """In a reduced picture, in its pixels."""
+        """In a reduced picture, in its pixels, those within its margin."""
 
 
 def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | None = None) -> list[Candidate]:
@@ -80,20 +81,21 @@ def whole(size: int, unit: int) -> int:
 
 
 def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Candidate]:
-    """Those whose middles lie in the block, in pixels of the scan."""
+    """Those that lie in the block, in pixels of the scan."""
     reductions = block.reductions({octave.factor for octave in octaves})
     width, height = (size - 2 * block.margin_px for size in block.size_px)
-    cell = even_part(width, CELL_PX, lcm(*reductions))
-    for octave, col0 in product(octaves, range(0, width, cell)):
-        factor, margin = octave.factor, octave.margin_px // octave.factor
-        size = np.array([min(cell, width - col0), height])
-        first = block.margin_px // factor - margin
-        left, cols, rows = first + col0 // factor, size[0] // factor + 2 * margin, size[1] // factor + 2 * margin
-        for patch in octave.patches(reductions[factor][first : first + rows, left : left + cols]):
-            own = (patch.center_px - margin + 0.5) * factor
-            place = own + np.array([block.col0 + block.margin_px + col0, block.row0 + block.margin_px])
-            if np.all((own >= 0) & (own < size) & (place <= (block.scan.width_px, block.scan.height_px))):
-                yield Candidate(place - 0.5, patch.pixel_from_disk * factor, patch.contrast_dn)
+    for octave in octaves:
+        factor, small = octave.factor, reductions[octave.factor]
+        margin, spare = octave.margin_px // factor, (block.margin_px - octave.margin_px) // factor
+        rows = slice(spare, spare + height // factor + 2 * margin)
+        part = even_part(width, octave.widest_px, factor) // factor
+        for col0 in range(0, width // factor, part):
+            first, last = spare + col0, spare + min(col0 + part, width // factor) + 2 * margin
+            place = np.array([block.col0, block.row0]) + factor * np.array([first, spare]) + (factor - 1) / 2
+            for patch in octave.patches(small[rows, first:last]):
+                center = patch.center_px * factor + place
+                if np.all(center <= (block.scan.width_px - 0.5, block.scan.height_px - 0.5)):
+                    yield Candidate(center, patch.pixel_from_disk * factor, patch.contrast_dn)
 
 
 def separate(found: list[Candidate]) -> list[Candidate]:

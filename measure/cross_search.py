@@ -18,6 +18,7 @@ Mask = NDArray[np.bool_]
 
 SEARCHED_ARM_PX = 12.0  # scans are reduced until half a cross has about this length, if its lines stay...
 THINNEST_PX = 1.5  # ...so wide
+WIDEST_PX = 1536  # of what is compared with its own noise
 OCTAVE = 2.0  # longest over shortest half cross that one reduction finds
 NOISE_SIGMAS = 5.0
 STEPS_DEG = 5.0  # of the directions that bars may have
@@ -75,13 +76,21 @@ class CrossOctave:
     half: tuple[float, float]
     search: CrossSearch
     full_scale_dn: float
+    widest_px = WIDEST_PX
 
     @property
     def margin_px(self) -> int:
-        return int(np.ceil(2.0 * self.half[1] + 4)) * self.factor
+        return self._margin * self.factor
+
+    @property
+    def _margin(self) -> int:
+        return int(np.ceil(2.0 * self.half[1] + 4))
 
     def patches(self, small: Image) -> list[Candidate]:
-        return _patches(small, self.half, self.search, self.full_scale_dn)
+        found = _patches(small, self.half, self.search, self.full_scale_dn)
+        first = self._margin - 0.5
+        last = np.array(small.shape[::-1]) - self._margin - 0.5
+        return [patch for patch in found if np.all((patch.center_px >= first) & (patch.center_px < last))]
 
 
 def _patches(small: Image, half: tuple[float, float], search: CrossSearch, full_scale_dn: float) -> list[Candidate]:

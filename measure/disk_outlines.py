@@ -51,7 +51,7 @@ class Outlines:
     @property
     def radius(self) -> Array:
         """(n,) of the circle of the same area."""
-        return np.asarray(2.0 * np.linalg.det(self.moments) ** 0.25)
+        return np.asarray(2.0 * np.maximum(np.linalg.det(self.moments), 0.0) ** 0.25)
 
 
 def outlines_about(image: Image, blobs: Blobs) -> Outlines:
@@ -80,47 +80,49 @@ class _Profiles:
         angle = 2 * np.pi * np.arange(rays) / rays
         self.directions = np.stack([np.cos(angle), np.sin(angle)])
         self.values = _sampled(image, blobs.places, self.directions[..., None] * along)
-        top = self.values[:, :, along <= CORE * radius].mean(axis=(1, 2))
-        beside = (along >= AROUND[0] * radius) & (along <= AROUND[1] * radius)
-        around = self.values[:, :, beside].mean(axis=2)
-        self.ground = np.partition(around, int(GROUND_SHARE * rays), axis=1)[:, int(GROUND_SHARE * rays)]
+        core, around = (along <= CORE * radius), (along >= AROUND[0] * radius) & (along <= AROUND[1] * radius)
+        shares = np.stack([core / core.sum(), around / around.sum()], axis=1).astype(np.float32)
+        inner, outer = np.moveaxis(self.values @ shares, 2, 0)
+        top, ground = inner.mean(axis=1), np.partition(outer, int(GROUND_SHARE * rays), axis=1)
+        self.ground = ground[:, int(GROUND_SHARE * rays)]
         self.height = top - self.ground
         self.level = (top + self.ground) / 2
         below = self.values < self.level[:, None, None]
         self.first_below = below.argmax(axis=2)
         self.ends = (self.first_below > 0).all(axis=1) & (self.height >= LEAST_HEIGHT * blobs.contrast)
 
-    def radii(self) -> Array:
+    def radii(self) -> Image:
         """(those that end, rays) px to where the rays fall below half of the height."""
         patch, ray = np.flatnonzero(self.ends)[:, None], np.arange(self.values.shape[1])
         last = self.first_below[self.ends] - 1
-        inner, outer = (self.values[patch, ray, last + k].astype(float) for k in (0, 1))
-        share = (inner - self.level[self.ends, None]) / np.maximum(inner - outer, 1e-9)
-        return np.asarray(self.step_px * (last + np.clip(share, 0.0, 1.0)))
+        inner, outer = self.values[patch, ray, last], self.values[patch, ray, last + 1]
+        share = (inner - self.level[self.ends, None]) / np.maximum(inner - outer, np.float32(1e-9))
+        return np.asarray(self.step_px * (last + np.clip(share, 0.0, 1.0)), np.float32)
 
 
 def _sampled(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
     """(n, rays, steps) grey values at offsets (2, rays, steps) from places (n, 2)."""
-    col, row = ((offsets[axis].reshape(1, -1) + places[:, axis, None]).astype(np.float32) for axis in (0, 1))
-    values = cv2.remap(image, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    at, off = places.astype(np.float32), offsets.reshape(2, -1).astype(np.float32)
+    values = cv2.remap(image, at[:, :1] + off[0], at[:, 1:] + off[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, np.float32).reshape(len(places), *offsets.shape[1:])
 
 
 def _outlines(places: NDArray[np.intp], profiles: _Profiles) -> Outlines:
     """Of the patches that end: the moments of the polygons that the rays' ends make, by Green's theorem."""
-    x, y = profiles.directions[:, None] * profiles.radii()
-    x1, y1 = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    x, y = profiles.directions[:, None].astype(np.float32) * profiles.radii()
+    x1, y1 = (np.concatenate([each[:, 1:], each[:, :1]], axis=1) for each in (x, y))
     twice = x * y1 - x1 * y
     area = twice.sum(axis=1) / 2
     col, row = ((twice * (a + b)).sum(axis=1) / (6 * area) for a, b in ((x, x1), (y, y1)))
     xx, yy = ((twice * (a * a + a * b + b * b)).sum(axis=1) / (12 * area) for a, b in ((x, x1), (y, y1)))
-    xy = (twice * (x * y1 + 2 * x * y + 2 * x1 * y1 + x1 * y)).sum(axis=1) / (24 * area)
-    moments = np.stack([xx - col**2, xy - col * row, xy - col * row, yy - row**2], axis=1).reshape(-1, 2, 2)
-    center = np.stack([col, row], axis=1)
-    off = np.stack([x, y], axis=2) - center[:, None]
-    squares = np.einsum("nri,nij,nrj->nr", off, np.linalg.inv(moments), off) / 4
+    xy = (twice * (2 * (x * y + x1 * y1) + x * y1 + x1 * y)).sum(axis=1) / (24 * area)
+    xx, xy, yy = xx - col * col, xy - col * row, yy - row * row
+    x, y = x - col[:, None], y - row[:, None]
+    squares = (yy[:, None] * x * x - 2 * xy[:, None] * x * y + xx[:, None] * y * y) / (4 * (xx * yy - xy * xy))[:, None]
     misfit = np.sqrt(np.mean((np.sqrt(np.maximum(squares, 0.0)) - 1) ** 2, axis=1))
-    return Outlines(places + center, moments, misfit, profiles.height[profiles.ends].astype(float))
+    center, moments = np.stack([col, row], axis=1), np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+    height = profiles.height[profiles.ends]
+    return Outlines(places + center.astype(float), moments.astype(float), misfit.astype(float), height.astype(float))
 
 
 def _joined(parts: list[Outlines]) -> Outlines:

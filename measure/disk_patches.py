@@ -1,7 +1,7 @@
 """Patches of a disk's shape in a picture: blobs by their Laplacian at several scales, then by the outline at half of
 their height."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import reduce
 from math import sqrt
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.disk_outlines import Blobs, Outlines, outlines_about
+from measure.disk_outlines import REACH, Blobs, Outlines, outlines_about
 from measure.noise import robust_scale
 
 Array = NDArray[np.float64]
@@ -20,6 +20,8 @@ Image = NDArray[np.float32]
 PEAK_OF_DISK = 2 / np.e  # of the scale-normalised Laplacian of a disk, in units of its contrast, at sigma = r / sqrt(2)
 RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale...
 TEXTURE_PX = 1024  # ...where it is so large, px of the scan along a side: a smaller one may be full of disks
+CELL_PX = 1536  # of the scan, side of what has one texture and one noise, about
+EVERY = 8  # column and row are enough to tell these
 WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, beside what noise makes of it
 NOISE_SIGMAS = 1.5  # by which that may exceed its expectation: it is that of many rays
 EDGE_PX = 2.5  # of an edge with a blur of a pixel: its whole height over its steepest slope
@@ -70,56 +72,96 @@ def strength(patch: Candidate) -> tuple[float, ...]:
 
 
 def margin_px(radii: list[float]) -> int:
-    """How far beyond a part of the picture its patches may be looked at."""
-    return int(np.ceil(4 * radii[-1])) + 3
+    """How far beyond a part of the picture its patches are looked at."""
+    return int(np.ceil(REACH * radii[-1])) + 3
 
 
 def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int) -> list[Candidate]:
-    """Patches of a disk's shape in a picture reduced by a factor, without its margin; some may be there twice."""
-    noise = fine_noise(small)
-    return [
-        Candidate(center, shape, sign * height)
-        for sign, own in blobs(small, radii, search, full_scale_dn, small.size * factor**2 >= TEXTURE_PX**2)
-        for center, shape, height in round_ones(outlines_about(small if sign > 0 else -small, own), noise, factor)
-    ]
+    """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
+    scan_px2 = small.size * factor**2
+    cells = Cells.of(small.shape[1], max(round(scan_px2 / CELL_PX**2), 1))
+    noise = cells.each(fine_noise, small)
+    found = []
+    for sign, own in blobs(small, radii, search, full_scale_dn, cells, scan_px2 >= TEXTURE_PX**2):
+        outlines = outlines_about(small if sign > 0 else -small, own)
+        for center, shape, height in round_ones(outlines, noise[cells.at(outlines.centers[:, 0])], factor):
+            found.append(Candidate(center, shape, sign * height))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Parts of a picture of about one width, which have a noise and a texture of their own; ends (n,): the columns
+    where they end."""
+
+    ends: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, width: int, count: int) -> "Cells":
+        return cls(np.linspace(0, width, count + 1).astype(np.intp)[1:])
+
+    def each(self, figure: Callable[[Image], float], picture: Image) -> Array:
+        """(n,) the figure of every cell."""
+        return np.array([figure(cell) for cell in np.split(picture, self.ends[:-1], axis=1)])
+
+    def at(self, columns: Array) -> NDArray[np.intp]:
+        """The cells in which columns lie."""
+        return np.searchsorted(self.ends[:-1], columns, side="right")
+
+    def above(self, picture: Image, levels: Array) -> Image:
+        """The picture where it is above its cell's level, 0 elsewhere."""
+        result = np.empty_like(picture)
+        for first, last, level in zip((0, *self.ends), self.ends, levels.tolist(), strict=False):
+            cv2.threshold(picture[:, first:last], level, 0.0, cv2.THRESH_TOZERO, result[:, first:last])
+        return result
 
 
 def blobs(
-    small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, is_textured: bool
+    small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, cells: Cells, is_textured: bool
 ) -> Iterator[tuple[int, Blobs]]:
-    """1 with the light ones and -1 with the dark ones, none so near to the border that its outline could be cut.
-    is_textured: whether they have to stand out of the picture's own texture."""
-    contrasts, levels = [], []
+    """1 with the light ones and -1 with the dark ones, within the picture's margin. is_textured: whether they have to
+    stand out of their cells' texture."""
+    contrasts: list[Image] = []
+    levels: list[Array] = []
     for radius in radii:
         sigma = radius / np.sqrt(2)
         smooth = cv2.GaussianBlur(small, 2 * (2 * int(3 * sigma + 0.5) + 1,), sigma)
-        contrasts.append(cv2.Laplacian(smooth, cv2.CV_32F, ksize=1, scale=-(sigma**2) / PEAK_OF_DISK))
-        texture = robust_scale(contrasts[-1][::8, ::8].astype(np.float64)) if is_textured else 0.0
-        levels.append(max(RESPONSE_SIGMAS * texture, search.least_contrast * full_scale_dn))
+        contrast = cv2.Laplacian(smooth, cv2.CV_32F, ksize=1, scale=-(sigma**2) / PEAK_OF_DISK)
+        contrasts.append(np.asarray(contrast, np.float32))
+        textures = cells.each(texture, contrasts[-1]) if is_textured else np.zeros(len(cells.ends))
+        levels.append(np.maximum(RESPONSE_SIGMAS * textures, search.least_contrast * full_scale_dn))
     neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * max(int(radii[0]), 1) + 1,))
-    border = int(np.ceil(3 * radii[-1])) + 2
+    margin, width = margin_px(radii), small.shape[1] - 2 * margin_px(radii)
     for sign, polarity in ((1, "light"), (-1, "dark")):
         if search.polarity in (polarity, "auto"):
             standing = [
-                cv2.threshold(contrast if sign > 0 else -contrast, level, 0, cv2.THRESH_TOZERO)[1]
+                cells.above(contrast if sign > 0 else -contrast, level)
                 for contrast, level in zip(contrasts, levels, strict=True)
             ]
-            strongest = reduce(cv2.max, standing)
+            strongest = reduce(np.maximum, standing)
             peaks = (strongest > 0) & (strongest >= cv2.dilate(strongest, neighbourhood))
-            rows, cols = (place + border for place in np.nonzero(peaks[border:-border, border:-border]))
+            rows, cols = (
+                place + margin for place in divmod(np.flatnonzero(peaks[margin:-margin, margin:-margin]), width)
+            )
             by_radius = np.stack([contrast[rows, cols] for contrast in standing])
             radius, contrast = np.array(radii)[by_radius.argmax(axis=0)], by_radius.max(axis=0).astype(float)
             yield sign, Blobs(np.stack([cols, rows], axis=1), radius, contrast)
 
 
+def texture(contrast: Image) -> float:
+    return robust_scale(contrast[::EVERY, ::EVERY].astype(np.float64))
+
+
 def fine_noise(small: Image) -> float:
     """The standard deviation of what is no smooth picture (Immerkaer, 1996, Fast noise variance estimation)."""
-    kernel = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], np.float32) / 6
-    return robust_scale(np.asarray(cv2.filter2D(small, cv2.CV_32F, kernel)[1:-1:8, 1:-1:8], np.float64))
+    above, row, below = (small[first : len(small) - 2 + first : EVERY] for first in range(3))
+    rows = above - 2 * row + below
+    left, column, right = (rows[:, first : rows.shape[1] - 2 + first : EVERY] for first in range(3))
+    return robust_scale((left - 2 * column + right).astype(np.float64) / 6)
 
 
-def round_ones(found: Outlines, noise: float, factor: int) -> Iterator[tuple[Array, Array, float]]:
-    """Centre (2,), shape (2, 2) and height of those that are ellipses but for noise.
+def round_ones(found: Outlines, noise: Array, factor: int) -> Iterator[tuple[Array, Array, float]]:
+    """Centre (2,), shape (2, 2) and height of those that are ellipses but for noise (n,).
 
     A disk that stands out of the noise of the scan's own pixels stands out of their means so much the more.
     """

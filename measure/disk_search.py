@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.block import Block
-from measure.block_search import search_blocks
+from measure.block_search import WIDEST_PX, search_blocks
 from measure.disk_batch import disks_among
 from measure.disk_patches import Candidate, DiskSearch, margin_px, patches
 from measure.disks import FittedDisk, fit_disk
@@ -63,6 +63,8 @@ class DiskOctave:
     radii: list[float]
     search: DiskSearch
     full_scale_dn: float
+
+    widest_px = WIDEST_PX
 
     @property
     def margin_px(self) -> int:

@@ -19,7 +19,7 @@ from measure.radiometry import Samples
 from measure.resolution import Pitch
 from measure.segment_cache import SegmentCache
 from measure.segments import Segments
-from measure.tiff_scan import open_tiff
+from measure.tiff_scan import RawRows, open_tiff
 
 Array = NDArray[np.float32]
 
@@ -63,6 +63,7 @@ class Scan:
         self.notes = notes
         self._segments = segments
         self._cache = SegmentCache(segments)
+        self._source = segments if isinstance(segments, RawRows) else self._cache
         self._reduced: dict[int, Array] = {}
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
@@ -113,7 +114,7 @@ class Scan:
         above, before = min(max(-row0, 0), height - 1), min(max(-col0, 0), width - 1)
         rows = samples[above : above + bottom + 1 - top]
         inside = rows[:, before : before + right + 1 - left]
-        self._fill(inside, top, left)
+        self._source.fill(inside, top, left)
         rows[:, :before], rows[:, before + inside.shape[1] :] = inside[:, :1], inside[:, -1:]
         samples[:above], samples[above + len(rows) :] = rows[0], rows[-1]
         return samples
@@ -179,17 +180,6 @@ class Scan:
         if len(weights) != self.channels:
             raise ValueError(f"{self.name}: {len(weights)} weights for {self.channels} channels")
         return weights
-
-    def _fill(self, samples: Samples, row0: int, col0: int) -> None:
-        """Samples (height, width, channels) of the scan from a row and column on, from the segments they touch."""
-        tall, wide = self.segment_px
-        height, width, _ = samples.shape
-        for i in range(row0 // tall, (row0 + height - 1) // tall + 1):
-            for j in range(col0 // wide, (col0 + width - 1) // wide + 1):
-                row, col = i * tall - row0, j * wide - col0
-                part = self._cache.read(i, j)[max(-row, 0) : height - row, max(-col, 0) : width - col]
-                row, col = max(row, 0), max(col, 0)
-                samples[row : row + part.shape[0], col : col + part.shape[1]] = part
 
 
 def reduced_side(fine_px: int, factor: int, most_px: int) -> int:

@@ -29,6 +29,17 @@ class SegmentCache:
         """How many rows of the picture have room."""
         return self._limit // self._row_bytes
 
+    def fill(self, samples: Samples, row0: int, col0: int) -> None:
+        """Samples (height, width, channels) of the picture from a row and column on."""
+        tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
+        height, width, _ = samples.shape
+        for i in range(row0 // tall, (row0 + height - 1) // tall + 1):
+            for j in range(col0 // wide, (col0 + width - 1) // wide + 1):
+                row, col = i * tall - row0, j * wide - col0
+                part = self.read(i, j)[max(-row, 0) : height - row, max(-col, 0) : width - col]
+                row, col = max(row, 0), max(col, 0)
+                samples[row : row + part.shape[0], col : col + part.shape[1]] = part
+
     def read(self, row: int, column: int) -> Samples:
         """Segment (row, column) of the grid."""
         key = (row, column)

@@ -21,7 +21,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
 JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
-RAW_HEIGHT_PX, RAW_WIDTH_PX = 128, 2048  # of an uncompressed file, taken at a time
+MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time
 REDUCED_IMAGE, TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
 DECODING_ERRORS = (RuntimeError, ValueError, OSError, IndexError, TypeError, struct.error, TiffFileError)
 
@@ -196,29 +196,36 @@ class TiffSegments:
 
 
 class RawRows(TiffSegments):
-    """An uncompressed file whose rows stand one after the other: any part can be read, whatever its strips."""
+    """An uncompressed file whose rows stand one after the other: any part can be read, whatever its strips, and none
+    need be kept."""
 
     def __init__(self, file: TiffFile, page: TiffPage, path: Path) -> None:
         super().__init__(file, page, path)
-        self.segment_height_px = min(RAW_HEIGHT_PX, self.height_px)
-        self.segment_width_px = min(RAW_WIDTH_PX, self.width_px)
+        self.segment_height_px, self.segment_width_px = 1, self.width_px
         self._dtype = np.dtype(page.dtype).newbyteorder(file.byteorder)
+        self._row_bytes = self.width_px * page.samplesperpixel * self._dtype.itemsize
 
     def read(self, row: int, column: int) -> Samples:
-        """The part of RAW_HEIGHT_PX x RAW_WIDTH_PX pixels in row `row` and column `column` of such parts."""
-        first, left = row * self.segment_height_px, column * self.segment_width_px
-        height = min(self.segment_height_px, self.height_px - first)
-        samples = self._page.samplesperpixel
-        row_bytes = self.width_px * samples * self._dtype.itemsize
-        start = int(self._page.dataoffsets[0]) + first * row_bytes
+        samples = np.empty((1, self.width_px, self.channels), np.uint8 if self.sample_bytes == 1 else np.uint16)
+        self.fill(samples, row, 0)
+        return samples
+
+    def fill(self, samples: Samples, row0: int, col0: int) -> None:
+        """Samples (height, width, channels) of the picture from a row and column on."""
+        rows = max(MAPPED_BYTES // self._row_bytes, 1)
+        for first in range(0, len(samples), rows):
+            self._fill(samples[first : first + rows], row0 + first, col0)
+
+    def _fill(self, samples: Samples, row0: int, col0: int) -> None:
+        height, width, _ = samples.shape
+        start = int(self._page.dataoffsets[0]) + row0 * self._row_bytes
         before = start % ALLOCATIONGRANULARITY
-        size = before + height * row_bytes
+        size = before + height * self._row_bytes
         try:
-            # Of the rows only the part's own pages are read, and none of them is held afterwards.
+            # Of the rows only the pages with these columns are read, and none of them is held afterwards.
             with mmap(self._file.filehandle.fileno(), size, access=ACCESS_READ, offset=start - before) as mapped:
-                rows = np.ndarray((height, self.width_px, samples), self._dtype, mapped, before)
-                stored = rows[:, left : left + self.segment_width_px].astype(self._dtype.newbyteorder("="))
+                rows = np.ndarray((height, self.width_px, self._page.samplesperpixel), self._dtype, mapped, before)
+                samples[:] = self._radiometry.apply(rows[:, col0 : col0 + width])
                 del rows
         except (ValueError, OSError) as error:
-            raise broken(self._path, f"rows {first} to {first + height - 1} lie beyond its end") from error
-        return self._radiometry.apply(stored)
+            raise broken(self._path, f"rows {row0} to {row0 + height - 1} lie beyond its end") from error

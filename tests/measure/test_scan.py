@@ -260,7 +260,7 @@ def test_a_window_decodes_only_its_tiles_and_a_whole_pass_each_tile_once(tmp_pat
 
             def close(self) -> None: ...
 
-        scan._cache = SegmentCache(Counting())
+        scan._cache = scan._source = SegmentCache(Counting())
         scan.window(33, 34, 20, 40)
         assert reads == [(1, 1), (2, 1)]
         scan.window(40, 40, 5, 5)
@@ -315,7 +315,7 @@ def test_a_block_is_a_part_of_the_scan_and_of_its_reductions(tmp_path: Path, cha
 class Watched:
     """An octave that finds nothing."""
 
-    factor, margin_px = 4, 8
+    factor, margin_px, widest_px = 4, 8, 100
 
     def patches(self, small: NDArray[np.float32]) -> list[Candidate]:
         return []
