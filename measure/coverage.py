@@ -150,7 +150,13 @@ def _add(covered: Single, pieces: _Pieces) -> None:
     tall_cells, wide_cells = row.max() - row0 + 1, col1 - col0 + 1
     cell = (row - row0) * wide_cells + col - col0
     count = tall_cells * wide_cells
-    added = np.bincount(cell, own, count) + np.bincount(cell + 1, tall - own, count)
-    areas = np.abs(np.cumsum(added.reshape(tall_cells, wide_cells), axis=1)).astype(np.float32)
+    # In place where it can be: a large mark's cells are many.
+    areas = np.bincount(cell, own, count)
+    areas += np.bincount(cell + 1, tall - own, count)
+    areas = areas.reshape(tall_cells, wide_cells)
+    np.cumsum(areas, axis=1, out=areas)
+    np.minimum(np.abs(areas, out=areas), 1.0, out=areas)
     about = covered[row0 : row0 + tall_cells, col0:col1]
-    about += (1 - about) * np.minimum(areas[:, :-1], 1.0)
+    free = 1 - about
+    free *= areas[:, :-1]
+    about += free

@@ -86,22 +86,25 @@ class PictureFit:
     def weigh(self, noise: NoiseModel) -> tuple[Array, Array]:
         """Adjust once more with the weights of grain, if it is grain: the unknowns' covariance (unknowns, unknowns),
         and their derivatives by the grey values (unknowns, height, width)."""
-        model, variance = self.model, max(noise.variance_dn2, _LEAST_VARIANCE_DN2)
-        plain = model.design * self.used / variance
-        if noise.is_white:
-            return self._covariance(plain, plain * variance)
-        smeared = correlated(plain, noise) * self.used
-        covariance, by_grey = self._covariance(plain, smeared)
         if noise.is_grain:
-            before = model.state
+            model, before = self.model, self.model.state
             weights, smeared = weighted(model.design, self.used, noise, self.contrast_dn)
             moved = self._step_by(weights)
-            # What has more weight now measures the same place, or the noise is not what it was taken for.
-            if moved is not None and moved @ np.linalg.solve(covariance[:2, :2], moved) < _ODDS:
-                return self._covariance(weights, smeared)
+            if moved is not None:
+                weighed = self._covariance(weights, smeared)
+                # What has more weight now measures the same place, or the noise is not what it was taken for. The plain
+                # covariance, which decides, takes its time and is larger than the weighed one, but for approximations.
+                if _is_likely(moved, weighed[0]) or _is_likely(moved, self._plain_covariance(noise)[0]):
+                    return weighed
             model.state = before
             model.linearise(self.used)
-        return covariance, by_grey
+        return self._plain_covariance(noise)
+
+    def _plain_covariance(self, noise: NoiseModel) -> tuple[Array, Array]:
+        """As `weigh` gives them, of an adjustment that took the noise as white."""
+        variance = max(noise.variance_dn2, _LEAST_VARIANCE_DN2)
+        plain = self.model.design * self.used / variance
+        return self._covariance(plain, plain * variance if noise.is_white else correlated(plain, noise) * self.used)
 
     def _covariance(self, weights: Array, smeared: Array) -> tuple[Array, Array]:
         """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these."""
@@ -212,3 +215,8 @@ class PictureFit:
             free[model.blur] = False
             step = solution(normal, right, free)
         return step
+
+
+def _is_likely(moved: Array, covariance: Array) -> bool:
+    """Whether noise of that covariance may have moved a place so far."""
+    return bool(moved @ np.linalg.solve(covariance[:2, :2], moved) < _ODDS)

@@ -26,6 +26,7 @@ _GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]]
     "ellipse": (_SCALE, _STRETCH, _SHEAR),
 }
 ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values adds
+_AS_NOISY = 0.02
 _BLUR_RANGE_PX = (0.3, 6.0)
 BENT, ROUGHLY_BENT = 0.075, 0.4  # of the mark's outline, times the blur: so far a series replaces a new drawing
 _PIXEL_VARIANCE_PX2 = 1 / 12
@@ -81,7 +82,8 @@ class PictureModel:
         # A chip already has its scan's blur: where none is estimated, none is added.
         sharp = isinstance(mark, MarkTemplate) and not options.estimate_blur
         self.state = state or State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
-        self._linearised: tuple[State, Array] | None = None  # the state of the design, and its residuals
+        # The state and the noise that the design is of, and its residuals.
+        self._linearised: tuple[State, float, Array] | None = None
         self.bent = BENT
         self._draw(start[:, :2])
         self.reach_px = reach_px(mark, start[:, :2])
@@ -94,9 +96,13 @@ class PictureModel:
         """Design and residuals of the present state; the greys from a linear fit to what is used, at first. Close to
         where the design was last computed it stays, and the residuals follow from it."""
         if self._linearised is not None:
-            at, residuals = self._linearised
+            at, noise_dn, residuals = self._linearised
             change = self._change(at)
-            if self._length_px(change) < _LINEAR * self.seen_blur_px and not self._is_bent():
+            if (
+                self._length_px(change) < _LINEAR * self.seen_blur_px
+                and not self._is_bent()
+                and self._as_noisy(noise_dn)
+            ):
                 self.residuals = residuals - combined(change, self.design)
                 return
         height, width = self.grey.shape
@@ -119,8 +125,11 @@ class PictureModel:
         columns *= -self.state.greys[0]
         self.residuals = self.grey - combined(self.state.greys, greys)
         self._censor()
-        # What is clipped depends on the noise as well.
-        self._linearised = None if self.clipped.any() else (self.state, self.residuals)
+        self._linearised = self.state, self.noise_dn, self.residuals
+
+    def _as_noisy(self, noise_dn: float) -> bool:
+        """Whether another noise would change no clipped grey value's part in the fit."""
+        return abs(self.noise_dn / noise_dn - 1) < _AS_NOISY or not self.clipped.any()
 
     def _change(self, before: State) -> Array:
         """(unknowns,) from a state before to the present one, both alike."""
