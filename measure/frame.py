@@ -43,6 +43,7 @@ _SAME_PX = 1.0
 _SETTLED_PX = 1.5  # about a mark that was matched already
 _ROUNDS = 2  # of looking for faint marks: the first ones tell where the others are
 _REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
+_NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
 
@@ -245,12 +246,14 @@ class _Sighter:
         return bool(self.belongs.sum() >= _MANY and clear >= _MANY / 2)
 
     def glimpse_faint(self, reach_px: float) -> None:
-        """Look again at every mark that is not clear or lies off, where the others put it: what stands out of its
-        texture there is this mark, the film being deformed where it lies off."""
+        """Look again at every mark that is not clear, or does not lie where the others put it: what stands out of its
+        texture there is this mark, the film being deformed where it lies off. A clear one may be a pattern beside it.
+        """
+        near = self.belongs & (self._misfit_mm() <= _NEAR * self._scatter_mm())
         faint = [
             (index, sighting)
             for index, sighting in enumerate(self.sightings)
-            if sighting is not None and sighting.inside and not (self.clear(index) and self.belongs[index])
+            if sighting is not None and sighting.inside and not (self.clear(index) and near[index])
             if not isinstance(self.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
         ]
         agreeing = [s.fit for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s is not None and s.fit]
@@ -290,17 +293,17 @@ class _Sighter:
 
     def _take(self, index: int, sighting: Sighting, seen: Glimpse | None, unseen: str) -> None:
         """Keep a clear fit where the glimpse is of the same; else the glimpse counts, or that there was none."""
-        clear = self.clear(index)
-        self.vouched[index] = seen is not None
+        clear, away = self.clear(index), np.inf
+        if seen is not None and sighting.fit is not None:
+            away = float(np.hypot(*(sighting.fit.center_px - seen.fit.center_px)))
+        # That the same pixels answer twice proves nothing of a clear mark that agreed with the others anyway.
+        again = clear and bool(self.belongs[index]) and away <= _SAME_PX
+        self.vouched[index] = seen is not None and (bool(self.vouched[index]) or not again)
         if seen is None and not clear:
             self.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
-        elif seen is not None:
-            off = np.inf if sighting.fit is None else np.hypot(*(sighting.fit.center_px - seen.fit.center_px))
-            if not clear or off > _SAME_PX:
-                reason = (
-                    f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
-                )
-                self.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
+        elif seen is not None and (not clear or away > _SAME_PX):
+            reason = f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
+            self.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
 
     def _certain(self, seen: Glimpse) -> bool:
         """Whether neither texture nor rounding feigns it."""
