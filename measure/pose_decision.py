@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.candidates import detail_px
 from measure.constellation import Placement
 from measure.data_strip import Beside, beside_frame, side_in_scan, strip_likelihoods
 from measure.fiducial_options import FiducialOptions
@@ -61,10 +62,11 @@ def decide_pose(
     ]
     if not named:
         return _decision([], layout)
-    sites = [Site(scan, fit, fit.center_px, frame.weights) for fit in seen]
+    finest_px = min(detail_px(mark.mark, frame.pixel_from_camera[:, :2]) for mark in layout.marks)
+    sites = [Site(scan, fit, fit.center_px, frame.weights, finest_px) for fit in seen]
     # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
     usual = sorted(seen, key=lambda fit: abs(fit.contrast_dn))[len(seen) // 2]
-    sites += [Site(scan, usual, place, frame.weights) for place in missed]
+    sites += [Site(scan, usual, place, frame.weights, finest_px) for place in missed]
     pictures = np.array(
         [site.likelihoods([each.shown(index, layout) for each in named]) for index, site in enumerate(sites)]
     ).reshape(len(sites), len(named))

@@ -20,6 +20,7 @@ Mask = NDArray[np.bool_]
 _ALIKE = 0.05  # of the contrast: pictures that differ nowhere by more are one
 _SAME_PX = 0.1  # poses whose parts lie no farther apart show one drawing
 _CELLS = 2  # along a pixel's side: pictures right to a hundredth
+_FINEST_PX = 3.0  # of the finest line, once the scan is reduced
 _ABOUT_PX = 3.0  # how far about the drawings the ground tells of its grey value
 _PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
 _OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
@@ -36,28 +37,37 @@ class Shown:
 
 
 class Site:
-    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark."""
+    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark. The scan
+    is looked at reduced, as far as the finest line of the marks allows: what tells them apart is coarser."""
 
-    def __init__(self, scan: Scan, like: Match, center_px: Array, weights: Sequence[float] | None) -> None:
-        self.scan, self.like, self.center_px, self.weights = scan, like, center_px, weights
+    def __init__(
+        self, scan: Scan, like: Match, center_px: Array, weights: Sequence[float] | None, finest_px: float
+    ) -> None:
+        """finest_px: how wide the finest line of all marks is in the scan."""
+        self.scan, self.weights = scan, weights
+        self.reduction = max(1, int(finest_px / _FINEST_PX))
+        self.center_px = (center_px - (self.reduction - 1) / 2) / self.reduction
+        self.sign = np.sign(like.contrast_dn)
+        self.blur_px = like.blur_px / self.reduction
+        self.noise_dn = like.noise_dn / self.reduction
 
     def likelihoods(self, shown: Sequence[Shown]) -> Array:
         """The log-likelihood of the picture under what each pose shows here, up to a constant: 0 for the best, and no
         less than the probability that something else spoils the picture."""
-        looks, look_of = _looks(shown)
+        looks, look_of = _looks([replace(each, linear=each.linear / self.reduction) for each in shown])
         if len(looks) == 1:
             return np.zeros(len(shown))
         reach = max(_reach_px(each) for each in looks) + 2 * _ABOUT_PX
         col0, row0 = np.floor(self.center_px - reach).astype(int)
         size = int(np.ceil(2 * reach)) + 1
-        window = self.scan.window(int(col0), int(row0), size, size, self.weights).astype(float)
+        window = self.scan.reduced_window(self.reduction, int(col0), int(row0), size, size, self.weights).astype(float)
         center = self.center_px - (col0, row0)
         pictures, kind_of = _distinct([self._picture(each, center, size) for each in looks])
         picture_of = [kind_of[look] for look in look_of]
         area = _area(pictures)
         residuals = [self._residuals(window, each, area) for each in pictures]
         # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
-        scale = max(self.like.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
+        scale = max(self.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
         misfits = np.array([np.sum(np.minimum(np.abs(each) / scale, _OUTLIER) ** 2) for each in residuals])
         relative = np.exp(-(misfits - misfits.min()) / 2 / _PIXELS_PER_DEGREE)
         return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[picture_of]
@@ -66,7 +76,7 @@ class Site:
         if shown.mark is None:
             return np.zeros((size, size))
         place = np.column_stack([shown.linear, center])
-        return picture(shown.mark, place, size, size, self.like.blur_px, _CELLS)
+        return picture(shown.mark, place, size, size, self.blur_px, _CELLS)
 
     def _residuals(self, window: Array, shown: Array, area: Mask) -> Array:
         """What the picture on a plane ground leaves, the mark being light or dark as the one that was found; its place
@@ -78,7 +88,7 @@ class Site:
             by_row, by_col = (np.asarray(np.gradient(shown, axis=axis)) for axis in (0, 1))
             columns = [*ground, shown[area], by_row[area], by_col[area]]
             residuals, solution = _robust(columns, grey)
-            if solution[len(ground)] * self.like.contrast_dn > 0:
+            if solution[len(ground)] * self.sign > 0:
                 return residuals
         return _robust(ground, grey)[0]
 
