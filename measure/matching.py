@@ -21,6 +21,7 @@ from measure.match_options import MatchOptions
 from measure.noise import is_textured, noise_model
 from measure.picture_fit import PictureFit
 from measure.picture_model import GREY, PictureModel, State, background_px
+from measure.pixel_sums import combined, factors
 from measure.rendering import extent_px
 from measure.shapes import Mark
 
@@ -212,9 +213,9 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
 
 
 def _likeness(fit: PictureFit) -> float:
-    background, grey = fit.model.ground[:, fit.used], fit.model.grey[fit.used]
-    if len(grey) <= len(background):
+    background, grey = fit.model.ground * fit.used, fit.model.grey * fit.used
+    if fit.used.sum() <= len(background):
         return 0.0
-    without = grey - background.T @ np.linalg.lstsq(background.T, grey, rcond=None)[0]
+    without = grey - combined(factors(background, grey), background)
     unexplained = np.sum(fit.model.residuals[fit.used] ** 2) / max(np.sum(without**2), 1e-12)
     return float(np.sqrt(max(1 - unexplained, 0.0)))

@@ -167,28 +167,32 @@ class PictureFit:
     def _adjust(self, robust: bool, tolerance_px: float) -> None:
         """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""
         model = self.model
-        model.noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
+        if model.is_clipped:
+            model.noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
         model.linearise(self.used)
         tukey_dn = self._tukey_scale()
         self.variance_dn2 = tukey_dn**2
         scale_dn = tukey_dn if robust else np.inf
+        cost = self._cost(scale_dn)
         for _ in range(self.options.max_iterations):
             step = self._solve(self.used * tukey_weights(model.residuals, scale_dn))
             if step is None:
                 self.reason = "the picture does not determine the mark's place"
                 return
-            before, cost = model.state, self._cost(scale_dn)
+            before, cost_before = model.state, cost
             moved = model.step(step)
             model.linearise(self.used)
             if moved < tolerance_px:
                 return
+            cost = self._cost(scale_dn)
             for _ in range(_HALVINGS):
-                if self._cost(scale_dn) <= cost:
+                if cost <= cost_before:
                     break
                 step = step / 2
                 model.state = before
                 moved = model.step(step)
                 model.linearise(self.used)
+                cost = self._cost(scale_dn)
             self.reason = model.ran_away()
             if self.reason or moved < tolerance_px:
                 return

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from measure.clipping import Sides, censored, tells
 from measure.match_options import Freedom, MatchOptions
-from measure.pixel_sums import combined
+from measure.pixel_sums import combined, factors
 from measure.rendering import Rendering, reach_px, render
 from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
 
@@ -73,6 +73,7 @@ class PictureModel:
         self.mark, self.start, self.options = mark, start, options
         self.background_px = background_px
         self.clipped, self.noise_dn = clipped, ROUNDING_DN
+        self.is_clipped = bool(clipped.any())
         self.tells = np.ones(grey.shape, dtype=bool)
         self.grey = self._detail(grey)
         generators = [g for g in _GENERATORS[options.freedom] if not (g is _TURN and is_round(mark))]
@@ -111,8 +112,7 @@ class PictureModel:
         greys = self.design[-GREY:]
         greys[0], greys[1:] = self._detail(shown.value), self.ground
         if not self.state.greys.any():
-            solved = np.linalg.lstsq(greys[:, used].T, self.grey[used], rcond=None)[0]
-            self.state = State(place, self.state.variance_px2, np.asarray(solved, dtype=float))
+            self.state = State(place, self.state.variance_px2, factors(greys * used, self.grey))
         columns = self.design[:-GREY]
         columns[0], columns[1] = shown.by_col, shown.by_row
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
@@ -129,7 +129,7 @@ class PictureModel:
 
     def _as_noisy(self, noise_dn: float) -> bool:
         """Whether another noise would change no clipped grey value's part in the fit."""
-        return abs(self.noise_dn / noise_dn - 1) < _AS_NOISY or not self.clipped.any()
+        return abs(self.noise_dn / noise_dn - 1) < _AS_NOISY or not self.is_clipped
 
     def _change(self, before: State) -> Array:
         """(unknowns,) from a state before to the present one, both alike."""

@@ -17,3 +17,10 @@ def combined(factors: Array, images: Array) -> Array:
 def products(first: Array, second: Array) -> Array:
     """(n, m) the sums over all pixels of the products of images (n, height, width) and (m, height, width)."""
     return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)
+
+
+def factors(images: Array, image: Array) -> Array:
+    """(n,) the factors by which images (n, height, width), 0 where they do not count, come closest to an image in least
+    squares."""
+    inverse = np.linalg.pinv(products(images, images), hermitian=True)
+    return np.asarray(inverse @ products(images, image[None])[:, 0])
