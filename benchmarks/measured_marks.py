@@ -8,6 +8,7 @@ from true_marks import KIND, TrueMark, scan_of, some_mark
 
 from measure.disks import PLAIN_MARGIN_PX, fit_disk
 from measure.fiducial_options import FiducialOptions
+from measure.frame import CLEAR_DAMAGE
 from measure.matching import match
 from measure.refinement import sight
 from measure.status import Status
@@ -100,7 +101,9 @@ def measured(
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     options = FiducialOptions().match
     fit = sight(scan, mark.kind.shape, start, SEARCH_PX, polarity, None, options, frame_sigma).fit
-    return None if fit is None else Found(fit.center_px, fit.covariance_px2)
+    if fit is None:
+        return None
+    return Found(fit.center_px, fit.covariance_px2, "damaged" if fit.damaged_fraction > CLEAR_DAMAGE else "")
 
 
 def grey_is_light(mark: TrueMark, grey: Array) -> bool:

@@ -30,7 +30,7 @@ _MANY = 6  # marks that agree and tell where a faint one must be
 CLEAR_LIKENESS = 0.5
 _CLEAR_RESPONSE = 0.25  # correlation of the same marks before they are fitted
 _CLEAR_SNR = 3.0
-_CLEAR_DAMAGE = 0.25
+CLEAR_DAMAGE = 0.25
 _CLEAR_SIGMA_PX = 0.3
 _GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
 _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
@@ -107,7 +107,7 @@ class Frame:
             reasons.append(f"it correlates with its drawing by only {fit.likeness:.2f}")
         if fit.snr < _CLEAR_SNR:
             reasons.append(f"its contrast is only {fit.snr:.1f} times the noise")
-        if fit.damaged_fraction > _CLEAR_DAMAGE:
+        if fit.damaged_fraction > CLEAR_DAMAGE:
             reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
         if sigma_px > _CLEAR_SIGMA_PX:

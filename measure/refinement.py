@@ -18,6 +18,7 @@ from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
 
 Array = NDArray[np.float64]
 
+_DRIFT_PX = 2.0  # of a fit, from the pixel where it begins: what goes farther has found something else, dust say
 _LEANING_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
 
 
@@ -57,6 +58,9 @@ def sight(
         return Sighting(predicted, True, None, f"nothing within {search_px:.0f} px of its place looks like it")
     if not fit.converged:
         return Sighting(predicted, True, None, fit.reason)
+    off_px = float(np.hypot(*(fit.center_px - predicted)))
+    if off_px > search_px + _DRIFT_PX:
+        return Sighting(predicted, True, None, f"what lies there is {off_px:.0f} px from its place")
     if abs(fit.contrast_dn) < FAINT * scan.full_scale_dn:
         return Sighting(predicted, True, None, "there is no contrast at its place")
     if fit.contrast_dn * polarity <= 0:
