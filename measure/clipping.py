@@ -10,8 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.special import log_ndtr
 
+from measure.noise import robust_scale
 from measure.scan import Scan
 
 Array = NDArray[np.float64]
@@ -20,19 +22,23 @@ Sides = NDArray[np.int8]
 
 _BITS = (8, 10, 12, 14, 16)  # of scanners' converters; their numbers are stored as they are, or moved up
 _LOG_DENSITY = -0.5 * np.log(2 * np.pi)
+_TAIL = 2.0
+_LEAST_STEPS = 1.5  # of the scan's grey values in a standard deviation: in less noise an even ground is a pile as well
+_FEWEST = 20  # pixels: fewer bend no fit
+_CHANCE = 1e-6  # of a natural end: there are many windows
 _TELLS = 0.5  # derivative of the residual, from which on it is a residual like the others
 
 
 def clipped_sides(scan: Scan, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None) -> Sides:
-    """(height, width): 1 where a grey value of the window is at the upper end of the scanner's range, -1 at the lower,
-    0 elsewhere. weights: of the channels of a colour scan; none is negative, so that a channel at its end, of those
-    that count, is a limit of the whole."""
+    """(height, width): 1 where a grey value of the window is at the upper end of the scanner's range, or where whites
+    were cut off below it, -1 at the lower end, 0 elsewhere. weights: of the channels of a colour scan; none is
+    negative, so that a channel at its end, of those that count, is a limit of the whole."""
     sides = np.zeros((height, width), np.int8)
     for channel in range(scan.channels):
         if weights is None or weights[channel] > 0:
             only = tuple(float(index == channel) for index in range(scan.channels))
             grey = scan.window(col0, row0, width, height, only)
-            if grey.max() in _limits(scan.full_scale_dn):
+            if grey.max() in _limits(scan.full_scale_dn) or _is_cut(grey):
                 sides[grey == grey.max()] = 1
             sides[grey == 0] = -1
     return sides
@@ -53,6 +59,22 @@ def censored(residuals: Array, sides: Sides, sigma_dn: float) -> tuple[Array, Ar
 def tells(slopes: Array) -> Mask:
     """Which residuals are as large as the noise makes them, and say how large it is."""
     return np.asarray(slopes > _TELLS)
+
+
+def _is_cut(grey: NDArray[np.floating]) -> bool:
+    """Whether the greatest value is where whites were cut off. Of the values within _TAIL standard deviations of the
+    noise below it, the last one of a tail that falls by itself has no more than an even share."""
+    greatest = grey.max()
+    pile = int((grey == greatest).sum())
+    if pile < _FEWEST:
+        return False
+    beside = (grey[:, 1:] < greatest) & (grey[:, :-1] < greatest)
+    sigma = robust_scale(np.diff(grey.astype(float), axis=1)[beside]) / np.sqrt(2)
+    step = float(np.diff(np.unique(grey)).min(initial=np.inf))
+    if beside.sum() < _FEWEST or not sigma > _LEAST_STEPS * step:
+        return False
+    tail = int((grey >= greatest - _TAIL * sigma).sum())
+    return bool(stats.binom.sf(pile - 1, tail, step / (_TAIL * sigma)) < _CHANCE)
 
 
 def _limits(full_scale_dn: float) -> set[float]:

@@ -69,3 +69,21 @@ def test_ends_of_the_range_are_those_of_the_converter() -> None:
     assert sides[5, 6] == -1
     assert np.count_nonzero(sides) == 2
     assert not clipped_sides(scan_of(grey), 10, 10, 20, 20, None).any()
+
+
+def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
+    rng = np.random.default_rng(3)
+    for beyond in (-0.05, 0.3):
+        mark = some_mark(KIND["wing"], 1.0, rng)
+        natural = 250 + 100 * (beyond - mark.picture + rng.standard_normal((mark.size, mark.size)) / 20)
+        scan = scan_of(np.minimum(natural, 250), 255)
+        sides = clipped_sides(scan, 0, 0, mark.size, mark.size, None)
+        np.testing.assert_array_equal(sides == 1, np.rint(natural) >= 250)
+        start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
+        fit = sight(scan, mark.kind.shape, start, 3.0, -1, None, FiducialOptions().match, mark.kind.known).fit
+        assert fit is not None
+        error = fit.center_px - mark.place[:, 2]
+        assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
+    for sigma in np.geomspace(0.2, 20, 40):
+        grey = 128 + sigma * rng.standard_normal((60, 60)) - 40 * (np.arange(60) > 40)
+        assert not clipped_sides(scan_of(grey, 255), 0, 0, 60, 60, None).any()
