@@ -199,7 +199,9 @@ def pattern(template: Array, detail_px: float) -> tuple[Map, Map]:
 def _about(template: Array, detail_px: float) -> Map:
     """1 on the drawing and twice as far about it as its finest detail is wide, 0 elsewhere."""
     rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
-    beside = (np.abs(template - np.median(rim)) < _DRAWN).astype(np.uint8)
+    drawn = np.abs(template - np.median(rim))
+    # Of a line far thinner than a pixel hardly anything is left.
+    beside = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
     return np.asarray(cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= 2 * detail_px + 1, np.float32)
 
 

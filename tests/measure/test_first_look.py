@@ -8,6 +8,7 @@ from true_marks import KIND, scan_of, some_mark
 from measure.fiducial_options import FiducialOptions
 from measure.first_look import seen
 from measure.refinement import sight
+from measure.shapes import MarkShape, cross
 
 GROUND, CONTRAST = 25000.0, 15000.0
 
@@ -36,3 +37,11 @@ def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
         error = fit.center_px - mark.place[:, 2]
         assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
         assert np.trace(fit.covariance_px2) < 1.5**2 * np.trace(mark.bound(0.2))
+
+
+def test_a_line_far_thinner_than_a_pixel_is_looked_for_without_complaint() -> None:
+    mark = MarkShape(cross(1.5, 0.06), "dark")
+    noise = np.random.default_rng(3).standard_normal((60, 60))
+    place = np.array([[1.5, 0.0, 30.0], [0.0, -1.5, 30.0]])  # 0.67 mm a pixel
+    sighting = sight(scan_of(GROUND + 3000 * noise), mark, place, 3.0, -1, None, FiducialOptions().match)
+    assert sighting.fit is None or sighting.fit.likeness < 1.0
