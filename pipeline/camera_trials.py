@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,10 +71,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Identification:
-    """The trials, best first, and what follows from them."""
+    """The trials, best first, and what follows from them. unreported: by name, what cameras without any calibration
+    report rest on."""
 
     scan: Path
     trials: tuple[Trial, ...]
+    unreported: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def best(self) -> tuple[Trial, ...]:
@@ -97,7 +99,8 @@ class Identification:
             told += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
         elif len(first.cameras) > 1:
             told += " Their marks are alike; the data strip or the focal length must decide."
-        return told
+        named = [name for trial in self.best for name in trial.cameras if name in self.unreported]
+        return told + "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
 
     def as_json(self) -> Json:
         trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
@@ -117,7 +120,9 @@ def identify(
         trials = _trials(scan, cameras, pitch, FiducialOptions(pitch_is_right=True), count)
         if pitch is not None and not any(trial.stands_out for trial in trials):
             trials = _trials(scan, cameras, pitch, FiducialOptions(), count)
-    return Identification(path, tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected))))
+    sources = {name: camera.source for name, camera in cameras.items()}
+    unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
+    return Identification(path, tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected))), unreported)
 
 
 def _trials(

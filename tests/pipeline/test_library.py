@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
@@ -185,3 +186,5 @@ def test_cameras_that_come_close_are_all_named() -> None:
     found = Identification(Path("a.tif"), (trial(("a", "b"), 0.9), trial(("c",), 0.85), trial(("d",), 0.4)))
     assert found.as_json()["best"] == ["a", "b", "c"]
     assert "c comes close with 0.85" in found.sentence()
+    without_report = replace(found, unreported={"c": "made from one frame", "d": "nobody knows"})
+    assert without_report.sentence().endswith("c rests on no calibration report: made from one frame.")
