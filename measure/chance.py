@@ -15,6 +15,7 @@ from measure.constellation import sign_of
 from measure.fiducial_options import FiducialOptions
 from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, REDUCED_PX, Frame
+from measure.frame_search import FrameSearch
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
 
@@ -28,13 +29,41 @@ SURE = 12  # marks that agree: no speck feigns so many
 FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
 
 
-def doubt(scan: Scan, layout: FiducialLayout, frame: Frame, options: FiducialOptions) -> str:
-    """A sentence where chance may have made the frame; empty where every mark was found, or chance is unlikely."""
+def doubt(search: FrameSearch, frame: Frame) -> str:
+    """A sentence where chance may have made the frame; empty where it is unlikely to."""
     inside = [index for index, sighting in enumerate(frame.sightings) if sighting.inside]
     clear = {index: fit.center_px for index, fit in enumerate(frame.fits) if fit and fit.likeness >= CLEAR_LIKENESS}
-    found = len(clear)
-    if found == len(inside) or frame.belongs.sum() >= SURE:
+    if frame.belongs.sum() >= SURE:
         return ""
+    if len(clear) == len(inside):
+        return _by_the_scan(search, frame, clear)
+    return _by_places_beside(search.scan, search.layout, frame, search.options, inside, clear)
+
+
+def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> str:
+    """Where every mark was found: whether the scan has many places that answer as strongly. Few frames lie in the
+    middle of it, and windows about the marks tell of no others."""
+    if len(clear) <= FREE or not search.was_everywhere(frame):
+        return ""
+    expected = search.expected_where_seen(frame, clear)
+    if expected <= LIKELY:
+        return ""
+    return (
+        f"so much of the scan looks like the {len(clear)} marks found that chance would make {expected:.2g} such "
+        "frames in it, and the frame may lie elsewhere"
+    )
+
+
+def _by_places_beside(
+    scan: Scan,
+    layout: FiducialLayout,
+    frame: Frame,
+    options: FiducialOptions,
+    inside: Sequence[int],
+    clear: dict[int, Array],
+) -> str:
+    """Where some marks were not found: whether places beside them look as much like marks as those that were."""
+    found = len(clear)
 
     def response(index: int, place: Array, radius_px: float) -> float:
         mark = layout.marks[index].mark

@@ -67,7 +67,7 @@ def measure_fiducials(
         pose = decide_pose(scan, layout, posed, frame, options)
         if pose.name != frame.placement.pose:
             frame = measure_frame(scan, layout, posed[POSES.index(pose.name)], options)
-    return _measurement(scan, layout, frame, pose, _rivals(found, frame.placement), doubt(scan, layout, frame, options))
+    return _measurement(scan, layout, frame, pose, _rivals(found, frame.placement), doubt(search, frame))
 
 
 def _in_the_middle(search: FrameSearch, given: PitchHypothesis) -> tuple[list[Placement], Frame | None]:

@@ -96,7 +96,16 @@ class FrameSearch:
             for index, (fit, verdict) in enumerate(zip(frame.fits, verdicts, strict=True))
             if fit is not None and verdict is Status.MEASURED
         }
-        return self._expected(frame.placement, seen, _ANSWER_PX, sum(sighting.inside for sighting in frame.sightings))
+        return self.expected_where_seen(frame, seen)
+
+    def was_everywhere(self, frame: Frame) -> bool:
+        """Whether the frame was searched in the whole scan, not only in the middle of it."""
+        return self._searched[frame.placement.pitch_mm].search.responses.origins is None
+
+    def expected_where_seen(self, frame: Frame, seen_px: dict[int, Array]) -> float:
+        """The same, with the marks that count as seen, by index, and where."""
+        inside = sum(sighting.inside for sighting in frame.sightings)
+        return self._expected(frame.placement, seen_px, _ANSWER_PX, inside)
 
     def _expected(self, placement: Placement, seen_px: dict[int, Array], reach_px: float, inside: int) -> float:
         """seen_px: by index, where marks were seen; their answers lie within reach_px (of the reduced scan)."""

@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 from measure.chance import doubt
 from measure.constellation import Placement
 from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
 from measure.frame import Frame, measure_frame
+from measure.frame_search import FrameSearch
 from measure.pose_decision import decide_pose
 from measure.poses import POSES, up_from_camera
 from measure.scan import Scan
 from measure.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, dot
+from measure.status import Status
 
 PX_PER_MM = 20.0
 CONTRAST_DN = 8000.0
@@ -77,7 +80,7 @@ def test_three_plain_dots_of_four_are_no_chance() -> None:
     scan = scan_of(picture(layout, "0", hidden=1))
     frame = frame_of(scan, layout)
     assert frame.belongs.tolist() == [True, False, True, True]
-    assert doubt(scan, layout, frame, OPTIONS) == ""
+    assert doubt(FrameSearch(scan, layout, OPTIONS), frame) == ""
 
 
 def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> None:
@@ -88,8 +91,18 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     scan = scan_of(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
     frame = frame_of(scan, layout)
     assert frame.belongs.tolist() == [False, True, True, True]
-    sentence = doubt(scan, layout, frame, OPTIONS)
+    sentence = doubt(FrameSearch(scan, layout, OPTIONS), frame)
     assert "of 64 places beside them look as much like marks: chance finds as many with a probability of" in sentence
+
+
+def test_specks_that_lie_as_all_marks_are_doubted_too() -> None:
+    layout = layout_of(DOT, DOT, DOT, DOT)
+    as_marks = np.rint(centers_px(layout, "0")).astype(int)
+    elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
+    free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
+    result = measure_fiducials(scan_of(strewn(np.concatenate([elsewhere[free], as_marks]))), layout, (50.0, 50.0))
+    assert Status.MEASURED not in {mark.status for mark in result.marks}
+    assert result.pose is None or not result.pose.decided
 
 
 def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
