@@ -158,7 +158,7 @@ def _nothing(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasuremen
     marks = tuple(
         MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}") for mark in layout.marks
     )
-    problem = f"no fiducial was measured: {reason}; look whether the scan and the camera belong together."
+    problem = f"no fiducial was measured: {reason}; look whether the camera is that of the scan, and the pitch right."
     return FrameMeasurement(scan.name, marks, None, None, (problem,))
 
 

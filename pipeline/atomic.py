@@ -19,6 +19,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         os.replace(temporary, path)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(
+            f"{path}: cannot be written: {error.filename} is a file, and a folder is needed there. Set another output."
+        ) from error
     except OSError as error:
         raise InputError(
             f"{path}: cannot be written ({error.strerror or error}). Nothing was changed there. "

@@ -14,7 +14,7 @@ from adjust.model_choice import Candidate, Choice, choose
 from adjust.models import Model
 from pipeline.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjustment_file import without_nan
-from pipeline.atomic import write_atomically
+from pipeline.atomic import check_writable, write_atomically
 from pipeline.comparator_file import read_comparator
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
@@ -27,6 +27,7 @@ def run_choose(project: Project, reporter: Reporter) -> Choice:
 
     Raises InputError or AdjustmentError where the project cannot be adjusted at all.
     """
+    check_writable(project.output)
     with reporter.stage("comparing") as count:
         adjustment = adjust_marks(project, read_comparator(project.comparator))
         half_mm = {camera.name: _half(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm}

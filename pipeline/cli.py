@@ -26,7 +26,7 @@ from pipeline.project_file import Project, read_project
 from pipeline.scene_file import render_project
 from pipeline.summary import Summary, print_summary
 
-DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR = 0, 1, 2, 3
+DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 TEMPLATES = ("project", "camera", "scene")
 
 app = typer.Typer(
@@ -40,17 +40,18 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON 
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code: 0 done, 1 look at something, 2 wrong input, 3 a fault of ours.
+    """Run one command and return its exit code: 0 done, 1 look at something, 2 wrong input, 3 a fault of ours,
+    130 interrupted, as shells count it.
 
     arguments: what follows the program's name; by default what it was called with.
     """
     try:
         code = app(args=arguments, standalone_mode=False)
+        if code == INTERRUPTED:  # what typer makes of it
+            return _message("interrupted; files that were complete stay as they are", INTERRUPTED)
         return code if isinstance(code, int) else DONE
     except typer.TyperException as error:
         return _message(error.format_message(), WRONG_INPUT)
-    except (typer.Abort, KeyboardInterrupt):
-        return _message("interrupted; files that were complete stay as they are", WRONG_INPUT)
     except (InputError, MeasurementError, AdjustmentError) as error:
         return _message(str(error), WRONG_INPUT)
     except OSError as error:

@@ -30,8 +30,7 @@ Json = dict[str, Any]
 def run_all(project: Project, reporter: Reporter) -> Summary:
     """Measure (where there are scans), adjust, visit the scans again, check, report."""
     scans: tuple[MeasuredScan, ...] = ()
-    for folder in (project.output, project.comparator.parent):
-        check_writable(folder)
+    _check_writable(project)
     if project.scans:
         scans = measure_scans(project, reporter)
         _write_marks(project, scans)
@@ -49,6 +48,7 @@ def run_all(project: Project, reporter: Reporter) -> Summary:
 
 def run_measure(project: Project, reporter: Reporter) -> Summary:
     """Scans to comparator.csv."""
+    _check_writable(project)
     _write_marks(project, measure_scans(project, reporter))
     return summarise(
         _measured(project), {"comparator coordinates": project.comparator, "measurement": project.measurement_path}
@@ -82,6 +82,11 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
     with reporter.stage("reporting") as count:
         count(project.report_path.name, 0, 1)
         return _reported(project, _adjusted(project))
+
+
+def _check_writable(project: Project) -> None:
+    for folder in (project.output, project.comparator.parent):
+        check_writable(folder)
 
 
 def _given_marks(project: Project) -> tuple[ComparatorPoint, ...]:

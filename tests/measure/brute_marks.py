@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
+from drawn import pixel_means
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from measure.scan import Scan, open_scan
 from measure.shapes import Bar, Disk, MarkShape, Part, Ring
@@ -30,9 +30,10 @@ def brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: i
         )
         x, y = (line[0] * col[None, :] + line[1] * row[:, None] for line in mark_from_pixel)
         inside[first[1] : last[1], first[0] : last[0]] |= is_inside(part, x, y)
-    kept = inside.reshape(rows * KEPT, POINTS // KEPT, cols * KEPT, POINTS // KEPT).mean(axis=(1, 3))
-    blurred = gaussian_filter(kept, blur_px * KEPT, truncate=5) if blur_px > 0 else kept
-    return np.asarray(blurred.reshape(rows, KEPT, cols, KEPT).mean(axis=(1, 3))[pad:-pad, pad:-pad])
+    step = POINTS // KEPT
+    across = np.asarray(np.sum([inside[:, k::step] for k in range(step)], axis=0, dtype=np.uint8))
+    counts = np.asarray(np.sum([across[k::step] for k in range(step)], axis=0, dtype=np.uint8))
+    return pixel_means(counts / step**2, blur_px, KEPT, pad)
 
 
 def corners_mm(part: Part) -> Array:

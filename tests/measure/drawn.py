@@ -1,11 +1,10 @@
-"""Pictures for the tests of measure, drawn by brute force: supersampling and scipy's Gaussian filter."""
+"""Pictures for the tests of measure, drawn by brute force: supersampling and a sampled Gaussian."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from measure.picture_scan import WholePicture
 from measure.resolution import NO_TAGS
@@ -27,10 +26,26 @@ def drawn(
     pad = int(np.ceil(5 * blur_px)) + 1
     fine = [(np.arange((size + 2 * pad) * fineness) + 0.5) / fineness - 0.5 - pad for size in (width, height)]
     sharp = inside(*np.meshgrid(*fine)).astype(float)
-    blurred = gaussian_filter(sharp, blur_px * fineness, truncate=5) if blur_px > 0 else sharp
-    rows, cols = height + 2 * pad, width + 2 * pad
-    pixels = blurred.reshape(rows, fineness, cols, fineness).mean(axis=(1, 3))
-    return np.asarray(pixels[pad:-pad, pad:-pad])
+    return pixel_means(sharp, blur_px, fineness, pad)
+
+
+def pixel_means(sharp: Array, blur_px: float, fineness: int, pad: int) -> Array:
+    """Means over the pixels after a Gaussian blur cut off at five sigmas; of samples `fineness` to a pixel along each
+    axis, with a border of `pad` pixels, of more than five sigmas, that the result has not."""
+    rows, columns = (_means_of_samples(size, blur_px * fineness, fineness, pad) for size in sharp.shape)
+    return np.asarray(rows @ sharp @ columns.T)
+
+
+def _means_of_samples(samples: int, sigma: float, fineness: int, pad: int) -> Array:
+    """(pixels, samples) what each sample counts in a pixel's mean: all blurred samples of the pixel, summed up."""
+    reach = int(5 * sigma + 0.5)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2) if sigma > 0 else np.ones(1)
+    of_pixel = np.convolve(np.ones(fineness), kernel / kernel.sum()) / fineness
+    means = np.zeros((samples // fineness - 2 * pad, samples))
+    for pixel, row in enumerate(means):
+        first = (pixel + pad) * fineness - reach
+        row[first : first + len(of_pixel)] = of_pixel
+    return means
 
 
 def ellipse(center_px: Array, pixel_from_disk: Array) -> Callable[[Array, Array], Array]:

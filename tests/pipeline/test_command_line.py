@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from pipeline import stages
 from pipeline.cli import run
 
 SAID = pytest.CaptureFixture[str]
@@ -136,6 +137,17 @@ def adjusted(project: Path, capsys: SAID, marks: str | None = None) -> tuple[int
     return code, json.loads(out) if out else {}, err
 
 
+def test_an_interrupt_is_told_and_has_a_code_of_its_own(
+    project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stages, "run_adjust", interrupted)
+    assert run(["adjust", str(project / "project.toml")]) == 130
+    assert "interrupted; files that were complete stay" in capsys.readouterr().err
+
+
 def test_point_that_nobody_measured_is_named(project: Path, capsys: SAID) -> None:
     with (project / "points.csv").open("a", encoding="utf-8") as file:
         file.write("999,1,2,3,0,0,0,0,0,1\n")
@@ -181,9 +193,9 @@ def test_singular_network_is_named_in_words(project: Path, capsys: SAID) -> None
 
 def test_scan_of_another_camera_is_said_to_be_one(project: Path, capsys: SAID) -> None:
     rng = np.random.default_rng(1)
-    picture = (20000 + 3000 * rng.standard_normal((1356, 1356))).astype(np.uint16)
+    picture = (20000 + 3000 * rng.standard_normal((678, 678))).astype(np.uint16)
     tifffile.imwrite(
-        project / "scans" / "frame4.tif", picture, resolution=(1e4 / 45, 1e4 / 45), resolutionunit="CENTIMETER"
+        project / "scans" / "frame4.tif", picture, resolution=(1e4 / 90, 1e4 / 90), resolutionunit="CENTIMETER"
     )
     text = (project / "project.toml").read_text(encoding="utf-8")
     alone = re.sub(r"^scans = .*$", 'scans = ["scans/frame4.tif"]', text, flags=re.MULTILINE)

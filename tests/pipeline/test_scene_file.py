@@ -3,6 +3,8 @@
 import csv
 import json
 import tomllib
+from collections.abc import Sequence
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -23,6 +25,7 @@ from pipeline.scene_project import SceneFile, write_project
 from synthetic_images.frame import make_frame
 from synthetic_images.scene import BoardField, ChipMark, DrawnMark
 from synthetic_images.targets import field_targets
+from synthetic_images.truth import FrameTruth
 
 TEMPLATE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")
 READY = sorted(
@@ -63,11 +66,21 @@ def test_the_ready_scenes_are_those_that_are_documented() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", READY)
-def test_every_frame_of_a_ready_scene_shows_its_marks_and_enough_targets(name: str) -> None:
+@cache
+def true_frames(name: str) -> tuple[FrameTruth, ...]:
+    """Where everything lies in the frames of a ready scene."""
     scene = read_scene(scene_path(name)).scene
-    for index in range(len(scene.images)):
-        truth = make_frame(scene, index).truth
+    return tuple(make_frame(scene, index).truth for index in range(len(scene.images)))
+
+
+def in_its_group(name: str) -> object:
+    """A scene whose tests run in one process, so that its frames are made once."""
+    return pytest.param(name, marks=pytest.mark.xdist_group(name))
+
+
+@pytest.mark.parametrize("name", [in_its_group(name) for name in READY])
+def test_every_frame_of_a_ready_scene_shows_its_marks_and_enough_targets(name: str) -> None:
+    for truth in true_frames(name):
         assert not any(position.hidden for position in truth.fiducials.values())
         assert len(truth.fiducials) == 8
         if name != "juhl_natural.toml":
@@ -287,7 +300,7 @@ def test_a_folder_that_cannot_be_made_is_an_input_error(tmp_path: Path) -> None:
         render_project(path, path / "out")
 
 
-@pytest.mark.parametrize("name", ["demo.toml", "aerial_five.toml"])
+@pytest.mark.parametrize("name", [in_its_group(name) for name in ("demo.toml", "aerial_five.toml")])
 def test_the_adjustment_finds_the_scenes_camera(tmp_path: Path, name: str) -> None:
     """Renderer and adjustment share no formula: a sign or a unit that one of them has wrong would show here."""
     scene_file = read_scene(scene_path(name))
@@ -295,7 +308,7 @@ def test_the_adjustment_finds_the_scenes_camera(tmp_path: Path, name: str) -> No
     project_file = tmp_path / "project.toml"
     lines = project_file.read_text(encoding="utf-8").splitlines(keepends=True)
     project_file.write_text("".join(line for line in lines if not line.startswith("scans")), encoding="utf-8")
-    (tmp_path / "comparator.csv").write_text(true_comparator(scene_file, 0.05), encoding="utf-8")
+    (tmp_path / "comparator.csv").write_text(true_comparator(scene_file, true_frames(name), 0.05), encoding="utf-8")
     project = read_project(project_file)
     adjustment = adjust_marks(project, read_comparator(project.comparator))
     assert adjustment.converged
@@ -312,14 +325,13 @@ def test_the_adjustment_finds_the_scenes_camera(tmp_path: Path, name: str) -> No
             assert abs(adjustment.value(found) - value) < 3.5 * adjustment.sigma(found), found
 
 
-def true_comparator(scene_file: SceneFile, noise_px: float) -> str:
+def true_comparator(scene_file: SceneFile, frames: Sequence[FrameTruth], noise_px: float) -> str:
     """comparator.csv of everything that can be seen, with noise."""
     scene = scene_file.scene
     pitch_mm = scene.scanner.pitch_um[0] / 1000
     generator = np.random.default_rng(11)
     lines = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm,rho,col_px,row_px,status,reason"]
-    for index, image in enumerate(scene.images):
-        truth = make_frame(scene, index).truth
+    for image, truth in zip(scene.images, frames, strict=True):
         marks = [("fiducial", *item) for item in truth.fiducials.items()]
         marks += [("target", *item) for item in truth.targets.items()]
         for kind, id, position in marks:

@@ -146,17 +146,27 @@ def test_a_chip_lies_with_its_origin_on_the_mark(tmp_path: Path) -> None:
         assert np.abs(centroid(picture, position.center_px, 14) - position.center_px).max() < 0.01
 
 
+@pytest.fixture(scope="module")
+def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Array]:
+    """The same scene in grey and in colour, uncompressed in strips."""
+    folder = tmp_path_factory.mktemp("plain")
+    return {
+        colour: rendered(folder / str(colour), scene(scanner=replace(SCANNER, colour=colour, noise=0.01)))[0]
+        for colour in (False, True)
+    }
+
+
 @pytest.mark.parametrize("compression", ["none", "lzw", "deflate", "zstd"])
 @pytest.mark.parametrize("tile_px", [0, 64, 384])
 @pytest.mark.parametrize("colour", [False, True])
-def test_files_hold_the_same_picture(tmp_path: Path, compression: Compression, tile_px: int, colour: bool) -> None:
-    scanner = replace(SCANNER, colour=colour, noise=0.01)
-    expected, _ = rendered(tmp_path / "a", scene(scanner=scanner))
-    other = replace(scanner, compression=compression, tile_px=tile_px)
-    picture, _ = rendered(tmp_path / "b", scene(scanner=other))
+def test_files_hold_the_same_picture(
+    tmp_path: Path, stored_plainly: dict[bool, Array], compression: Compression, tile_px: int, colour: bool
+) -> None:
+    scanner = replace(SCANNER, colour=colour, noise=0.01, compression=compression, tile_px=tile_px)
+    picture, _ = rendered(tmp_path, scene(scanner=scanner))
     assert picture.shape == ((350, 350, 3) if colour else (350, 350))
-    assert np.array_equal(picture, expected)
-    with tifffile.TiffFile(tmp_path / "b" / "scans" / "f.tif") as file:
+    assert np.array_equal(picture, stored_plainly[colour])
+    with tifffile.TiffFile(tmp_path / "scans" / "f.tif") as file:
         tags = file.pages.first.tags
         assert tags["XResolution"].value[0] / tags["XResolution"].value[1] == pytest.approx(250.0)  # a cm over 40 um
         assert ("TileWidth" in tags) == (tile_px > 0)
