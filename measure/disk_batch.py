@@ -4,12 +4,13 @@ patches do not outlast, then with all."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from measure.block import Block
-from measure.disk_model import GREYS, DiskModel, DiskStates, radius_px, solved
+from measure.disk_model import GREYS, UNKNOWNS, DiskModel, DiskStates, each, radius_px, solved
 from measure.disk_patches import Candidate, strength
 from measure.robust import tukey_weights
 from measure.scan import Scan
@@ -24,7 +25,7 @@ MARGIN, LEAST_MARGIN_PX = 0.3, 2.5  # of its radius: the ground is not plain for
 SIZE_STEP = 1.3  # from the smallest to the largest that are fitted together
 TOGETHER_PIXELS = 1 << 15  # of all windows: with their derivatives they stay in the processor's cache
 COARSE_PX = 3.0  # radius in pixels that are enough for a first look and its steps
-COARSE_STEPS, STEPS, ROBUST_STEPS = 2, 1, 1
+COARSE_STEPS = 2  # before one that is robust
 SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale
 FIRST_BLUR_PX = 1.0
 HOPELESS = 1.5  # times the misfit that is allowed, before all steps: an outline is right to a few percent
@@ -64,8 +65,10 @@ def _shapes(disks: Sequence[_Disk]) -> Array:
 
 
 def _reach_px(shapes: Array) -> Array:
-    """(n,) how far from the middle grey values are used."""
-    return np.asarray(np.sqrt((shapes**2).sum(axis=(1, 2))) + _margin_px(shapes) + 1.0)
+    """(n,) how far from the middle grey values are used: to the margin about the longer half axis."""
+    squares, area = (shapes**2).sum(axis=(1, 2)), radius_px(shapes) ** 2
+    longer = np.sqrt((squares + np.sqrt(np.maximum(squares**2 - 4 * area**2, 0.0))) / 2)
+    return np.asarray(longer + _margin_px(shapes) + 1.0)
 
 
 def _margin_px(shapes: Array) -> Array:
@@ -79,32 +82,32 @@ def _hopeful(block: Block, disks: list[_Disk], every: int) -> list[_Disk]:
     group = group.part(group.misfit() < HOPELESS)
     if not len(group.disks):
         return []
-    group = group.adjusted(COARSE_STEPS)
+    for step in range(COARSE_STEPS + 1):
+        group = group.stepped(is_robust=step == COARSE_STEPS)
     return group.part((group.misfit() < HOPELESS) & group.is_sane()).disks_now()
 
 
 def _fitted(block: Block, disks: list[_Disk]) -> list[_Disk]:
-    """Those of about one size that are disks."""
-    group = _Group.of(block, disks, 1).adjusted(STEPS)
-    return group.part((group.misfit() < 1.0) & group.is_sane()).disks_now()
+    """Those of about one size that are disks, after two steps with all pixels."""
+    group = _Group.of(block, disks, 1).stepped(is_robust=True)
+    last = group.stepped(is_robust=True)
+    return last.part((group.misfit() < 1.0) & last.is_sane()).disks_now()
 
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Windows of side x side pixels, or every so many of their columns and rows, about n disks of about one size: their
-    first pixels' places corners (n, 2), their grey values (n, rows, cols), which of these are used, and what the disks
-    are by now."""
+    """n disks of about one size: their windows' first pixels' places corners (n, 2), grey values (n, rows, cols), which
+    of these are used, and what the disks are by now."""
 
     disks: list[_Disk]
     corners: NDArray[np.int64]
-    side: int
-    every: int
     grey: Image
     used: Mask
-    state: DiskStates
+    model: DiskModel
 
     @classmethod
     def of(cls, block: Block, disks: list[_Disk], every: int) -> "_Group":
+        """With every so many columns and rows of their windows."""
         shapes = _shapes(disks)
         half = int(np.ceil(_reach_px(shapes).max()))
         side = 2 * half + 1
@@ -113,44 +116,52 @@ class _Group:
         corners = np.clip(np.rint(places).astype(np.int64) - half - block.place_px, 0, inside) + block.place_px
         grey = np.stack([block.window(col, row, side, side, every) for col, row in corners.tolist()])
         blur = np.array([disk.blur_px for disk in disks])
-        state = DiskStates(places - corners, shapes, blur, np.zeros((len(disks), GREYS)))
-        model = DiskModel(state, side, every)
+        model = DiskModel(DiskStates(places - corners, shapes, blur, np.zeros((len(disks), GREYS))), side, every)
         used = model.distance > -_margin_px(shapes)[:, None, None]
-        used &= _in_scan(block.scan, corners, side)[:, ::every, ::every]
+        used &= _in_scan(block.scan, corners[..., None] + np.arange(0, side, every))
         greys = solved(model.grey_design(), grey, used.astype(np.float32))
-        return cls(disks, corners, side, every, grey, used, replace(state, greys=greys))
+        return cls(disks, corners, grey, used, model.with_greys(greys))
+
+    @property
+    def state(self) -> DiskStates:
+        return self.model.state
+
+    @cached_property
+    def residuals(self) -> Image:
+        return self.grey - self.model.grey()
+
+    @cached_property
+    def scale(self) -> Array:
+        """(n,) the standard deviation that most residuals of each window have."""
+        count = len(self.used)
+        rising = np.sort(np.where(self.used, np.abs(self.residuals), np.float32(np.inf)).reshape(count, -1), axis=1)
+        pixels = self.used.reshape(count, -1).sum(axis=1)
+        unbiased = np.sqrt(pixels / np.maximum(pixels - UNKNOWNS, 1))
+        return np.asarray(1.4826 * rising[np.arange(count), pixels // 2] * unbiased, float)
 
     def part(self, chosen: Mask) -> "_Group":
         disks = [disk for disk, is_chosen in zip(self.disks, chosen.tolist(), strict=True) if is_chosen]
-        grey, used = self.grey[chosen], self.used[chosen]
-        return _Group(disks, self.corners[chosen], self.side, self.every, grey, used, self.state.part(chosen))
-
-    def adjusted(self, steps: int) -> "_Group":
-        """After so many steps and those in which dust and neighbours count less."""
-        group = self
-        for step in range(steps + ROBUST_STEPS):
-            group = group.stepped(is_robust=step >= steps)
-        return group
+        model = self.model.at(self.state.part(chosen))
+        return _Group(disks, self.corners[chosen], self.grey[chosen], self.used[chosen], model)
 
     def stepped(self, is_robust: bool) -> "_Group":
-        model = DiskModel(self.state, self.side, self.every)
-        residuals, weights = self.grey - model.grey(), self.used.astype(np.float32)
+        """After one step of the adjustment, a robust one being little moved by dust and neighbours."""
+        weights = self.used.astype(np.float32)
         if is_robust:
-            scale = np.maximum(_scale(residuals, self.used), SCALE_FLOOR * np.abs(self.state.greys[:, 0]) + 1e-6)
-            weights *= tukey_weights(np.asarray(residuals / scale[:, None, None], float), 1.0)
-        return replace(self, state=self.state.stepped(solved(model.design(), residuals, weights)))
+            scale = np.maximum(self.scale, SCALE_FLOOR * np.abs(self.state.greys[:, 0]) + 1e-6)
+            weights *= tukey_weights(self.residuals / each(scale), 1.0)
+        step = solved(self.model.design(), self.residuals, weights)
+        return replace(self, model=self.model.at(self.state.stepped(step)))
 
     def misfit(self) -> Array:
         """(n,) what a disk leaves unexplained, over what is allowed; a picture of something else is alike in
         neighbouring pixels."""
-        residuals = self.grey - DiskModel(self.state, self.side, self.every).grey()
-        left = residuals * self.used
+        left = self.residuals * self.used
         beside = (left[:, :, 1:] * left[:, :, :-1]).sum(axis=(1, 2))
         below = (left[:, 1:] * left[:, :-1]).sum(axis=(1, 2))
         correlation = (beside + below) / np.maximum(2 * (left**2).sum(axis=(1, 2)), 1e-6)
         allowed = np.where(correlation > SMOOTH, WORST_SMOOTH_MISFIT, WORST_MISFIT)
-        least = np.maximum(allowed * np.abs(self.state.greys[:, 0]), 1e-6)
-        return np.asarray(_scale(residuals, self.used) / least, float)
+        return np.asarray(self.scale / np.maximum(allowed * np.abs(self.state.greys[:, 0]), 1e-6), float)
 
     def is_sane(self) -> Mask:
         """(n,) whether the disks are still about what they started from."""
@@ -168,15 +179,7 @@ class _Group:
         return [_Disk(patch, blur) for patch, blur in zip(patches, state.blur.tolist(), strict=True)]
 
 
-def _in_scan(scan: Scan, corners: NDArray[np.int64], side: int) -> Mask:
-    """(n, side, side): which pixels of the windows are the scan's."""
-    along = corners[:, :, None] + np.arange(side)
+def _in_scan(scan: Scan, along: NDArray[np.int64]) -> Mask:
+    """(n, rows, cols): which pixels are the scan's; along (n, 2, side): their columns, and their rows."""
     inside = (along >= 0) & (along < np.array([[scan.width_px], [scan.height_px]]))
     return np.asarray(inside[:, 1, :, None] & inside[:, 0, None, :])
-
-
-def _scale(residuals: Image, used: Mask) -> Array:
-    """(n,) the standard deviation that most residuals of each window have."""
-    rising = np.sort(np.where(used, np.abs(residuals), np.float32(np.inf)).reshape(len(used), -1), axis=1)
-    middle = used.reshape(len(used), -1).sum(axis=1) // 2
-    return np.asarray(1.4826 * rising[np.arange(len(used)), middle], float)

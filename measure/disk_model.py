@@ -2,7 +2,10 @@
 is taken for straight where it is blurred, which changes a disk's size by a few hundredths of a pixel and its place by
 nothing."""
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +18,7 @@ Mask = NDArray[np.bool_]
 BLUR_PX = (0.5, 8.0)  # pixels' own width included
 LONGEST_STEP = 0.3  # of the radius
 DAMPING = 1e-4
-GREYS = 4
+GREYS, UNKNOWNS = 4, 10
 _GENERATORS = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
 
 
@@ -53,69 +56,95 @@ def radius_px(shapes: Array) -> Array:
     return np.asarray(np.sqrt(np.abs(shapes[:, 0, 0] * shapes[:, 1, 1] - shapes[:, 0, 1] * shapes[:, 1, 0])))
 
 
-class DiskModel:
-    """n disks at a state, in windows of side x side pixels, or every so many of their columns and rows.
+class _Edges(NamedTuple):
+    """Each (n, rows, cols) but col (n, 1, cols) and row (n, rows, 1), px from the centres. distance: from the edge, px,
+    positive inside; by_col, by_row, slope: derivatives of the distance in radii and their size; place: distance in
+    blurs; share: of the disk in the pixel."""
 
-    distance (n, rows, cols): from the edge, px, positive inside; share (n, rows, cols): of the disk in the pixel.
-    """
+    col: Image
+    row: Image
+    by_col: Image
+    by_row: Image
+    slope: Image
+    distance: Image
+    place: Image
+    share: Image
+
+
+class DiskModel:
+    """n disks at a state, in windows of side x side pixels, or every so many of their columns and rows."""
 
     def __init__(self, state: DiskStates, side: int, every: int = 1) -> None:
-        self._state = state
-        along = np.arange(0, side, every)
-        self._col = (along - state.centers[:, :1]).astype(np.float32)[:, None, :]
-        self._row = (along - state.centers[:, 1:]).astype(np.float32)[:, :, None]
+        self.state = state
+        self._side, self._every = side, every
+
+    def at(self, state: DiskStates) -> "DiskModel":
+        return DiskModel(state, self._side, self._every)
+
+    def with_greys(self, greys: Array) -> "DiskModel":
+        model = copy(self)
+        model.state = replace(self.state, greys=greys)
+        return model
+
+    @cached_property
+    def _edges(self) -> _Edges:
+        state, along = self.state, np.arange(0, self._side, self._every)
+        col = (along - state.centers[:, :1]).astype(np.float32)[:, None, :]
+        row = (along - state.centers[:, 1:]).astype(np.float32)[:, :, None]
         inverse = np.linalg.inv(state.shapes).astype(np.float32)[..., None, None]
-        x = inverse[:, 0, 0] * self._col + inverse[:, 0, 1] * self._row
-        y = inverse[:, 1, 0] * self._col + inverse[:, 1, 1] * self._row
+        x = inverse[:, 0, 0] * col + inverse[:, 0, 1] * row
+        y = inverse[:, 1, 0] * col + inverse[:, 1, 1] * row
         radius = np.maximum(np.sqrt(x * x + y * y), np.float32(1e-6))
-        self._by_col = inverse[:, 0, 0] * x + inverse[:, 1, 0] * y
-        self._by_row = inverse[:, 0, 1] * x + inverse[:, 1, 1] * y
-        self._slope = np.sqrt(self._by_col * self._by_col + self._by_row * self._by_row)
-        np.maximum(self._slope, np.float32(1e-9), out=self._slope)
-        self.distance = (radius - radius * radius) / self._slope
-        self._place = self.distance / self._each(state.blur)
-        self.share = ndtr(self._place)
+        by_col = (inverse[:, 0, 0] * x + inverse[:, 1, 0] * y) / radius
+        by_row = (inverse[:, 0, 1] * x + inverse[:, 1, 1] * y) / radius
+        slope = np.sqrt(by_col * by_col + by_row * by_row)
+        distance = (1 - radius) / slope
+        place = distance / each(state.blur)
+        return _Edges(col, row, by_col, by_row, slope, distance, place, ndtr(place))
+
+    @property
+    def distance(self) -> Image:
+        """(n, rows, cols) from the edge, px, positive inside."""
+        return self._edges.distance
 
     def grey(self) -> Image:
         """(n, rows, cols) as modelled."""
-        gain, offset, by_col, by_row = (self._each(greys) for greys in self._state.greys.T)
-        size = self._each(self._state.radius)
-        return np.asarray(gain * self.share + (offset + by_col / size * self._col + by_row / size * self._row))
+        gain, offset, by_col, by_row = (each(greys) for greys in self.state.greys.T)
+        size, edges = each(self.state.radius), self._edges
+        return np.asarray(gain * edges.share + (offset + by_col / size * edges.col + by_row / size * edges.row))
 
     def design(self) -> Image:
         """(n, unknowns, rows, cols): columns and rows of the centres, the shapes' scale, stretch and shear in radii,
         the blur, the greys."""
-        gain, blur, size = (self._each(of) for of in (self._state.greys[:, 0], self._state.blur, self._state.radius))
-        edge = gain / (np.float32(np.sqrt(2 * np.pi)) * blur) * np.exp(np.float32(-0.5) * self._place * self._place)
-        moved = edge / self._slope
-        count, rows, cols = self.distance.shape
-        design = np.empty((count, 6 + GREYS, rows, cols), np.float32)
-        outward_col = np.multiply(moved, self._by_col, out=design[:, 0])
-        outward_row = np.multiply(moved, self._by_row, out=design[:, 1])
-        col, row = self._col / size, self._row / size
+        gain, blur, size = (each(of) for of in (self.state.greys[:, 0], self.state.blur, self.state.radius))
+        edges = self._edges
+        design = np.empty((len(gain), UNKNOWNS, *edges.share.shape[1:]), np.float32)
+        steepness = (
+            gain / (np.float32(np.sqrt(2 * np.pi)) * blur) * np.exp(np.float32(-0.5) * edges.place * edges.place)
+        )
+        moved = steepness / edges.slope
+        outward_col = np.multiply(moved, edges.by_col, out=design[:, 0])
+        outward_row = np.multiply(moved, edges.by_row, out=design[:, 1])
+        col, row = edges.col / size, edges.row / size
         along_col, along_row = outward_col * col, outward_row * row
         np.add(along_col, along_row, out=design[:, 2])
         np.subtract(along_col, along_row, out=design[:, 3])
         np.add(outward_col * row, outward_row * col, out=design[:, 4])
-        np.multiply(edge, -self._place, out=design[:, 5])
-        self._put_greys(design[:, 6:])
+        np.multiply(steepness, -edges.place, out=design[:, 5])
+        design[:, -GREYS:] = self.grey_design()
         return design
 
     def grey_design(self) -> Image:
         """(n, GREYS, rows, cols): that of the greys alone."""
-        count, rows, cols = self.distance.shape
-        design = np.empty((count, GREYS, rows, cols), np.float32)
-        self._put_greys(design)
+        size, edges = each(self.state.radius), self._edges
+        design = np.empty((len(size), GREYS, *edges.share.shape[1:]), np.float32)
+        design[:, 0], design[:, 1], design[:, 2], design[:, 3] = edges.share, 1, edges.col / size, edges.row / size
         return design
 
-    def _put_greys(self, design: Image) -> None:
-        size = self._each(self._state.radius)
-        design[:, 0], design[:, 1], design[:, 2], design[:, 3] = self.share, 1, self._col / size, self._row / size
 
-    @staticmethod
-    def _each(values: Array) -> Image:
-        """(n, 1, 1)"""
-        return np.asarray(values, np.float32)[:, None, None]
+def each(values: Array) -> Image:
+    """(n, 1, 1)"""
+    return np.asarray(values, np.float32)[:, None, None]
 
 
 def solved(design: Image, residuals: Image, weights: Image) -> Array:

@@ -4,6 +4,7 @@ A disk's picture is seen whole from its middle: each ray leaves it once. So the 
 once, to a fraction of a pixel, and the ellipse with the moments of each is compared with it.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -57,17 +58,21 @@ class Outlines:
 def outlines_about(image: Image, blobs: Blobs) -> Outlines:
     """Of those blobs, light ones, that end on every ray; most of what stands out of a landscape runs on along some."""
     found = []
-    for radius in np.unique(blobs.radius):
+    for radius in np.unique(blobs.radius).tolist():
         alike = blobs.part(blobs.radius == radius)
-        samples = RAYS * round(REACH * radius / 0.5)
-        for first in range(0, len(alike.radius), max(_CHUNK // samples, 1)):
-            some = alike.part(slice(first, first + max(_CHUNK // samples, 1)))
-            some = some.part(_Profiles(image, some, float(radius), FEW_RAYS, 1.0).ends)
-            if not len(some.radius):
-                continue
-            profiles = _Profiles(image, some, float(radius), RAYS, 0.5)
+        ends = [
+            _Profiles(image, some, radius, FEW_RAYS, 1.0).ends for some in _chunks(alike, FEW_RAYS * REACH * radius)
+        ]
+        for some in _chunks(alike.part(np.concatenate(ends)), RAYS * REACH * radius / 0.5):
+            profiles = _Profiles(image, some, radius, RAYS, 0.5)
             found.append(_outlines(some.places[profiles.ends], profiles))
     return _joined(found)
+
+
+def _chunks(blobs: Blobs, samples: float) -> Iterator[Blobs]:
+    """Blobs of which each takes so many samples."""
+    count = max(int(_CHUNK / samples), 1)
+    return (blobs.part(slice(first, first + count)) for first in range(0, len(blobs.radius), count))
 
 
 class _Profiles:

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 PEAK_OF_DISK = 2 / np.e  # of the scale-normalised Laplacian of a disk, in units of its contrast, at sigma = r / sqrt(2)
-RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale...
-TEXTURE_PX = 1024  # ...where it is so large, px of the scan along a side: a smaller one may be full of disks
+RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale
+TEXTURE_PX = 1024  # side, px of the scan: a smaller picture may be full of disks, which are no texture or noise
 CELL_PX = 1536  # of the scan, side of what has one texture and one noise, about
 EVERY = 8  # column and row are enough to tell these
 WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, beside what noise makes of it
@@ -80,9 +80,10 @@ def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn:
     """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
     scan_px2 = small.size * factor**2
     cells = Cells.of(small.shape[1], max(round(scan_px2 / CELL_PX**2), 1))
-    noise = cells.each(fine_noise, small)
+    is_textured = scan_px2 >= TEXTURE_PX**2
+    noise = cells.each(fine_noise, small) if is_textured else np.zeros(len(cells.ends))
     found = []
-    for sign, own in blobs(small, radii, search, full_scale_dn, cells, scan_px2 >= TEXTURE_PX**2):
+    for sign, own in blobs(small, radii, search, full_scale_dn, cells, is_textured):
         outlines = outlines_about(small if sign > 0 else -small, own)
         for center, shape, height in round_ones(outlines, noise[cells.at(outlines.centers[:, 0])], factor):
             found.append(Candidate(center, shape, sign * height))

@@ -1,5 +1,7 @@
 """Least squares that hold against dust: Tukey's biweight, the search for damage, and a guarded solution."""
 
+from typing import TypeVar
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +11,12 @@ from measure.noise import robust_scale
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+Real = TypeVar("Real", np.float32, np.float64)
+
 _TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 
 
-def tukey_weights(residuals: Array, scale_dn: float) -> Array:
+def tukey_weights(residuals: NDArray[Real], scale_dn: float) -> NDArray[Real]:
     """Weights between 0 and 1, all 1 where the scale is infinite."""
     if not np.isfinite(scale_dn):
         return np.ones_like(residuals)
