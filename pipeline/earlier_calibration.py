@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adjust.families import parameter_names
 from adjust.network import Calibration, Camera, Distortion, Fiducial, Prior
-from pipeline.adjustment_file import Covariance, read_adjustment, read_covariance
+from pipeline.adjustment_reader import Covariance, read_adjustment, read_covariance
 from pipeline.tables import Table
 
 Array = NDArray[np.float64]

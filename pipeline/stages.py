@@ -8,7 +8,8 @@ from typing import Any
 
 from adjust.result import Adjustment
 from pipeline.adjust_stage import adjust_marks
-from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
+from pipeline.adjustment_file import write_adjustment
+from pipeline.adjustment_reader import covariance_path, read_adjustment, read_covariance
 from pipeline.atomic import check_writable, write_atomically
 from pipeline.check import check_against_opencv
 from pipeline.comparator_file import ComparatorPoint, read_comparator, write_comparator

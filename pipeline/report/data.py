@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.adjustment_file import Covariance
+from pipeline.adjustment_reader import Covariance
 from pipeline.comparator_file import ComparatorPoint
 
 Json = dict[str, Any]

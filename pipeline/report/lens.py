@@ -10,7 +10,7 @@ from adjust.distortion import image_equations
 from adjust.families import family, parameter_names
 from adjust.network import Distortion
 from adjust.projection import ideal_from_observed
-from pipeline.adjustment_file import Covariance
+from pipeline.adjustment_reader import Covariance
 from pipeline.report import svg
 from pipeline.report.data import Json
 

@@ -33,7 +33,8 @@ from adjust.result import (
     Suspect,
 )
 from measure.status import Status
-from pipeline.adjustment_file import read_adjustment, read_covariance, write_adjustment
+from pipeline.adjustment_file import write_adjustment
+from pipeline.adjustment_reader import read_adjustment, read_covariance
 from pipeline.comparator_file import ComparatorPoint
 from pipeline.report import ReportData, Thumbnail
 

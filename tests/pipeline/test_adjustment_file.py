@@ -14,7 +14,8 @@ from adjust.adjustment import adjust
 from adjust.network import ObjectPoint, Prior
 from adjust.result import Adjustment, Residuals
 from pipeline import covariance_arrays
-from pipeline.adjustment_file import covariance_path, read_adjustment, read_covariance, write_adjustment
+from pipeline.adjustment_file import write_adjustment
+from pipeline.adjustment_reader import covariance_path, read_adjustment, read_covariance
 from pipeline.errors import InputError
 
 

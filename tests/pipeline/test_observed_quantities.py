@@ -15,7 +15,8 @@ from adjust.network import EXTERIOR_NAMES
 from adjust.result import Adjustment
 from adjust.rotation import rotation_from_angles
 from pipeline.adjust_stage import adjust_marks
-from pipeline.adjustment_file import read_adjustment, write_adjustment
+from pipeline.adjustment_file import write_adjustment
+from pipeline.adjustment_reader import read_adjustment
 from pipeline.check import check_against_opencv
 from pipeline.comparator_file import read_comparator
 from pipeline.errors import InputError

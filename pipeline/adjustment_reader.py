@@ -1,0 +1,174 @@
+"""`adjustment.json` and `adjustment.npz` read back, and refused where they are not what was written."""
+
+import json
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """The a-posteriori covariance of all unknowns: names (n), values (n,), matrix (n, n); mm, object units, rad."""
+
+    names: tuple[str, ...]
+    values: Array
+    matrix: Array
+
+    def of(self, names: Iterable[str]) -> Array:
+        """The covariance (k, k) of some unknowns; one that is not listed was fixed, its row is zero."""
+        at = np.array([self._positions.get(name, -1) for name in names], dtype=int)
+        block: Array = self.matrix[np.ix_(at, at)]
+        block[at < 0, :] = 0.0
+        block[:, at < 0] = 0.0
+        return block
+
+    @cached_property
+    def _positions(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
+
+def covariance_path(path: Path) -> Path:
+    """Where the covariance of `adjustment.json` stands."""
+    return path.with_suffix(".npz")
+
+
+def read_adjustment(path: Path) -> Json:
+    """The contents of `adjustment.json`, checked as far as readers rely on it.
+
+    Raises InputError for a file that is missing, no JSON, or lacks a key or has a wrong value at one.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file. Run `reseau adjust` first.") from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: is not valid JSON ({error}). {_AGAIN}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    _check(content, _ADJUSTMENT, path, "")
+    return dict(content)
+
+
+def read_covariance(path: Path) -> Covariance:
+    """The covariance beside the `adjustment.json` at `path`. Raises InputError where it is missing or broken."""
+    file = covariance_path(path)
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            names, values, matrix = arrays["names"], arrays["values"], arrays["matrix"]
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file; it belongs to {path.name}. {_AGAIN}") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file}: is not a covariance file ({error}). {_AGAIN}") from None
+    if values.shape != names.shape or matrix.shape != (*names.shape, *names.shape):
+        raise InputError(f"{file}: {names.size} names do not fit a matrix of shape {matrix.shape}. {_AGAIN}")
+    return Covariance(tuple(str(name) for name in names), values, matrix)
+
+
+_AGAIN = "Run `reseau adjust` again; it writes both files."
+
+
+@dataclass(frozen=True)
+class _Each:
+    """A table from names, or a list, whose every entry has the same form."""
+
+    container: type
+    form: object
+
+
+_NUMBER = (float, int, type(None))  # null: a number that has no meaning here
+_RESIDUAL_NUMBERS = (
+    "vx_um", "vy_um", "redundancy_x", "redundancy_y", "w", "weight", "sx_um", "sy_um",
+    "camera_x_mm", "camera_y_mm", "camera_vx_um", "camera_vy_um",
+)  # fmt: skip
+FURTHER_NUMBERS = ("sigma", "v", "redundancy", "w", "detectable")
+_NAMED = {"name": str, **dict.fromkeys(("value", *FURTHER_NUMBERS), _NUMBER)}
+_QUANTITY = {"value": _NUMBER, "sigma": _NUMBER}
+_ADJUSTMENT = {
+    "reseau": str,
+    "converged": bool,
+    "termination": str,
+    "iterations": int,
+    "observations": int,
+    "conditions": int,
+    "unknowns": int,
+    "redundancy": int,
+    "sigma0": _NUMBER,
+    "singular": _Each(list, {"parameters": list, "cause": str, "remedy": str}),
+    "cameras": _Each(
+        dict,
+        {
+            "principal_distance_mm": _QUANTITY,
+            "principal_point_mm": {"x": _QUANTITY, "y": _QUANTITY},
+            "distortion": {"family": str},
+            "fiducials": _Each(dict, {"x_mm": _QUANTITY, "y_mm": _QUANTITY, "rho": _NUMBER}),
+        },
+    ),
+    "images": _Each(
+        dict,
+        {
+            "transformation": {"kind": str},
+            "exterior": dict.fromkeys(("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"), _QUANTITY),
+        },
+    ),
+    "points": _Each(dict, {"X": _QUANTITY, "Y": _QUANTITY, "Z": _QUANTITY}),
+    "residuals": _Each(
+        list, dict.fromkeys(("image", "point", "kind"), str) | dict.fromkeys(_RESIDUAL_NUMBERS, _NUMBER)
+    ),
+    "distances": _Each(
+        list,
+        dict.fromkeys(("from", "to"), str) | dict.fromkeys(("distance", *FURTHER_NUMBERS), _NUMBER),
+    ),
+    "correlations": _Each(list, {"parameters": list, "rho": _NUMBER, "cause": str, "remedy": str}),
+    "calibrations": _Each(list, _NAMED),
+    "antennas": _Each(list, _NAMED),
+    "warnings": _Each(list, str),
+    "variance_factors": _Each(dict, _NUMBER),
+    "variance_sigmas": _Each(dict, _NUMBER),
+    "suspects": _Each(
+        list,
+        {"name": str, "group": str, "owner": str, "point": str, "alike": list, "error": list, "removed": bool}
+        | dict.fromkeys(("statistic", "critical", "w", "tau", "critical_tau"), _NUMBER),
+    ),
+    "reliability": (dict, type(None)),
+    "groups": _Each(dict, dict.fromkeys(("sigma0", "rms_x_um", "rms_y_um", "redundancy"), _NUMBER)),
+}
+
+
+def _check(content: Any, form: Any, path: Path, place: str) -> None:
+    """Refuse content that has not the form; keys beyond it are welcome."""
+    if isinstance(form, _Each):
+        _check(content, form.container, path, place)
+        entries = content.items() if isinstance(content, dict) else enumerate(content)
+        for key, item in entries:
+            _check(item, form.form, path, f"{place}[{key!r}]")
+    elif isinstance(form, dict):
+        _check(content, dict, path, place)
+        for key, inner in form.items():
+            if key not in content:
+                raise InputError(f"{path}: {place or 'the file'} has no key {key!r}. {_AGAIN}")
+            _check(content[key], inner, path, f"{place}.{key}" if place else key)
+    elif not isinstance(content, form) or (isinstance(content, bool) and form is not bool):
+        expected = " or ".join(_JSON_NAMES[kind] for kind in (form if isinstance(form, tuple) else (form,)))
+        raise InputError(f"{path}: {place or 'the file'} is {content!r:.40}; it should be {expected}. {_AGAIN}")
+
+
+_JSON_NAMES = {
+    dict: "a table",
+    list: "a list",
+    str: "a text",
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    type(None): "null",
+}
