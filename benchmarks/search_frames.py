@@ -65,7 +65,7 @@ SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
 @dataclass(frozen=True, eq=False)
 class Case:
     """A frame and its truth. picture: what disturbs it, in words; centers_px: (2,) of each mark by id; hidden: the ids
-    of marks that cannot be seen. decidable: whether anything tells its pose."""
+    of marks that cannot be seen. without_marks: paints the same picture (rows, columns) anew, its marks left out."""
 
     kind: str
     symmetry: str
@@ -76,6 +76,7 @@ class Case:
     scan: Scan
     centers_px: dict[str, Array]
     hidden: frozenset[str]
+    without_marks: Callable[[], Array]
 
 
 def draw_case(seed: int, index: int) -> Case:
@@ -85,10 +86,11 @@ def draw_case(seed: int, index: int) -> Case:
     layout = _layout(rng, kind, symmetry)
     tones, picture = _tones(rng)
     scene = _scene(rng, layout, tones)
-    frame = make_frame(scene, 0)
-    frame = replace(frame, paints=(*frame.paints, *_clutter(rng, layout, frame.truth.geometry, tones)))
-    grey = np.concatenate(list(grey_strips(frame, 0, scene_background(scene))))
-    positions = frame.truth.fiducials
+    truth = make_frame(scene, 0).truth
+    clutter = _clutter(rng, layout, truth.geometry, tones)
+    uncovered = tuple(replace(image, covered=()) for image in scene.images)
+    bare = replace(scene, camera=replace(scene.camera, fiducials=()), images=uncovered)
+    grey, positions = _painted(scene, clutter), truth.fiducials
     return Case(
         kind=kind,
         symmetry=symmetry,
@@ -99,7 +101,15 @@ def draw_case(seed: int, index: int) -> Case:
         scan=Scan(Path(f"{index}.tif"), WholePicture(grey[..., None]), NO_TAGS),
         centers_px={id: position.center_px for id, position in positions.items()},
         hidden=frozenset(id for id, position in positions.items() if position.hidden),
+        without_marks=lambda: _painted(bare, clutter).astype(float),
     )
+
+
+def _painted(scene: Scene, clutter: Sequence[Paint]) -> NDArray[np.uint16]:
+    """The picture's grey values, (rows, columns)."""
+    frame = make_frame(scene, 0)
+    frame = replace(frame, paints=(*frame.paints, *clutter))
+    return np.concatenate(list(grey_strips(frame, 0, scene_background(scene))))
 
 
 def _layout(rng: Generator, kind: str, symmetry: str) -> FiducialLayout:
