@@ -97,7 +97,7 @@ def match(
     start[:, 2] -= origin_px
     given = _Window(np.where(usable, grey, 0.0), usable, sides, mark, start)
     part, fit = _fitted(given, options)
-    if fit.reason or is_textured(fit.model.residuals, fit.telling):
+    if fit.reason or is_textured(fit.model.residuals, fit.telling, fit.floor_dn):
         detail_part, detail = _fitted(given, options, background_px(mark, start))
         part, fit = (part, fit) if detail.reason else (detail_part, detail)
     free = blank.copy()

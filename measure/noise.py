@@ -48,12 +48,13 @@ def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
     return NoiseModel(variance, lags * _taper(REACH_PX), correlation)
 
 
-def is_textured(residuals: Array, used: Mask) -> bool:
-    """Whether what a fit leaves is a landscape rather than grain: still alike beyond the reach of any grain."""
+def is_textured(residuals: Array, used: Mask, floor_dn: float) -> bool:
+    """Whether what a fit leaves is a landscape rather than grain: still alike beyond the reach of any grain. Residuals
+    below floor_dn are the drawing's own."""
     kept = np.where(used, residuals, 0.0)
     if not kept.any():
         return False
-    return bool(_covariance_along(kept, used, REACH_PX) > _TEXTURE * (kept**2).sum() / used.sum())
+    return bool(_covariance_along(kept, used, REACH_PX) > _TEXTURE * max((kept**2).sum() / used.sum(), floor_dn**2))
 
 
 def robust_scale(values: Array) -> float:

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
-_DAMAGE_FLOOR = 0.005  # of the contrast, under the scale of smoothed residuals, for the same reason
+_FLOOR = 0.005  # of the contrast: residuals below it may be the drawing's own
 _HALVINGS = 4
 _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
 _LEAST_VARIANCE_DN2 = 1e-12
@@ -61,9 +61,8 @@ class PictureFit:
         for round_ in range(self.options.damage_rounds):
             if self.reason:
                 return
-            floor_dn = _DAMAGE_FLOOR * self.contrast_dn
             shown = self.area & self.model.tells
-            undamaged = self.area & ~damage(self.model.residuals, shown, self.options.damage_sigmas, floor_dn)
+            undamaged = self.area & ~damage(self.model.residuals, shown, self.options.damage_sigmas, self.floor_dn)
             if round_ > 0 and np.array_equal(undamaged, self.used):
                 return
             self.used = undamaged
@@ -79,9 +78,10 @@ class PictureFit:
         """Whether undamaged pixels far from the mark vary as the nearer ones do."""
         near, far = self.used & ~self.far, self.used & self.far
         squares = self.model.residuals**2
-        floor_dn = _DAMAGE_FLOOR * self.contrast_dn
         plain = far.sum() >= _PLAIN_SHARE * (self.area & self.far).sum()
-        return bool(not far.any() or (plain and squares[far].mean() < _PLAIN * (squares[near].mean() + floor_dn**2)))
+        return bool(
+            not far.any() or (plain and squares[far].mean() < _PLAIN * (squares[near].mean() + self.floor_dn**2))
+        )
 
     def weigh(self, noise: NoiseModel) -> tuple[Array, Array]:
         """Adjust once more with the weights of grain, if it is grain: the unknowns' covariance (unknowns, unknowns),
@@ -136,6 +136,11 @@ class PictureFit:
     @property
     def contrast_dn(self) -> float:
         return abs(float(self.model.state.greys[0]))
+
+    @property
+    def floor_dn(self) -> float:
+        """Residuals that tell nothing of the film."""
+        return _FLOOR * self.contrast_dn
 
     @property
     def telling(self) -> Mask:

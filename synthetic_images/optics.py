@@ -19,8 +19,13 @@ def reach_px(blur_px: float) -> int:
     return int(np.ceil(REACH * blur_px))
 
 
-def seen_coverage(areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, blur_px: float) -> Cover:
-    """(height, width) the share of every pixel of a window that the union of the areas takes, after a Gaussian blur."""
+def seen_coverage(
+    areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, blur_px: float, fold: int = FOLD
+) -> Cover:
+    """(height, width) the share of every pixel of a window that the union of the areas takes, after a Gaussian blur.
+
+    fold: every pixel is divided into fold x fold.
+    """
     reach = reach_px(blur_px)
     plain = coverage(areas, col0 - reach, row0 - reach, width + 2 * reach, height + 2 * reach)
     seen = plain[reach : reach + height, reach : reach + width].copy()
@@ -29,17 +34,17 @@ def seen_coverage(areas: tuple[Area, ...], col0: int, row0: int, width: int, hei
             tall, wide = min(BLOCK_PX, height - top), min(BLOCK_PX, width - left)
             around = plain[top : top + tall + 2 * reach, left : left + wide + 2 * reach]
             if around.min() < around.max():
-                block = _fine(areas, col0 + left, row0 + top, wide, tall, blur_px)
+                block = _fine(areas, col0 + left, row0 + top, wide, tall, blur_px, fold)
                 seen[top : top + tall, left : left + wide] = block
     return seen
 
 
-def _fine(areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, blur_px: float) -> Cover:
-    """The same for a window that edges cross, by way of pixels of a quarter of the size."""
+def _fine(areas: tuple[Area, ...], col0: int, row0: int, width: int, height: int, blur_px: float, fold: int) -> Cover:
+    """The same for a window that edges cross, by way of finer pixels."""
     reach = reach_px(blur_px)
-    fine = coverage(areas, col0 - reach, row0 - reach, width + 2 * reach, height + 2 * reach, FOLD)
+    fine = coverage(areas, col0 - reach, row0 - reach, width + 2 * reach, height + 2 * reach, fold)
     if reach > 0:
-        size = 2 * reach * FOLD + 1
-        fine = np.asarray(cv2.GaussianBlur(fine, (size, size), blur_px * FOLD), np.float32)
-        fine = fine[reach * FOLD : (reach + height) * FOLD, reach * FOLD : (reach + width) * FOLD]
-    return np.asarray(fine.reshape(height, FOLD, width, FOLD).mean(axis=(1, 3)), np.float32)
+        size = 2 * reach * fold + 1
+        fine = np.asarray(cv2.GaussianBlur(fine, (size, size), blur_px * fold), np.float32)
+        fine = fine[reach * fold : (reach + height) * fold, reach * fold : (reach + width) * fold]
+    return np.asarray(fine.reshape(height, fold, width, fold).mean(axis=(1, 3)), np.float32)

@@ -28,6 +28,7 @@ TURN, SCALE = (0.0, -1.0, 1.0, 0.0), (1.0, 0.0, 0.0, 1.0)
 STRETCH, SHEAR = (1.0, 0.0, 0.0, -1.0), (0.0, 1.0, 1.0, 0.0)
 GREYS = 4  # gain, offset, two slopes
 MARGIN_PX = 8
+_FOLD = 8  # pixels of a quarter leave bars that cross almost along the pixels 0.001 px off
 WHITE = 0.1  # of the variance of grain: the scanner's own noise
 
 
@@ -158,7 +159,7 @@ class TrueMark:
         col0, row0 = max(col0 - reach, 0), max(row0 - reach, 0)
         width, height = min(width + 2 * reach, self.size - col0), min(height + 2 * reach, self.size - row0)
         seen = np.zeros((self.size, self.size))
-        shown = seen_coverage(outlines, col0, row0, width, height, blur_px)
+        shown = seen_coverage(outlines, col0, row0, width, height, blur_px, _FOLD)
         seen[row0 : row0 + height, col0 : col0 + width] = shown
         return seen
 
