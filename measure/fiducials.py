@@ -52,7 +52,7 @@ def measure_fiducials(
         found, frame = _anywhere(search, hypotheses[0])
     tried = len(hypotheses[0])
     for others in hypotheses[1:]:
-        if frame is not None and frame.accepted:
+        if frame is not None and frame.accepted and not doubt(search, frame):
             break
         tried += len(others)
         found, frame = _in_spite_of_pitch(search, others, tried) or (found, frame)

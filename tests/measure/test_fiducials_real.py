@@ -102,6 +102,19 @@ def test_a_nearly_black_frame_says_what_became_of_every_mark() -> None:
 
 
 @pytest.mark.slow
+def test_handwriting_in_two_corners_is_not_taken_for_faint_crosses() -> None:
+    """The pixels are longer one way: only where the pitch as given is doubted the crosses are found in their places."""
+    layout = square(MarkShape(cross(1.75, 0.12, 0.25, 45.0), "light"))
+    with open_scan(SCANS / "aerial" / "0cec8b13.jpeg") as scan:
+        result = measure_fiducials(scan, layout, scan.pitch_um)
+    seen = observations(result, layout)[1]
+    crosses = np.array([(78.2, 83.9), (68.0, 1779.7), (1734.5, 103.0)])  # seen by a person
+    distance = np.hypot(*np.moveaxis(seen[:, None] - crosses[None], -1, 0))
+    assert len(seen) == 3
+    assert distance.min(axis=0).max() < 1.0
+
+
+@pytest.mark.slow
 def test_a_reseau_is_not_seen_in_a_frame_of_another_camera() -> None:
     with open_scan(SCANS / "aerial" / "0cec8b13.jpeg") as scan:
         result = measure_fiducials(scan, lattice(), (RESEAU_PITCH_UM, RESEAU_PITCH_UM))
