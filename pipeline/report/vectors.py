@@ -106,13 +106,13 @@ def all_images_plot(residuals: list[Json], on: Plane, px_per_um: float) -> Marku
 
 
 def scale_bar(on: Plane, px_per_um: float) -> Markup:
-    """A bar of a round length in um, and one of mm."""
+    """A bar of a round length in um, and under it one of mm."""
     um, mm = svg.round_step(60.0 / px_per_um), svg.round_step(60.0 / on.px_per_mm)
-    y = on.height_px + 8.0
+    x = MARGIN_PX
     bars = Markup("")
-    for x, length, text in (
-        (MARGIN_PX, um * px_per_um, f"{um:g} µm (vectors)"),
-        (on.width_px / 2.0, mm * on.px_per_mm, f"{mm:g} mm (frame)"),
+    for y, length, text in (
+        (on.height_px + 4.0, um * px_per_um, f"{um:g} µm (vectors)"),
+        (on.height_px + 19.0, mm * on.px_per_mm, f"{mm:g} mm (frame)"),
     ):
         bars += svg.line((x, x, x, x + length, x + length, x + length), (y - 3, y + 3, y, y, y - 3, y + 3), "bar")
         bars += svg.words(x + length + 6.0, y + 4.0, text, "tick")
