@@ -26,7 +26,7 @@ _FEWEST = 20  # patches whose bendings have a variance worth the name
 @dataclass(frozen=True, eq=False)
 class Bending:
     """What a piece shows of its bending q (6,) against the reference's: coefficients of u², uv and v² in units of the
-    patch's radius, of the columns' shift and then of the rows', px of the patch.
+    usual patch's radius, whatever the size of this one, of the columns' shift and then of the rows', px of the patch.
 
     seen (6,) is response (6, 6) @ q and noise of covariance noise (6, 6); on_place (2, 6) @ q is what it does to the
     place, px of the patch.

@@ -26,7 +26,7 @@ from measure.noise import NoiseModel, correlated, noise_model
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-RADIUS_PX = 15  # of the round patch: texture enough nearly everywhere, and small enough for the ground to be plane
+RADIUS_PX = 15  # of a round patch: texture enough nearly everywhere, and small enough for the ground to be plane
 SPARE_PX = 12  # about the patch in a window: room to move, to be stretched and to be smoothed
 _UNKNOWNS = 8  # of a frame: six of the affine geometry, gain and offset
 _SMOOTHING_PX = (2.0, 1.0, 0.0)  # first a smoothed picture, which draws from farther, at last the picture itself
@@ -70,9 +70,9 @@ class Matched:
     reason: str = ""
 
 
-def match_pieces(pieces: Sequence[Piece], reference: int) -> tuple[Matched, ...]:
-    """Match the pieces of one point jointly; the reference's point stays where it is."""
-    fit = _Fit(pieces, reference)
+def match_pieces(pieces: Sequence[Piece], reference: int, radius_px: int = RADIUS_PX) -> tuple[Matched, ...]:
+    """Match the pieces of one point jointly, in a patch of that radius; the reference's point stays where it is."""
+    fit = _Fit(pieces, reference, radius_px)
     best: tuple[Matched, ...] = ()
     for smoothing_px in _SMOOTHING_PX:
         fit.run(smoothing_px)
@@ -92,13 +92,13 @@ def _area(matched: Sequence[Matched]) -> float:
 class _Fit:
     """The pieces' geometries in progress."""
 
-    def __init__(self, pieces: Sequence[Piece], reference: int) -> None:
+    def __init__(self, pieces: Sequence[Piece], reference: int, radius_px: int) -> None:
         self.pieces, self.reference = pieces, reference
         self.maps = [np.array(piece.scan_from_patch, dtype=float) for piece in pieces]
         self.reasons = [""] * len(pieces)
-        edge = np.arange(-RADIUS_PX - 1, RADIUS_PX + 2)
+        edge = np.arange(-radius_px - 1, radius_px + 2)
         self.grid = np.stack(np.meshgrid(edge, edge), axis=-1).astype(float)
-        self.used: Mask = np.hypot(self.grid[..., 0], self.grid[..., 1]) <= RADIUS_PX
+        self.used: Mask = np.hypot(self.grid[..., 0], self.grid[..., 1]) <= radius_px
         self.values = np.zeros((len(pieces), *self.used.shape))
         self.gains = np.ones(len(pieces))
         self.design = np.zeros((6, *self.used.shape))

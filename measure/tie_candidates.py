@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from measure.epipolar import agreeing
 from measure.features import Features, find_features, in_turn, reduction, shared_features
 from measure.local_maps import LocalMaps
+from measure.multi_image import RADIUS_PX
 from measure.parallel import mapped
 from measure.scan import open_scan
 from measure.tie_frame import TieFrame
@@ -33,10 +34,12 @@ _CELLS = 8  # a side of a frame, over which points are spread
 
 @dataclass(frozen=True, eq=False)
 class TieCandidate:
-    """A track: the approximate affine maps (2, 3) from its patch to the scans, by frame; which frame defines it."""
+    """A track: the approximate affine maps (2, 3) from its patch, of radius_px, to the scans, by frame; which frame
+    defines it."""
 
     reference: int
     maps: dict[int, Array]
+    radius_px: int = RADIUS_PX
 
 
 def frame_features(wanted: int, frame: TieFrame) -> Features:
@@ -92,6 +95,24 @@ def candidates(
         cells.append((reference * 1000 + col) * 1000 + row)
         textures.append(min(features[frame].textures[feature] for frame, feature in track.items()))
     return [found[k] for k in in_turn(np.array(cells, np.intp), np.array(textures))] if found else []
+
+
+def widened(
+    candidates: Sequence[TieCandidate], radius_px: int, frames: Sequence[TieFrame], fewest: int
+) -> list[TieCandidate]:
+    """The candidates with patches of that radius, as far as at least `fewest` frames, the defining one among them, show
+    these whole."""
+    shown: list[dict[int, Array]] = [{} for _ in candidates]
+    for i, frame in enumerate(frames):
+        own = [k for k, candidate in enumerate(candidates) if i in candidate.maps]
+        places = np.array([candidates[k].maps[i][:, 2] for k in own]).reshape(-1, 2)
+        for k in np.array(own, int)[frame.usable(places, _size_px(frame), radius_px)]:
+            shown[k][i] = candidates[k].maps[i]
+    return [
+        TieCandidate(candidate.reference, maps, radius_px)
+        for candidate, maps in zip(candidates, shown, strict=True)
+        if len(maps) >= fewest and candidate.reference in maps
+    ]
 
 
 def _maps(

@@ -41,14 +41,14 @@ class TieFrame:
         linear, shift = self.pixel_from_camera[:, :2], self.pixel_from_camera[:, 2]
         return np.asarray((places_px - shift) @ np.linalg.inv(linear).T * self.px_per_mm)
 
-    def usable(self, places_px: Array, size_px: tuple[int, int]) -> Mask:
+    def usable(self, places_px: Array, size_px: tuple[int, int], radius_px: int = RADIUS_PX) -> Mask:
         """Where a whole patch lies in the exposed frame and beside the marks."""
-        rim = RADIUS_PX + SPARE_PX
+        rim = radius_px + SPARE_PX
         inside = np.all((places_px >= rim) & (places_px <= np.array(size_px) - 1 - rim), axis=1)
         if self.frame_mm is not None:
             half = np.array(self.frame_mm) / 2 * self.px_per_mm - rim
             inside &= np.all(np.abs(self.camera_px(places_px)) <= half, axis=1)
         if len(self.taken_px) and len(places_px):
             for col, row, radius in self.taken_px:
-                inside &= np.hypot(*(places_px - (col, row)).T) > radius + RADIUS_PX
+                inside &= np.hypot(*(places_px - (col, row)).T) > radius + radius_px
         return np.asarray(inside)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import combinations
+from itertools import chain, combinations, compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,14 @@ from measure.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_piece
 from measure.noise import robust_scale
 from measure.parallel import mapped
 from measure.scan import open_scan
-from measure.tie_candidates import TieCandidate
+from measure.tie_candidates import TieCandidate, widened
 from measure.tie_frame import TieFrame
 
 Array = NDArray[np.float64]
 Windows = dict[int, tuple[NDArray[np.float32], tuple[int, int]]]
 
-_LEAST_DISTANCE_PX = 2.0 * RADIUS_PX  # of points, so that no patches overlap
+_RADII_PX = (RADIUS_PX, 21)  # of patches: where the texture is too weak for the usual one, of twice its area
+_WIDEST_PX = 2.0 * _RADII_PX[-1]
 _LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
 _FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
 _CHUNK = 16  # points that a worker gets at a time
@@ -64,22 +65,27 @@ def measured_points(
     workers: Executor | None,
 ) -> list[TiePoint]:
     """Candidates measured, the first of them first, until so many stand sharply in at least `fewest` scans; none behind
-    the last one wanted.
+    the last one wanted. Where too few do, those that are not sharp make room for wider patches.
 
     No two patches overlap: the errors of neighbours would be correlated, and the adjustment takes them for independent.
     A candidate beside one that could not be matched still has its chance; not one beside a point that is refused by
     comparison with others, for with more of these it may stand again.
     """
-    points, matched = list[TiePoint](), list[TiePoint]()
-    left, sharp = list(candidates), np.zeros(0, dtype=int)
-    while left and sharp.sum() < wanted:
-        missing = max(wanted - int(sharp.sum()), wanted // _LEAST_BATCH)
-        chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
-        windows = _windows(frames, chosen)
-        matched += mapped(workers, partial(_point, fewest), list(zip(chosen, windows, strict=True)), _CHUNK)
-        points = _straightened(matched)
-        _judge(frames, points)
-        sharp = np.array([sum(map(is_sharp, _sigmas(point))) >= fewest for point in points])
+    points, matched, sharp = list[TiePoint](), list[TiePoint](), np.zeros(0, dtype=bool)
+    for radius_px in _RADII_PX:
+        left = widened(candidates, radius_px, frames, fewest)
+        if not left or sharp.sum() >= wanted:
+            break
+        settled = [bool(own or point.refused) and bool(point.matched) for own, point in zip(sharp, points, strict=True)]
+        matched, points, sharp = list(compress(matched, settled)), list(compress(points, settled)), sharp[settled]
+        while left and sharp.sum() < wanted:
+            missing = max(wanted - int(sharp.sum()), wanted // _LEAST_BATCH)
+            chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
+            windows = _windows(frames, chosen)
+            matched += mapped(workers, partial(_point, fewest), list(zip(chosen, windows, strict=True)), _CHUNK)
+            points = _straightened(matched)
+            _judge(frames, points)
+            sharp = np.array([sum(map(is_sharp, _sigmas(point))) >= fewest for point in points], dtype=bool)
     return points[: int(np.searchsorted(np.cumsum(sharp), wanted)) + 1]
 
 
@@ -101,28 +107,29 @@ def _apart(
 
 
 class _Taken:
-    """Where patches lie already, by frame and by squares as wide as a patch."""
+    """Where patches lie already, by frame and by squares as wide as the widest patch."""
 
     def __init__(self, members: Sequence[TieCandidate] = ()) -> None:
         self.members: list[TieCandidate] = []
-        self.places: dict[tuple[int, int, int], list[Array]] = defaultdict(list)
+        self.places: dict[tuple[int, int, int], list[tuple[Array, int]]] = defaultdict(list)
         for member in members:
             self.add(member)
 
     def add(self, candidate: TieCandidate) -> None:
         self.members.append(candidate)
         for frame, matrix in candidate.maps.items():
-            col, row = np.floor(matrix[:, 2] / _LEAST_DISTANCE_PX).astype(int)
-            self.places[frame, col, row].append(matrix[:, 2])
+            col, row = np.floor(matrix[:, 2] / _WIDEST_PX).astype(int)
+            self.places[frame, col, row].append((matrix[:, 2], candidate.radius_px))
 
     def touches(self, candidate: TieCandidate) -> bool:
         """Whether its patch overlaps one of these in some frame."""
         for frame, matrix in candidate.maps.items():
             place = matrix[:, 2]
-            col, row = np.floor(place / _LEAST_DISTANCE_PX).astype(int)
+            col, row = np.floor(place / _WIDEST_PX).astype(int)
             near = [self.places.get((frame, col + i, row + j), ()) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-            if any(np.hypot(*(place - other)) < _LEAST_DISTANCE_PX for places in near for other in places):
-                return True
+            for other, radius_px in chain.from_iterable(near):
+                if np.hypot(*(place - other)) < candidate.radius_px + radius_px:
+                    return True
         return False
 
 
@@ -134,7 +141,7 @@ def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate]) -> 
             own = [k for k, candidate in enumerate(candidates) if i in candidate.maps]
             for k in sorted(own, key=lambda k: candidates[k].maps[i][1, 2]):
                 matrix = candidates[k].maps[i]
-                half = int(np.ceil(RADIUS_PX * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
+                half = int(np.ceil(candidates[k].radius_px * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
                 col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
                 windows[k][i] = (scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0))
     return windows
@@ -146,7 +153,9 @@ def _point(fewest: int, sought: tuple[TieCandidate, Windows]) -> TiePoint:
     members, unmatched = sorted(candidate.maps), dict[int, str]()
     while True:
         pieces = [Piece(*windows[i], candidate.maps[i]) for i in members]
-        matched = dict(zip(members, match_pieces(pieces, members.index(candidate.reference)), strict=True))
+        matched = dict(
+            zip(members, match_pieces(pieces, members.index(candidate.reference), candidate.radius_px), strict=True)
+        )
         failed = {i: piece.reason for i, piece in matched.items() if piece.reason}
         if not failed:
             return TiePoint(candidate, matched, unmatched)

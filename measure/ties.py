@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from measure.epipolar import FEWEST_PAIRS
-from measure.multi_image import RADIUS_PX
 from measure.parallel import mapped
 from measure.results import MarkMeasurement
 from measure.status import Status
@@ -99,7 +98,7 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
         "sigma_to_reference_px": sigma,
         "reference": float(frame == point.candidate.reference),
         "images": float(len(point.standing)),
-        "size_px": 2.0 * RADIUS_PX + 1.0,
+        "size_px": 2.0 * point.candidate.radius_px + 1.0,
     }
     status, reason = Status.MEASURED, ""
     if frame in point.refused:

@@ -53,11 +53,12 @@ def pieces(rng: np.random.Generator, noise: float) -> list[Piece]:
     return made
 
 
-def test_errors_are_as_large_as_their_covariances_say() -> None:
+@pytest.mark.parametrize(("radius_px", "limit_px", "rounds"), [(RADIUS_PX, 0.06, 16), (21, 0.035, 30)])
+def test_errors_are_as_large_as_their_covariances_say(radius_px: int, limit_px: float, rounds: int) -> None:
     rng = np.random.default_rng(1)
     errors, normalised = [], []
-    for _ in range(30):
-        matched = match_pieces(pieces(rng, 4.0), 0)
+    for _ in range(rounds):
+        matched = match_pieces(pieces(rng, 4.0), 0, radius_px)
         assert not any(each.reason for each in matched)
         assert np.all(matched[0].center_px == 0.0)
         for index in (1, 2):
@@ -66,7 +67,7 @@ def test_errors_are_as_large_as_their_covariances_say() -> None:
             error = matched[index].center_px - MAPS[index][:, 2]
             errors.append(error)
             normalised.append(error @ np.linalg.solve(covariance, error) / 2)
-    assert np.sqrt(np.mean(np.square(errors))) < 0.06
+    assert np.sqrt(np.mean(np.square(errors))) < limit_px
     assert np.sqrt(np.mean(normalised)) == pytest.approx(1.0, abs=0.15)
 
 
