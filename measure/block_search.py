@@ -67,7 +67,9 @@ def block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:
     decode no more than their share; strips are taken whole."""
     tall, wide = scan.segment_px
     width = scan.width_px if wide >= scan.width_px else even_part(scan.width_px, WIDEST_PX, unit)
-    kept = scan.rows_kept * scan.width_px // width // max(cv2.getNumThreads(), 1) - 2 * margin - tall
+    if tall >= scan.height_px:  # is decoded at once, and held
+        return width, even_part(scan.height_px, TALLEST_PX, unit)
+    kept = (scan.rows_kept * scan.width_px // width - tall) // max(cv2.getNumThreads(), 1) - 2 * margin
     return width, even_part(scan.height_px, min(max(kept, 2 * margin), TALLEST_PX), unit)
 
 
