@@ -19,6 +19,10 @@ from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
 Array = NDArray[np.float64]
 
 _DRIFT_PX = 2.0  # of a fit, from the pixel where it begins: what goes farther has found something else, dust say
+_MOST_CONTRAST = (
+    2.0  # times the scanner's range: more than that no light takes, and lines are hardly twice as wide as drawn
+)
+_SURE = 3.0  # standard deviations
 _LEANING_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
 
 
@@ -58,14 +62,28 @@ def sight(
         return Sighting(predicted, True, None, f"nothing within {search_px:.0f} px of its place looks like it")
     if not fit.converged:
         return Sighting(predicted, True, None, fit.reason)
-    off_px = float(np.hypot(*(fit.center_px - predicted)))
-    if off_px > search_px + _DRIFT_PX:
-        return Sighting(predicted, True, None, f"what lies there is {off_px:.0f} px from its place")
-    if abs(fit.contrast_dn) < FAINT * scan.full_scale_dn:
-        return Sighting(predicted, True, None, "there is no contrast at its place")
-    if fit.contrast_dn * polarity <= 0:
-        return Sighting(predicted, True, None, "what lies there has the other polarity")
+    reason = _unlike(fit, predicted, search_px, polarity, scan.full_scale_dn)
+    if reason:
+        return Sighting(predicted, True, None, reason)
     return Sighting(predicted, True, replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn)))
+
+
+def _unlike(fit: Match, predicted_px: Array, search_px: float, polarity: int, full_scale_dn: float) -> str:
+    """Why what was fitted is no such mark; empty where it may be."""
+    off_px = float(np.hypot(*(fit.center_px - predicted_px)))
+    if off_px > search_px + _DRIFT_PX:
+        return f"what lies there is {off_px:.0f} px from its place"
+    contrast = abs(fit.contrast_dn) / full_scale_dn
+    if contrast < FAINT:
+        return "there is no contrast at its place"
+    if contrast * (1 - _SURE / max(fit.significance, _SURE)) > _MOST_CONTRAST:
+        return (
+            "what lies there is far wider than the mark's lines: as fine as these, it would have "
+            f"{contrast:.1f} times the contrast that a scan can show"
+        )
+    if fit.contrast_dn * polarity <= 0:
+        return "what lies there has the other polarity"
+    return ""
 
 
 def _fitted(

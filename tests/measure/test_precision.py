@@ -19,7 +19,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.matching import Match
 from measure.refinement import sight
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned
+from measure.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
 
 GROUND, CONTRAST, SNR = 25000.0, 15000.0, 20.0
 
@@ -105,3 +105,13 @@ def test_a_notch_in_a_soft_scan_is_matched_with_enough_of_its_ground() -> None:
         fit = sighted(mark, GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / SNR), rng)
         shares.append(np.trace(fit.covariance_px2) / np.trace(mark.bound(1 / SNR)))
     assert np.sqrt(np.mean(shares)) < 1.08  # with four standard deviations of the blur: 1.11 and more
+
+
+def test_lines_far_wider_than_the_mark_s_are_not_the_mark() -> None:
+    """Handwriting, say: drawn as finely as the mark it would need more contrast than a scan has."""
+    wide, fine = (MarkShape(cross(1.5, line_mm)) for line_mm in (0.5, 0.03))
+    mark = TrueMark(Kind("wide cross", wide), np.array([[10.0, 0.0, 40.3], [0.0, -10.0, 39.8]]), 81, 3.0)
+    grey = 30 + 200 * mark.picture + np.random.default_rng(1).normal(0, 3, mark.picture.shape)
+    sighting = sight(scan_of(grey, 255), fine, mark.place, 3.0, 1, None, FiducialOptions().match)
+    assert sighting.fit is None
+    assert "far wider than the mark's lines" in sighting.reason
