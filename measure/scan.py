@@ -232,8 +232,7 @@ def first_bytes(path: Path) -> bytes:
             start = file.read(16)
     except FileNotFoundError:
         raise MeasurementError(
-            f"there is no scan {path} (looked for {path.resolve()}): check the name in `scans`; "
-            "paths are relative to the project file"
+            f"there is no scan {path} (looked for {path.resolve()}): check its name and its folder"
         ) from None
     except OSError as error:
         raise MeasurementError(

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import signal
 import sys
 
 
@@ -12,4 +13,5 @@ def main() -> None:
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as an interrupt does, worker processes with it
     sys.exit(importlib.import_module("pipeline.cli").run())

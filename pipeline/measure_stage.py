@@ -1,13 +1,12 @@
 """Scans to marks: the fiducials of every frame first, then the targets that they make predictable."""
 
-import multiprocessing
-import os
+import math
+import time
 from collections.abc import Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from measure.coma import one_definition
@@ -28,6 +27,7 @@ from pipeline.progress import Reporter
 from pipeline.project_file import Project
 from pipeline.target_stage import measure_targets
 from pipeline.tie_stage import check_tie_names, with_ties
+from pipeline.workers import processes, worker_pool
 
 
 def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, ...]:
@@ -42,7 +42,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
         CodedSheet.of(project, project.targets)
     check_tie_names(project)
     _check_readable(list(project.scans.values()))
-    with _workers(len(project.scans)) as workers:
+    with worker_pool(len(project.scans)) as workers:
         learned = learn_marks(project, reporter, workers)
         scans = _measured_scans(learned, reporter, workers)
         checked = _checked(learned, _one_definition(project, scans))
@@ -54,11 +54,27 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
 
 def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> list[MeasuredScan]:
     with reporter.stage("measured") as count:
-        futures = {workers.submit(measure_scan, project, name): name for name in project.scans}
+        futures = {workers.submit(_timed, project, name): name for name in project.scans}
         for done, future in enumerate(as_completed(futures), 1):
-            future.result()
+            _, seconds = future.result()
             count(futures[future], done, len(futures))
-    return [future.result() for future in futures]
+            if done == 1 < len(futures):
+                reporter.say(expected_time(seconds, len(futures)))
+    return [future.result()[0] for future in futures]
+
+
+def _timed(project: Project, name: str) -> tuple[MeasuredScan, float]:
+    """A scan measured, and the seconds that it took."""
+    start = time.monotonic()
+    return measure_scan(project, name), time.monotonic() - start
+
+
+def expected_time(first_s: float, scans: int) -> str:
+    """What measuring all scans takes if each takes as long as the first, of which `processes` run at a time."""
+    at_a_time = processes(scans)
+    total_s = first_s * math.ceil(scans / at_a_time)
+    told = f"{total_s / 60:.0f} minutes" if total_s >= 100 else f"{total_s:.0f} s"
+    return f"about {told} for {scans} scans, if all take as long as the first: {first_s:.0f} s, {at_a_time} at a time"
 
 
 def _checked(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
@@ -80,13 +96,6 @@ def _one_definition(project: Project, measured: Sequence[MeasuredScan]) -> tuple
         for scan, marks in zip(own, one_definition([scan.frame.marks for scan in own]), strict=True):
             frames[scan.scan] = replace(scan.frame, marks=marks)
     return tuple(replace(scan, frame=frames[scan.scan]) for scan in measured)
-
-
-def _workers(scans: int) -> Executor:
-    """A process a core, of one thread: a scan is measured alone, so the result does not depend on their number."""
-    processes = min(scans, os.cpu_count() or 1)
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(processes, mp_context=context, initializer=cv2.setNumThreads, initargs=(1,))
 
 
 def _check_readable(paths: Sequence[Path]) -> None:

@@ -28,6 +28,10 @@ class Reporter:
         else:
             yield self._lines(title)
 
+    def say(self, text: str) -> None:
+        """A line that stays, above the bar where there is one."""
+        self._console.print(text, markup=False, highlight=False)
+
     def _lines(self, title: str) -> Count:
         """A plain line whenever another thing is in hand."""
         last = ""
@@ -35,7 +39,7 @@ class Reporter:
         def line(what: str, _done: int, _total: int) -> None:
             nonlocal last
             if what != last:
-                self._console.print(f"{title} {what}", markup=False, highlight=False)
+                self.say(f"{title} {what}")
             last = what
 
         return line

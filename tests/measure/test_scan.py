@@ -354,7 +354,7 @@ def test_the_cache_keeps_to_its_limit_and_holds_two_rows_of_tiles(
 
 
 def test_a_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(MeasurementError, match=r"no scan .*nowhere\.tif.*looked for.*relative to the project file"):
+    with pytest.raises(MeasurementError, match=r"no scan .*nowhere\.tif.*looked for.*check its name"):
         open_scan(tmp_path / "nowhere.tif")
 
 

@@ -1,9 +1,11 @@
 """The command line on right and on wrong input: one message, the right code, earlier results untouched."""
 
 import json
+import multiprocessing
 import re
 import resource
 import signal
+import time
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +17,8 @@ import tifffile
 
 from pipeline import stages
 from pipeline.cli import run
+from pipeline.measure_stage import expected_time
+from pipeline.workers import worker_pool
 
 SAID = pytest.CaptureFixture[str]
 pytestmark = pytest.mark.xdist_group("demonstration")  # one run of it serves all
@@ -146,6 +150,27 @@ def test_an_interrupt_is_told_and_has_a_code_of_its_own(
     monkeypatch.setattr(stages, "run_adjust", interrupted)
     assert run(["adjust", str(project / "project.toml")]) == 130
     assert "interrupted; files that were complete stay" in capsys.readouterr().err
+
+
+def test_an_interrupt_does_not_wait_for_the_scans_in_hand() -> None:
+    def measured() -> None:
+        with worker_pool(4) as workers:
+            for _ in range(8):
+                workers.submit(time.sleep, 300.0)
+            raise KeyboardInterrupt
+
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        measured()
+    assert time.monotonic() - start < 100.0
+    assert not multiprocessing.active_children()
+
+
+def test_the_time_to_expect_is_told_from_the_first_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.workers.os.cpu_count", lambda: 2)
+    told = "about 10 minutes for 299 scans, if all take as long as the first: 4 s, 2 at a time"
+    assert expected_time(4.0, 299) == told
+    assert expected_time(4.0, 3) == "about 8 s for 3 scans, if all take as long as the first: 4 s, 2 at a time"
 
 
 def test_point_that_nobody_measured_is_named(project: Path, capsys: SAID) -> None:

@@ -1,0 +1,38 @@
+"""The processes that scans are shared among."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+
+import cv2
+
+
+def processes(scans: int) -> int:
+    """How many scans are measured at a time: one a core."""
+    return min(scans, os.cpu_count() or 1)
+
+
+@contextmanager
+def worker_pool(scans: int) -> Iterator[Executor]:
+    """A process a core, of one thread: a scan is measured alone, so the result does not depend on their number.
+
+    Whatever ends the block early ends the processes too: nobody waits for scans whose results are not wanted any more.
+    """
+    pool = ProcessPoolExecutor(processes(scans), multiprocessing.get_context("spawn"), initializer=_prepare)
+    try:
+        yield pool
+    except BaseException:
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _prepare() -> None:
+    """An interrupt from the terminal reaches every process; the one that started this one answers it for all."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)
