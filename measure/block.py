@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,12 +41,23 @@ class Block:
         return weighted(self.samples[top : top + height : every, left : left + width : every], self.scan.weights)
 
     def reductions(self, factors: Iterable[int]) -> dict[int, Image]:
-        """Its grey values area-averaged by each factor, from the coarsest of the others that it divides."""
+        """Its grey values area-averaged by each factor, from the coarsest of the others that divides it; an even
+        factor's are right to half a grey value."""
         known: dict[int, Image] = {}
         for factor in sorted(factors):
             finer = [other for other in known if factor % other == 0]
             if finer:
                 known[factor] = means(known[finer[-1]][..., None], factor // finer[-1])[..., 0]
             else:
-                known[factor] = weighted(means(self.samples, factor), self.scan.weights)
+                known[factor] = weighted(nearly_means(self.samples, factor), self.scan.weights)
         return known
+
+
+def nearly_means(samples: Samples, factor: int) -> Image:
+    """(height / factor, width / factor, channels) means over squares, by an even factor from means of four rounded to
+    whole grey values: in a third of the time, and half a grey value is no matter in a search."""
+    if factor % 2:
+        return means(samples, factor)
+    height, width, channels = samples.shape
+    half = cv2.resize(samples, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    return means(half.astype(samples.dtype, copy=False).reshape(height // 2, width // 2, channels), factor // 2)

@@ -88,10 +88,9 @@ def _hopeful(block: Block, disks: list[_Disk], every: int) -> list[_Disk]:
 
 
 def _fitted(block: Block, disks: list[_Disk]) -> list[_Disk]:
-    """Those of about one size that are disks, after two steps with all pixels."""
+    """Those of about one size that are disks, after one step more with all pixels."""
     group = _Group.of(block, disks, 1).stepped(is_robust=True)
-    last = group.stepped(is_robust=True)
-    return last.part((group.misfit() < 1.0) & last.is_sane()).disks_now()
+    return group.part((group.misfit() < 1.0) & group.is_sane()).disks_now()
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -19,6 +18,7 @@ BLUR_PX = (0.5, 8.0)  # pixels' own width included
 LONGEST_STEP = 0.3  # of the radius
 DAMPING = 1e-4
 GREYS, UNKNOWNS = 4, 10
+_TAIL = 0.2316419, np.array([1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.319381530]) / np.sqrt(2 * np.pi)
 _GENERATORS = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
 
 
@@ -59,7 +59,7 @@ def radius_px(shapes: Array) -> Array:
 class _Edges(NamedTuple):
     """Each (n, rows, cols) but col (n, 1, cols) and row (n, rows, 1), px from the centres. distance: from the edge, px,
     positive inside; by_col, by_row, slope: derivatives of the distance in radii and their size; place: distance in
-    blurs; share: of the disk in the pixel."""
+    blurs; density: of the normal distribution there, over its largest; share: of the disk in the pixel."""
 
     col: Image
     row: Image
@@ -68,6 +68,7 @@ class _Edges(NamedTuple):
     slope: Image
     distance: Image
     place: Image
+    density: Image
     share: Image
 
 
@@ -100,7 +101,8 @@ class DiskModel:
         slope = np.sqrt(by_col * by_col + by_row * by_row)
         distance = (1 - radius) / slope
         place = distance / each(state.blur)
-        return _Edges(col, row, by_col, by_row, slope, distance, place, ndtr(place))
+        density = np.exp(np.float32(-0.5) * place * place)
+        return _Edges(col, row, by_col, by_row, slope, distance, place, density, normal_share(place, density))
 
     @property
     def distance(self) -> Image:
@@ -119,9 +121,7 @@ class DiskModel:
         gain, blur, size = (each(of) for of in (self.state.greys[:, 0], self.state.blur, self.state.radius))
         edges = self._edges
         design = np.empty((len(gain), UNKNOWNS, *edges.share.shape[1:]), np.float32)
-        steepness = (
-            gain / (np.float32(np.sqrt(2 * np.pi)) * blur) * np.exp(np.float32(-0.5) * edges.place * edges.place)
-        )
+        steepness = gain / (np.float32(np.sqrt(2 * np.pi)) * blur) * edges.density
         moved = steepness / edges.slope
         outward_col = np.multiply(moved, edges.by_col, out=design[:, 0])
         outward_row = np.multiply(moved, edges.by_row, out=design[:, 1])
@@ -140,6 +140,19 @@ class DiskModel:
         design = np.empty((len(size), GREYS, *edges.share.shape[1:]), np.float32)
         design[:, 0], design[:, 1], design[:, 2], design[:, 3] = edges.share, 1, edges.col / size, edges.row / size
         return design
+
+
+def normal_share(place: Image, density: Image) -> Image:
+    """Of a normal distribution below a place in its sigmas, to some 1e-7, for its density there over the largest
+    (Abramowitz and Stegun, 1964, 26.2.17): in single precision ten times as fast as the error function."""
+    falling, (first, *others) = _TAIL
+    near = 1 / (1 + np.float32(falling) * np.abs(place))
+    tail = np.float32(first) * near
+    for coefficient in others:
+        tail += np.float32(coefficient)
+        tail *= near
+    tail *= density
+    return np.asarray(np.copysign(np.float32(0.5) - tail, place) + np.float32(0.5))
 
 
 def each(values: Array) -> Image:

@@ -4,8 +4,9 @@ A disk's picture is seen whole from its middle: each ray leaves it once. So the 
 once, to a fraction of a pixel, and the ellipse with the moments of each is compared with it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Sampled = Callable[[NDArray[np.intp], Array], Image]
 
 RAYS, FEW_RAYS = 32, 16
 REACH = 3.0  # radii of a blob: where its patch must have ended
@@ -57,14 +59,13 @@ class Outlines:
 
 def outlines_about(image: Image, blobs: Blobs) -> Outlines:
     """Of those blobs, light ones, that end on every ray; most of what stands out of a landscape runs on along some."""
+    near, between = partial(_nearest, image), partial(_interpolated, image)
     found = []
     for radius in np.unique(blobs.radius).tolist():
         alike = blobs.part(blobs.radius == radius)
-        ends = [
-            _Profiles(image, some, radius, FEW_RAYS, 1.0).ends for some in _chunks(alike, FEW_RAYS * REACH * radius)
-        ]
+        ends = [_Profiles(near, some, radius, FEW_RAYS, 1.0).ends for some in _chunks(alike, FEW_RAYS * REACH * radius)]
         for some in _chunks(alike.part(np.concatenate(ends)), RAYS * REACH * radius / 0.5):
-            profiles = _Profiles(image, some, radius, RAYS, 0.5)
+            profiles = _Profiles(between, some, radius, RAYS, 0.5)
             found.append(_outlines(some.places[profiles.ends], profiles))
     return _joined(found)
 
@@ -79,15 +80,15 @@ class _Profiles:
     """Grey values along rays from blobs of one radius, at steps of so many px; ends (n,): whether all fall below half
     of the blob's height."""
 
-    def __init__(self, image: Image, blobs: Blobs, radius: float, rays: int, step_px: float) -> None:
+    def __init__(self, sampled: Sampled, blobs: Blobs, radius: float, rays: int, step_px: float) -> None:
         self.step_px = step_px
         along = step_px * np.arange(int(np.ceil(REACH * radius / step_px)) + 1)
         angle = 2 * np.pi * np.arange(rays) / rays
         self.directions = np.stack([np.cos(angle), np.sin(angle)])
-        self.values = _sampled(image, blobs.places, self.directions[..., None] * along)
+        self.values = sampled(blobs.places, self.directions[..., None] * along)
         core, around = (along <= CORE * radius), (along >= AROUND[0] * radius) & (along <= AROUND[1] * radius)
         shares = np.stack([core / core.sum(), around / around.sum()], axis=1).astype(np.float32)
-        inner, outer = np.moveaxis(self.values @ shares, 2, 0)
+        inner, outer = (self.values.reshape(-1, len(along)) @ shares).T.reshape(2, -1, rays)
         top, ground = inner.mean(axis=1), np.partition(outer, int(GROUND_SHARE * rays), axis=1)
         self.ground = ground[:, int(GROUND_SHARE * rays)]
         self.height = top - self.ground
@@ -105,7 +106,15 @@ class _Profiles:
         return np.asarray(self.step_px * (last + np.clip(share, 0.0, 1.0)), np.float32)
 
 
-def _sampled(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
+def _nearest(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
+    """(n, rays, steps) pixels nearest to offsets (2, rays, steps) from places (n, 2), within the image."""
+    col, row = np.rint(offsets).astype(np.intp)
+    width = image.shape[1]
+    at = (places @ (1, width))[:, None, None] + (col + width * row)
+    return np.asarray(image.ravel().take(at), np.float32)
+
+
+def _interpolated(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
     """(n, rays, steps) grey values at offsets (2, rays, steps) from places (n, 2)."""
     at, off = places.astype(np.float32), offsets.reshape(2, -1).astype(np.float32)
     values = cv2.remap(image, at[:, :1] + off[0], at[:, 1:] + off[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -78,7 +78,7 @@ def margin_px(radii: list[float]) -> int:
 
 def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int) -> list[Candidate]:
     """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
-    scan_px2 = small.size * factor**2
+    small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
     cells = Cells.of(small.shape[1], max(round(scan_px2 / CELL_PX**2), 1))
     is_textured = scan_px2 >= TEXTURE_PX**2
     noise = cells.each(fine_noise, small) if is_textured else np.zeros(len(cells.ends))

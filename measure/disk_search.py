@@ -18,7 +18,7 @@ Image = NDArray[np.float32]
 
 SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk stands out by a tenth less
 SIZE_TOLERANCE = 1.4  # of what is found, to the sizes that are looked for
-SEARCH_RADIUS_PX = 2.2  # reduced so far that the smallest disk of an octave has at least this radius
+SEARCH_RADIUS_PX = 2.0  # reduced so far that the smallest disk of an octave has at least this radius
 
 
 def find_disks(scan: Scan, search: DiskSearch) -> tuple[FittedDisk, ...]:

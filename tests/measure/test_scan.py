@@ -309,7 +309,8 @@ def test_a_block_is_a_part_of_the_scan_and_of_its_reductions(tmp_path: Path, cha
         for factor, small in block.reductions({2, 3, 4}).items():
             row, col, height, width = 0, 12 // factor, 60 // factor, 72 // factor
             part = scan.reduced(factor)[row : row + height, col : col + width]
-            np.testing.assert_allclose(small, part, rtol=2e-6)
+            rounding = 0.5 if factor % 2 == 0 else 0.0
+            np.testing.assert_allclose(small, part, rtol=2e-6, atol=rounding)
 
 
 class Watched:
