@@ -1,4 +1,5 @@
-"""Where near its predicted place a mark looks most like itself, at full resolution, and whether noise would look so."""
+"""Where near its predicted place a mark looks most like itself, at full or half resolution, and whether noise would
+look so."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from scipy import stats
 from measure.candidates import FAINT, correlated, detail_px, flattened, pattern
 from measure.matching import window_about
 from measure.rendering import extent_px, picture
+from measure.response_layers import highest
 from measure.scan import Scan
 from measure.shapes import Mark
 
@@ -18,14 +20,15 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 _CHANCE = 0.05  # of noise as coarse as the window's: what is likelier is not worth a fit
+_HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows it as well
 _SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
 
 
 def seen(
     scan: Scan, mark: Mark, pixel_from_mark: Array, search_px: float, polarity: int, weights: Sequence[float] | None
 ) -> Array | None:
-    """The scan's pixel (col, row) within the search radius where the mark correlates best, drawn sharp or else soft;
-    None where noise would do so as well."""
+    """Column and row of the scan within the search radius where the mark correlates best, drawn sharp or else soft, to
+    a part of a pixel; None where noise would do so as well."""
     for blur_px in (_SHARP_PX, _SOFT_PX):
         look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, blur_px)
         if look.chance() <= _CHANCE:
@@ -36,7 +39,7 @@ def seen(
 def strongest(
     scan: Scan, mark: Mark, pixel_from_mark: Array, search_px: float, polarity: int, weights: Sequence[float] | None
 ) -> tuple[Array, float]:
-    """The scan's pixel (col, row) within the search radius where the mark correlates best, and how well."""
+    """Column and row of the scan within the search radius where the mark correlates best, and how well."""
     look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, _SHARP_PX)
     return look.center_px, look.height
 
@@ -58,25 +61,32 @@ class _Look:
         weights: Sequence[float] | None,
         blur_px: float,
     ) -> None:
+        reduction = 2 if detail_px(mark, pixel_from_mark[:, :2]) >= _HALVED_PX else 1
+        shift_px = (reduction - 1) / 2
+        reduced = np.column_stack([pixel_from_mark[:, :2], pixel_from_mark[:, 2] - shift_px]) / reduction
+        search_px, blur_px = search_px / reduction, blur_px / reduction
         spare = int(np.ceil(2 * blur_px))
-        col0, row0, width, tall = window_about(mark, pixel_from_mark, search_px + spare + 2)
-        centred = np.column_stack([pixel_from_mark[:, :2], np.zeros(2)])
+        col0, row0, width, tall = window_about(mark, reduced, search_px + spare + 2)
+        centred = np.column_stack([reduced[:, :2], np.zeros(2)])
         least, greatest = extent_px(mark, centred)
         low, high = np.floor(least).astype(int) - spare, np.ceil(greatest).astype(int) + spare
         centred[:, 2] = -low
         size = high - low + 1
-        finest_px = max(detail_px(mark, pixel_from_mark[:, :2]), blur_px)
+        finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
         template = picture(mark, centred, int(size[0]), int(size[1]), blur_px)
-        window = np.asarray(scan.window(col0, row0, width, tall, weights), np.float32)
+        window = scan.reduced_window(reduction, col0, row0, width, tall, weights)
         self._flat = polarity * flattened(window, finest_px, scan.full_scale_dn * FAINT)
         self._pattern, self._counts = pattern(template, finest_px)
         response = correlated(self._flat, template, finest_px)
         place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)
         place += np.array([col0, row0]) - low
-        near = np.hypot(*np.moveaxis(place - pixel_from_mark[:, 2], -1, 0)) <= search_px
+        near = np.hypot(*np.moveaxis(place - reduced[:, 2], -1, 0)) <= search_px
         self._best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
         self._places = int(near.sum())
-        self.center_px, self.height = np.asarray(place[self._best]), float(response[self._best])
+        # A fit that begins within a part of a pixel takes a step less.
+        top = highest(response, np.array([self._best[::-1]]), 0.0)[0][0]
+        self.center_px = (top + np.array([col0, row0]) - low) * reduction + shift_px
+        self.height = float(response[self._best])
 
     def chance(self) -> float:
         """The expected number of places that noise makes answer so well. The correlation of two rows of numbers, each

@@ -181,8 +181,9 @@ class _Sighter:
         self.weights = best_weights(self.scan, places)
 
     def look(self, indices: Sequence[int], search_px: float) -> None:
-        for index in indices:
-            self.sightings[index] = self._sight(index, search_px, self.weights)
+        sighted = self.scan.each(lambda index: self._sight(index, search_px, self.weights), indices)
+        for index, sighting in zip(indices, sighted, strict=True):
+            self.sightings[index] = sighting
 
     def look_astray(self, indices: Sequence[int]) -> None:
         """Look at marks where the others put them, first near by, then as far off as one may lie that keeps the gate:

@@ -67,9 +67,11 @@ def decide_pose(
     # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
     usual = sorted(seen, key=lambda fit: abs(fit.contrast_dn))[len(seen) // 2]
     sites += [Site(scan, usual, place, frame.weights, finest_px) for place in missed]
-    pictures = np.array(
-        [site.likelihoods([each.shown(index, layout) for each in named]) for index, site in enumerate(sites)]
-    ).reshape(len(sites), len(named))
+
+    def of_site(index: int) -> Array:
+        return sites[index].likelihoods([each.shown(index, layout) for each in named])
+
+    pictures = np.array(scan.each(of_site, range(len(sites)))).reshape(len(sites), len(named))
     verdicts = [each.verdict(pictures[:, index]) for index, each in enumerate(named)]
     if layout.data_strip is None or not frame.accepted:
         return _decision(verdicts, layout)

@@ -42,7 +42,7 @@ class Layer:
 
     def highest(self, places: Array, radius_px: float) -> tuple[Array, Array]:
         """The highest responses about places (n, 2) of the reduced scan, and (n,) how high; 0 outside of the map."""
-        tops, heights = _highest(self.map, places - self.origin, radius_px)
+        tops, heights = highest(self.map, places - self.origin, radius_px)
         return tops + self.origin, heights
 
 
@@ -73,7 +73,7 @@ def _dilated(map_: Map, radius_px: float) -> Map:
     return np.asarray(cv2.dilate(map_, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))))
 
 
-def _highest(map_: Map, places: Array, radius_px: float) -> tuple[Array, Array]:
+def highest(map_: Map, places: Array, radius_px: float) -> tuple[Array, Array]:
     """The highest responses within a square about places (n, 2), refined by parabolas, and (n,) how high; 0 outside of
     the map."""
     size = np.array(map_.shape[::-1])
