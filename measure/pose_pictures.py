@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from measure.matching import Match
 from measure.noise import robust_scale
-from measure.rendering import extent_px, picture
+from measure.rendering import chip_mask, extent_px, picture
 from measure.robust import tukey_weights
 from measure.scan import Scan
-from measure.shapes import Bar, Mark, MarkShape, Polygon
+from measure.shapes import Bar, Mark, MarkShape, MarkTemplate, Polygon
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -64,11 +64,13 @@ class Site:
         center = self.center_px - (col0, row0)
         pictures, kind_of = _distinct([self._picture(each, center, size) for each in looks])
         picture_of = [kind_of[look] for look in look_of]
-        area = _area(pictures)
-        residuals = [self._residuals(window, each, area) for each in pictures]
+        told = [_told(looks[kind_of.index(kind)], center, size) for kind in range(len(pictures))]
+        area = _area(pictures) & np.any(told, axis=0)
+        residuals = [self._residuals(window, each, area & own) for each, own in zip(pictures, told, strict=True)]
         # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
         scale = max(self.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
         misfits = np.array([np.sum(np.minimum(np.abs(each) / scale, _OUTLIER) ** 2) for each in residuals])
+        misfits += [_OUTLIER**2 * (area.sum() - len(each)) for each in residuals]  # what a chip does not tell it misses
         relative = np.exp(-(misfits - misfits.min()) / 2 / _PIXELS_PER_DEGREE)
         return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[picture_of]
 
@@ -140,6 +142,14 @@ def _distinct(pictures: Sequence[Array]) -> tuple[list[Array], list[int]]:
         if not alike:
             kinds.append(each)
     return kinds, index
+
+
+def _told(shown: Shown, center: Array, size: int) -> Mask:
+    """Where a mark tells the grey values. A chip is only continued beyond its edge, and a learned one has the landscape
+    of other scans beside its mark."""
+    if not isinstance(shown.mark, MarkTemplate):
+        return np.ones((size, size), dtype=bool)
+    return chip_mask(shown.mark, np.column_stack([shown.linear, center]), size, size)
 
 
 def _area(pictures: Sequence[Array]) -> Mask:

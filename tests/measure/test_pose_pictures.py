@@ -1,0 +1,49 @@
+"""What tells a mark's direction where its chip holds the landscape of other scans."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.matching import MatchOptions, match
+from measure.picture_scan import WholePicture
+from measure.pose_pictures import Shown, Site
+from measure.resolution import NO_TAGS
+from measure.scan import Scan
+from measure.shapes import MarkTemplate
+
+SIDE = 61
+BLOCK = np.zeros((SIDE, SIDE), np.uint8)
+BLOCK[:, :24], BLOCK[18:43, :36], BLOCK[28:40, :45] = 1, 1, 1  # of the border, reaching into the frame, lopsided
+
+
+def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
+    """A block steady in its chip, in landscapes as rough as it is deep, in each of its four directions."""
+    template = MarkTemplate(
+        np.where(BLOCK > 0, 20.0, 150.0),
+        1000.0,
+        (30, 30),
+        polarity="light",
+        steady=cv2.dilate(BLOCK, np.ones((5, 5))) > 0,
+    )
+    turned = [np.diag([x, y]).astype(float) for x in (1, -1) for y in (-1, 1)]
+    for seed in range(2):
+        for index, linear in enumerate(turned):
+            site = among_landscape(template, linear, seed)
+            told = site.likelihoods([Shown(template, each) for each in turned])
+            assert told.argmax() == index
+            assert np.sort(told)[-2] < -4.0
+
+
+def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: int) -> Site:
+    rng = np.random.default_rng(seed)
+    landscape = cv2.GaussianBlur(rng.normal(0.0, 1.0, (3 * SIDE, 3 * SIDE)), (0, 0), 4.0)
+    grey = 150.0 + 45.0 * landscape / landscape.std()
+    shown = BLOCK[:: int(-linear[1, 1]), :: int(linear[0, 0])] > 0
+    grey[SIDE : 2 * SIDE, SIDE : 2 * SIDE][shown] = 20.0
+    grey = np.clip(np.rint(grey + rng.normal(0.0, 1.5, grey.shape)), 0, 255)
+    scan = Scan(Path("scan"), WholePicture(grey.astype(np.uint8)[..., None]), NO_TAGS)
+    place = np.column_stack([linear, [SIDE + 30.0, SIDE + 30.0]])
+    fit = match(grey, (0, 0), template, place, MatchOptions(freedom="shift", estimate_blur=False))
+    return Site(scan, fit, fit.center_px, None, 3.0)
