@@ -29,19 +29,22 @@ def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -
     size = np.sqrt((design[:, used] ** 2).sum(axis=1))[:, None, None]
     right = (design * used / size).astype(np.float32)
     solution, product = np.zeros_like(right), np.zeros_like(right)
-    rest = right.copy()
+    # Columns that are close leave the rounds: those of a mark's edges are so at once, the ground's later.
+    left, rest = np.arange(len(right)), right
     direction = ahead = covariance.roughly_inverse(rest)
     strength = _dots(rest, ahead)
     for _ in range(_ROUNDS):
         seen = covariance.times(direction)
         length = strength / np.maximum(_dots(direction, seen), 1e-30)
-        solution += length * direction
-        product += length * seen
-        rest -= length * seen
-        if np.all(_dots(rest, rest) < _CLOSE**2):  # of columns of unit length
+        solution[left] += length * direction
+        product[left] += length * seen
+        rest = rest - length * seen
+        far = _dots(rest, rest)[:, 0, 0] >= _CLOSE**2  # of columns of unit length
+        if not far.any():
             break
+        left, rest, direction, before = left[far], rest[far], direction[far], strength[far]
         ahead = covariance.roughly_inverse(rest)
-        strength, before = _dots(rest, ahead), strength
+        strength = _dots(rest, ahead)
         direction = np.asarray(ahead + strength / np.maximum(before, 1e-30) * direction, np.float32)
     scale = size / covariance.scale_dn2
     return np.asarray(solution * scale, float), np.asarray(product * size, float)
