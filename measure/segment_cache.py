@@ -62,9 +62,10 @@ class SegmentCache:
         own.set_result(samples)
         with self._lock:
             self._held += samples.nbytes
-            for oldest in list(self._decoded):
-                if self._held <= self._limit:
-                    break
-                if oldest != key and self._decoded[oldest].done():
-                    self._held -= self._decoded.pop(oldest).result().nbytes
+            while self._held > self._limit and (oldest := self._oldest_but(key)):
+                self._held -= self._decoded.pop(oldest).result().nbytes
         return samples
+
+    def _oldest_but(self, key: tuple[int, int]) -> tuple[int, int] | None:
+        """Of the segments that are decoded, the one that was wanted longest ago, and is not of this key."""
+        return next((other for other, segment in self._decoded.items() if other != key and segment.done()), None)

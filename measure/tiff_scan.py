@@ -4,7 +4,6 @@ import logging
 import struct
 from mmap import ACCESS_READ, ALLOCATIONGRANULARITY, mmap
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from measure.segments import Segments
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
 
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
+UNCOMPRESSED = 1
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
 JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
 MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time
@@ -146,7 +146,6 @@ class TiffSegments:
 
     def __init__(self, file: TiffFile, page: TiffPage, path: Path) -> None:
         self._file, self._page, self._path = file, page, path
-        self._reading = Lock()  # the file has one position for all threads
         self._radiometry = page_radiometry(page, path)
         self.rounding_step_dn = page_rounding_step_dn(file, page)
         self.channels, self.full_scale_dn = self._radiometry.channels, self._radiometry.full_scale_dn
@@ -174,13 +173,9 @@ class TiffSegments:
 
     def _decoded(self, index: int) -> NDArray[np.generic]:
         """(height, width, samples) of the stored numbers; a tile that was left out of the file is all zeros."""
-        page, handle = self._page, self._file.filehandle
-        data = None
-        if page.databytecounts[index]:
-            with self._reading:
-                handle.seek(page.dataoffsets[index])
-                data = handle.read(page.databytecounts[index])
+        page = self._page
         try:
+            data = self._mapped(index) if page.databytecounts[index] else None
             decoded, _, shape = page.decode(data, index, jpegtables=page.jpegtables, jpegheader=page.jpegheader)
         except DECODING_ERRORS as error:
             raise broken(self._path, f"tile or strip {index}: {error}") from error
@@ -189,7 +184,15 @@ class TiffSegments:
         if decoded is None:
             return np.zeros(shape[1:], page.dtype)
         samples: NDArray[np.generic] = np.asarray(decoded)[0]
-        return samples
+        return samples.copy() if page.compression == UNCOMPRESSED else samples  # it would keep the file mapped
+
+    def _mapped(self, index: int) -> memoryview:
+        """A tile or strip as the file has it, which no thread copies or waits for."""
+        offset = self._page.dataoffsets[index]
+        before = offset % ALLOCATIONGRANULARITY
+        size = before + self._page.databytecounts[index]
+        mapped = mmap(self._file.filehandle.fileno(), size, access=ACCESS_READ, offset=offset - before)
+        return memoryview(mapped)[before:]
 
     def close(self) -> None:
         self._file.close()
