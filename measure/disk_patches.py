@@ -169,5 +169,6 @@ def round_ones(found: Outlines, noise: Array, factor: int) -> Iterator[tuple[Arr
     share = np.minimum(noise / np.maximum(found.height, 1e-9), 1 / (LEAST_SNR * factor))
     kept = found.part(found.misfit < np.hypot(WORST_MISFIT, NOISE_SIGMAS * EDGE_PX * share / found.radius))
     axes, directions = np.linalg.eigh(kept.moments)
-    for index in np.flatnonzero(axes[:, 0] >= LEAST_FLAT * axes[:, 1]):
-        yield kept.centers[index], directions[index] * (2 * np.sqrt(axes[index])), float(kept.height[index])
+    shapes = directions * (2 * np.sqrt(np.maximum(axes, 0.0)))[:, None]
+    is_wide = axes[:, 0] >= LEAST_FLAT * axes[:, 1]
+    return zip(kept.centers[is_wide], shapes[is_wide], kept.height[is_wide].tolist(), strict=True)

@@ -65,8 +65,9 @@ def robust_scale(values: Array) -> float:
 
 
 def _median(values: Array) -> float:
-    middle = (values.size - 1) // 2, values.size // 2  # numpy's own takes four times as long for a small window
-    return float(np.partition(values, middle, axis=None)[list(middle)].mean())
+    below, above = (values.size - 1) // 2, values.size // 2  # numpy's own takes four times as long for a small window
+    rising = np.partition(values, (below, above), axis=None)
+    return float(rising[below] + rising[above]) / 2
 
 
 def correlated(columns: Array, noise: NoiseModel) -> Array:
