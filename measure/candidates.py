@@ -13,21 +13,15 @@ from numpy.typing import NDArray
 from measure.rendering import extent_px, picture
 from measure.scan import Scan
 from measure.shapes import Mark, thinnest_mm
+from measure.surroundings import WIDE, Map, Surroundings
 
 Array = NDArray[np.float64]
-Map = NDArray[np.float32]
 
 _EXTENT_PX = 14.0  # of the reduced mark
 _THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns
 _LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
 _SHARED_PX = 16  # of the reduced scan: places so near to one another share a window
 _ALIKE = 0.8  # correlation above which two pictures of marks share one response
-_COARSE = 4.0  # times the finest detail: coarser structure is background
-_CLIP = 3.0  # times the local contrast
-_MEAN = 0.3  # of the coarse: the side of the squares whose median is background
-_DRAWN = 0.05  # of the mark's own contrast: what differs by more from the ground is the mark
-_SMOOTHED_PX = 3.0  # the standard deviation of a Gaussian that a reduced picture still shows
-_EVEN = 1e-5  # mean square in units of the local contrast: a three hundredth of it is rounding
 FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 
 
@@ -37,12 +31,14 @@ class Responses:
 
     maps: by the kind of look and +1 or -1, (rows, columns) of how much the place looks like the mark lighter or darker
     than its surroundings. reduction: by which the scan was reduced. origins: (kinds, 2) column and row of the reduced
-    scan where the maps of each kind begin; None: they hold all of it.
+    scan where the maps of each kind begin; None: they hold all of it. surroundings: what counts
+    about a mark.
     """
 
     maps: Mapping[tuple[int, int], Map]
     reduction: int
     origins: NDArray[np.int_] | None = None
+    surroundings: Surroundings = WIDE
 
     def origin(self, kind: int) -> NDArray[np.int_]:
         """(2,) pixel of the reduced scan where the maps of a kind begin."""
@@ -65,7 +61,9 @@ class Look:
     linear: Array
 
 
-def respond(scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1)) -> tuple[Responses, tuple[int, ...]]:
+def respond(
+    scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1), surroundings: Surroundings = WIDE
+) -> tuple[Responses, tuple[int, ...]]:
     """The responses to the looks that differ, lighter (+1) and darker (-1) than their surroundings as signs says, and
     for every look which of the kinds is its own.
 
@@ -80,10 +78,10 @@ def respond(scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1))
         grey = scan.reduced(reduction, weights)
         around = np.asarray(cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE), np.float32)
         for detail in sorted(set(details)):
-            image = flattened(around, detail, scan.full_scale_dn * FAINT)
+            image = surroundings.flattened(around, detail, scan.full_scale_dn * FAINT)
             for kind in (kind for kind, own in enumerate(details) if own == detail):
-                _strongest(maps, kind, signs, _within(correlated(image, kinds[kind], detail), grey.shape))
-    return Responses(maps, reduction), index
+                _strongest(maps, kind, signs, _within(surroundings.correlated(image, kinds[kind], detail), grey.shape))
+    return Responses(maps, reduction, surroundings=surroundings), index
 
 
 def respond_about(
@@ -105,9 +103,9 @@ def respond_about(
         maps: dict[tuple[int, int], Map] = {}
         for weights in _channel_weights(scan):
             grey = scan.reduced_window(reduction, col0, row0, size + 2 * half, size + 2 * half, weights)
-            image = flattened(grey, detail, scan.full_scale_dn * FAINT)
+            image = WIDE.flattened(grey, detail, scan.full_scale_dn * FAINT)
             for kind, shape in ((kind, shape) for kind, (own, shape) in enumerate(kinds) if own == corner):
-                _strongest(maps, kind, signs, _within(correlated(image, shapes[shape], detail), (size, size)))
+                _strongest(maps, kind, signs, _within(WIDE.correlated(image, shapes[shape], detail), (size, size)))
         return maps
 
     every = {key: map_ for maps in scan.each(at_corner, range(len(corners))) for key, map_ in maps.items()}
@@ -135,74 +133,6 @@ def peaks(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[A
 def detail_px(mark: Mark, linear: Array) -> float:
     """The width of the mark's finest detail in px, and no less than one."""
     return max(float(np.sqrt(abs(np.linalg.det(linear)))) * thinnest_mm(mark), 1.0)
-
-
-def flattened(image: Map, detail_px: float, faint_dn: float) -> Map:
-    """The picture freed of what is much coarser than detail_px, in units of its contrast about every pixel: a thin
-    cross on a landscape answers as on an even ground. Contrasts of faint_dn or below count for less.
-
-    The ground is a median, which keeps the frame's edge: a mean would spread it over the marks beside it, and drown
-    those that are faint.
-    """
-    coarse_px = _COARSE * detail_px
-    detail = image - _ground(image, coarse_px)
-    contrast = np.sqrt(_smoothed(detail**2, 2 * coarse_px) + faint_dn**2)
-    return np.asarray(np.clip(detail / contrast, -_CLIP, _CLIP), np.float32)
-
-
-def _ground(image: Map, coarse_px: float) -> Map:
-    """The median of five by five means."""
-    return _enlarged(cv2.medianBlur(_reduced(image, max(1, int(_MEAN * coarse_px))), 5), image)
-
-
-def _smoothed(image: Map, sigma_px: float) -> Map:
-    """The picture under a Gaussian; a wide one takes, for its price, hardly more than a reduced picture tells."""
-    factor = max(1, int(sigma_px / _SMOOTHED_PX))
-    # The averaging and the straight lines between its pixels blur by themselves: f^2 / 12 and f^2 / 6 of variance.
-    left = np.sqrt(sigma_px**2 - (factor**2 - 1) / 4) / factor
-    return _enlarged(cv2.GaussianBlur(_reduced(image, factor), (0, 0), left), image)
-
-
-def _reduced(image: Map, factor: int) -> Map:
-    height, width = image.shape
-    size = -(-width // factor), -(-height // factor)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _enlarged(small: NDArray[np.integer | np.floating], image: Map) -> Map:
-    """A reduced picture in the size of the other."""
-    return np.asarray(cv2.resize(small, image.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-
-
-def correlated(image: Map, template: Array, detail_px: float) -> Map:
-    """The normalised correlation with a flattened picture, wherever the template lies inside of it. Only pixels about
-    the drawing count: beside it may lie the frame's edge, or writing.
-
-    OpenCV's own correlation under a mask gives the same for three times the price.
-    """
-    chip, about = pattern(template, detail_px)
-    sums, squares, products = (
-        cv2.matchTemplate(each, part, cv2.TM_CCORR) for each, part in ((image, about), (image**2, about), (image, chip))
-    )
-    spread = (squares - sums**2 / about.sum()) * np.sum(chip**2)
-    least = _EVEN * about.sum() * np.sum(chip**2)  # nothing but even ground is no answer
-    return np.asarray(np.where(spread > least, products / np.sqrt(np.maximum(spread, least)), 0.0), np.float32)
-
-
-def pattern(template: Array, detail_px: float) -> tuple[Map, Map]:
-    """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts."""
-    about = _about(template, detail_px)
-    chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), _COARSE * detail_px), np.float32)
-    return about * (chip - np.average(chip, weights=about)), about
-
-
-def _about(template: Array, detail_px: float) -> Map:
-    """1 on the drawing and twice as far about it as its finest detail is wide, 0 elsewhere."""
-    rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
-    drawn = np.abs(template - np.median(rim))
-    # Of a line far thinner than a pixel hardly anything is left.
-    beside = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
-    return np.asarray(cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= 2 * detail_px + 1, np.float32)
 
 
 def _within(response: Map, shape: tuple[int, ...]) -> Map:

@@ -69,7 +69,7 @@ def _by_places_beside(
         mark = layout.marks[index].mark
         start = np.column_stack([frame.pixel_from_camera[:, :2], place])
         sign = sign_of(mark, frame.placement.polarity)
-        return strongest(scan, mark, start, radius_px, sign, frame.weights)[1]
+        return strongest(scan, mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)[1]
 
     radius = REDUCED_PX * frame.placement.reduction + options.search_mm(layout) / float(
         np.mean(frame.placement.pitch_mm)

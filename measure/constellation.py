@@ -14,6 +14,7 @@ from measure.candidates import Responses
 from measure.poses import up_from_camera
 from measure.response_layers import Layer, Reach, narrowed
 from measure.shapes import LayoutMark, Mark
+from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -41,7 +42,7 @@ class Placement:
     """A frame in its scan. score: how much of the constellation answers; supported: how many marks do.
 
     pixel_from_camera: (2, 3). polarity: of the marks that are not drawn with one, +1 lighter than their surroundings,
-    -1 darker. reduction: of the scan, and pitch_mm that it was found with.
+    -1 darker. reduction: of the scan, and pitch_mm and surroundings that it was found with.
     """
 
     pose: str
@@ -51,6 +52,7 @@ class Placement:
     polarity: int
     reduction: int
     pitch_mm: tuple[float, float]
+    surroundings: Surroundings = WIDE
 
     def same_place(self, other: "Placement") -> bool:
         """Whether both put the frame at the same place and size, however its marks are named."""
@@ -159,6 +161,7 @@ class _Constellation:
                 polarity,
                 self.responses.reduction,
                 (float(self.pitch[0]), float(self.pitch[1])),
+                self.responses.surroundings,
             )
             for a, b, score, count in zip(
                 scale.tolist(), offset.tolist(), scores.tolist(), supported.tolist(), strict=True

@@ -22,12 +22,15 @@ from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scan import Scan
 from measure.shapes import FiducialLayout, LayoutMark, MarkTemplate
 from measure.status import Status
+from measure.surroundings import CLOSE
 
 Array = NDArray[np.float64]
 
+_FAINT = "the frame was found at a closer look only, its marks being faint beside what surrounds them"
 _SET = ("set in the project.",)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
+_STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 _HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
@@ -56,10 +59,14 @@ def measure_fiducials(
             break
         tried += len(others)
         found, frame = _in_spite_of_pitch(search, others, tried) or (found, frame)
+    if frame is None or not frame.accepted:
+        reason = frame.misfit() if frame else "nothing in the scan looks like two or more of the camera's marks"
+        search = FrameSearch(scan, layout, options, CLOSE)
+        limit = np.inf if pitch_um is None else _STRETCH
+        closer = [replace(each, tolerance=min(each.tolerance, limit)) for each in hypotheses[0]]
+        found, frame = _at_a_closer_look(search, closer, tried + len(closer))
     if frame is None:
-        return _nothing(scan, layout, "nothing in the scan looks like two or more of the camera's marks")
-    if not frame.accepted:
-        return _nothing(scan, layout, frame.misfit())
+        return _nothing(scan, layout, reason)
     found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
     pose = Pose(options.pose, True, _SET)
     if options.pose == "auto":
@@ -118,6 +125,20 @@ def _in_spite_of_pitch(
     return (found, min(sure, key=search.expected_as_good)) if sure else None
 
 
+def _at_a_closer_look(
+    search: FrameSearch, hypotheses: Sequence[PitchHypothesis], tried: int
+) -> tuple[list[Placement], Frame | None]:
+    """The same where marks are looked at closer by, as the frame's edge may drown them. Their pictures need not be
+    clear, where chance would hardly make so many that agree in all the hypotheses tried."""
+    found = search.anywhere(hypotheses)
+    if not found or tried * search.expected_alike(found[0]) > _HOPELESS:
+        return [], None
+    frame = _as_its_pictures_say(search, found, found[0])
+    seen = {index: fit.center_px for index, fit in enumerate(frame.fits) if fit}
+    sure = frame.agrees and tried * search.expected_where_seen(frame, seen) <= _CHANCE
+    return found, frame if sure else None
+
+
 def _others(found: Sequence[Placement]) -> list[Placement]:
     """The placements that put the frame elsewhere, those first that many marks speak for: a few strong answers are
     often false ones."""
@@ -165,12 +186,13 @@ def _nothing(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasuremen
 def _measurement(
     scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, rivals: Sequence[str], chance: str
 ) -> FrameMeasurement:
-    """rivals, chance: why the frame may lie elsewhere, sentences; if it may be chance none of its marks is certain."""
+    """rivals, chance: why the frame may lie elsewhere, sentences; if it may be chance none of its marks is certain, nor
+    if it was found at a closer look."""
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
-    if chance:
+    weak = chance or (_FAINT if frame.placement.surroundings == CLOSE else "")
+    if weak:
         marks = tuple(
-            replace(mark, status=Status.WEAK, reason=chance) if mark.status is Status.MEASURED else mark
-            for mark in marks
+            replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
         )
     problems = [f"{sentence}." for sentence in (*rivals, *([chance] if chance else []))]
     if problems and pose.evidence != _SET:

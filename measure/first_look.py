@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from measure.candidates import FAINT, correlated, detail_px, flattened, pattern
+from measure.candidates import FAINT, detail_px
 from measure.matching import window_about
 from measure.rendering import extent_px, picture
 from measure.response_layers import highest
 from measure.scan import Scan
 from measure.shapes import Mark
+from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -25,22 +26,34 @@ _SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine
 
 
 def seen(
-    scan: Scan, mark: Mark, pixel_from_mark: Array, search_px: float, polarity: int, weights: Sequence[float] | None
+    scan: Scan,
+    mark: Mark,
+    pixel_from_mark: Array,
+    search_px: float,
+    polarity: int,
+    weights: Sequence[float] | None,
+    surroundings: Surroundings = WIDE,
 ) -> Array | None:
     """Column and row of the scan within the search radius where the mark correlates best, drawn sharp or else soft, to
     a part of a pixel; None where noise would do so as well."""
     for blur_px in (_SHARP_PX, _SOFT_PX):
-        look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, blur_px)
+        look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, surroundings, blur_px)
         if look.chance() <= _CHANCE:
             return look.center_px
     return None
 
 
 def strongest(
-    scan: Scan, mark: Mark, pixel_from_mark: Array, search_px: float, polarity: int, weights: Sequence[float] | None
+    scan: Scan,
+    mark: Mark,
+    pixel_from_mark: Array,
+    search_px: float,
+    polarity: int,
+    weights: Sequence[float] | None,
+    surroundings: Surroundings = WIDE,
 ) -> tuple[Array, float]:
     """Column and row of the scan within the search radius where the mark correlates best, and how well."""
-    look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, _SHARP_PX)
+    look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, surroundings, _SHARP_PX)
     return look.center_px, look.height
 
 
@@ -59,6 +72,7 @@ class _Look:
         search_px: float,
         polarity: int,
         weights: Sequence[float] | None,
+        surroundings: Surroundings,
         blur_px: float,
     ) -> None:
         reduction = 2 if detail_px(mark, pixel_from_mark[:, :2]) >= _HALVED_PX else 1
@@ -75,9 +89,9 @@ class _Look:
         finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
         template = picture(mark, centred, int(size[0]), int(size[1]), blur_px)
         window = scan.reduced_window(reduction, col0, row0, width, tall, weights)
-        self._flat = polarity * flattened(window, finest_px, scan.full_scale_dn * FAINT)
-        self._pattern, self._counts = pattern(template, finest_px)
-        response = correlated(self._flat, template, finest_px)
+        self._flat = polarity * surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
+        self._pattern, self._counts = surroundings.pattern(template, finest_px)
+        response = surroundings.correlated(self._flat, template, finest_px)
         place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)
         place += np.array([col0, row0]) - low
         near = np.hypot(*np.moveaxis(place - reduced[:, 2], -1, 0)) <= search_px

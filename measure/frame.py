@@ -81,13 +81,20 @@ class Frame:
         return [np.asarray(place) for place, gone in zip(places, missed, strict=True) if gone]
 
     @property
-    def accepted(self) -> bool:
-        """Whether enough marks agree for the frame not to be chance: three, and three in ten of those in the scan, and
-        three of them clear ones."""
+    def agrees(self) -> bool:
+        """Whether enough marks agree, clear or not: three, and three in ten of those in the scan."""
         inside = sum(sighting.inside for sighting in self.sightings)
-        least = max(min(3, len(self.sightings)), 2)
+        return int(self.belongs.sum()) >= max(self._least, int(np.ceil(0.3 * inside)))
+
+    @property
+    def accepted(self) -> bool:
+        """Whether enough marks agree for the frame not to be chance, three of them clear ones."""
         clear = sum(fit is not None and fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
-        return int(self.belongs.sum()) >= max(least, int(np.ceil(0.3 * inside))) and clear >= least
+        return self.agrees and clear >= self._least
+
+    @property
+    def _least(self) -> int:
+        return max(min(3, len(self.sightings)), 2)
 
     def misfit(self) -> str:
         """A sentence for a frame that is not accepted."""
@@ -150,7 +157,7 @@ class _Sighter:
         options: FiducialOptions,
     ) -> None:
         self.scan, self.layout, self.placement, self.options = scan, layout, placement, options
-        self.pitch = np.asarray(placement.pitch_mm)
+        self.pitch, self.surroundings = np.asarray(placement.pitch_mm), placement.surroundings
         self.camera = np.array([mark.xy_mm for mark in layout.marks])
         self.turn = up_from_camera(placement.pose)
         self.pixel_from_camera = placement.pixel_from_camera
@@ -172,7 +179,7 @@ class _Sighter:
         for index in range(0, len(self.layout.marks), step):
             mark, start = self.layout.marks[index].mark, self._start(index)
             answers = [
-                strongest(self.scan, mark, start, self.first_search_px, self._sign(mark), weights)
+                strongest(self.scan, mark, start, self.first_search_px, self._sign(mark), weights, self.surroundings)
                 for weights in (LUMINANCE, *_SINGLE)
             ]
             place, height = max(answers, key=lambda answer: answer[1])
@@ -236,7 +243,9 @@ class _Sighter:
             if before is None or before.fit is None:
                 continue
             start, sign = np.column_stack([linear, before.fit.center_px]), self._sign(mark)
-            after = sight(self.scan, mark, start, _SETTLED_PX, sign, self.weights, match, frame_sigma)
+            after = sight(
+                self.scan, mark, start, _SETTLED_PX, sign, self.weights, match, frame_sigma, self.surroundings
+            )
             if after.fit is not None:
                 self.sightings[index] = replace(before, fit=after.fit)
         self.judge()
@@ -345,8 +354,9 @@ class _Sighter:
         return misfit
 
     def _sight(self, index: int, search_px: float, weights: Sequence[float] | None) -> Sighting:
-        mark = self.layout.marks[index].mark
-        sighting = sight(self.scan, mark, self._start(index), search_px, self._sign(mark), weights, self.options.match)
+        mark, start, match = self.layout.marks[index].mark, self._start(index), self.options.match
+        sign = self._sign(mark)
+        sighting = sight(self.scan, mark, start, search_px, sign, weights, match, surroundings=self.surroundings)
         fit = sighting.fit
         if fit is not None and (fit.likeness < _LEAST_LIKENESS or fit.significance < _LEAST_SIGNIFICANCE):
             reason = f"nothing within {search_px:.0f} px of its place looks like it"

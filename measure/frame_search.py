@@ -17,6 +17,7 @@ from measure.poses import POSES, up_from_camera
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
 from measure.status import Status
+from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
@@ -50,8 +51,10 @@ def expected_alike(
 class FrameSearch:
     """The search in one scan; it draws and correlates the marks once for hypotheses that share a drawing."""
 
-    def __init__(self, scan: Scan, layout: FiducialLayout, options: FiducialOptions) -> None:
-        self.scan, self.layout, self.options = scan, layout, options
+    def __init__(
+        self, scan: Scan, layout: FiducialLayout, options: FiducialOptions, surroundings: Surroundings = WIDE
+    ) -> None:
+        self.scan, self.layout, self.options, self.surroundings = scan, layout, options, surroundings
         self.poses = POSES if options.pose == "auto" else (options.pose,)
         self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
         self._drawn: tuple[Pair, Responses, tuple[int, ...]] | None = None
@@ -62,7 +65,8 @@ class FrameSearch:
         found: list[Placement] = []
         for hypothesis in hypotheses:
             if self._drawn is None or self._drawn[0] != hypothesis.drawn_mm:
-                self._drawn = (hypothesis.drawn_mm, *respond(self.scan, self._looks(hypothesis), self._signs))
+                looks = self._looks(hypothesis)
+                self._drawn = (hypothesis.drawn_mm, *respond(self.scan, looks, self._signs, self.surroundings))
             found += self._placements(hypothesis, *self._drawn[1:])
         return _best_first(found)
 

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.candidates import FAINT, flattened
+from measure.candidates import FAINT
 from measure.scan import Scan
+from measure.surroundings import WIDE
 
 Array = NDArray[np.float64]
 Window = NDArray[np.float32]
@@ -51,7 +52,7 @@ def about(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm: float, re
         2, 1, 1
     )
     sampled = ndimage.map_coordinates(fine, [row, col], order=1, mode="nearest").astype(np.float32)
-    return flattened(sampled, _DETAIL, scan.full_scale_dn * FAINT)
+    return WIDE.flattened(sampled, _DETAIL, scan.full_scale_dn * FAINT)
 
 
 def recurrence(reference: Window, others: Sequence[Window], size_mm: float) -> Recurrence:

@@ -15,6 +15,7 @@ from measure.frame_corner import corner_of_edges
 from measure.matching import Match, MatchOptions, match, window_about
 from measure.scan import Scan
 from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
+from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 
@@ -46,18 +47,19 @@ def sight(
     weights: Sequence[float] | None,
     options: MatchOptions,
     frame_sigma: float | None = None,
+    surroundings: Surroundings = WIDE,
 ) -> Sighting:
     """Look for the mark within search_px of its predicted place and match it there.
 
     pixel_from_mark: (2, 3), predicted. polarity: +1 for a mark lighter than its surroundings, -1 for a darker one.
     frame_sigma: standard deviation of the predicted rotation (rad) and scale, where a frame fitted to all marks gives
-    them.
+    them. surroundings: what about the mark counts where it is looked for.
     """
     predicted = pixel_from_mark[:, 2].copy()
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
         return Sighting(predicted, False, None, "its place is outside of the scan")
-    fit = _fitted(scan, mark, pixel_from_mark, search_px, polarity, weights, options, frame_sigma)
+    fit = _fitted(scan, mark, pixel_from_mark, search_px, polarity, weights, options, frame_sigma, surroundings)
     if fit is None:
         return Sighting(predicted, True, None, f"nothing within {search_px:.0f} px of its place looks like it")
     if not fit.converged:
@@ -95,11 +97,12 @@ def _fitted(
     weights: Sequence[float] | None,
     options: MatchOptions,
     frame_sigma: float | None,
+    surroundings: Surroundings,
 ) -> Match | None:
     """The mark matched where it looks most like itself; None where nothing looks like it."""
     if isinstance(mark, FrameCorner):
         return corner_of_edges(scan, mark, pixel_from_mark, search_px, polarity, weights)
-    center_px = seen(scan, mark, pixel_from_mark, search_px, polarity, weights)
+    center_px = seen(scan, mark, pixel_from_mark, search_px, polarity, weights, surroundings)
     if center_px is None:
         return None
     start = np.column_stack([pixel_from_mark[:, :2], center_px])

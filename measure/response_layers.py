@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.candidates import Map, peaks
+from measure.candidates import peaks
+from measure.surroundings import Map
 
 Array = NDArray[np.float64]
 

@@ -3,8 +3,8 @@
 import numpy as np
 from brute_marks import brute_picture
 
-from measure.candidates import correlated, flattened
 from measure.shapes import MarkShape, ring_cross
+from measure.surroundings import WIDE
 
 
 def test_a_faint_mark_beside_the_frames_edge_is_what_answers_most() -> None:
@@ -18,7 +18,7 @@ def test_a_faint_mark_beside_the_frames_edge_is_what_answers_most() -> None:
     grey += 6000.0 * brute_picture(mark, np.column_stack([linear, place]), 180, 180, 0.8)
     grey += rng.normal(0.0, 1000.0, grey.shape)
     template = brute_picture(mark, np.column_stack([linear, [12.0, 12.0]]), 25, 25, 0.6)
-    response = correlated(flattened(grey.astype(np.float32), 1.2, 130.0), template, 1.2)
+    response = WIDE.correlated(WIDE.flattened(grey.astype(np.float32), 1.2, 130.0), template, 1.2)
     row, col = np.unravel_index(int(response.argmax()), response.shape)
     assert abs(col + 12 - place[0]) <= 1
     assert abs(row + 12 - place[1]) <= 1
