@@ -93,8 +93,10 @@ def respond_about(
     shapes, shape_of = _distinct(_templates(looks, reduction))
     detail = _reduced_detail_px(looks[0], reduction)
     reach, half = int(np.ceil(reach_px / reduction)), max(template.shape[0] for template in shapes) // 2
-    corners, corner_of = np.unique(np.floor(places_px / reduction / _SHARED_PX), axis=0, return_inverse=True)
-    origins = corners.astype(int) * _SHARED_PX - reach
+    # Row by row: strips of the file that windows share are still decoded for the next one.
+    squares = np.floor(places_px[:, ::-1] / reduction / _SHARED_PX)
+    corners, corner_of = np.unique(squares, axis=0, return_inverse=True)
+    origins = corners[:, ::-1].astype(int) * _SHARED_PX - reach
     size = _SHARED_PX + 2 * reach
     kinds = sorted(set(zip(corner_of.tolist(), shape_of, strict=True)))
 

@@ -188,8 +188,11 @@ class _Sighter:
         self.weights = best_weights(self.scan, places)
 
     def look(self, indices: Sequence[int], search_px: float) -> None:
-        sighted = self.scan.each(lambda index: self._sight(index, search_px, self.weights), indices)
-        for index, sighting in zip(indices, sighted, strict=True):
+        # From below upwards: the search of windows ended there, and what it read last is still decoded.
+        rows = self._predicted_px()[:, 1]
+        upwards = sorted(indices, key=lambda index: -rows[index])
+        sighted = self.scan.each(lambda index: self._sight(index, search_px, self.weights), upwards)
+        for index, sighting in zip(upwards, sighted, strict=True):
             self.sightings[index] = sighting
 
     def look_astray(self, indices: Sequence[int]) -> None:
