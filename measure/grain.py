@@ -53,7 +53,10 @@ def grain_model(
     white_share, grain_share = fits[best][0]
     lags = grain_share * _kernel(GRAIN_PX[best])
     lags[REACH_PX, REACH_PX] += white_share
-    is_grain = blank is not None and len(blank) > 0 and GRAIN_PX[best] <= _COARSEST_PX
+    # A fit makes residuals less alike than the noise is. If they still are more alike than the coarsest grain, a
+    # landscape, whose like is not in the series, was taken for grain.
+    is_film = GRAIN_PX[best] <= _COARSEST_PX and neighbour_correlation < _kernel(_COARSEST_PX)[REACH_PX, REACH_PX + 1]
+    is_grain = blank is not None and len(blank) > 0 and bool(is_film)
     return NoiseModel(float(lags[REACH_PX, REACH_PX]), lags, neighbour_correlation, is_grain)
 
 
