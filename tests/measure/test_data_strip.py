@@ -13,6 +13,7 @@ from test_fiducials import ALIKE, PITCH_UM, frame_picture, pixel_from_camera
 from measure.data_strip import Beside, beside_frame, strip_likelihoods
 from measure.fiducials import measure_fiducials
 from measure.results import Pose
+from measure.shapes import Side
 
 SIZE_PX = 640
 MIDDLE = (SIZE_PX - 1) / 2
@@ -83,6 +84,6 @@ def test_only_writing_counts(tmp_path: Path) -> None:
 def test_what_the_scan_does_not_show_says_nothing() -> None:
     unseen = Beside(0, 0)
     assert unseen.log_odds == pytest.approx(0.0)
-    beside = {"left": unseen, "right": unseen, "top": unseen, "bottom": Beside(40, 40)}
-    by_pose = strip_likelihoods(beside, "left", ("0", "90", "180"), 0.01)  # type: ignore[arg-type]
+    beside: dict[Side, Beside] = {"left": unseen, "right": unseen, "top": unseen, "bottom": Beside(40, 40)}
+    by_pose = strip_likelihoods(beside, "left", ("0", "90", "180"), 0.01)
     assert by_pose == pytest.approx([np.log(0.01), 0.0, np.log(0.01)], abs=0.02)
