@@ -10,6 +10,7 @@ from measure.disks import PLAIN_MARGIN_PX, fit_disk
 from measure.fiducial_options import FiducialOptions
 from measure.frame import CLEAR_DAMAGE
 from measure.matching import match
+from measure.prediction import MarkPrediction
 from measure.refinement import sight
 from measure.status import Status
 from measure.targets import TargetPrediction, measure_disks
@@ -100,7 +101,7 @@ def measured(
     polarity = 1 if grey_is_light(mark, grey) else -1
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     options = FiducialOptions().match
-    fit = sight(scan, mark.kind.shape, start, SEARCH_PX, polarity, None, options, frame_sigma).fit
+    fit = sight(scan, MarkPrediction(mark.kind.shape, start, SEARCH_PX, polarity), options, frame_sigma).fit
     if fit is None:
         return None
     return Found(fit.center_px, fit.covariance_px2, "damaged" if fit.damaged_fraction > CLEAR_DAMAGE else "")

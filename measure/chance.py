@@ -14,8 +14,10 @@ from scipy import stats
 from measure.constellation import sign_of
 from measure.fiducial_options import FiducialOptions
 from measure.first_look import strongest
-from measure.frame import CLEAR_LIKENESS, REDUCED_PX, Frame
+from measure.frame import CLEAR_LIKENESS, Frame
 from measure.frame_search import FrameSearch
+from measure.frame_sighting import REDUCED_PX
+from measure.prediction import MarkPrediction
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
 
@@ -69,7 +71,8 @@ def _by_places_beside(
         mark = layout.marks[index].mark
         start = np.column_stack([frame.pixel_from_camera[:, :2], place])
         sign = sign_of(mark, frame.placement.polarity)
-        return strongest(scan, mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)[1]
+        expected = MarkPrediction(mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)
+        return strongest(scan, expected)[1]
 
     radius = REDUCED_PX * frame.placement.reduction + options.search_mm(layout) / float(
         np.mean(frame.placement.pitch_mm)

@@ -11,9 +11,10 @@ from measure.chance import doubt
 from measure.constellation import Placement
 from measure.edge_place import EdgePlace
 from measure.fiducial_options import FiducialOptions
-from measure.frame import Frame, measure_frame
+from measure.frame import Frame
 from measure.frame_fit import AFFINITY_SIGMA
 from measure.frame_search import FrameSearch
+from measure.frame_sighting import measure_frame
 from measure.learned import honest_covariance
 from measure.pitches import PitchHypothesis, pitch_hypotheses
 from measure.pose_decision import decide_pose

@@ -1,7 +1,6 @@
 """Where near its predicted place a mark looks most like itself, at full or half resolution, and whether noise would
 look so."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,11 +10,10 @@ from scipy import stats
 
 from measure.candidates import FAINT, detail_px
 from measure.matching import window_about
+from measure.prediction import MarkPrediction
 from measure.rendering import extent_px, picture
 from measure.response_layers import highest
 from measure.scan import Scan
-from measure.shapes import Mark
-from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -25,35 +23,19 @@ _HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows 
 _SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
 
 
-def seen(
-    scan: Scan,
-    mark: Mark,
-    pixel_from_mark: Array,
-    search_px: float,
-    polarity: int,
-    weights: Sequence[float] | None,
-    surroundings: Surroundings = WIDE,
-) -> Array | None:
+def seen(scan: Scan, expected: MarkPrediction) -> Array | None:
     """Column and row of the scan within the search radius where the mark correlates best, drawn sharp or else soft, to
     a part of a pixel; None where noise would do so as well."""
     for blur_px in (_SHARP_PX, _SOFT_PX):
-        look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, surroundings, blur_px)
+        look = _Look(scan, expected, blur_px)
         if look.chance() <= _CHANCE:
             return look.center_px
     return None
 
 
-def strongest(
-    scan: Scan,
-    mark: Mark,
-    pixel_from_mark: Array,
-    search_px: float,
-    polarity: int,
-    weights: Sequence[float] | None,
-    surroundings: Surroundings = WIDE,
-) -> tuple[Array, float]:
+def strongest(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
     """Column and row of the scan within the search radius where the mark correlates best, and how well."""
-    look = _Look(scan, mark, pixel_from_mark, search_px, polarity, weights, surroundings, _SHARP_PX)
+    look = _Look(scan, expected, _SHARP_PX)
     return look.center_px, look.height
 
 
@@ -64,21 +46,12 @@ class _Look:
     center_px: Array
     height: float
 
-    def __init__(
-        self,
-        scan: Scan,
-        mark: Mark,
-        pixel_from_mark: Array,
-        search_px: float,
-        polarity: int,
-        weights: Sequence[float] | None,
-        surroundings: Surroundings,
-        blur_px: float,
-    ) -> None:
-        reduction = 2 if detail_px(mark, pixel_from_mark[:, :2]) >= _HALVED_PX else 1
+    def __init__(self, scan: Scan, expected: MarkPrediction, blur_px: float) -> None:
+        mark, surroundings = expected.mark, expected.surroundings
+        reduction = 2 if detail_px(mark, expected.linear) >= _HALVED_PX else 1
         shift_px = (reduction - 1) / 2
-        reduced = np.column_stack([pixel_from_mark[:, :2], pixel_from_mark[:, 2] - shift_px]) / reduction
-        search_px, blur_px = search_px / reduction, blur_px / reduction
+        reduced = np.column_stack([expected.linear, expected.center_px - shift_px]) / reduction
+        search_px, blur_px = expected.search_px / reduction, blur_px / reduction
         spare = int(np.ceil(2 * blur_px))
         col0, row0, width, tall = window_about(mark, reduced, search_px + spare + 2)
         centred = np.column_stack([reduced[:, :2], np.zeros(2)])
@@ -88,8 +61,8 @@ class _Look:
         size = high - low + 1
         finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
         template = picture(mark, centred, int(size[0]), int(size[1]), blur_px)
-        window = scan.reduced_window(reduction, col0, row0, width, tall, weights)
-        self._flat = polarity * surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
+        window = scan.reduced_window(reduction, col0, row0, width, tall, expected.weights)
+        self._flat = expected.polarity * surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
         self._pattern, self._counts = surroundings.pattern(template, finest_px)
         response = surroundings.correlated(self._flat, template, finest_px)
         place = np.stack(np.meshgrid(*(np.arange(count, dtype=float) for count in response.shape[::-1])), axis=-1)

@@ -18,6 +18,7 @@ from scipy.special import erf
 from measure.candidates import FAINT
 from measure.matching import Match
 from measure.noise import robust_scale
+from measure.prediction import MarkPrediction
 from measure.robust import tukey_weights
 from measure.scan import Scan
 from measure.shapes import FrameCorner
@@ -54,18 +55,42 @@ class _Edge:
     count: int
 
 
-def corner_of_edges(
-    scan: Scan,
-    mark: FrameCorner,
-    pixel_from_mark: Array,
-    search_px: float,
-    polarity: int,
-    weights: Sequence[float] | None,
-) -> Match:
-    """The corner within search_px of the last column of pixel_from_mark (2, 3); polarity: +1 where the frame is lighter
-    than its border. Not converged, with a reason, where either edge is not to be seen."""
-    start = pixel_from_mark[:, 2]
-    inward = pixel_from_mark[:, :2] * np.array(mark.toward)  # columns: along x', y' into the frame, px per mm
+@dataclass(frozen=True, eq=False)
+class _Course:
+    """Where an edge is expected to run: from the start (2,) in the scan along, the frame's inside lying across, both
+    (2,) of length 1."""
+
+    scan: Scan
+    start: Array
+    along: Array
+    across: Array
+    weights: Sequence[float] | None
+
+    def profiles(self, middle: Array, offset: Array, share: float, half: float) -> tuple[Array, Mask]:
+        """(n, samples) grey values across the edge about an offset (n,), each the mean over its share of the edge, and
+        which of them lie in the scan."""
+        s = np.arange(-round(half / _STEP_PX), round(half / _STEP_PX) + 1) * _STEP_PX
+        run = np.linspace(-0.5, 0.5, max(int(share), 2), endpoint=False) * share
+        slope = np.gradient(offset, middle) if len(middle) > 1 else np.zeros(1)
+        t = middle[:, None, None] + run[:, None]
+        q = (offset[:, None] + slope[:, None] * run)[:, :, None] + s
+        places = (
+            self.start[:, None, None, None] + self.along[:, None, None, None] * t + self.across[:, None, None, None] * q
+        )
+        low = np.floor(places.min(axis=(1, 2, 3))).astype(int) - 2
+        size = np.ceil(places.max(axis=(1, 2, 3))).astype(int) + 3 - low
+        window = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
+        col, row = places - low[:, None, None, None]
+        grey = map_coordinates(window, [row, col], order=1, mode="nearest").mean(axis=1)
+        limit = np.array([self.scan.width_px, self.scan.height_px])[:, None, None, None] - 1
+        inside = ((places >= 0) & (places <= limit)).all(axis=(0, 2, 3))
+        return np.asarray(grey, dtype=float), np.asarray(inside)
+
+
+def corner_of_edges(scan: Scan, mark: FrameCorner, expected: MarkPrediction) -> Match:
+    """The mark, within the search radius of its predicted place, its frame being lighter than its border or darker as
+    the polarity says. Not converged, with a reason, where either edge is not to be seen."""
+    inward = expected.linear * np.array(mark.toward)  # columns: along x', y' into the frame, px per mm
     per_mm = np.hypot(*inward)
     unit = inward / per_mm
     edges = []
@@ -73,69 +98,32 @@ def corner_of_edges(
         along, across = unit[:, side], unit[:, 1 - side]
         reach = mark.reach_mm * per_mm[side]
         first = max(mark.radius_mm * per_mm[side], _ROUNDED * reach)
-        edge = _edge(scan, start, along, across, (first, reach), search_px, polarity, weights)
+        course = _Course(scan, expected.center_px, along, across, expected.weights)
+        edge = _edge(course, (first, reach), expected.search_px, expected.polarity)
         if edge is None:
-            return _missed(pixel_from_mark, "an edge of the frame is not to be seen there as one line")
+            return _missed(expected.pixel_from_mark, "an edge of the frame is not to be seen there as one line")
         edges.append(edge)
-    return _met(edges, unit, pixel_from_mark)
+    return _met(edges, unit, expected.pixel_from_mark)
 
 
-def _edge(
-    scan: Scan,
-    start: Array,
-    along: Array,
-    across: Array,
-    extent: tuple[float, float],
-    search_px: float,
-    polarity: int,
-    weights: Sequence[float] | None,
-) -> _Edge | None:
+def _edge(course: _Course, extent: tuple[float, float], search_px: float, polarity: int) -> _Edge | None:
     """The edge that runs along from the start, the frame's inside lying across."""
     share = (extent[1] - extent[0]) / _PROFILES
     middle: Array = np.asarray(extent[0] + share * (np.arange(_PROFILES) + 0.5), dtype=float)
     half = round(search_px + _THEN_PX)
-    near, inside = _profiles(scan, start, along, across, middle, np.zeros(_PROFILES), share, half, weights)
+    near, inside = course.profiles(middle, np.zeros(_PROFILES), share, half)
     near, middle = near[inside], middle[inside]
     if len(middle) < _LEAST_SHARE * _PROFILES:
         return None
     line = _straightest(near * polarity, middle, half)
-    found, _ = _profiles(scan, start, along, across, middle, line[0] + line[1] * middle, share, _THEN_PX, weights)
+    found, _ = course.profiles(middle, line[0] + line[1] * middle, share, _THEN_PX)
     steps = _fit_steps(found)
-    good = steps.good & (steps.contrast * polarity > FAINT * scan.full_scale_dn)
+    good = steps.good & (steps.contrast * polarity > FAINT * course.scan.full_scale_dn)
     good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
     if good.sum() < _LEAST_SHARE * _PROFILES:
         return None
     place = line[0] + line[1] * middle[good] + steps.place[good]
     return _line(middle[good], place, steps, good, len(middle))
-
-
-def _profiles(
-    scan: Scan,
-    start: Array,
-    along: Array,
-    across: Array,
-    middle: Array,
-    offset: Array,
-    share: float,
-    half: float,
-    weights: Sequence[float] | None,
-) -> tuple[Array, Mask]:
-    """(n, samples) grey values across the edge about an offset (n,), each the mean over its share of the edge, and
-    which of them lie in the scan."""
-    s = np.arange(-round(half / _STEP_PX), round(half / _STEP_PX) + 1) * _STEP_PX
-    run = np.linspace(-0.5, 0.5, max(int(share), 2), endpoint=False) * share
-    slope = np.gradient(offset, middle) if len(middle) > 1 else np.zeros(1)
-    t = middle[:, None, None] + run[:, None]
-    q = (offset[:, None] + slope[:, None] * run)[:, :, None] + s
-    places = start[:, None, None, None] + along[:, None, None, None] * t + across[:, None, None, None] * q
-    low = np.floor(places.min(axis=(1, 2, 3))).astype(int) - 2
-    size = np.ceil(places.max(axis=(1, 2, 3))).astype(int) + 3 - low
-    window = scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), weights)
-    col, row = places - low[:, None, None, None]
-    grey = map_coordinates(window, [row, col], order=1, mode="nearest").mean(axis=1)
-    limit = np.array([scan.width_px, scan.height_px])[:, None, None, None] - 1
-    inside = ((places >= 0) & (places <= limit)).all(axis=(0, 2, 3))
-    return np.asarray(grey, dtype=float), np.asarray(inside)
 
 
 def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:

@@ -6,7 +6,6 @@ Geometry of Random Fields, 1981: excursions of a Gaussian field), and so is, fro
 the mark from its true place.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,9 +14,9 @@ from numpy.typing import NDArray
 
 from measure.candidates import FAINT, detail_px
 from measure.matching import Match
+from measure.prediction import MarkPrediction
 from measure.rendering import extent_px, picture
 from measure.scan import Scan
-from measure.shapes import Mark
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -48,32 +47,23 @@ class Glimpse:
         return float(np.sqrt(np.linalg.eigvalsh(self.fit.covariance_px2)[-1]))
 
 
-def glimpse(
-    scan: Scan,
-    mark: Mark,
-    pixel_from_mark: Array,
-    reach_px: float,
-    polarity: int,
-    extreme_dn: float,
-    blur_px: float,
-    weights: Sequence[float] | None,
-) -> Glimpse | None:
-    """The strongest response to the mark within reach_px of its predicted place, None where there is no contrast.
+def glimpse(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> Glimpse | None:
+    """The strongest response to the mark within the search radius of its predicted place, None where there is no
+    contrast.
 
-    pixel_from_mark: (2, 3), predicted. polarity: +1 for a light mark, -1 for a dark one. extreme_dn: the lightest or
-    darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as light or as dark it does
-    not show.
+    extreme_dn: the lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as
+    light or as dark it does not show.
     """
-    field = _Field(scan, mark, pixel_from_mark, reach_px, polarity, extreme_dn, weights)
-    center, reach = pixel_from_mark[:, 2] - field.origin, reach_px
+    field = _Field(scan, expected, extreme_dn)
+    center, reach_px = expected.center_px - field.origin, expected.search_px
     response = field.response(center, blur_px)
     for _ in range(_ROUNDS):
         response = field.response(center, blur_px)
-        place = response.highest(center, reach)
+        place = response.highest(center, reach_px)
         if place is None:
             return None
-        center, reach = place, 1.5
-    return field.seen(response, center, pixel_from_mark, blur_px)
+        center, reach_px = place, 1.5
+    return field.seen(response, center, blur_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,32 +93,24 @@ class _Response:
 class _Field:
     """The window about a predicted place, freed of everything coarser than the mark's lines."""
 
-    def __init__(
-        self,
-        scan: Scan,
-        mark: Mark,
-        pixel_from_mark: Array,
-        reach_px: float,
-        polarity: int,
-        extreme_dn: float,
-        weights: Sequence[float] | None,
-    ) -> None:
-        self.mark, self.linear, self.polarity = mark, np.asarray(pixel_from_mark[:, :2]), polarity
-        self.coarse_px = _BACKGROUND * detail_px(mark, self.linear)
-        least, greatest = extent_px(mark, np.column_stack([self.linear, np.zeros(2)]))
+    def __init__(self, scan: Scan, expected: MarkPrediction, extreme_dn: float) -> None:
+        self.mark, self.linear, self.polarity = expected.mark, expected.linear, expected.polarity
+        self.predicted = expected.center_px
+        self.coarse_px = _BACKGROUND * detail_px(self.mark, self.linear)
+        least, greatest = extent_px(self.mark, np.column_stack([self.linear, np.zeros(2)]))
         self.half = int(np.ceil(max(-least.min(), greatest.max()) + 2 * self.coarse_px)) + 1
-        side = self.half + int(np.ceil(max(reach_px, _RING)))
-        first = np.floor(pixel_from_mark[:, 2]).astype(int) - side
+        side = self.half + int(np.ceil(max(expected.search_px, _RING)))
+        first = np.floor(self.predicted).astype(int) - side
         self.origin = first.astype(float)
-        grey = scan.window(int(first[0]), int(first[1]), 2 * side + 1, 2 * side + 1, weights)
+        grey = scan.window(int(first[0]), int(first[1]), 2 * side + 1, 2 * side + 1, expected.weights)
         inside = self._inside(scan, first, 2 * side + 1)
         ground = cv2.GaussianBlur(grey, (0, 0), self.coarse_px)
         detail = grey - ground
         spread = cv2.GaussianBlur(detail**2, (0, 0), _TEXTURE * self.coarse_px)
         self.texture_dn: Array = np.sqrt(spread + (FAINT * scan.full_scale_dn) ** 2)
-        self.room_dn = np.where(inside, np.maximum(polarity * (extreme_dn - ground), 0.0), 0.0).astype(np.float32)
+        self.room_dn = np.where(inside, np.maximum(self.polarity * (extreme_dn - ground), 0.0), 0.0).astype(np.float32)
         self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
-        self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * polarity, dtype=float)
+        self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
 
     def response(self, center: Array, blur_px: float) -> _Response:
         """The response to the mark as it looks with its centre where given between the pixels."""
@@ -139,7 +121,7 @@ class _Field:
         norm = np.sqrt(np.maximum(_correlated(self.room**2, template**2), 0.0) + 1e-6)
         return _Response(_correlated(self.detail * self.room, template) / norm, norm, template, fraction)
 
-    def seen(self, response: _Response, center: Array, pixel_from_mark: Array, blur_px: float) -> Glimpse | None:
+    def seen(self, response: _Response, center: Array, blur_px: float) -> Glimpse | None:
         """What the response at the mark's place is worth, against what the texture about it answers."""
         col, row = (int(index) for index in np.rint(center - response.fraction))
         patch = np.s_[row - self.half : row + self.half + 1, col - self.half : col + self.half + 1]
@@ -156,7 +138,7 @@ class _Field:
         slopes = np.asarray(np.cov(np.stack([by_col[texture], by_row[texture]])), dtype=float)
         scatter = float(np.sqrt(np.mean(response.value[texture] ** 2)))
         inverse, place = np.linalg.inv(bend), center + self.origin
-        distance_px = float(np.hypot(*(place - pixel_from_mark[:, 2])))
+        distance_px = float(np.hypot(*(place - self.predicted)))
         lines = np.abs(response.template)
         lit = lines * self.room[patch]
         fit = Match(

@@ -1,6 +1,5 @@
 """One mark, looked for about a predicted place at full resolution and matched."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,9 +12,9 @@ from measure.compression import with_loss
 from measure.first_look import seen
 from measure.frame_corner import corner_of_edges
 from measure.matching import Match, MatchOptions, match, window_about
+from measure.prediction import MarkPrediction
 from measure.scan import Scan
 from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
-from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 
@@ -38,42 +37,31 @@ class Sighting:
     reason: str = ""
 
 
-def sight(
-    scan: Scan,
-    mark: Mark,
-    pixel_from_mark: Array,
-    search_px: float,
-    polarity: int,
-    weights: Sequence[float] | None,
-    options: MatchOptions,
-    frame_sigma: float | None = None,
-    surroundings: Surroundings = WIDE,
-) -> Sighting:
-    """Look for the mark within search_px of its predicted place and match it there.
+def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None) -> Sighting:
+    """Look for the mark within the search radius of its predicted place and match it there.
 
-    pixel_from_mark: (2, 3), predicted. polarity: +1 for a mark lighter than its surroundings, -1 for a darker one.
     frame_sigma: standard deviation of the predicted rotation (rad) and scale, where a frame fitted to all marks gives
-    them. surroundings: what about the mark counts where it is looked for.
+    them.
     """
-    predicted = pixel_from_mark[:, 2].copy()
+    predicted = expected.center_px.copy()
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
         return Sighting(predicted, False, None, "its place is outside of the scan")
-    fit = _fitted(scan, mark, pixel_from_mark, search_px, polarity, weights, options, frame_sigma, surroundings)
+    fit = _fitted(scan, expected, options, frame_sigma)
     if fit is None:
-        return Sighting(predicted, True, None, f"nothing within {search_px:.0f} px of its place looks like it")
+        return Sighting(predicted, True, None, f"nothing within {expected.search_px:.0f} px of its place looks like it")
     if not fit.converged:
         return Sighting(predicted, True, None, fit.reason)
-    reason = _unlike(fit, predicted, search_px, polarity, scan.full_scale_dn)
+    reason = _unlike(fit, expected, scan.full_scale_dn)
     if reason:
         return Sighting(predicted, True, None, reason)
     return Sighting(predicted, True, replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn)))
 
 
-def _unlike(fit: Match, predicted_px: Array, search_px: float, polarity: int, full_scale_dn: float) -> str:
+def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> str:
     """Why what was fitted is no such mark; empty where it may be."""
-    off_px = float(np.hypot(*(fit.center_px - predicted_px)))
-    if off_px > search_px + _DRIFT_PX:
+    off_px = float(np.hypot(*(fit.center_px - expected.center_px)))
+    if off_px > expected.search_px + _DRIFT_PX:
         return f"what lies there is {off_px:.0f} px from its place"
     contrast = abs(fit.contrast_dn) / full_scale_dn
     if contrast < FAINT:
@@ -83,29 +71,20 @@ def _unlike(fit: Match, predicted_px: Array, search_px: float, polarity: int, fu
             "what lies there is far wider than the mark's lines: as fine as these, it would have "
             f"{contrast:.1f} times the contrast that a scan can show"
         )
-    if fit.contrast_dn * polarity <= 0:
+    if fit.contrast_dn * expected.polarity <= 0:
         return "what lies there has the other polarity"
     return ""
 
 
-def _fitted(
-    scan: Scan,
-    mark: Mark,
-    pixel_from_mark: Array,
-    search_px: float,
-    polarity: int,
-    weights: Sequence[float] | None,
-    options: MatchOptions,
-    frame_sigma: float | None,
-    surroundings: Surroundings,
-) -> Match | None:
+def _fitted(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None) -> Match | None:
     """The mark matched where it looks most like itself; None where nothing looks like it."""
+    mark, weights = expected.mark, expected.weights
     if isinstance(mark, FrameCorner):
-        return corner_of_edges(scan, mark, pixel_from_mark, search_px, polarity, weights)
-    center_px = seen(scan, mark, pixel_from_mark, search_px, polarity, weights, surroundings)
+        return corner_of_edges(scan, mark, expected)
+    center_px = seen(scan, expected)
     if center_px is None:
         return None
-    start = np.column_stack([pixel_from_mark[:, :2], center_px])
+    start = expected.moved(center_px).pixel_from_mark
     col0, row0, width, tall = window_about(mark, start, options.margin_px + BESIDE_PX)
     window = scan.window(col0, row0, width, tall, weights).astype(float)
     valid = _inside_scan(scan, col0, row0, width, tall)

@@ -7,6 +7,7 @@ from true_marks import KIND, TrueMark, scan_of, some_mark, whitened_rms
 from measure.clipping import censored, clipped_sides
 from measure.fiducial_options import FiducialOptions
 from measure.matching import Match
+from measure.prediction import MarkPrediction
 from measure.refinement import sight
 
 FULL, CONTRAST = 65535.0, 20000.0
@@ -22,7 +23,9 @@ def dark_mark(name: str, beyond: float, snr: float, rng: np.random.Generator) ->
 def sighted(mark: TrueMark, grey: np.ndarray, polarity: int = -1) -> Match:
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
-    fit = sight(scan_of(grey), mark.kind.shape, start, 3.0, polarity, None, FiducialOptions().match, frame_sigma).fit
+    fit = sight(
+        scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, polarity), FiducialOptions().match, frame_sigma
+    ).fit
     assert fit is not None
     return fit
 
@@ -80,7 +83,7 @@ def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
         sides = clipped_sides(scan, 0, 0, mark.size, mark.size, None)
         np.testing.assert_array_equal(sides == 1, np.rint(natural) >= 250)
         start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
-        fit = sight(scan, mark.kind.shape, start, 3.0, -1, None, FiducialOptions().match, mark.kind.known).fit
+        fit = sight(scan, MarkPrediction(mark.kind.shape, start, 3.0, -1), FiducialOptions().match, mark.kind.known).fit
         assert fit is not None
         error = fit.center_px - mark.place[:, 2]
         assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand

@@ -7,6 +7,7 @@ from true_marks import KIND, scan_of, some_mark
 
 from measure.fiducial_options import FiducialOptions
 from measure.first_look import seen
+from measure.prediction import MarkPrediction
 from measure.refinement import sight
 from measure.shapes import MarkShape, cross
 
@@ -22,7 +23,7 @@ def test_noise_is_rarely_worth_a_fit_however_coarse_it_is(texture_px: float) -> 
         noise = rng.standard_normal((mark.size, mark.size))
         if texture_px:
             noise = gaussian_filter(noise, texture_px) * texture_px * 3
-        answers += seen(scan_of(GROUND + 3000 * noise), mark.kind.shape, mark.place, 3.0, 1, None) is not None
+        answers += seen(scan_of(GROUND + 3000 * noise), MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)) is not None
     assert answers <= 13  # of sixty at a twentieth, sharp or soft: more in one run of a thousand
 
 
@@ -32,7 +33,7 @@ def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
         mark = some_mark(KIND["gap cross"], 2.5, rng)
         grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 5)
         start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
-        fit = sight(scan_of(grey), mark.kind.shape, start, 3.0, 1, None, FiducialOptions().match).fit
+        fit = sight(scan_of(grey), MarkPrediction(mark.kind.shape, start, 3.0, 1), FiducialOptions().match).fit
         assert fit is not None
         error = fit.center_px - mark.place[:, 2]
         assert error @ np.linalg.solve(fit.covariance_px2, error) < 13.8  # one in a thousand
@@ -43,5 +44,5 @@ def test_a_line_far_thinner_than_a_pixel_is_looked_for_without_complaint() -> No
     mark = MarkShape(cross(1.5, 0.06), "dark")
     noise = np.random.default_rng(3).standard_normal((60, 60))
     place = np.array([[1.5, 0.0, 30.0], [0.0, -1.5, 30.0]])  # 0.67 mm a pixel
-    sighting = sight(scan_of(GROUND + 3000 * noise), mark, place, 3.0, -1, None, FiducialOptions().match)
+    sighting = sight(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1), FiducialOptions().match)
     assert sighting.fit is None or sighting.fit.likeness < 1.0

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.frame_corner import corner_of_edges
+from measure.prediction import MarkPrediction
 from measure.shapes import FiducialLayout, LayoutMark, frame_corner
 from measure.status import Status
 
@@ -81,6 +82,7 @@ def test_no_corner_is_seen_in_a_landscape(tmp_path: Path) -> None:
     land = 15000 + 3000 * gaussian_filter(np.random.default_rng(3).normal(0, 1, (400, 400)), 3.0) / 0.09
     start = np.column_stack([MATRIX[:, :2], (200.0, 200.0)])
     with scan_of(np.asarray(land), tmp_path) as scan:
-        fit = corner_of_edges(scan, frame_corner((-10.0, 10.0), 5.0), start, 10.0, 1, None)
+        corner = frame_corner((-10.0, 10.0), 5.0)
+        fit = corner_of_edges(scan, corner, MarkPrediction(corner, start, 10.0, 1))
     assert not fit.converged
     assert "edge of the frame" in fit.reason

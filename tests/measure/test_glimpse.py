@@ -7,6 +7,7 @@ from brute_marks import Array, brute_picture, scan_of
 from scipy.ndimage import gaussian_filter
 
 from measure.glimpse import Glimpse, glimpse
+from measure.prediction import MarkPrediction
 from measure.shapes import MarkShape, cross
 
 CROSS = MarkShape(cross(0.5, 0.05), "dark")
@@ -29,7 +30,10 @@ def places(seed: int) -> Array:
 
 def seen_at(grey: Array, predicted: Array, folder: Path) -> list[Glimpse | None]:
     with scan_of(grey, folder) as scan:
-        return [glimpse(scan, CROSS, np.column_stack([LINEAR, place]), 3.0, -1, 0.0, 0.7, None) for place in predicted]
+        return [
+            glimpse(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1), 0.0, 0.7)
+            for place in predicted
+        ]
 
 
 def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma(tmp_path: Path) -> None:

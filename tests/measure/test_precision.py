@@ -18,6 +18,7 @@ from measure.disks import fit_disk
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.matching import Match
+from measure.prediction import MarkPrediction
 from measure.refinement import sight
 from measure.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
 
@@ -28,7 +29,7 @@ def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
     scan, options = scan_of(grey, rounding_step_dn=rounding_step_dn), FiducialOptions().match
-    fit = sight(scan, mark.kind.shape, start, 3.0, 1, None, options, frame_sigma).fit
+    fit = sight(scan, MarkPrediction(mark.kind.shape, start, 3.0, 1), options, frame_sigma).fit
     assert fit is not None
     return fit
 
@@ -112,6 +113,6 @@ def test_lines_far_wider_than_the_mark_s_are_not_the_mark() -> None:
     wide, fine = (MarkShape(cross(1.5, line_mm)) for line_mm in (0.5, 0.03))
     mark = TrueMark(Kind("wide cross", wide), np.array([[10.0, 0.0, 40.3], [0.0, -10.0, 39.8]]), 81, 3.0)
     grey = 30 + 200 * mark.picture + np.random.default_rng(1).normal(0, 3, mark.picture.shape)
-    sighting = sight(scan_of(grey, 255), fine, mark.place, 3.0, 1, None, FiducialOptions().match)
+    sighting = sight(scan_of(grey, 255), MarkPrediction(fine, mark.place, 3.0, 1), FiducialOptions().match)
     assert sighting.fit is None
     assert "far wider than the mark's lines" in sighting.reason
