@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from concurrent.futures import Future
+from itertools import product
 from threading import Lock
 
 from measure.radiometry import Samples
@@ -30,18 +31,31 @@ class SegmentCache:
         return self._limit // self._row_bytes
 
     def fill(self, samples: Samples, row0: int, col0: int) -> None:
-        """Samples (height, width, channels) of the picture from a row and column on."""
+        """Samples (height, width, channels) of the picture from a row and column on. Segments that other threads are
+        decoding come last: there may be more to decode meanwhile."""
         tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
         height, width, _ = samples.shape
-        for i in range(row0 // tall, (row0 + height - 1) // tall + 1):
-            for j in range(col0 // wide, (col0 + width - 1) // wide + 1):
-                row, col = i * tall - row0, j * wide - col0
-                part = self.read(i, j)[max(-row, 0) : height - row, max(-col, 0) : width - col]
-                row, col = max(row, 0), max(col, 0)
-                samples[row : row + part.shape[0], col : col + part.shape[1]] = part
+        rows = range(row0 // tall, (row0 + height - 1) // tall + 1)
+        cols = range(col0 // wide, (col0 + width - 1) // wide + 1)
 
-    def read(self, row: int, column: int) -> Samples:
-        """Segment (row, column) of the grid."""
+        def take(i: int, j: int, segment: Samples) -> None:
+            row, col = i * tall - row0, j * wide - col0
+            part = segment[max(-row, 0) : height - row, max(-col, 0) : width - col]
+            row, col = max(row, 0), max(col, 0)
+            samples[row : row + part.shape[0], col : col + part.shape[1]] = part
+
+        others: list[tuple[int, int, Future[Samples]]] = []
+        for i, j in product(rows, cols):
+            segment = self._segment(i, j)
+            if segment.done():
+                take(i, j, segment.result())
+            else:
+                others.append((i, j, segment))
+        for i, j, segment in others:
+            take(i, j, segment.result())
+
+    def _segment(self, row: int, column: int) -> "Future[Samples]":
+        """Segment (row, column) of the grid, decoded here unless another thread has begun to."""
         key = (row, column)
         with self._lock:
             known = self._decoded.get(key)
@@ -49,9 +63,12 @@ class SegmentCache:
                 own = self._decoded[key] = Future()
             else:
                 self._decoded.move_to_end(key)
-        return known.result() if known is not None else self._read(key, own)
+        if known is not None:
+            return known
+        self._decode(key, own)
+        return own
 
-    def _read(self, key: tuple[int, int], own: "Future[Samples]") -> Samples:
+    def _decode(self, key: tuple[int, int], own: "Future[Samples]") -> None:
         try:
             samples = self._segments.read(*key)
         except BaseException as error:
@@ -64,7 +81,6 @@ class SegmentCache:
             self._held += samples.nbytes
             while self._held > self._limit and (oldest := self._oldest_but(key)):
                 self._held -= self._decoded.pop(oldest).result().nbytes
-        return samples
 
     def _oldest_but(self, key: tuple[int, int]) -> tuple[int, int] | None:
         """Of the segments that are decoded, the one that was wanted longest ago, and is not of this key."""
