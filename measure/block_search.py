@@ -18,7 +18,7 @@ from measure.scan import Scan
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-WIDEST_PX, TALLEST_PX = 8192, 1024  # of a block
+ROW_BYTES, BLOCK_BYTES = 1 << 14, 1 << 24  # of a block at most, but that strips are taken whole: a margin comes on top
 
 Confirmed = Callable[[Block, list[Candidate]], list[Candidate]]
 
@@ -66,11 +66,13 @@ def block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:
     """Width and height of blocks, in whole units. What all threads have in work stays decoded, so that neighbours
     decode no more than their share; strips are taken whole."""
     tall, wide = scan.segment_px
-    width = scan.width_px if wide >= scan.width_px else even_part(scan.width_px, WIDEST_PX, unit)
-    if tall >= scan.height_px:  # is decoded at once, and held
-        return width, even_part(scan.height_px, TALLEST_PX, unit)
-    kept = (scan.rows_kept * scan.width_px // width - tall) // max(cv2.getNumThreads(), 1) - 2 * margin
-    return width, even_part(scan.height_px, min(max(kept, 2 * margin), TALLEST_PX), unit)
+    pixel = scan.channels * np.dtype(scan.samples_dtype).itemsize
+    width = scan.width_px if wide >= scan.width_px else even_part(scan.width_px, ROW_BYTES // pixel, unit)
+    tallest = max(BLOCK_BYTES // (width * pixel), 1)
+    if tall < scan.height_px:  # else all is decoded at once, and held
+        kept = (scan.rows_kept * scan.width_px // width - tall) // max(cv2.getNumThreads(), 1) - 2 * margin
+        tallest = min(max(kept, 2 * margin), tallest)
+    return width, even_part(scan.height_px, tallest, unit)
 
 
 def even_part(size: int, most: int, unit: int) -> int:

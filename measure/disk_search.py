@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.block import Block
-from measure.block_search import WIDEST_PX, search_blocks
+from measure.block_search import search_blocks
 from measure.disk_batch import disks_among
 from measure.disk_patches import Candidate, DiskSearch, margin_px, patches
 from measure.disks import FittedDisk, fit_disk
@@ -18,6 +18,7 @@ Image = NDArray[np.float32]
 
 SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk stands out by a tenth less
 SIZE_TOLERANCE = 1.4  # of what is found, to the sizes that are looked for
+WIDEST_PX = 6144  # of what is looked at in one piece
 SEARCH_RADIUS_PX = 2.0  # reduced so far that the smallest disk of an octave has at least this radius
 
 

@@ -1,7 +1,7 @@
 """The segments of a scan decoded last, for all threads that read it."""
 
 from collections import OrderedDict
-from concurrent.futures import Future
+from dataclasses import dataclass, field
 from itertools import product
 from threading import Lock
 
@@ -9,6 +9,14 @@ from measure.radiometry import Samples
 from measure.segments import Segments
 
 CACHE_BYTES = 40 << 20
+
+
+@dataclass(eq=False)
+class _Segment:
+    """samples: None until the thread that decodes them, which holds the lock, is done."""
+
+    samples: Samples | None = None
+    lock: Lock = field(default_factory=Lock)
 
 
 class SegmentCache:
@@ -22,7 +30,7 @@ class SegmentCache:
         tall = min(2 * segments.segment_height_px, segments.height_px)
         self._limit = max(CACHE_BYTES, tall * self._row_bytes)
         self._held = 0
-        self._decoded: OrderedDict[tuple[int, int], Future[Samples]] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, int], _Segment] = OrderedDict()
         self._lock = Lock()
 
     @property
@@ -38,50 +46,43 @@ class SegmentCache:
         rows = range(row0 // tall, (row0 + height - 1) // tall + 1)
         cols = range(col0 // wide, (col0 + width - 1) // wide + 1)
 
-        def take(i: int, j: int, segment: Samples) -> None:
+        def take(i: int, j: int, decoded: Samples) -> None:
             row, col = i * tall - row0, j * wide - col0
-            part = segment[max(-row, 0) : height - row, max(-col, 0) : width - col]
+            part = decoded[max(-row, 0) : height - row, max(-col, 0) : width - col]
             row, col = max(row, 0), max(col, 0)
             samples[row : row + part.shape[0], col : col + part.shape[1]] = part
 
-        others: list[tuple[int, int, Future[Samples]]] = []
-        for i, j in product(rows, cols):
-            segment = self._segment(i, j)
-            if segment.done():
-                take(i, j, segment.result())
+        others: list[tuple[tuple[int, int], _Segment]] = []
+        for key in product(rows, cols):
+            segment = self._segment(key)
+            if segment.samples is None and segment.lock.locked():
+                others.append((key, segment))
             else:
-                others.append((i, j, segment))
-        for i, j, segment in others:
-            take(i, j, segment.result())
+                take(*key, self._decoded(key, segment))
+        for key, segment in others:
+            take(*key, self._decoded(key, segment))
 
-    def _segment(self, row: int, column: int) -> "Future[Samples]":
-        """Segment (row, column) of the grid, decoded here unless another thread has begun to."""
-        key = (row, column)
+    def _segment(self, key: tuple[int, int]) -> _Segment:
+        """Of the grid, by row and column."""
         with self._lock:
-            known = self._decoded.get(key)
-            if known is None:
-                own = self._decoded[key] = Future()
-            else:
-                self._decoded.move_to_end(key)
-        if known is not None:
-            return known
-        self._decode(key, own)
-        return own
+            segment = self._kept.setdefault(key, _Segment())
+            self._kept.move_to_end(key)
+        return segment
 
-    def _decode(self, key: tuple[int, int], own: "Future[Samples]") -> None:
-        try:
-            samples = self._segments.read(*key)
-        except BaseException as error:
-            with self._lock:
-                del self._decoded[key]
-            own.set_exception(error)
-            raise
-        own.set_result(samples)
+    def _decoded(self, key: tuple[int, int], segment: _Segment) -> Samples:
+        """Decoded here unless another thread has begun to."""
+        with segment.lock:
+            samples = segment.samples
+            if samples is None:
+                samples = segment.samples = self._segments.read(*key)
+                self._make_room(samples.nbytes)
+        return samples
+
+    def _make_room(self, added: int) -> None:
+        """For so many bytes, from the segments that were wanted longest ago."""
         with self._lock:
-            self._held += samples.nbytes
-            while self._held > self._limit and (oldest := self._oldest_but(key)):
-                self._held -= self._decoded.pop(oldest).result().nbytes
-
-    def _oldest_but(self, key: tuple[int, int]) -> tuple[int, int] | None:
-        """Of the segments that are decoded, the one that was wanted longest ago, and is not of this key."""
-        return next((other for other, segment in self._decoded.items() if other != key and segment.done()), None)
+            self._held += added
+            while self._held > self._limit:
+                oldest, samples = next((key, own.samples) for key, own in self._kept.items() if own.samples is not None)
+                self._held -= samples.nbytes
+                del self._kept[oldest]

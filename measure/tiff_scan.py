@@ -4,6 +4,7 @@ import logging
 import struct
 from mmap import ACCESS_READ, ALLOCATIONGRANULARITY, mmap
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,6 @@ from measure.segments import Segments
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
 
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
-UNCOMPRESSED = 1
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
 JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
 MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time
@@ -146,6 +146,7 @@ class TiffSegments:
 
     def __init__(self, file: TiffFile, page: TiffPage, path: Path) -> None:
         self._file, self._page, self._path = file, page, path
+        self._reading = Lock()
         self._radiometry = page_radiometry(page, path)
         self.rounding_step_dn = page_rounding_step_dn(file, page)
         self.channels, self.full_scale_dn = self._radiometry.channels, self._radiometry.full_scale_dn
@@ -175,7 +176,7 @@ class TiffSegments:
         """(height, width, samples) of the stored numbers; a tile that was left out of the file is all zeros."""
         page = self._page
         try:
-            data = self._mapped(index) if page.databytecounts[index] else None
+            data = self._stored(index) if page.databytecounts[index] else None
             decoded, _, shape = page.decode(data, index, jpegtables=page.jpegtables, jpegheader=page.jpegheader)
         except DECODING_ERRORS as error:
             raise broken(self._path, f"tile or strip {index}: {error}") from error
@@ -184,15 +185,13 @@ class TiffSegments:
         if decoded is None:
             return np.zeros(shape[1:], page.dtype)
         samples: NDArray[np.generic] = np.asarray(decoded)[0]
-        return samples.copy() if page.compression == UNCOMPRESSED else samples  # it would keep the file mapped
+        return samples
 
-    def _mapped(self, index: int) -> memoryview:
-        """A tile or strip as the file has it, which no thread copies or waits for."""
-        offset = self._page.dataoffsets[index]
-        before = offset % ALLOCATIONGRANULARITY
-        size = before + self._page.databytecounts[index]
-        mapped = mmap(self._file.filehandle.fileno(), size, access=ACCESS_READ, offset=offset - before)
-        return memoryview(mapped)[before:]
+    def _stored(self, index: int) -> bytes:
+        """A tile or strip as the file has it."""
+        with self._reading:
+            self._file.filehandle.seek(self._page.dataoffsets[index])
+            return self._file.filehandle.read(self._page.databytecounts[index])
 
     def close(self) -> None:
         self._file.close()

@@ -326,8 +326,8 @@ class Watched:
 def test_a_search_by_blocks_decodes_each_segment_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr("measure.block_search.TALLEST_PX", 40)
-    monkeypatch.setattr("measure.block_search.WIDEST_PX", 50)
+    monkeypatch.setattr("measure.block_search.BLOCK_BYTES", 40 * 100)
+    monkeypatch.setattr("measure.block_search.ROW_BYTES", 100)
     tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", compression="lzw", **layout)
     with open_scan(tmp_path / "s.tif") as scan:
         reads: list[tuple[int, ...]] = []
@@ -351,7 +351,8 @@ def test_the_cache_keeps_to_its_limit_and_holds_two_rows_of_tiles(
     with open_scan(tmp_path / "s.tif") as scan:
         np.testing.assert_array_equal(scan.window(0, 0, WIDTH, HEIGHT), picture())
         assert scan._cache._held <= 2 * 32 * WIDTH * 2
-        assert scan._cache._held == sum(own.result().nbytes for own in scan._cache._decoded.values())
+        kept = [own.samples for own in scan._cache._kept.values() if own.samples is not None]
+        assert scan._cache._held == sum(samples.nbytes for samples in kept)
 
 
 def test_a_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:
