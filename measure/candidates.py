@@ -5,6 +5,7 @@ A mark alone gives false answers on every film, so nothing is decided here: the 
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from measure.shapes import Mark, thinnest_mm
 from measure.surroundings import WIDE, Map, Surroundings
 
 Array = NDArray[np.float64]
+Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
 
 _EXTENT_PX = 14.0  # of the reduced mark
 _THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns
@@ -170,19 +172,22 @@ def _templates(looks: Sequence[Look], reduction: int) -> list[Array]:
         if look.mark not in drawn:
             drawn[look.mark] = look.linear, _template(look, reduction)
         linear, template = drawn[look.mark]
-        turned = _turned(template, look.linear @ np.linalg.inv(linear))
-        shown[key] = _template(look, reduction) if turned is None else turned
+        turn = look.linear @ np.linalg.inv(linear)
+        shown[key] = quarter_turned(template, turn) if _is_quarter(turn) else _template(look, reduction)
     return [shown[look.mark, look.linear.tobytes()] for look in looks]
 
 
-def _turned(template: Array, turn: Array) -> Array | None:
-    """The picture under a turn (2, 2) by quarters, after a mirror if there is one; None where it is no such turn."""
+def quarter_turned(image: Grid, turn: Array) -> Grid:
+    """The image under a turn (2, 2) of its columns and rows by whole quarters, after a mirror if there is one."""
     whole = np.rint(turn)
-    if not np.allclose(turn, whole, atol=1e-9) or not np.array_equal(np.abs(whole).sum(axis=0), [1, 1]):
-        return None
-    turned = template if whole[0, 0] else template.T
+    turned = image if whole[0, 0] else image.T
     across, down = whole.sum(axis=1)
     return np.ascontiguousarray(turned[:: int(down), :: int(across)])
+
+
+def _is_quarter(turn: Array) -> bool:
+    whole = np.rint(turn)
+    return bool(np.allclose(turn, whole, atol=1e-9) and np.array_equal(np.abs(whole).sum(axis=0), [1, 1]))
 
 
 def _template(look: Look, reduction: int) -> Array:

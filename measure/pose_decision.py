@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.candidates import detail_px
 from measure.constellation import Placement
 from measure.data_strip import Beside, beside_frame, side_in_scan, strip_likelihoods
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
 from measure.frame_fit import FrameFit, fit_frame
 from measure.matching import Match
-from measure.pose_pictures import SPOILT, Shown, Site
+from measure.pose_pictures import SPOILT, Drawings, Shown, Site
 from measure.poses import up_from_camera
 from measure.results import Pose
 from measure.scan import Scan
@@ -62,11 +61,13 @@ def decide_pose(
     ]
     if not named:
         return _decision([], layout)
-    finest_px = min(detail_px(mark.mark, frame.pixel_from_camera[:, :2]) for mark in layout.marks)
-    sites = [Site(scan, fit, fit.center_px, frame.weights, finest_px) for fit in seen]
+    scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(up_from_camera(frame.placement.pose))
+    blur_px = float(np.median([fit.blur_px for fit in seen]))
+    drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
+    sites = [Site(scan, fit, fit.center_px, frame.weights, drawings) for fit in seen]
     # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
     usual = sorted(seen, key=lambda fit: abs(fit.contrast_dn))[len(seen) // 2]
-    sites += [Site(scan, usual, place, frame.weights, finest_px) for place in missed]
+    sites += [Site(scan, usual, place, frame.weights, drawings) for place in missed]
 
     def of_site(index: int) -> Array:
         return sites[index].likelihoods([each.shown(index, layout) for each in named])
@@ -106,7 +107,6 @@ class _Named:
     pose: str
     names: tuple[int, ...]
     fit: FrameFit | None
-    linear: Array
 
     @classmethod
     def of(
@@ -129,7 +129,7 @@ class _Named:
             return None
         near, centers = near[: len(seen)], centers[: len(seen)]
         if near.sum() < 2:
-            alone = cls(placement.pose, tuple(names.tolist()), None, placement.pixel_from_camera[:, :2])
+            alone = cls(placement.pose, tuple(names.tolist()), None)
             return alone if len(seen) < 2 else None
         own = names[: len(seen)][near]
         given = np.array([min(max(layout.marks[name].sigma_mm), 1e3) for name in own])
@@ -137,11 +137,11 @@ class _Named:
         sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
         up = centers[near] * pitch * (1.0, -1.0)
         fit = fit_frame(camera[own], up, sigma, up_from_camera(placement.pose))
-        linear = np.diag([1.0, -1.0]) @ fit.up_from_camera[:, :2] / pitch[:, None]
-        return cls(placement.pose, tuple(names.tolist()), fit, linear)
+        return cls(placement.pose, tuple(names.tolist()), fit)
 
     def shown(self, site: int, layout: FiducialLayout) -> Shown:
-        return Shown(None if self.names[site] < 0 else layout.marks[self.names[site]].mark, self.linear)
+        name = self.names[site]
+        return Shown(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
 
     def verdict(self, pictures: Array) -> _Verdict:
         """The coordinates' likelihood is Student's: nobody knows the film's standard deviation well."""

@@ -1,70 +1,92 @@
 """What a found mark's picture says of which of the camera's marks it is, in whichever direction a pose shows it."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.candidates import detail_px, quarter_turned
 from measure.matching import Match
 from measure.noise import robust_scale
 from measure.rendering import chip_mask, extent_px, picture
 from measure.robust import tukey_weights
-from measure.scan import Scan
-from measure.shapes import Bar, Mark, MarkShape, MarkTemplate, Polygon
+from measure.scan import Scan, means
+from measure.shapes import Mark, MarkTemplate
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
 
 _ALIKE = 0.05  # of the contrast: pictures that differ nowhere by more are one
-_SAME_PX = 0.1  # poses whose parts lie no farther apart show one drawing
-_CELLS = 2  # along a pixel's side: pictures right to a hundredth
-_FINEST_PX = 3.0  # of the finest line, once the scan is reduced
+_FINEST_PX = 3.0  # of the finest line on the grid
+_CUBIC_PX = 3.0  # that an interpolation asks beyond its last place
 _ABOUT_PX = 3.0  # how far about the drawings the ground tells of its grey value
 _PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
 _OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
 _ROUNDS = 4  # of robust weights
+_FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
 SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark feigns or hides what tells marks apart
+
+
+_BARE = np.zeros((1, 1)), np.ones((1, 1), dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A mark as a pose shows it at a site: linear, the (2, 2) part of pixel_from_mark. None: bare ground."""
+    """A mark as a pose shows it at a site: turn (2, 2), from its x and y to right and up. None: bare ground."""
 
     mark: Mark | None
-    linear: Array
+    turn: Array
+
+
+class Drawings:
+    """A camera's marks on a grid that lies upright in the frame, where poses turn and mirror them by whole quarters: so
+    each is drawn once. The grid is coarser than the scan, as far as the finest line of the marks allows: what tells
+    them apart is coarser."""
+
+    def __init__(self, marks: Collection[Mark], scan_from_up: Array, blur_px: float) -> None:
+        """scan_from_up (2, 2): px of the scan from mm right and up in the frame; blur_px: of the scan."""
+        finest_px = min(detail_px(mark, scan_from_up) for mark in marks)
+        self.reduction = max(1, int(finest_px / _FINEST_PX))
+        per_mm = float(np.sqrt(abs(np.linalg.det(scan_from_up)))) / self.reduction
+        grid_from_up = per_mm * _FLIP
+        self.scan_from_grid = scan_from_up @ np.linalg.inv(grid_from_up)
+        self._drawn = {mark: _drawn(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}
+
+    def seen(self, shown: Sequence[Shown]) -> list[tuple[Array, Mask]]:
+        """What each pose shows at a place, which is in the middle: the picture (size, size), and where it tells the
+        grey values."""
+        drawn = [_BARE if each.mark is None else self._drawn[each.mark] for each in shown]
+        half = max(len(own) // 2 for own, _ in drawn)
+        turns = [_FLIP @ each.turn @ _FLIP for each in shown]
+        return [
+            (_wider(quarter_turned(own, turn), half), _wider(quarter_turned(told, turn), half))
+            for (own, told), turn in zip(drawn, turns, strict=True)
+        ]
 
 
 class Site:
-    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark. The scan
-    is looked at reduced, as far as the finest line of the marks allows: what tells them apart is coarser."""
+    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark."""
 
     def __init__(
-        self, scan: Scan, like: Match, center_px: Array, weights: Sequence[float] | None, finest_px: float
+        self, scan: Scan, like: Match, center_px: Array, weights: Sequence[float] | None, drawings: Drawings
     ) -> None:
-        """finest_px: how wide the finest line of all marks is in the scan."""
-        self.scan, self.weights = scan, weights
-        self.reduction = max(1, int(finest_px / _FINEST_PX))
-        self.center_px = (center_px - (self.reduction - 1) / 2) / self.reduction
+        self.scan, self.center_px, self.weights, self.drawings = scan, center_px, weights, drawings
         self.sign = np.sign(like.contrast_dn)
-        self.blur_px = like.blur_px / self.reduction
-        self.noise_dn = like.noise_dn / self.reduction
+        self.noise_dn = like.noise_dn / drawings.reduction
 
     def likelihoods(self, shown: Sequence[Shown]) -> Array:
         """The log-likelihood of the picture under what each pose shows here, up to a constant: 0 for the best, and no
         less than the probability that something else spoils the picture."""
-        looks, look_of = _looks([replace(each, linear=each.linear / self.reduction) for each in shown])
-        if len(looks) == 1:
+        seen = self.drawings.seen(shown)
+        pictures, picture_of = _distinct([own for own, _ in seen])
+        if len(pictures) == 1:
             return np.zeros(len(shown))
-        reach = max(_reach_px(each) for each in looks) + 2 * _ABOUT_PX
-        col0, row0 = np.floor(self.center_px - reach).astype(int)
-        size = int(np.ceil(2 * reach)) + 1
-        window = self.scan.reduced_window(self.reduction, int(col0), int(row0), size, size, self.weights).astype(float)
-        center = self.center_px - (col0, row0)
-        pictures, kind_of = _distinct([self._picture(each, center, size) for each in looks])
-        picture_of = [kind_of[look] for look in look_of]
-        told = [_told(looks[kind_of.index(kind)], center, size) for kind in range(len(pictures))]
+        told = [seen[picture_of.index(kind)][1] for kind in range(len(pictures))]
+        window = self._window(len(pictures[0]))
         area = _area(pictures) & np.any(told, axis=0)
         residuals = [self._residuals(window, each, area & own) for each, own in zip(pictures, told, strict=True)]
         # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
@@ -74,11 +96,20 @@ class Site:
         relative = np.exp(-(misfits - misfits.min()) / 2 / _PIXELS_PER_DEGREE)
         return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[picture_of]
 
-    def _picture(self, shown: Shown, center: Array, size: int) -> Array:
-        if shown.mark is None:
-            return np.zeros((size, size))
-        place = np.column_stack([shown.linear, center])
-        return picture(shown.mark, place, size, size, self.blur_px, _CELLS)
+    def _window(self, size: int) -> Array:
+        """(size, size) grey values of the scan on the drawings' grid, the site in the middle."""
+        reduction = self.drawings.reduction
+        fine = size * reduction
+        scan_from_fine = self.drawings.scan_from_grid / reduction
+        reach = np.abs(scan_from_fine).sum(axis=1) * fine / 2 + _CUBIC_PX
+        low, high = np.floor(self.center_px - reach).astype(int), np.ceil(self.center_px + reach).astype(int)
+        width, height = (high - low + 1).tolist()
+        window = self.scan.window(int(low[0]), int(low[1]), width, height, self.weights)
+        first = self.center_px - low - scan_from_fine @ np.full(2, (fine - 1) / 2)
+        scan_from_fine = np.column_stack([scan_from_fine, first])
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        upright = cv2.warpAffine(window, scan_from_fine, (fine, fine), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(means(np.asarray(upright, np.float32)[..., None], reduction)[..., 0], np.float64)
 
     def _residuals(self, window: Array, shown: Array, area: Mask) -> Array:
         """What the picture on a plane ground leaves, the mark being light or dark as the one that was found; its place
@@ -95,41 +126,23 @@ class Site:
         return _robust(ground, grey)[0]
 
 
-def _looks(shown: Sequence[Shown]) -> tuple[list[Shown], list[int]]:
-    """Those that are drawn apart, and which of them each is: a symmetric mark looks the same in several poses."""
-    looks: list[Shown] = []
-    drawn: list[tuple[object, Array]] = []
-    index = []
-    for each in shown:
-        own = _drawn(each)
-        alike = [number for number, other in enumerate(drawn) if _same(own, other)]
-        index.append(alike[0] if alike else len(looks))
-        if not alike:
-            looks.append(each)
-            drawn.append(own)
-    return looks, index
+def _drawn(mark: Mark, grid_from_mark: Array, blur_px: float) -> tuple[Array, Mask]:
+    """The mark's picture about its origin, and where it tells the grey values: a chip is only continued beyond its
+    edge, and a learned one has the landscape of other scans beside its mark."""
+    place = np.column_stack([grid_from_mark, np.zeros(2)])
+    half = int(np.ceil(np.abs(extent_px(mark, place)).max() + 2 * _ABOUT_PX))
+    place[:, 2] = half
+    size = 2 * half + 1
+    told = np.ones((size, size), dtype=bool)
+    if isinstance(mark, MarkTemplate):
+        told = chip_mask(mark, place, size, size)
+    return picture(mark, place, size, size, blur_px), told
 
 
-def _drawn(shown: Shown) -> tuple[object, Array]:
-    """What is drawn: kinds and sizes in a fixed order, and (n, 2) px of the points by which these parts lie."""
-    if not isinstance(shown.mark, MarkShape):
-        return shown.mark, shown.linear
-    parts = []
-    for part in shown.mark.parts:
-        if isinstance(part, Bar):
-            middle = np.add(part.from_mm, part.to_mm) / 2
-            parts += [(f"bar {part.line_mm}", point) for point in (part.from_mm, middle, part.to_mm)]
-        elif isinstance(part, Polygon):
-            parts += [("corner", point) for point in part.vertices_mm]
-        else:
-            parts.append((str(replace(part, center_mm=(0.0, 0.0))), part.center_mm))
-    points = np.array([point for _, point in parts]) @ shown.linear.T
-    order = sorted(range(len(parts)), key=lambda index: (parts[index][0], *np.round(points[index]).tolist()))
-    return [parts[index][0] for index in order], points[order]
-
-
-def _same(first: tuple[object, Array], second: tuple[object, Array]) -> bool:
-    return first[0] == second[0] and float(np.abs(first[1] - second[1]).max()) < _SAME_PX
+def _wider(image: Grid, half: int) -> Grid:
+    """The image, whose edge goes on until its sides are 2 half + 1."""
+    spare = half - len(image) // 2
+    return np.pad(image, spare, mode="edge") if spare else image
 
 
 def _distinct(pictures: Sequence[Array]) -> tuple[list[Array], list[int]]:
@@ -142,14 +155,6 @@ def _distinct(pictures: Sequence[Array]) -> tuple[list[Array], list[int]]:
         if not alike:
             kinds.append(each)
     return kinds, index
-
-
-def _told(shown: Shown, center: Array, size: int) -> Mask:
-    """Where a mark tells the grey values. A chip is only continued beyond its edge, and a learned one has the landscape
-    of other scans beside its mark."""
-    if not isinstance(shown.mark, MarkTemplate):
-        return np.ones((size, size), dtype=bool)
-    return chip_mask(shown.mark, np.column_stack([shown.linear, center]), size, size)
 
 
 def _area(pictures: Sequence[Array]) -> Mask:
@@ -168,10 +173,3 @@ def _robust(columns: Sequence[Array], grey: Array) -> tuple[Array, Array]:
         residuals = grey - solution @ design
         weights = tukey_weights(residuals, max(robust_scale(residuals), 1e-9))
     return residuals, solution
-
-
-def _reach_px(shown: Shown) -> float:
-    """How far the mark reaches from its centre, along columns or rows."""
-    if shown.mark is None:
-        return 0.0
-    return float(np.abs(extent_px(shown.mark, np.column_stack([shown.linear, np.zeros(2)]))).max())

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from measure.matching import MatchOptions, match
 from measure.picture_scan import WholePicture
-from measure.pose_pictures import Shown, Site
+from measure.pose_pictures import Drawings, Shown, Site
 from measure.resolution import NO_TAGS
 from measure.scan import Scan
 from measure.shapes import MarkTemplate
 
 SIDE = 61
+FLIP = np.diag([1.0, -1.0])
 BLOCK = np.zeros((SIDE, SIDE), np.uint8)
 BLOCK[:, :24], BLOCK[18:43, :36], BLOCK[28:40, :45] = 1, 1, 1  # of the border, reaching into the frame, lopsided
 
@@ -31,7 +32,7 @@ def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
     for seed in range(2):
         for index, linear in enumerate(turned):
             site = among_landscape(template, linear, seed)
-            told = site.likelihoods([Shown(template, each) for each in turned])
+            told = site.likelihoods([Shown(template, FLIP @ each) for each in turned])
             assert told.argmax() == index
             assert np.sort(told)[-2] < -4.0
 
@@ -46,4 +47,4 @@ def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: i
     scan = Scan(Path("scan"), WholePicture(grey.astype(np.uint8)[..., None]), NO_TAGS)
     place = np.column_stack([linear, [SIDE + 30.0, SIDE + 30.0]])
     fit = match(grey, (0, 0), template, place, MatchOptions(freedom="shift", estimate_blur=False))
-    return Site(scan, fit, fit.center_px, None, 3.0)
+    return Site(scan, fit, fit.center_px, None, Drawings([template], FLIP, 0.0))
