@@ -1,13 +1,15 @@
 """A frame that lies about in the middle of a large scan: its marks are looked for where it puts them, and only the file
 about them is read. Where any of them is not plainly there, the whole scan is searched."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.frame import Frame
 from measure.scan import Scan
-from measure.shapes import FiducialLayout
+from measure.shapes import FiducialLayout, LayoutMark
 
 Array = NDArray[np.float64]
 
@@ -42,6 +44,14 @@ def is_lattice(layout: FiducialLayout) -> bool:
     places = _FINE * near * np.stack([fine.real, fine.imag], axis=1)
     alike = [times[others].sum() for others in cKDTree(places).query_ball_point(places, near)] if len(places) else []
     return max(alike, default=0) > _ALIKE * len(xy)
+
+
+def outermost(marks: Sequence[LayoutMark]) -> tuple[LayoutMark, ...]:
+    """The four marks toward the corners, which say where a frame lies: the others are then looked for where these put
+    them. All marks where the constellation has no such four."""
+    diagonal = np.array([mark.xy_mm for mark in marks]) @ [(1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)]
+    outer = np.unique(diagonal.argmax(axis=0))
+    return tuple(marks[index] for index in outer) if len(outer) == _LEAST_MARKS else tuple(marks)
 
 
 def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Array) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.centred_frame import is_complete, is_worth_a_look
+from measure.centred_frame import is_complete, is_worth_a_look, outermost
 from measure.chance import doubt
 from measure.constellation import Placement
 from measure.edge_place import EdgePlace
@@ -83,7 +83,8 @@ def _in_the_middle(search: FrameSearch, given: PitchHypothesis) -> tuple[list[Pl
     where they are not worth a look or there is none."""
     if not is_worth_a_look(search.scan, search.layout, given.mm):
         return [], None
-    found = search.in_the_middle(given)
+    few = replace(search.layout, marks=outermost(search.layout.marks))
+    found = FrameSearch(search.scan, few, search.options).in_the_middle(given)
     return found, measure_frame(search.scan, search.layout, found[0], search.options) if found else None
 
 

@@ -104,7 +104,8 @@ class FrameSearch:
 
     def was_everywhere(self, frame: Frame) -> bool:
         """Whether the frame was searched in the whole scan, not only in the middle of it."""
-        return self._searched[frame.placement.pitch_mm].search.responses.origins is None
+        searched = self._searched.get(frame.placement.pitch_mm)
+        return searched is not None and searched.search.responses.origins is None
 
     def expected_where_seen(self, frame: Frame, seen_px: dict[int, Array]) -> float:
         """The same, with the marks that count as seen, by index, and where."""
