@@ -1,4 +1,7 @@
-"""Film grain behind the residuals of a fit: white scanner noise and grain of Gaussian correlation, by their shares.
+"""Film grain behind the residuals of a fit: white scanner noise and grain of several sizes, by their shares.
+
+Any noise that is alike in all directions, and the more the nearer, is about a sum of grains of Gaussian correlation: a
+film's needs one or two sizes, a landscape, which has detail of every size, many.
 
 The residuals alone mislead. Each unknown takes noise out of them, most of it where noise is strongest, at low
 frequencies; in a small window little of that is left, and a covariance from the residuals' own autocovariance comes out
@@ -27,6 +30,7 @@ Single = NDArray[np.float32]
 GRAIN_PX = (0.4, 0.5, 0.6, 0.7, 0.8, 0.95, 1.1, 1.3, 1.5, 1.8, 2.2)
 _COARSEST_PX = 1.8
 REACH_PX = 8  # grain of 1.5 px is correlated by one in a thousand there
+_HERE = REACH_PX  # index of no lag at all
 _FARTHEST_PX = 3.0  # lags that are compared: beyond it the residuals hold the fit's marks rather than the noise's
 _FARTHEST_BLANK_PX = 5.0
 _ALIKE = 1e-10  # of the largest eigenvalue: what unknowns tell apart by less is no direction of its own
@@ -35,7 +39,7 @@ _ALIKE = 1e-10  # of the largest eigenvalue: what unknowns tell apart by less is
 def grain_model(
     residuals: Array, used: Mask, design: Array, neighbour_correlation: float, blank: Array | None = None
 ) -> NoiseModel:
-    """The noise model whose residuals after the fit are most like the ones there are.
+    """The noise model, a sum of white noise and grains, whose residuals after the fit are most like the ones there are.
 
     residuals (height, width), where used; design (unknowns, height, width): derivatives by the unknowns of the fit.
     blank (n, PATCH_PX, PATCH_PX): patches of blank film less a plane.
@@ -48,16 +52,14 @@ def grain_model(
         weights = patch.weights / np.sqrt(count)
         left = np.concatenate([left, patch.products(blank) * weights])
         expected = np.concatenate([expected, patch.expected * weights * count], axis=1)
-    fits = [nnls(np.stack([expected[0], each], axis=1), left) for each in expected[1:]]
-    best = min(range(len(fits)), key=lambda index: float(fits[index][1]))
-    white_share, grain_share = fits[best][0]
-    lags = grain_share * _kernel(GRAIN_PX[best])
-    lags[REACH_PX, REACH_PX] += white_share
-    # A fit makes residuals less alike than the noise is. If they still are more alike than the coarsest grain, a
-    # landscape, whose like is not in the series, was taken for grain.
-    is_film = GRAIN_PX[best] <= _COARSEST_PX and neighbour_correlation < _kernel(_COARSEST_PX)[REACH_PX, REACH_PX + 1]
-    is_grain = blank is not None and len(blank) > 0 and bool(is_film)
-    return NoiseModel(float(lags[REACH_PX, REACH_PX]), lags, neighbour_correlation, is_grain)
+    shares, _ = nnls(expected.T, left)
+    lags = np.tensordot(shares, _KERNELS, axes=1)
+    variance = float(lags[_HERE, _HERE])
+    # A fit makes residuals less alike than the noise is. If they still are more alike than the coarsest grain, or the
+    # model is, a landscape was taken for grain.
+    alike = max(neighbour_correlation, lags[_HERE, _HERE + 1] / max(variance, 1e-300))
+    is_grain = blank is not None and len(blank) > 0 and bool(alike < _kernel(_COARSEST_PX)[_HERE, _HERE + 1])
+    return NoiseModel(variance, lags, neighbour_correlation, is_grain)
 
 
 def _kernel(grain_px: float | None) -> Array:
@@ -103,7 +105,7 @@ class _Window:
             beside = (taken @ beside.T) @ taken - 2 * beside
             lags = fft.irfft2((spectra * fft.rfft2(beside.reshape(self.taken.shape), s=shape)).sum(axis=0), s=shape)
             less = _KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel()
-            left.append(pairs * _KERNELS[:, REACH_PX + ring.lags[0][0], REACH_PX + ring.lags[0][1]] + less)
+            left.append(pairs * _KERNELS[:, _HERE + ring.lags[0][0], _HERE + ring.lags[0][1]] + less)
         return np.stack(left, axis=1)
 
 

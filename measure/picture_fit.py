@@ -86,19 +86,23 @@ class PictureFit:
     def weigh(self, noise: NoiseModel) -> tuple[Array, Array]:
         """Adjust once more with the weights of grain, if it is grain: the unknowns' covariance (unknowns, unknowns),
         and their derivatives by the grey values (unknowns, height, width)."""
-        if noise.is_grain:
-            model, before = self.model, self.model.state
-            weights, smeared = weighted(model.design, self.used, noise, self.contrast_dn)
-            moved = self._step_by(weights)
-            if moved is not None:
-                weighed = self._covariance(weights, smeared)
-                # What has more weight now measures the same place, or the noise is not what it was taken for. The plain
-                # covariance, which decides, takes its time and is larger than the weighed one, but for approximations.
-                if _is_likely(moved, weighed[0]) or _is_likely(moved, self._plain_covariance(noise)[0]):
-                    return weighed
-            model.state = before
-            model.linearise(self.used)
-        return self._plain_covariance(noise)
+        if not noise.is_grain:
+            return self._plain_covariance(noise)
+        model, before = self.model, self.model.state
+        weights, smeared = weighted(model.design, self.used, noise, self.contrast_dn)
+        moved = self._step_by(weights)
+        if moved is not None:
+            weighed = self._covariance(weights, smeared)
+            # What has more weight now measures the same place, or the noise is not what it was taken for. The plain
+            # covariance, which decides, takes its time and is larger than the weighed one, but for approximations.
+            if _is_likely(moved, weighed[0]) or _is_likely(moved, self._plain_covariance(noise)[0]):
+                return weighed
+        model.state = before
+        model.linearise(self.used)
+        covariance, by_grey = self._plain_covariance(noise)
+        if moved is not None:  # a hair along a line, say: neither place is known better than they differ
+            covariance[:2, :2] += np.sum(moved**2) / 2 * np.eye(2)
+        return covariance, by_grey
 
     def _plain_covariance(self, noise: NoiseModel) -> tuple[Array, Array]:
         """As `weigh` gives them, of an adjustment that took the noise as white."""
