@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.rendering import extent_px, picture
+from measure.rendering import ROUGH_CELLS, extent_px, picture
 from measure.scan import Scan
 from measure.shapes import Mark, thinnest_mm
 from measure.surroundings import WIDE, Map, Surroundings
@@ -195,7 +195,7 @@ def _template(look: Look, reduction: int) -> Array:
     least, greatest = extent_px(look.mark, linear)
     half = int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + 2
     linear[:, 2] = half
-    return picture(look.mark, linear, 2 * half + 1, 2 * half + 1, 0.6)
+    return picture(look.mark, linear, 2 * half + 1, 2 * half + 1, 0.6, ROUGH_CELLS)
 
 
 def _centred(linear: Array) -> Array:

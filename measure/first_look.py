@@ -11,7 +11,7 @@ from scipy import stats
 from measure.candidates import FAINT, detail_px
 from measure.matching import window_about
 from measure.prediction import MarkPrediction
-from measure.rendering import extent_px, picture
+from measure.rendering import ROUGH_CELLS, extent_px, picture
 from measure.response_layers import highest
 from measure.scan import Scan
 
@@ -60,7 +60,7 @@ class _Look:
         centred[:, 2] = -low
         size = high - low + 1
         finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
-        template = picture(mark, centred, int(size[0]), int(size[1]), blur_px)
+        template = picture(mark, centred, int(size[0]), int(size[1]), blur_px, ROUGH_CELLS)
         window = scan.reduced_window(reduction, col0, row0, width, tall, expected.weights)
         self._flat = expected.polarity * surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
         self._pattern, self._counts = surroundings.pattern(template, finest_px)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from measure.candidates import detail_px, quarter_turned
 from measure.matching import Match
 from measure.noise import robust_scale
-from measure.rendering import chip_mask, extent_px, picture
+from measure.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
 from measure.robust import tukey_weights
 from measure.scan import Scan, means
 from measure.shapes import Mark, MarkTemplate
@@ -136,7 +136,7 @@ def _drawn(mark: Mark, grid_from_mark: Array, blur_px: float) -> tuple[Array, Ma
     told = np.ones((size, size), dtype=bool)
     if isinstance(mark, MarkTemplate):
         told = chip_mask(mark, place, size, size)
-    return picture(mark, place, size, size, blur_px), told
+    return picture(mark, place, size, size, blur_px, ROUGH_CELLS), told
 
 
 def _wider(image: Grid, half: int) -> Grid:

@@ -18,6 +18,7 @@ Single = NDArray[np.float32]
 Integers = NDArray[np.int_]
 
 _DRAWINGS = 16  # kept: more than a camera has kinds of marks
+ROUGH_CELLS = 2  # along a pixel's side: of pictures that are right to a hundredth
 _BLOCK = 4  # pixels that are averaged at once: of a matrix for more, too much would be empty
 
 
@@ -82,6 +83,7 @@ def reach_px(mark: Mark, linear: Array) -> float:
     return float(np.hypot(*(linear @ _outline_mm(mark).T)).max())
 
 
+@lru_cache(maxsize=_DRAWINGS)
 def _outline_mm(mark: Mark) -> Array:
     """(n, 2) corners of a region that holds the mark."""
     if isinstance(mark, MarkTemplate):
