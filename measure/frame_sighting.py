@@ -13,12 +13,14 @@ from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, Frame
 from measure.frame_fit import fit_frame, strangers
 from measure.glimpse import Glimpse, glimpse
+from measure.matching import Match, MatchOptions
 from measure.poses import up_from_camera
 from measure.prediction import MarkPrediction
 from measure.refinement import Sighting, leans_on_frame, sight
 from measure.rendering import extent_px
 from measure.scan import LUMINANCE, Scan
-from measure.shapes import FiducialLayout, FrameCorner
+from measure.shapes import FiducialLayout, FrameCorner, MarkShape
+from measure.shared_blur import shared_blurs
 from measure.unseen import reason_unseen
 
 Array = NDArray[np.float64]
@@ -63,6 +65,7 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
             sighter.glimpse_faint(sighter.reach_px())
             sighter.judge()
     sighter.settle()
+    sighter.share_blur()
     return sighter.frame()
 
 
@@ -147,25 +150,56 @@ class _Sighter:
 
     def settle(self) -> None:
         """Match marks that do not tell their own rotation and scale once more, with those of the frame."""
-        leaning = [
-            index
-            for index, mark in enumerate(self.layout.marks)
-            if self.belongs[index] and self.clear(index) and leans_on_frame(mark.mark)
-        ]
-        if not leaning or self.belongs.sum() < 2:
+        leaning = [index for index in self._drawn() if leans_on_frame(self.layout.marks[index].mark)]
+        if leaning and self.belongs.sum() >= 2:
+            frame_sigma = self._frame_sigma()
+            for index in leaning:
+                self._match_again(index, self.options.match, frame_sigma)
+            self.judge()
+
+    def share_blur(self) -> None:
+        """Match marks that hardly tell their own blur once more, with that of the others; what differs from theirs is
+        doubted."""
+        fits = {index: fit for index, fit in self._drawn().items() if fit.covariance is not None}  # no glimpses
+        told = zip(fits, shared_blurs(list(fits.values())), strict=True)
+        shared = {index: blur for index, blur in told if blur is not None}
+        if not shared:
             return
+        frame_sigma = self._frame_sigma()
+        for index, blur in shared.items():
+            match = replace(self.options.match, blur_px=blur.blur_px, blur_sigma=blur.sigma)
+            self._match_again(index, match, frame_sigma)
+            sighting = self.sightings[index]
+            if blur.differs and sighting is not None:
+                own_px = fits[index].blur_px
+                reason = f"its blur is {own_px:.2f} px, where the other marks have {blur.blur_px:.2f}"
+                self.sightings[index] = replace(sighting, reason=reason)
+        self.judge()
+
+    def _drawn(self) -> dict[int, Match]:
+        """The fits of marks that belong, are plainly there and drawn: a picture of a mark has a blur of its own."""
+        return {
+            index: sighting.fit
+            for index, (mark, sighting) in enumerate(zip(self.layout.marks, self.sightings, strict=True))
+            if self.belongs[index] and self.clear(index) and isinstance(mark.mark, MarkShape)
+            if sighting is not None and sighting.fit is not None
+        }
+
+    def _frame_sigma(self) -> float:
+        """The standard deviation of the frame's rotation (rad) and scale."""
         belonging = self.camera[self.belongs]
         radius_mm = float(np.hypot(*(belonging - belonging.mean(axis=0)).T).mean())
-        frame_sigma = float(np.hypot(self.options.film_sigma_mm, self._scatter_mm())) / radius_mm
-        for index in leaning:
-            before = self.sightings[index]
-            if before is None or before.fit is None:
-                continue
-            expected = self._expected(index, _SETTLED_PX).moved(before.fit.center_px)
-            after = sight(self.scan, expected, self.options.match, frame_sigma)
-            if after.fit is not None:
-                self.sightings[index] = replace(before, fit=after.fit)
-        self.judge()
+        return float(np.hypot(self.options.film_sigma_mm, self._scatter_mm())) / radius_mm
+
+    def _match_again(self, index: int, options: MatchOptions, frame_sigma: float) -> None:
+        """Where it was found, with the frame's rotation and scale where it leans on them."""
+        before = self.sightings[index]
+        if before is None or before.fit is None:
+            return
+        expected = self._expected(index, _SETTLED_PX).moved(before.fit.center_px)
+        after = sight(self.scan, expected, options, frame_sigma)
+        if after.fit is not None:
+            self.sightings[index] = replace(before, fit=after.fit)
 
     def sure(self) -> bool:
         """Whether so many marks agree, some of them clear ones, that they tell where every other must be."""

@@ -14,6 +14,8 @@ class MatchOptions:
 
     freedom: what is estimated beside the shift; "ellipse" is an affinity without rotation, for disks.
     blur_px: standard deviation of the scan's blur; the start of its estimation, if it is estimated.
+    blur_sigma: prior standard deviation of the logarithm of the blur, the pixel's share included, as known from the
+    other marks.
     linear_sigma: prior standard deviation of rotation (rad), scale and shear, as known from the other marks; the
     default holds only what the picture does not show at all.
     margin_px: how far about the mark grey values are used; in a blurred scan so many standard deviations of the blur.
@@ -22,6 +24,7 @@ class MatchOptions:
 
     freedom: Freedom = "similarity"
     blur_px: float = 0.8
+    blur_sigma: float = inf
     estimate_blur: bool = True
     linear_sigma: float = 0.3
     margin_px: float = 6.0
@@ -38,6 +41,7 @@ class MatchOptions:
             raise ValueError(f"freedom is {self.freedom!r}; one of {', '.join(FREEDOMS)} is right")
         for name in (
             "blur_px",
+            "blur_sigma",
             "linear_sigma",
             "margin_px",
             "plain_px",

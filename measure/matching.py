@@ -44,7 +44,9 @@ class Match:
     redundancy: pixels used less unknowns. neighbour_correlation: of the residuals; they were taken as white where
     covariance_is_white. likeness: correlation of the fitted picture with the window, less its plane background: 1 for a
     perfect mark, 0 for none.
-    significance: the contrast over its own standard deviation. edges: the mark's place by another method, to compare.
+    significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
+    share included; infinite where it was not estimated, or is at an end of its range. edges: the mark's place by
+    another method, to compare.
     """
 
     converged: bool
@@ -62,6 +64,7 @@ class Match:
     likeness: float
     significance: float
     residuals_dn: Array
+    blur_sigma: float = np.inf
     edges: EdgePlace | None = None
     covariance: Array | None = None
 
@@ -207,9 +210,16 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         likeness=_likeness(fit),
         significance=fit.contrast_dn / gain_sigma,
         residuals_dn=np.where(fit.area, model.residuals, np.nan),
+        blur_sigma=_blur_sigma(model, covariance),
         edges=edges,
         covariance=covariance,
     )
+
+
+def _blur_sigma(model: PictureModel, covariance: Array) -> float:
+    if model.blur is None or model.blur_is_at_limit:
+        return np.inf
+    return float(np.sqrt(covariance[model.blur, model.blur]) / (2 * model.seen_blur_px**2))
 
 
 def _likeness(fit: PictureFit) -> float:

@@ -29,7 +29,7 @@ ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values ad
 _AS_NOISY = 0.02
 _BLUR_RANGE_PX = (0.3, 6.0)
 BENT, ROUGHLY_BENT = 0.075, 0.4  # of the mark's outline, times the blur: so far a series replaces a new drawing
-_PIXEL_VARIANCE_PX2 = 1 / 12
+PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
 _MOST_BLURRED = 2.0  # times the blur, likewise
 _LINEAR = 0.015  # times the blur: within it a linearisation is as good as a new one, to 1e-4 of the blur
@@ -169,7 +169,7 @@ class PictureModel:
     @property
     def seen_blur_px(self) -> float:
         """The standard deviation of blur and pixel."""
-        return float(np.sqrt(self.state.variance_px2 + _PIXEL_VARIANCE_PX2))
+        return float(np.sqrt(self.state.variance_px2 + PIXEL_VARIANCE_PX2))
 
     def place_drawn(self) -> Array:
         """(2, 3) the present place of the mark as it was last drawn: its linear part is close to the present one."""
@@ -194,7 +194,7 @@ class PictureModel:
         place = self.place_drawn()
         shown = render(self.mark, place, width, height, self.blur_px)
         change = self._bent()
-        return shown.bent(change, place[:, 2], self.state.variance_px2 + _PIXEL_VARIANCE_PX2) if change.any() else shown
+        return shown.bent(change, place[:, 2], self.state.variance_px2 + PIXEL_VARIANCE_PX2) if change.any() else shown
 
     def step(self, step: Array) -> float:
         """Take a step, shortened where it leaves the range of a linearisation; its length in px."""
@@ -208,7 +208,7 @@ class PictureModel:
             # As a change of the standard deviation, the pixel's share included: so a blur far off is near in a step.
             seen = self.seen_blur_px
             ratio = np.clip(1 + step[self.blur] / longest / (2 * seen**2), 1 / _MOST_BLURRED, _MOST_BLURRED)
-            variance = float(np.clip((seen * ratio) ** 2 - _PIXEL_VARIANCE_PX2, *self._variance_range()))
+            variance = float(np.clip((seen * ratio) ** 2 - PIXEL_VARIANCE_PX2, *self._variance_range()))
         self.state = State(place, variance, self.state.greys + step[-GREY:] / longest)
         reach = max(self.grey.shape) / 4
         return float(np.hypot(*shift) + reach * _LONGEST_CHANGE * np.abs(linear).max(initial=0.0))
@@ -221,16 +221,26 @@ class PictureModel:
         variance, change = self.state.variance_px2, step[self.blur]
         return bool((variance <= low and change < 0) or (variance >= high and change > 0))
 
+    @property
+    def blur_is_at_limit(self) -> bool:
+        low, high = self._variance_range()
+        return not low < self.state.variance_px2 < high
+
     def prior_weights(self) -> Array:
-        """1 / variance of the priors of rotation, scale and shear; 0 for all else."""
+        """1 / variance of the priors of rotation, scale and shear, and of the blur's variance; 0 for all else."""
         weights = np.zeros(len(self.design))
         weights[self.linear] = 1 / self.options.linear_sigma**2
+        if self.blur is not None:
+            seen = self.options.blur_px**2 + PIXEL_VARIANCE_PX2
+            weights[self.blur] = 1 / (2 * seen * self.options.blur_sigma) ** 2
         return weights
 
     def departures(self) -> Array:
-        """How far the parameters under a prior are from where they started."""
+        """How far the parameters under a prior are from where it has them."""
         departures = np.zeros(len(self.design))
         departures[self.linear] = self._parameters(self._distortion())
+        if self.blur is not None:
+            departures[self.blur] = self.state.variance_px2 - self.options.blur_px**2
         return departures
 
     def ran_away(self) -> str:
