@@ -23,7 +23,7 @@ from measure.picture_fit import PictureFit
 from measure.picture_model import GREY, PictureModel, State, background_px
 from measure.pixel_sums import combined, factors
 from measure.rendering import extent_px
-from measure.shapes import Mark
+from measure.shapes import Mark, MarkTemplate
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
 
@@ -40,10 +40,10 @@ class Match:
     center_px (2,), covariance_px2 (2, 2), pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
     unknowns of the `PictureModel`, None where another model was fitted.
     contrast_dn: the mark's grey value less the background's, negative for a dark mark. noise_dn: standard deviation of
-    one pixel. damaged_fraction: share of the pixels about the mark, within plain_px of it, that were cut out.
-    redundancy: pixels used less unknowns. neighbour_correlation: of the residuals; they were taken as white where
-    covariance_is_white. likeness: correlation of the fitted picture with the window, less its plane background: 1 for a
-    perfect mark, 0 for none.
+    one pixel, of a chip's picture after smoothing. damaged_fraction: share of the pixels about the mark, within
+    plain_px of it, that were cut out. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
+    they were taken as white where covariance_is_white. likeness: correlation of the fitted picture with the window,
+    less its plane background: 1 for a perfect mark, 0 for none.
     significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
     share included; infinite where it was not estimated, or is at an end of its range. edges: the mark's place by
     another method, to compare.
@@ -95,7 +95,8 @@ def match(
     grey = np.asarray(window, dtype=float)
     usable = np.isfinite(grey) if valid is None else np.isfinite(grey) & valid
     sides = np.zeros(grey.shape, np.int8) if clipped is None else clipped
-    blank = np.zeros_like(usable) if is_lossy else usable & (sides == 0)
+    # A chip's picture is smoothed for the fit, and blank film beside it is not.
+    blank = np.zeros_like(usable) if is_lossy or isinstance(mark, MarkTemplate) else usable & (sides == 0)
     start = np.array(pixel_from_mark, dtype=float)
     start[:, 2] -= origin_px
     given = _Window(np.where(usable, grey, 0.0), usable, sides, mark, start)

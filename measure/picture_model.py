@@ -33,6 +33,7 @@ PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
 _MOST_BLURRED = 2.0  # times the blur, likewise
 _LINEAR = 0.015  # times the blur: within it a linearisation is as good as a new one, to 1e-4 of the blur
+_CHIP_SMOOTHED_PX = 0.7  # and of what it is compared with: as sharp as pixels, edges are sampled falsely in both
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +76,16 @@ class PictureModel:
         self.clipped, self.noise_dn = clipped, ROUNDING_DN
         self.is_clipped = bool(clipped.any())
         self.tells = np.ones(grey.shape, dtype=bool)
-        self.grey = self._detail(grey)
+        is_chip = isinstance(mark, MarkTemplate)
+        seen = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), dtype=float) if is_chip else grey
+        self.grey = self._detail(seen)
         generators = [g for g in _GENERATORS[options.freedom] if not (g is _TURN and is_round(mark))]
         self.generators = np.array(generators).reshape(-1, 2, 2)
         self.linear = slice(2, 2 + len(self.generators))
         self.blur = 2 + len(self.generators) if options.estimate_blur else None
         # A chip already has its scan's blur: where none is estimated, none is added.
-        sharp = isinstance(mark, MarkTemplate) and not options.estimate_blur
-        self.state = state or State(start.copy(), 0.0 if sharp else options.blur_px**2, np.zeros(GREY))
+        added_px2 = 0.0 if is_chip and not options.estimate_blur else options.blur_px**2
+        self.state = state or State(start.copy(), added_px2 + is_chip * _CHIP_SMOOTHED_PX**2, np.zeros(GREY))
         # The state and the noise that the design is of, and its residuals.
         self._linearised: tuple[State, float, Array] | None = None
         self.bent = BENT
