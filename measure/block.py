@@ -41,8 +41,8 @@ class Block:
         return weighted(self.samples[top : top + height : every, left : left + width : every], self.scan.weights)
 
     def reductions(self, factors: Iterable[int]) -> dict[int, Image]:
-        """Its grey values area-averaged by each factor, from the coarsest of the others that divides it; an even
-        factor's are right to half a grey value."""
+        """Its grey values area-averaged by each factor, from the coarsest of the others that divides it; each
+        halving of stored samples is right to half a grey value."""
         known: dict[int, Image] = {}
         for factor in sorted(factors):
             finer = [other for other in known if factor % other == 0]
@@ -55,9 +55,10 @@ class Block:
 
 def nearly_means(samples: Samples, factor: int) -> Image:
     """(height / factor, width / factor, channels) means over squares, by an even factor from means of four rounded to
-    whole grey values: in a third of the time, and half a grey value is no matter in a search."""
-    if factor % 2:
-        return means(samples, factor)
-    height, width, channels = samples.shape
-    half = cv2.resize(samples, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    return means(half.astype(samples.dtype, copy=False).reshape(height // 2, width // 2, channels), factor // 2)
+    whole grey values, again and again: in a quarter of the time, and a grey value is no matter in a search."""
+    while factor % 2 == 0:
+        height, width, channels = samples.shape
+        half = cv2.resize(samples, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+        samples = half.astype(samples.dtype, copy=False).reshape(height // 2, width // 2, channels)
+        factor //= 2
+    return means(samples, factor)

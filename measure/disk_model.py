@@ -57,15 +57,18 @@ def radius_px(shapes: Array) -> Array:
 
 
 class _Edges(NamedTuple):
-    """Each (n, rows, cols) but col (n, 1, cols) and row (n, rows, 1), px from the centres. distance: from the edge, px,
-    positive inside; by_col, by_row, slope: derivatives of the distance in radii and their size; place: distance in
-    blurs; density: of the normal distribution there, over its largest; share: of the disk in the pixel."""
+    """Each (n, rows, cols) but col (n, 1, cols) and row (n, rows, 1), px from the centres.
+
+    along_col, along_row, length: a vector at right angles to the ellipse, and its length; distance: from the edge, px,
+    positive inside; place: distance in blurs; density: of the normal distribution there, over its largest; share: of
+    the disk in the pixel.
+    """
 
     col: Image
     row: Image
-    by_col: Image
-    by_row: Image
-    slope: Image
+    along_col: Image
+    along_row: Image
+    length: Image
     distance: Image
     place: Image
     density: Image
@@ -92,17 +95,16 @@ class DiskModel:
         state, along = self.state, np.arange(0, self._side, self._every)
         col = (along - state.centers[:, :1]).astype(np.float32)[:, None, :]
         row = (along - state.centers[:, 1:]).astype(np.float32)[:, :, None]
-        inverse = np.linalg.inv(state.shapes).astype(np.float32)[..., None, None]
-        x = inverse[:, 0, 0] * col + inverse[:, 0, 1] * row
-        y = inverse[:, 1, 0] * col + inverse[:, 1, 1] * row
-        radius = np.maximum(np.sqrt(x * x + y * y), np.float32(1e-6))
-        by_col = (inverse[:, 0, 0] * x + inverse[:, 1, 0] * y) / radius
-        by_row = (inverse[:, 0, 1] * x + inverse[:, 1, 1] * y) / radius
-        slope = np.sqrt(by_col * by_col + by_row * by_row)
-        distance = (1 - radius) / slope
+        inverse = np.linalg.inv(state.shapes)
+        form = (inverse.swapaxes(1, 2) @ inverse).astype(np.float32)[..., None, None]  # col, row: squares of radii
+        along_col = form[:, 0, 0] * col + form[:, 0, 1] * row
+        along_row = form[:, 1, 0] * col + form[:, 1, 1] * row
+        radius = np.sqrt(np.maximum(along_col * col + along_row * row, np.float32(0)))
+        length = np.maximum(np.sqrt(along_col * along_col + along_row * along_row), np.float32(1e-12))
+        distance = (1 - radius) * radius / length
         place = distance / each(state.blur)
         density = np.exp(np.float32(-0.5) * place * place)
-        return _Edges(col, row, by_col, by_row, slope, distance, place, density, normal_share(place, density))
+        return _Edges(col, row, along_col, along_row, length, distance, place, density, normal_share(place, density))
 
     @property
     def distance(self) -> Image:
@@ -122,9 +124,9 @@ class DiskModel:
         edges = self._edges
         design = np.empty((len(gain), UNKNOWNS, *edges.share.shape[1:]), np.float32)
         steepness = gain / (np.float32(np.sqrt(2 * np.pi)) * blur) * edges.density
-        moved = steepness / edges.slope
-        outward_col = np.multiply(moved, edges.by_col, out=design[:, 0])
-        outward_row = np.multiply(moved, edges.by_row, out=design[:, 1])
+        moved = steepness / edges.length
+        outward_col = np.multiply(moved, edges.along_col, out=design[:, 0])
+        outward_row = np.multiply(moved, edges.along_row, out=design[:, 1])
         col, row = edges.col / size, edges.row / size
         along_col, along_row = outward_col * col, outward_row * row
         np.add(along_col, along_row, out=design[:, 2])

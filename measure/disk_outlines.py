@@ -22,7 +22,7 @@ REACH = 3.0  # radii of a blob: where its patch must have ended
 CORE, AROUND = 0.5, (1.5, 2.5)  # radii of a blob: within, that it is as high as; between, that there is ground
 GROUND_SHARE = 1 / 3  # of the rays, that are lower there: other things may stand about
 LEAST_HEIGHT = 0.5  # of the blob's contrast
-_CHUNK = 1 << 17  # samples taken at a time: they stay in the processor's cache
+_CHUNK = 1 << 18  # samples taken at a time: they take a few MiB
 
 
 @dataclass(frozen=True, eq=False)

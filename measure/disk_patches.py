@@ -1,7 +1,7 @@
 """Patches of a disk's shape in a picture: blobs by their Laplacian at several scales, then by the outline at half of
 their height."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 from math import sqrt
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.disk_outlines import REACH, Blobs, Outlines, outlines_about
-from measure.noise import robust_scale
+from measure.noise import robust_scales
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -79,9 +79,9 @@ def margin_px(radii: list[float]) -> int:
 def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int) -> list[Candidate]:
     """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
     small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
-    cells = Cells.of(small.shape[1], max(round(scan_px2 / CELL_PX**2), 1))
+    cells = Cells.of(small.shape[1], round(scan_px2 / CELL_PX**2))
     is_textured = scan_px2 >= TEXTURE_PX**2
-    noise = cells.each(fine_noise, small) if is_textured else np.zeros(len(cells.ends))
+    noise = cells.scales(fine_structure(small)) if is_textured else np.zeros(len(cells.ends))
     found = []
     for sign, own in blobs(small, radii, search, full_scale_dn, cells, is_textured):
         outlines = outlines_about(small if sign > 0 else -small, own)
@@ -99,11 +99,16 @@ class Cells:
 
     @classmethod
     def of(cls, width: int, count: int) -> "Cells":
+        """Some count of them, as far as they hold samples."""
+        count = max(min(count, width // (2 * EVERY)), 1)
         return cls(np.linspace(0, width, count + 1).astype(np.intp)[1:])
 
-    def each(self, figure: Callable[[Image], float], picture: Image) -> Array:
-        """(n,) the figure of every cell."""
-        return np.array([figure(cell) for cell in np.split(picture, self.ends[:-1], axis=1)])
+    def scales(self, samples: Image) -> Array:
+        """(n,) robust standard deviations of the samples (rows, columns) in each cell, spread over all of them."""
+        count, rows = len(self.ends), len(samples)
+        wide = samples.shape[1] // count
+        own = samples[:, : count * wide].reshape(rows, count, wide).swapaxes(0, 1)
+        return robust_scales(own.reshape(count, -1))
 
     def at(self, columns: Array) -> NDArray[np.intp]:
         """The cells in which columns lie."""
@@ -129,7 +134,7 @@ def blobs(
         smooth = cv2.GaussianBlur(small, 2 * (2 * int(3 * sigma + 0.5) + 1,), sigma)
         contrast = cv2.Laplacian(smooth, cv2.CV_32F, ksize=1, scale=-(sigma**2) / PEAK_OF_DISK)
         contrasts.append(np.asarray(contrast, np.float32))
-        textures = cells.each(texture, contrasts[-1]) if is_textured else np.zeros(len(cells.ends))
+        textures = cells.scales(contrasts[-1][::EVERY, ::EVERY]) if is_textured else np.zeros(len(cells.ends))
         levels.append(np.maximum(RESPONSE_SIGMAS * textures, search.least_contrast * full_scale_dn))
     neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * max(int(radii[0]), 1) + 1,))
     margin, width = margin_px(radii), small.shape[1] - 2 * margin_px(radii)
@@ -149,16 +154,13 @@ def blobs(
             yield sign, Blobs(np.stack([cols, rows], axis=1), radius, contrast)
 
 
-def texture(contrast: Image) -> float:
-    return robust_scale(contrast[::EVERY, ::EVERY].astype(np.float64))
-
-
-def fine_noise(small: Image) -> float:
-    """The standard deviation of what is no smooth picture (Immerkaer, 1996, Fast noise variance estimation)."""
+def fine_structure(small: Image) -> Image:
+    """Samples of what is no smooth picture, with the noise's standard deviation (Immerkaer, 1996, Fast noise variance
+    estimation)."""
     above, row, below = (small[first : len(small) - 2 + first : EVERY] for first in range(3))
     rows = above - 2 * row + below
     left, column, right = (rows[:, first : rows.shape[1] - 2 + first : EVERY] for first in range(3))
-    return robust_scale((left - 2 * column + right).astype(np.float64) / 6)
+    return np.asarray((left - 2 * column + right) / 6)
 
 
 def round_ones(found: Outlines, noise: Array, factor: int) -> Iterator[tuple[Array, Array, float]]:

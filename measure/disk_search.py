@@ -18,7 +18,7 @@ Image = NDArray[np.float32]
 
 SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk stands out by a tenth less
 SIZE_TOLERANCE = 1.4  # of what is found, to the sizes that are looked for
-WIDEST_PX = 6144  # of what is looked at in one piece
+WIDEST_PX = 12288  # of what is looked at in one piece
 SEARCH_RADIUS_PX = 2.0  # reduced so far that the smallest disk of an octave has at least this radius
 
 

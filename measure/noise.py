@@ -64,6 +64,13 @@ def robust_scale(values: Array) -> float:
     return 1.4826 * _median(np.abs(values - _median(values)))
 
 
+def robust_scales(values: NDArray[np.floating]) -> Array:
+    """(n,) that of each row of many values (n, many), at once."""
+    middle = values.shape[1] // 2
+    off = np.abs(values - np.partition(values, middle, axis=1)[:, middle, None])
+    return np.asarray(1.4826 * np.partition(off, middle, axis=1)[:, middle], float)
+
+
 def _median(values: Array) -> float:
     below, above = (values.size - 1) // 2, values.size // 2  # numpy's own takes four times as long for a small window
     rising = np.partition(values, (below, above), axis=None)
