@@ -152,14 +152,16 @@ def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -
 
 
 def dusty_frame(rng: np.random.Generator) -> tuple[Array, Mask, Array]:
-    """A frame of 25 disks, all light or all dark, their contrasts alike to 5 % and their forms predicted to 2 % but for
-    a common scale: errors in px, nan where one was refused, which are flagged, and how much dust is on each."""
+    """A frame of 25 disks, all light or all dark, their contrasts alike to 5 %, their blur, of 0.6 to 1.4 px, to 10 %,
+    and their forms predicted to 2 % but for a common scale: errors in px, nan where one was refused, which are flagged,
+    and how much dust is on each."""
     tile, snr, sign, scale = 81, rng.uniform(10, 50), rng.choice((-1, 1)), rng.uniform(0.9, 1.1)
+    blur = rng.uniform(0.6, 1.4)
     ground = GROUND + (1 - sign) / 2 * CONTRAST
     frame, places, predictions = np.empty((5 * tile, 5 * tile)), [], []
     dusts = rng.choice((0.0, 0.01, 0.03, 0.05), 25)
     for number, share in enumerate(dusts):
-        mark = some_mark(KIND["ellipse"], rng.uniform(0.6, 1.4), rng, tile, 10 * rng.uniform(2.0, 4.0) / 6)
+        mark = some_mark(KIND["ellipse"], blur * np.exp(rng.normal(0, 0.1)), rng, tile, 10 * rng.uniform(2.0, 4.0) / 6)
         contrast = CONTRAST * np.exp(rng.normal(0, 0.05))
         grey = ground + sign * contrast * mark.picture + CONTRAST / snr * rng.standard_normal((tile, tile))
         corner = tile * np.array(divmod(number, 5)[::-1])

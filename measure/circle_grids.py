@@ -79,6 +79,6 @@ def as_mark(name: str, disk: FittedDisk, was_seen: bool) -> MarkMeasurement:
     if disk.reason:
         status = Status.REJECTED if was_seen else Status.PREDICTED
         return MarkMeasurement(name, "target", disk.center_px, None, status, f"not fitted: {disk.reason}")
-    weakness = disk.weakness or disk.smallness
+    weakness = disk.weakness or disk.lone_doubt
     status = Status.WEAK if weakness else Status.MEASURED
     return MarkMeasurement(name, "target", disk.center_px, disk.covariance_px2, status, weakness, disk.quality)

@@ -23,10 +23,11 @@ SEARCH_RADIUS_PX = 2.0  # reduced so far that the smallest disk of an octave has
 
 
 def find_disks(scan: Scan, search: DiskSearch) -> tuple[FittedDisk, ...]:
-    """All disks of the frame that the fit does not refuse, from top to bottom."""
+    """All disks of the frame that the fit does not refuse and that are no spots, from top to bottom."""
     patches = disk_candidates(scan, search)
     fitted = scan.each(lambda patch: fit_disk(scan, patch.center_px, patch.pixel_from_disk), patches)
-    kept = [disk for disk in fitted if not disk.reason and disk.half_axes_px[0] < search.diameter_px[1]]
+    sharp = (disk for disk in fitted if not (disk.reason or disk.is_soft))
+    kept = [disk for disk in sharp if disk.half_axes_px[0] < search.diameter_px[1]]
     return tuple(sorted(without_doubles(kept), key=lambda disk: (disk.center_px[1], disk.center_px[0])))
 
 

@@ -31,9 +31,9 @@ MOST_BLUR = 0.7  # of the shorter half axis
 @dataclass(frozen=True, eq=False)
 class FittedDisk:
     """An ellipse as fitted. center_px (2,), covariance_px2 (2, 2); pixel_from_disk (2, 2): the unit disk's image, its
-    columns two radius vectors, px; contrast_dn: positive for a light disk; look_covariance (4, 4): of the relative
-    changes of its size, its stretch along the columns, its shear and its contrast. weakness: why it is doubtful;
-    reason: why it is no disk, and then the numbers are the fit's last."""
+    columns two radius vectors, px; contrast_dn: positive for a light disk; look_covariance (5, 5): of the relative
+    changes of its size, its stretch along the columns, its shear and its contrast, and of its blur's variance, px².
+    weakness: why it is doubtful; reason: why it is no disk, and then the numbers are the fit's last."""
 
     center_px: Array
     covariance_px2: Array
@@ -57,11 +57,12 @@ class FittedDisk:
         return bool(np.all(np.isfinite(self.covariance_px2)) and self.blur_px > MOST_BLUR * self.half_axes_px[1])
 
     @property
-    def smallness(self) -> str:
-        """Why a disk that cannot be compared with others is doubtful, for its size; empty where it is not."""
+    def lone_doubt(self) -> str:
+        """Why a disk that cannot be compared with others is doubtful: dust and spots look like it; empty otherwise."""
         shorter = self.half_axes_px[1]
-        small = shorter < SMALL_RADIUS_PX
-        return f"small: half axis {shorter:.1f} px, dust of its size would look the same" if small else ""
+        if shorter < SMALL_RADIUS_PX:
+            return f"small: half axis {shorter:.1f} px, dust of its size would look the same"
+        return f"its edge is as soft as a spot's: blur {self.blur_px:.1f} px, half axis {shorter:.1f} px" * self.is_soft
 
     @property
     def quality(self) -> dict[str, float]:
@@ -134,10 +135,11 @@ def fit_disk(
 
 
 def look_covariance(fit: Match) -> Array:
-    """(4, 4) as a fitted disk has it."""
+    """(5, 5) as a fitted disk has it."""
     assert fit.covariance is not None
-    look = [2, 3, 4, len(fit.covariance) - GREY]
-    per = np.array([1.0, 1.0, 1.0, fit.contrast_dn or 1.0])
+    gain = len(fit.covariance) - GREY
+    look = [2, 3, 4, gain, gain - 1]
+    per = np.array([1.0, 1.0, 1.0, fit.contrast_dn or 1.0, 1.0])
     return np.asarray(fit.covariance[np.ix_(look, look)] / np.outer(per, per))
 
 
@@ -159,8 +161,6 @@ def judged(disk: FittedDisk, residual_correlation: float) -> FittedDisk:
         reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
     elif disk.noise_dn > (WORST_SMOOTH_MISFIT if residual_correlation > SMOOTH else WORST_MISFIT) * contrast:
         reason = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
-    elif disk.is_soft:
-        reason = f"no disk: its edge is as soft as a spot's, blur {disk.blur_px:.1f} px, half axis {shorter:.1f} px"
     elif disk.damaged_fraction > MOST_DAMAGE:
         reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
     elif shorter < SMALLEST_RADIUS_PX:

@@ -129,7 +129,7 @@ def test_a_disk_of_another_size_or_polarity_is_no_target() -> None:
 
 def test_small_disks_are_flagged_where_too_few_others_tell_what_they_look_like() -> None:
     field = Field(6, np.zeros(2))
-    field.add("small", np.array([115.0, 105.0]), 2.1, np.zeros(2), 10.0)
+    field.add("small", np.array([115.0, 105.0]), 2.3, np.zeros(2), 10.0)
     assert field.measured()["small"].status is Status.MEASURED
     field.predictions = field.predictions[-5:]
     mark = field.measured()["small"]

@@ -1,10 +1,13 @@
 """Small disks with dust on them, against the others of their frame."""
 
 import numpy as np
-from drawn import drawn, ellipse, scan_of
+import pytest
+from drawn import drawn, ellipse, scan_of, whitened
 
+from measure.disks import FittedDisk
 from measure.status import Status
 from measure.targets import TargetPrediction, measure_disks
+from measure.unlike import doubts
 
 CONTRAST, GROUND = 15000.0, 25000.0
 
@@ -28,3 +31,50 @@ def test_a_speck_that_passes_for_the_disk_is_told_by_the_other_disks() -> None:
     assert [mark.point for mark in marks if mark.status is Status.WEAK] == ["7"]
     assert "unlike the other targets" in marks[7].reason
     assert all(mark.status is Status.MEASURED for mark in marks if mark.point != "7")
+
+
+def test_small_disks_whose_edges_are_as_soft_as_a_spots_are_measured_where_all_are_alike() -> None:
+    rng = np.random.default_rng(2)
+    picture = GROUND + rng.normal(0, 500, (60, 40 * 24))
+    predictions, places = [], []
+    for number in range(24):
+        place = np.array([20 + 40 * number, 30]) + rng.uniform(-0.5, 0.5, 2)
+        shape = 2.1 * np.diag([1.0, rng.uniform(0.8, 0.95)])
+        blurred = drawn(ellipse(place - (40 * number, 0), shape), 40, 60, 1.45)
+        picture[:, 40 * number : 40 * number + 40] += rng.normal(1.0, 0.04) * CONTRAST * blurred
+        predictions.append(TargetPrediction(str(number), place + 0.3, 1.05 * shape, 4.0))
+        places.append(place)
+    marks = measure_disks(scan_of(picture), predictions)
+    assert sum(mark.status is Status.MEASURED for mark in marks) >= 20
+    errors = [
+        whitened(np.asarray(mark.center_px) - place, np.asarray(mark.covariance_px2))
+        for mark, place in zip(marks, places, strict=True)
+        if mark.status is Status.MEASURED
+    ]
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.3  # three standard deviations of 40 numbers
+    lone = measure_disks(scan_of(picture), predictions[:6])
+    assert all(mark.status is not Status.MEASURED for mark in lone)
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.0, 0.04), (0.2, 0.15)])
+def test_targets_are_odd_by_more_than_noise_and_what_all_differ_by(share: float, doubted: float) -> None:
+    """Looks drawn as the comparison takes them to be, 5 % in contrast and 2 % in form, in noise of half to five times
+    that variance; a share of them changed by 20 standard deviations."""
+    rng = np.random.default_rng(3)
+    spread = np.array([0.014, 0.014, 0.014, 0.05, 0.1])
+    weak, odd = [], []
+    for _ in range(25):
+        disks, is_odd = [], rng.uniform(size=25) < share
+        for change in 20.0 * is_odd * rng.choice((-1, 1), 25):
+            mixing = (np.eye(5) + rng.normal(0, 0.3, (5, 5))) * spread
+            noise = rng.uniform(0.5, 5) * mixing @ mixing.T
+            look = rng.normal(0, spread) + rng.multivariate_normal(np.zeros(5), noise)
+            look[3] += change * np.hypot(spread[3], np.sqrt(noise[3, 3]))
+            values, vectors = np.linalg.eigh([[look[0] + look[1], look[2]], [look[2], look[0] - look[1]]])
+            shape, blur = 3 * (vectors * np.exp(values)) @ vectors.T, float(np.sqrt(max(1.5 + look[4], 0.1)))
+            contrast = float(np.exp(look[3])) * CONTRAST
+            disks.append(FittedDisk(np.zeros(2), 0.001 * np.eye(2), shape, contrast, 100.0, blur, 0.0, noise))
+        weak += [bool(reason) for reason in doubts(disks, [3 * np.eye(2)] * 25)]
+        odd += is_odd.tolist()
+    assert np.mean(np.array(weak)[~np.array(odd)]) < doubted
+    assert np.all(np.array(weak)[odd])
