@@ -34,11 +34,12 @@ class Block:
         """Width and height, its margin included."""
         return self.samples.shape[1], self.samples.shape[0]
 
-    def window(self, col0: int, row0: int, width: int, height: int, every: int = 1) -> Image:
-        """(height, width) grey values from a column and row of the scan on, all of them in the block, or every so many
-        of their columns and rows."""
-        left, top = col0 - self.col0, row0 - self.row0
-        return weighted(self.samples[top : top + height : every, left : left + width : every], self.scan.weights)
+    def windows(self, corners: NDArray[np.int64], side: int, every: int = 1) -> Image:
+        """(n, side, side) grey values from columns and rows (n, 2) of the scan on, all of them in the block, or every
+        so many of their columns and rows."""
+        firsts = (corners - self.place_px).tolist()
+        cut = [self.samples[top : top + side : every, left : left + side : every] for left, top in firsts]
+        return weighted(np.stack(cut), self.scan.weights)
 
     def reductions(self, factors: Iterable[int]) -> dict[int, Image]:
         """Its grey values area-averaged by each factor, from the coarsest of the others that divides it; each

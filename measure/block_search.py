@@ -88,7 +88,6 @@ def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Candidate]:
     """Those that lie in the block, in pixels of the scan."""
     reductions = block.reductions({octave.factor for octave in octaves})
     width, height = (size - 2 * block.margin_px for size in block.size_px)
-    last_px = np.array([block.scan.width_px, block.scan.height_px]) - 0.5
     for octave in octaves:
         factor, small = octave.factor, reductions[octave.factor]
         margin, spare = octave.margin_px // factor, (block.margin_px - octave.margin_px) // factor
@@ -99,7 +98,7 @@ def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Candidate]:
             place = np.array([block.col0, block.row0]) + factor * np.array([first, spare]) + (factor - 1) / 2
             for patch in octave.patches(small[rows, first:last]):
                 center = patch.center_px * factor + place
-                if (center <= last_px).all():
+                if center[0] < block.scan.width_px - 0.5 and center[1] < block.scan.height_px - 0.5:
                     yield Candidate(center, patch.pixel_from_disk * factor, patch.contrast_dn)
 
 

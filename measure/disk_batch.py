@@ -113,7 +113,7 @@ class _Group:
         places = np.array([disk.patch.center_px for disk in disks])
         inside = np.array(block.size_px) - side
         corners = np.clip(np.rint(places).astype(np.int64) - half - block.place_px, 0, inside) + block.place_px
-        grey = np.stack([block.window(col, row, side, side, every) for col, row in corners.tolist()])
+        grey = block.windows(corners, side, every)
         blur = np.array([disk.blur_px for disk in disks])
         model = DiskModel(DiskStates(places - corners, shapes, blur, np.zeros((len(disks), GREYS))), side, every)
         used = model.distance > -_margin_px(shapes)[:, None, None]

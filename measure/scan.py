@@ -244,7 +244,7 @@ def first_bytes(path: Path) -> bytes:
 
 
 def weighted(samples: Samples | Array, weights: Sequence[float]) -> Array:
-    """(height, width) float32 grey values of (height, width, channels) samples."""
+    """(..., height, width) float32 grey values of (..., height, width, channels) samples."""
     grey = samples[..., 0].astype(np.float32)
     if weights[0] != 1.0:
         grey *= weights[0]
