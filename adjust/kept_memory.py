@@ -8,9 +8,10 @@ LARGEST_FOLLOWED = 31 << 20  # bytes; glibc's threshold follows freed blocks of 
 def keep_freed_memory() -> None:
     """Have glibc keep tens of MiB of freed memory instead of giving every array back to the system.
 
-    An adjustment asks for the same arrays in every step. Memory that was given back comes again page by page, zeroed,
-    which took a fifth of the time of an adjustment of 20,000 points. What is kept follows the largest block that was
-    ever freed (mallopt(3), M_MMAP_THRESHOLD and M_TRIM_THRESHOLD): this one is never touched and takes no memory. Other
-    C libraries have rules of their own, and nothing happens.
+    An adjustment asks for the same arrays in every step, and one mark for arrays as large as the last one's. Memory
+    that was given back comes again page by page, zeroed, which took a fifth of the time of an adjustment of 20,000
+    points. What is kept follows the largest block that was ever freed (mallopt(3), M_MMAP_THRESHOLD and
+    M_TRIM_THRESHOLD): this one is never touched and takes no memory. Other C libraries have rules of their own, and
+    nothing happens.
     """
     np.empty(LARGEST_FOLLOWED, dtype=np.uint8)

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 
 import cv2
 
+from adjust.kept_memory import keep_freed_memory
+
 
 def processes(scans: int) -> int:
     """How many scans are measured at a time: one a core."""
@@ -36,3 +38,4 @@ def _prepare() -> None:
     """An interrupt from the terminal reaches every process; the one that started this one answers it for all."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
+    keep_freed_memory()  # one mark asks for arrays as large as the last one's: a twentieth of a scan's time
