@@ -16,7 +16,7 @@ from measure.glimpse import Glimpse, glimpse
 from measure.matching import Match, MatchOptions
 from measure.poses import up_from_camera
 from measure.prediction import MarkPrediction
-from measure.refinement import Sighting, leans_on_frame, sight
+from measure.refinement import Sighting, leans_on_frame, sight, strained_px
 from measure.rendering import extent_px
 from measure.scan import LUMINANCE, Scan
 from measure.shapes import FiducialLayout, FrameCorner, MarkShape
@@ -38,6 +38,7 @@ _FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, 
 _FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
 _LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
 _SAME_PX = 1.0
+_STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
 _SETTLED_PX = 1.5  # about a mark that was matched already
 _ROUNDS = 2  # of looking for faint marks: the first ones tell where the others are
 _REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
@@ -149,11 +150,18 @@ class _Sighter:
         self.pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / self.pitch[:, None]
 
     def settle(self) -> None:
-        """Match marks that do not tell their own rotation and scale once more, with those of the frame."""
-        leaning = [index for index in self._drawn() if leans_on_frame(self.layout.marks[index].mark)]
-        if leaning and self.belongs.sum() >= 2:
+        """Match marks that do not tell their own rotation and scale once more, with those of the frame; and those that
+        the frame's stretch and shear move, which no match tells."""
+        fits, linear = self._drawn(), self.pixel_from_camera[:, :2]
+        unsettled = [
+            index
+            for index, fit in fits.items()
+            if leans_on_frame(mark := self.layout.marks[index].mark)
+            or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
+        ]
+        if unsettled and self.belongs.sum() >= 2:
             frame_sigma = self._frame_sigma()
-            for index in leaning:
+            for index in unsettled:
                 self._match_again(index, self.options.match, frame_sigma)
             self.judge()
 

@@ -69,6 +69,11 @@ class Match:
     covariance: Array | None = None
 
     @property
+    def sigma_px(self) -> float:
+        """Standard deviation of a coordinate."""
+        return float(np.sqrt(np.trace(self.covariance_px2) / 2))
+
+    @property
     def snr(self) -> float:
         return abs(self.contrast_dn) / max(self.noise_dn, 1e-12)
 

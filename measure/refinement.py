@@ -13,6 +13,7 @@ from measure.first_look import seen
 from measure.frame_corner import corner_of_edges
 from measure.matching import Match, MatchOptions, match, window_about
 from measure.prediction import MarkPrediction
+from measure.rendering import extent_px
 from measure.scan import Scan
 from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
 
@@ -113,3 +114,12 @@ def leans_on_frame(mark: Mark) -> bool:
     """Whether the mark's own picture does not tell its scale from its place, as of a wedge's or a notch's edges: then
     rotation and scale come from the other marks."""
     return isinstance(mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.parts)
+
+
+def strained_px(mark: Mark, fitted: Array, linear: Array) -> float:
+    """How far about a mark is off because it was fitted with the stretch and shear of fitted (2, 2) instead of those of
+    linear: by as much as they move what of its drawing reaches farther to one side than to the other."""
+    change = linear @ np.linalg.inv(fitted) - np.eye(2)
+    strain = (change + change.T) / 2 - np.trace(change) / 2 * np.eye(2)
+    least, greatest = extent_px(mark, np.column_stack([linear, np.zeros(2)]))
+    return float(np.hypot(*(strain @ (least + greatest))))
