@@ -71,15 +71,14 @@ def same_picture(
     marks: Sequence[LayoutMark],
     first: tuple[str, Sequence[int]],
     second: tuple[str, Sequence[int]],
-    bounds: Bounds,
+    within_mm: float,
 ) -> bool:
-    """Whether two poses, each with the looks of its marks, put like marks in the same places: then one search does
-    for both."""
+    """Whether two poses, each with the looks of its marks, put like marks in the same places."""
     xy = np.array([mark.xy_mm for mark in marks])
     of_first, of_second = (xy @ up_from_camera(pose).T for pose, _ in (first, second))
     distance = np.hypot(*np.moveaxis(of_first[:, None] - of_second[None], -1, 0))
     nearest = distance.argmin(axis=1)
-    close = bool((distance.min(axis=1) < 0.1 * bounds.misfit_mm).all())
+    close = bool((distance.min(axis=1) < within_mm).all())
     alike = np.array_equal(np.asarray(first[1]), np.asarray(second[1])[nearest])
     polarities = [mark.mark.polarity for mark in marks]
     return close and alike and polarities == [polarities[index] for index in nearest]

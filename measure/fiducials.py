@@ -65,7 +65,7 @@ def measure_fiducials(
         search = FrameSearch(scan, layout, options, CLOSE)
         limit = np.inf if pitch_um is None else _STRETCH
         closer = [replace(each, tolerance=min(each.tolerance, limit)) for each in hypotheses[0]]
-        found, frame = _at_a_closer_look(search, closer, tried + len(closer))
+        found, frame = _at_a_closer_look(search, closer)
     if frame is None:
         return _nothing(scan, layout, reason)
     found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
@@ -128,14 +128,20 @@ def _in_spite_of_pitch(
 
 
 def _at_a_closer_look(
-    search: FrameSearch, hypotheses: Sequence[PitchHypothesis], tried: int
+    search: FrameSearch, hypotheses: Sequence[PitchHypothesis]
 ) -> tuple[list[Placement], Frame | None]:
     """The same where marks are looked at closer by, as the frame's edge may drown them. Their pictures need not be
-    clear, where chance would hardly make so many that agree in all the hypotheses tried."""
-    found = search.anywhere(hypotheses)
+    clear, where chance would hardly make so many that agree in all these hypotheses."""
+    found, tried = search.anywhere(hypotheses), len(hypotheses)
     if not found or tried * search.expected_alike(found[0]) > _HOPELESS:
         return [], None
-    frame = _as_its_pictures_say(search, found, found[0])
+    frames = [_as_its_pictures_say(search, found, found[0])]
+    if frames[0].belongs.any() and search.options.pose == "auto":
+        # Faint marks are not seen under one another's names, though they say not surely which these are.
+        posed = [_posed(found, frames[0].placement, pose) for pose in POSES]
+        pose = decide_pose(search.scan, search.layout, posed, frames[0], search.options)
+        frames.append(measure_frame(search.scan, search.layout, posed[POSES.index(pose.name)], search.options))
+    frame = max(frames, key=lambda frame: frame.belongs.sum())
     seen = {index: fit.center_px for index, fit in enumerate(frame.fits) if fit}
     sure = frame.agrees and tried * search.expected_where_seen(frame, seen) <= _CHANCE
     return found, frame if sure else None

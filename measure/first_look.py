@@ -23,13 +23,15 @@ _HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows 
 _SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
 
 
-def seen(scan: Scan, expected: MarkPrediction) -> Array | None:
+def seen(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None:
     """Column and row of the scan within the search radius where the mark correlates best, drawn sharp or else soft, to
-    a part of a pixel; None where noise would do so as well."""
+    a part of a pixel, and the expected number of places there that noise makes answer so well; None where noise would
+    do so."""
     for blur_px in (_SHARP_PX, _SOFT_PX):
         look = _Look(scan, expected, blur_px)
-        if look.chance() <= _CHANCE:
-            return look.center_px
+        chance = look.chance()
+        if chance <= _CHANCE:
+            return look.center_px, chance
     return None
 
 

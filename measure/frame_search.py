@@ -23,12 +23,14 @@ Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 _COMPARED = 8  # best placements: the one that chance makes least is among them
-_ANSWER_PX = 2.0  # of the reduced scan: how far from a mark its answer may lie
+_TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
+_NARROW = 0.25  # of the tolerance: marks on film that is hardly deformed agree as well
 
 
 @dataclass(frozen=True, eq=False)
 class _Searched:
-    """One hypothesis searched. looks: by pose, the kind of response of every mark; differ: poses that are no twins."""
+    """One hypothesis searched. looks: by pose, the kind of response of every mark; differ: poses whose marks do not
+    lie within the tolerance of another pose's."""
 
     search: PlacementSearch
     looks: dict[str, tuple[int, ...]]
@@ -90,7 +92,7 @@ class FrameSearch:
         places = self._camera_mm @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
         inside = np.all((places >= 0) & (places < (self.scan.width_px, self.scan.height_px)), axis=1)
         seen = {index: places[index] for index in np.flatnonzero(inside).tolist()}
-        return self._expected(placement, seen, search.tolerance_px, len(seen))
+        return self._expected(placement, seen, len(seen), search.tolerance_px)
 
     def expected_as_good(self, frame: Frame) -> float:
         """The same of a frame that was measured, only its marks without blemish counting as seen."""
@@ -108,35 +110,49 @@ class FrameSearch:
         return searched is not None and searched.search.responses.origins is None
 
     def expected_where_seen(self, frame: Frame, seen_px: dict[int, Array]) -> float:
-        """The same, with the marks that count as seen, by index, and where."""
-        inside = sum(sighting.inside for sighting in frame.sightings)
-        return self._expected(frame.placement, seen_px, _ANSWER_PX, inside)
+        """The same, with the marks that count as seen, by index, and where. Chance puts marks anywhere within the
+        tolerance: those that a similarity fits better are the less likely, the more of them there are."""
+        placement, inside = frame.placement, sum(sighting.inside for sighting in frame.sightings)
+        widest_px = self._searched[placement.pitch_mm].search.tolerance_px
+        tolerances = (widest_px, _NARROW * widest_px)
+        kept = [each for each in tolerances if each == widest_px or self._misfit_px(placement, seen_px) <= each]
+        return len(tolerances) * min(self._expected(placement, seen_px, inside, each) for each in kept)
 
-    def _expected(self, placement: Placement, seen_px: dict[int, Array], reach_px: float, inside: int) -> float:
-        """seen_px: by index, where marks were seen; their answers lie within reach_px (of the reduced scan)."""
-        searched = self._searched[placement.pitch_mm]
-        shares = []
+    def _misfit_px(self, placement: Placement, seen_px: dict[int, Array]) -> float:
+        """How far from its place (px of the reduced scan) the best similarity leaves a mark that was seen."""
+        if not seen_px:
+            return 0.0
+        pitch = np.asarray(placement.pitch_mm)
+        given = self._camera_mm[list(seen_px)] @ placement.pixel_from_camera[:, :2].T
+        given, seen = ((each - each.mean(axis=0)) * pitch @ (1, 1j) for each in (given, np.array([*seen_px.values()])))
+        turn = np.vdot(given, seen) / max(float(np.vdot(given, given).real), 1e-12)
+        return float(np.abs(seen - turn * given).max() / pitch.mean() / placement.reduction)
+
+    def _expected(self, placement: Placement, seen_px: dict[int, Array], inside: int, tolerance_px: float) -> float:
+        """seen_px: by index, where marks were seen, within tolerance_px (of the reduced scan) of the frame's places."""
+        searched, shares, same_px = self._searched[placement.pitch_mm], [], 1
         for index, place in seen_px.items():
             sign = sign_of(self.layout.marks[index].mark, placement.polarity)
             layer = searched.search.layers[searched.looks[placement.pose][index], sign]
-            _, heights = layer.highest(searched.search.responses.reduced_px(place)[None], reach_px)
-            shares.append(layer.wide.share(float(heights[0])))
+            reach = layer.within(tolerance_px)
+            shares.append(reach.share(searched.search.responses.reduced_px(place)))
+            same_px = reach.area_px
         counts = np.arange(min(3, inside), len(shares) + 1)
         if len(counts) == 0:
             return np.inf
         likely = comb(inside, counts) * np.sort(shares)[counts - 1] ** counts
-        return float(len(counts) * likely.min() * self._different_frames(searched))
+        return float(len(counts) * likely.min() * self._different_frames(searched, same_px))
 
-    def _different_frames(self, searched: _Searched) -> float:
+    def _different_frames(self, searched: _Searched, same_px: int) -> float:
+        """same_px: of the reduced scan: places so near to one another that they answer alike."""
         search = searched.search
         span_px = (
             float(np.hypot(*np.ptp(self._camera_mm, axis=0))) / float(search.pitch.mean()) / search.responses.reduction
         )
         places = self.scan.width_px * self.scan.height_px / search.responses.reduction**2
         of_other = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
-        same = np.pi * search.tolerance_px**2
         polarities = 2 if len(self._signs) > 1 else 1
-        return places / same * of_other / same * searched.differ * polarities
+        return places / same_px * of_other / same_px * searched.differ * polarities
 
     @property
     def _signs(self) -> set[int]:
@@ -157,10 +173,13 @@ class FrameSearch:
         differ = 0
         for number, pose in enumerate(self.poses):
             own = look_of[number * count : (number + 1) * count]
-            twin = next((name for name in found if same_picture(marks, (name, looks[name]), (pose, own), bounds)), "")
+            twin, like = (
+                next((name for name in found if same_picture(marks, (name, looks[name]), (pose, own), within_mm)), "")
+                for within_mm in (_TWIN * bounds.misfit_mm, bounds.misfit_mm)
+            )
             looks[pose] = own
             found[pose] = [place.posed(pose) for place in found[twin]] if twin else search.of_pose(pose, own)
-            differ += not twin
+            differ += not like
         self._searched[hypothesis.mm] = _Searched(search, looks, differ)
         return [placement for of_pose in found.values() for placement in of_pose]
 

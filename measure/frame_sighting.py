@@ -21,6 +21,7 @@ from measure.rendering import extent_px
 from measure.scan import LUMINANCE, Scan
 from measure.shapes import FiducialLayout, FrameCorner, MarkShape
 from measure.shared_blur import shared_blurs
+from measure.surroundings import CLOSE
 from measure.unseen import reason_unseen
 
 Array = NDArray[np.float64]
@@ -28,6 +29,7 @@ Mask = NDArray[np.bool_]
 
 _LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well
 _LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
+_FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly makes what is seen: contrast there is, at 95 %
 _MANY = 6  # marks that agree and tell where a faint one must be
 _CLEAR_RESPONSE = 0.25  # correlation of marks before they are fitted, where likenesses are CLEAR_LIKENESS
 _GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
@@ -304,9 +306,12 @@ class _Sighter:
         return misfit
 
     def _sight(self, index: int, search_px: float) -> Sighting:
+        """At a closer look a mark may be as faint as what texture feigns, where it hardly ever does so near by."""
         sighting = sight(self.scan, self._expected(index, search_px), self.options.match)
-        fit = sighting.fit
-        if fit is not None and (fit.likeness < _LEAST_LIKENESS or fit.significance < _LEAST_SIGNIFICANCE):
+        fit, closer = sighting.fit, self.placement.surroundings == CLOSE
+        sure = closer and sighting.chance <= _CHANCE
+        least = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
+        if fit is not None and (fit.likeness < least[0] or fit.significance < least[1]):
             reason = f"nothing within {search_px:.0f} px of its place looks like it"
             return Sighting(sighting.predicted_px, True, None, reason)
         return sighting

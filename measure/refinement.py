@@ -30,12 +30,14 @@ _LEANING_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """What was seen where a mark was predicted: predicted_px (2,); fit is None where nothing could be fitted, and
-    reason says why. inside: whether the predicted place lies in the scan."""
+    reason says why. inside: whether the predicted place lies in the scan. chance: the expected number of places about
+    it that noise makes look as much like the mark."""
 
     predicted_px: Array
     inside: bool
     fit: Match | None
     reason: str = ""
+    chance: float = 1.0
 
 
 def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None) -> Sighting:
@@ -48,7 +50,7 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
         return Sighting(predicted, False, None, "its place is outside of the scan")
-    fit = _fitted(scan, expected, options, frame_sigma)
+    fit, chance = _fitted(scan, expected, options, frame_sigma)
     if fit is None:
         return Sighting(predicted, True, None, f"nothing within {expected.search_px:.0f} px of its place looks like it")
     if not fit.converged:
@@ -56,7 +58,8 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     reason = _unlike(fit, expected, scan.full_scale_dn)
     if reason:
         return Sighting(predicted, True, None, reason)
-    return Sighting(predicted, True, replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn)))
+    fit = replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn))
+    return Sighting(predicted, True, fit, chance=chance)
 
 
 def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> str:
@@ -77,21 +80,25 @@ def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> str:
     return ""
 
 
-def _fitted(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None) -> Match | None:
-    """The mark matched where it looks most like itself; None where nothing looks like it."""
+def _fitted(
+    scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None
+) -> tuple[Match | None, float]:
+    """The mark matched where it looks most like itself, and the expected number of places that noise makes look so;
+    None where nothing looks like it."""
     mark, weights = expected.mark, expected.weights
     if isinstance(mark, FrameCorner):
-        return corner_of_edges(scan, mark, expected)
-    center_px = seen(scan, expected)
-    if center_px is None:
-        return None
+        return corner_of_edges(scan, mark, expected), 1.0
+    look = seen(scan, expected)
+    if look is None:
+        return None, 1.0
+    center_px, chance = look
     start = expected.moved(center_px).pixel_from_mark
     col0, row0, width, tall = window_about(mark, start, options.margin_px + BESIDE_PX)
     window = scan.window(col0, row0, width, tall, weights).astype(float)
     valid = _inside_scan(scan, col0, row0, width, tall)
     clipped = clipped_sides(scan, col0, row0, width, tall, weights)
     own = _options_for(mark, options, frame_sigma)
-    return match(window, (col0, row0), mark, start, own, valid, clipped, scan.is_lossy)
+    return match(window, (col0, row0), mark, start, own, valid, clipped, scan.is_lossy), chance
 
 
 def _inside_scan(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:

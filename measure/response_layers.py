@@ -27,19 +27,26 @@ class Layer:
 
     def __init__(self, map_: Map, origin: NDArray[np.int_], tolerance_px: float) -> None:
         self.map, self.origin, self.tolerance_px = map_, origin, tolerance_px
+        self._reaches: dict[float, Reach] = {}
 
     @cached_property
     def candidates(self) -> Array:
         """(n, 2) px of the reduced scan."""
         return peaks(self.map, _CANDIDATES, _LEAST_RESPONSE)[0] + self.origin
 
-    @cached_property
+    @property
     def wide(self) -> "Reach":
-        return Reach(self.map, self.origin, self.tolerance_px)
+        return self.within(self.tolerance_px)
 
-    @cached_property
+    @property
     def near(self) -> "Reach":
-        return Reach(self.map, self.origin, narrowed(self.tolerance_px))
+        return self.within(narrowed(self.tolerance_px))
+
+    def within(self, radius_px: float) -> "Reach":
+        """What is asked of the responses within a radius."""
+        if radius_px not in self._reaches:
+            self._reaches[radius_px] = Reach(self.map, self.origin, radius_px)
+        return self._reaches[radius_px]
 
     def highest(self, places: Array, radius_px: float) -> tuple[Array, Array]:
         """The highest responses about places (n, 2) of the reduced scan, and (n,) how high; 0 outside of the map."""
@@ -48,16 +55,18 @@ class Layer:
 
 
 class Reach:
-    """The highest response within a radius of every place, and what chance places answer: nineteen in twenty of them
-    stay below it."""
+    """The highest response within a radius of every place, area_px large, and what chance places answer: nineteen in
+    twenty of them stay below it."""
 
     def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float) -> None:
-        self.map, self.origin = _dilated(map_, radius_px), origin
+        about = _about(radius_px)
+        self.map, self.origin, self.area_px = np.asarray(cv2.dilate(map_, about)), origin, int(about.sum())
         self.chance = max(float(np.percentile(self.map[::3, ::3], 95)), 0.0)
 
-    def share(self, height: float) -> float:
-        """Of all places, those that answer as strongly."""
-        return float(np.mean(self.map >= height))
+    def share(self, place: Array) -> float:
+        """Of all places, those that answer as strongly as the one (2,) of the reduced scan."""
+        col, row = np.clip(np.rint(place).astype(int) - self.origin, 0, np.array(self.map.shape[::-1]) - 1)
+        return float(np.mean(self.map >= self.map[row, col]))
 
     def strength(self, places: NDArray[np.int_]) -> tuple[Array, NDArray[np.bool_]]:
         """How much the places (n, 2) of the reduced scan answer beyond chance, and which of them lie in the map; those
@@ -69,9 +78,10 @@ class Reach:
         return np.maximum(np.maximum(response, 0.0) ** 2 - self.chance**2, 0.0), inside
 
 
-def _dilated(map_: Map, radius_px: float) -> Map:
+def _about(radius_px: float) -> NDArray[np.uint8]:
+    """1 within the radius."""
     size = 2 * round(radius_px) + 1
-    return np.asarray(cv2.dilate(map_, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))))
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
 
 
 def highest(map_: Map, places: Array, radius_px: float) -> tuple[Array, Array]:
