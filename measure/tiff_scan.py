@@ -21,7 +21,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds
 WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
 JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
-MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time
+MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time; larger tiles and strips are not copied
 REDUCED_IMAGE, TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
 DECODING_ERRORS = (RuntimeError, ValueError, OSError, IndexError, TypeError, struct.error, TiffFileError)
 
@@ -187,11 +187,18 @@ class TiffSegments:
         samples: NDArray[np.generic] = np.asarray(decoded)[0]
         return samples
 
-    def _stored(self, index: int) -> bytes:
-        """A tile or strip as the file has it."""
+    def _stored(self, index: int) -> bytes | memoryview:
+        """A tile or strip as the file has it: mapped where it is so large that a copy would take long, for a mapping
+        takes longer than the copy of a small one."""
+        offset, size = self._page.dataoffsets[index], self._page.databytecounts[index]
+        if size > MAPPED_BYTES:
+            before = offset % ALLOCATIONGRANULARITY
+            length = before + size
+            mapped = mmap(self._file.filehandle.fileno(), length, access=ACCESS_READ, offset=offset - before)
+            return memoryview(mapped)[before:]
         with self._reading:
-            self._file.filehandle.seek(self._page.dataoffsets[index])
-            return self._file.filehandle.read(self._page.databytecounts[index])
+            self._file.filehandle.seek(offset)
+            return self._file.filehandle.read(size)
 
     def close(self) -> None:
         self._file.close()
