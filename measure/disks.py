@@ -57,6 +57,11 @@ class FittedDisk:
         return bool(np.all(np.isfinite(self.covariance_px2)) and self.blur_px > MOST_BLUR * self.half_axes_px[1])
 
     @property
+    def is_spoilt(self) -> bool:
+        """Whether it was fitted, and too little about it fits a disk."""
+        return bool(np.all(np.isfinite(self.covariance_px2)) and self.damaged_fraction > MOST_DAMAGE)
+
+    @property
     def lone_doubt(self) -> str:
         """Why a disk that cannot be compared with others is doubtful: dust and spots look like it; empty otherwise."""
         shorter = self.half_axes_px[1]
@@ -130,8 +135,11 @@ def fit_disk(
         softer = fitted(soft)
         return disk if softer.reason else softer
     # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
-    # it does how soft an edge is.
-    return fitted(sure) if sure < wide and disk.reason and not disk.is_soft else disk
+    # it does how soft an edge is: what passes with less of it may be the dust itself.
+    if not disk.reason or disk.is_soft or not sure < wide:
+        return disk
+    narrow = fitted(sure)
+    return replace(narrow, weakness=f"with more ground: {disk.reason}") if disk.is_spoilt else narrow
 
 
 def look_covariance(fit: Match) -> Array:
@@ -161,7 +169,7 @@ def judged(disk: FittedDisk, residual_correlation: float) -> FittedDisk:
         reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
     elif disk.noise_dn > (WORST_SMOOTH_MISFIT if residual_correlation > SMOOTH else WORST_MISFIT) * contrast:
         reason = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
-    elif disk.damaged_fraction > MOST_DAMAGE:
+    elif disk.is_spoilt:
         reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
     elif shorter < SMALLEST_RADIUS_PX:
         reason = f"too small: half axis {shorter:.1f} px"

@@ -8,7 +8,7 @@ from measure.noise import NoiseModel, correlated, robust_scale
 from measure.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.pixel_sums import combined, products
 from measure.rendering import chip_mask, picture
-from measure.robust import damage, solution, tukey_loss, tukey_weights
+from measure.robust import damage, grown, solution, tukey_loss, tukey_weights
 from measure.shapes import MarkTemplate
 from measure.uneven_residuals import covariance_where_uneven
 from measure.weighting import weighted
@@ -77,7 +77,7 @@ class PictureFit:
 
     def _is_plain(self) -> bool:
         """Whether undamaged pixels far from the mark vary as the nearer ones do."""
-        near, far = self.used & ~self.far, self.used & self.far
+        near, far = self._clear & ~self.far, self._clear & self.far
         squares = self.model.residuals**2
         plain = far.sum() >= _PLAIN_SHARE * (self.area & self.far).sum()
         return bool(
@@ -157,9 +157,14 @@ class PictureFit:
 
     @property
     def damaged_fraction(self) -> float:
-        """Of the pixels about the mark, as far as the ground has to be plain there."""
+        """Of the pixels about the mark, as far as the ground has to be plain there: those on damage or next to it."""
         near = self.area & ~self.far
-        return 1.0 - float((near & self.used).sum() / max(near.sum(), 1))
+        return 1.0 - float((near & self._clear).sum() / max(near.sum(), 1))
+
+    @property
+    def _clear(self) -> Mask:
+        """The pixels used that do not touch damage."""
+        return self.used & ~grown(self.area & ~self.used)
 
     def choose_area(self) -> None:
         """The pixels within margin_px of the mark: beyond it the background only disturbs."""

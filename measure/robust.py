@@ -45,14 +45,30 @@ def solution(normal: Array, right: Array, free: Mask) -> Array | None:
 
 
 def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float) -> Mask:
-    """Pixels of dust and scratches: where smoothed residuals exceed so many of their standard deviations over more
-    than a pixel, and the pixels next to these. floor_dn: under that standard deviation, for clean data have none."""
+    """Pixels of dust and scratches: regions where smoothed residuals exceed so many of their standard deviations, and
+    that are wider than a pixel somewhere. floor_dn: under that standard deviation, for clean data have none.
+
+    The smoothing already reaches as far beyond a speck as its blurred edge does. To grow the regions by another pixel
+    costs more of a small mark's edge than what is left of the specks spoils."""
     weight = cv2.GaussianBlur(area.astype(float), (0, 0), 0.8)
     smooth = cv2.GaussianBlur(np.where(area, residuals, 0.0), (0, 0), 0.8) / np.maximum(weight, 0.1)
     smooth = np.where(area, smooth, 0.0)
-    scale = max(robust_scale(smooth[area]), floor_dn)
-    large = (np.abs(smooth) > sigmas * scale).astype(np.uint8)
-    # An even square lies off its middle: where it erodes to the left it has to dilate to the right.
+    limit = sigmas * max(robust_scale(smooth[area]), floor_dn)
+    # Much dust widens even that scale, and hides the fainter specks: what it shows at once is left out of it.
+    limit = sigmas * max(robust_scale(smooth[area & (np.abs(smooth) <= limit)]), floor_dn)
+    large = np.abs(smooth) > limit
+    # How wide a region is that leaves the area is not known: there it counts as wide. An even square lies off its
+    # middle: where it erodes to the left it has to dilate to the right.
     speck = np.ones((2, 2), np.uint8)
-    opened = cv2.dilate(cv2.erode(large, speck, anchor=(0, 0)), speck, anchor=(1, 1))
-    return np.asarray(cv2.dilate(opened, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) > 0)
+    eroded = cv2.erode((large | ~area).astype(np.uint8), speck, anchor=(0, 0))
+    wide = cv2.dilate(eroded, speck, anchor=(1, 1)) > 0
+    count, regions = cv2.connectedComponents(large.astype(np.uint8), connectivity=4)
+    is_damage = np.zeros(count, dtype=bool)
+    is_damage[regions[wide & large]] = True
+    return np.asarray(is_damage[regions])
+
+
+def grown(mask: Mask) -> Mask:
+    """The mask and the pixels that touch it along an edge."""
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), cross) > 0)
