@@ -15,7 +15,7 @@ from measure.matching import Match, MatchOptions, match, window_about
 from measure.prediction import MarkPrediction
 from measure.rendering import extent_px
 from measure.scan import Scan
-from measure.shapes import FrameCorner, Mark, MarkShape, Polygon
+from measure.shapes import Disk, FrameCorner, Mark, MarkShape, Polygon
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ _MOST_CONTRAST = (
     2.0  # times the scanner's range: more than that no light takes, and lines are hardly twice as wide as drawn
 )
 _SURE = 3.0  # standard deviations
-_LEANING_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
+_SOLID_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +108,20 @@ def _inside_scan(scan: Scan, col0: int, row0: int, width: int, height: int) -> N
 
 
 def _options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
-    """Where the mark leans on the frame, its rotation and scale stay as predicted, or near it."""
+    """A solid mark gets more ground. Where the mark leans on the frame, its rotation and scale stay as predicted, or
+    near it."""
+    if _is_solid(mark):
+        options = replace(options, margin_blurs=max(options.margin_blurs, _SOLID_MARGIN_BLURS))
     if not leans_on_frame(mark):
         return options
-    options = replace(options, margin_blurs=max(options.margin_blurs, _LEANING_MARGIN_BLURS))
     if frame_sigma is None:
         return replace(options, freedom="shift")
     return replace(options, freedom="similarity", linear_sigma=frame_sigma)
+
+
+def _is_solid(mark: Mark) -> bool:
+    """Whether the mark has an outline only and no lines, whose two edges hold it whatever the ground's slope is."""
+    return isinstance(mark, MarkShape) and all(isinstance(part, Polygon | Disk) for part in mark.parts)
 
 
 def leans_on_frame(mark: Mark) -> bool:
