@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from measure.rendering import ROUGH_CELLS, extent_px, picture
 from measure.scan import Scan
-from measure.shapes import Mark, thinnest_mm
+from measure.shapes import Mark, MarkTemplate, thinnest_mm
 from measure.surroundings import WIDE, Map, Surroundings
 
 Array = NDArray[np.float64]
@@ -24,6 +24,7 @@ _THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns
 _LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
 _SHARED_PX = 16  # of the reduced scan: places so near to one another share a window
 _ALIKE = 0.8  # correlation above which two pictures of marks share one response
+_LEARNED = 2.0  # times its finest detail: a notch or block is wider, and would be most of what ground is the median of
 FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
 
 
@@ -157,7 +158,9 @@ def _reduction(scan: Scan, looks: Sequence[Look]) -> int:
 
 
 def _reduced_detail_px(look: Look, reduction: int) -> float:
-    return max(detail_px(look.mark, look.linear) / reduction, 1.0)
+    """In px of the reduced scan, the width of what is no ground: the finest detail, or of a learned picture more."""
+    wide = _LEARNED if isinstance(look.mark, MarkTemplate) else 1.0
+    return max(wide * detail_px(look.mark, look.linear) / reduction, 1.0)
 
 
 def _templates(looks: Sequence[Look], reduction: int) -> list[Array]:
