@@ -208,7 +208,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         pixel_from_mark=state.pixel_from_mark,
         contrast_dn=float(state.greys[0]),
         noise_dn=float(np.sqrt(noise.variance_dn2)),
-        blur_px=model.blur_px,
+        blur_px=model.scan_blur_px,
         damaged_fraction=fit.damaged_fraction,
         redundancy=int(used.sum()) - len(model.design),
         neighbour_correlation=noise.neighbour_correlation,

@@ -77,6 +77,7 @@ class PictureModel:
         self.is_clipped = bool(clipped.any())
         self.tells = np.ones(grey.shape, dtype=bool)
         is_chip = isinstance(mark, MarkTemplate)
+        self.smoothed_px2 = _CHIP_SMOOTHED_PX**2 if is_chip else 0.0
         seen = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), dtype=float) if is_chip else grey
         self.grey = self._detail(seen)
         generators = [g for g in _GENERATORS[options.freedom] if not (g is _TURN and is_round(mark))]
@@ -85,7 +86,7 @@ class PictureModel:
         self.blur = 2 + len(self.generators) if options.estimate_blur else None
         # A chip already has its scan's blur: where none is estimated, none is added.
         added_px2 = 0.0 if is_chip and not options.estimate_blur else options.blur_px**2
-        self.state = state or State(start.copy(), added_px2 + is_chip * _CHIP_SMOOTHED_PX**2, np.zeros(GREY))
+        self.state = state or State(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
         # The state and the noise that the design is of, and its residuals.
         self._linearised: tuple[State, float, Array] | None = None
         self.bent = BENT
@@ -168,6 +169,11 @@ class PictureModel:
     @property
     def blur_px(self) -> float:
         return float(np.sqrt(self.state.variance_px2))
+
+    @property
+    def scan_blur_px(self) -> float:
+        """The scan's own blur; beside a chip only what it has more than that."""
+        return float(np.sqrt(max(self.state.variance_px2 - self.smoothed_px2, 0.0)))
 
     @property
     def seen_blur_px(self) -> float:
