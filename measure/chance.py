@@ -16,7 +16,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, Frame
 from measure.frame_search import FrameSearch
-from measure.frame_sighting import REDUCED_PX
+from measure.frame_sighter import REDUCED_PX
 from measure.prediction import MarkPrediction
 from measure.scan import Scan
 from measure.shapes import FiducialLayout

@@ -45,8 +45,8 @@ class Match:
     they were taken as white where covariance_is_white. likeness: correlation of the fitted picture with the window,
     less its plane background: 1 for a perfect mark, 0 for none.
     significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
-    share included; infinite where it was not estimated, or is at an end of its range. edges: the mark's place by
-    another method, to compare.
+    share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
+    of its range. edges: the mark's place by another method, to compare.
     """
 
     converged: bool
@@ -65,6 +65,7 @@ class Match:
     significance: float
     residuals_dn: Array
     blur_sigma: float = np.inf
+    size_sigma: float = np.inf
     edges: EdgePlace | None = None
     covariance: Array | None = None
 
@@ -217,6 +218,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         significance=fit.contrast_dn / gain_sigma,
         residuals_dn=np.where(fit.area, model.residuals, np.nan),
         blur_sigma=_blur_sigma(model, covariance),
+        size_sigma=float(np.sqrt(covariance[2, 2])) if model.tells_size else np.inf,
         edges=edges,
         covariance=covariance,
     )

@@ -167,6 +167,11 @@ class PictureModel:
             self.tells[at] = tells(slopes)
 
     @property
+    def tells_size(self) -> bool:
+        """Whether the size is an unknown: then it is the first of the generators' parameters."""
+        return len(self.generators) > 0
+
+    @property
     def blur_px(self) -> float:
         return float(np.sqrt(self.state.variance_px2))
 

@@ -123,6 +123,15 @@ def test_writing_beside_one_mark_names_no_pose(tmp_path: Path) -> None:
     assert not result.pose.decided, result.pose.evidence
 
 
+def test_what_covers_a_dot_and_looks_like_a_smaller_one_is_doubted(tmp_path: Path) -> None:
+    dot, speck = MarkShape((Disk((0.0, 0.0), 0.4),)), MarkShape((Disk((0.01, -0.015), 0.34),))
+    matrix = pixel_from_camera("0")
+    given = layout_of([dot] * 4)
+    result = measured(frame_picture(layout_of([dot, dot, dot, speck]), matrix), given, tmp_path)
+    assert [mark.status for mark in result.marks] == [Status.MEASURED] * 3 + [Status.WEAK]
+    assert "0.85 times as large as the other marks" in result.marks[3].reason
+
+
 def test_the_users_pose_is_taken(tmp_path: Path) -> None:
     matrix = pixel_from_camera("270m")
     result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, FiducialOptions(pose="270m"))

@@ -1,4 +1,4 @@
-"""What marks tell of one another's blur, against blurs drawn at random about the scan's own."""
+"""What marks tell of one another's blur and size, against such drawn at random about the scan's own."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from measure.shared_blur import shared_blurs
+from measure.shared_looks import odd_sizes, shared_blurs
 
 PIXEL = 1 / 12
 
@@ -41,3 +41,26 @@ def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
 
 def test_too_few_marks_tell_nothing() -> None:
     assert shared_blurs(fits([1.2, 1.2, 1.2, 0.6], [0.01, np.inf, np.inf, 0.1])) == [None] * 4
+
+
+def test_marks_of_one_size_are_rarely_doubted_and_another_size_is() -> None:
+    rng, linear = np.random.default_rng(2), np.array([[19.0, 2.0], [2.0, -19.0]])
+    doubted, found = 0, 0
+    for _ in range(300):
+        sigmas = rng.uniform(0.005, 0.05, 5)
+        sizes = 1.08 * np.exp(rng.normal(0, np.hypot(sigmas, 0.03)))  # of all alike: the drawing's fault
+        doubted += any(size is not None for size in odd_sizes(sized(sizes, sigmas, linear), linear))
+        sizes[0], sigmas[0] = 0.85, 0.02
+        odd = odd_sizes(sized(sizes, sigmas, linear), linear)[0]
+        found += odd is not None and abs(odd - 0.79) < 0.08
+    assert doubted <= 12
+    assert found > 270
+
+
+def sized(sizes: Any, sigmas: Any, linear: Any) -> list[Any]:
+    """As matches have them, each turned otherwise."""
+    turns = [np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in np.arange(len(sizes))]
+    return [
+        SimpleNamespace(pixel_from_mark=np.column_stack([size * turn @ linear, np.zeros(2)]), size_sigma=sigma)
+        for size, turn, sigma in zip(sizes, turns, sigmas, strict=True)
+    ]

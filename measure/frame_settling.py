@@ -1,0 +1,100 @@
+"""The marks of a frame settled by what it says of them: matched again where the frame or the other marks know better,
+and doubted where they look unlike the others."""
+
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+
+from measure.frame_sighter import FrameSighter
+from measure.match_options import MatchOptions
+from measure.matching import Match
+from measure.refinement import leans_on_frame, sight, strained_px
+from measure.shapes import Mark, MarkShape
+from measure.shared_looks import odd_sizes, shared_blurs
+
+_STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
+_SETTLED_PX = 1.5  # about a mark that was matched already
+
+
+def settle(sighter: FrameSighter) -> None:
+    """Match marks that do not tell their own rotation and scale once more, with those of the frame; and those that the
+    frame's stretch and shear move, which no match tells."""
+    linear = sighter.pixel_from_camera[:, :2]
+    unsettled = [
+        index
+        for index, fit in _drawn(sighter).items()
+        if leans_on_frame(mark := sighter.layout.marks[index].mark)
+        or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
+    ]
+    if unsettled and sighter.belongs.sum() >= 2:
+        frame_sigma = _frame_sigma(sighter)
+        for index in unsettled:
+            _match_again(sighter, index, sighter.options.match, frame_sigma)
+        sighter.judge()
+
+
+def share_blur(sighter: FrameSighter) -> None:
+    """Match marks that hardly tell their own blur once more, with that of the others; what differs from theirs is
+    doubted."""
+    fits = _adjusted(sighter)
+    told = zip(fits, shared_blurs(list(fits.values())), strict=True)
+    shared = {index: blur for index, blur in told if blur is not None}
+    if not shared:
+        return
+    frame_sigma = _frame_sigma(sighter)
+    for index, blur in shared.items():
+        match = replace(sighter.options.match, blur_px=blur.blur_px, blur_sigma=blur.sigma)
+        _match_again(sighter, index, match, frame_sigma)
+        if blur.differs:
+            own_px = fits[index].blur_px
+            sighter.doubt(index, f"its blur is {own_px:.2f} px, where the other marks have {blur.blur_px:.2f}")
+    sighter.judge()
+
+
+def doubt_sizes(sighter: FrameSighter) -> None:
+    """Doubt marks of another size than the others that are drawn alike: dust, say, that covers one."""
+    alike: dict[Mark, list[int]] = defaultdict(list)
+    fits = _adjusted(sighter)
+    for index in fits:
+        mark = sighter.layout.marks[index].mark
+        if not leans_on_frame(mark):
+            alike[mark].append(index)
+    for indices in alike.values():
+        sizes = odd_sizes([fits[index] for index in indices], sighter.pixel_from_camera[:, :2])
+        for index, size in zip(indices, sizes, strict=True):
+            if size is not None:
+                sighter.doubt(index, f"it is {size:.2f} times as large as the other marks: dust may cover it")
+
+
+def _drawn(sighter: FrameSighter) -> dict[int, Match]:
+    """The fits of marks that belong, are plainly there and drawn: a picture of a mark has a blur of its own."""
+    return {
+        index: sighting.fit
+        for index, (mark, sighting) in enumerate(zip(sighter.layout.marks, sighter.sightings, strict=True))
+        if sighter.belongs[index] and sighter.clear(index) and isinstance(mark.mark, MarkShape)
+        if sighting is not None and sighting.fit is not None
+    }
+
+
+def _adjusted(sighter: FrameSighter) -> dict[int, Match]:
+    """Those of them that are no glimpses."""
+    return {index: fit for index, fit in _drawn(sighter).items() if fit.covariance is not None}
+
+
+def _frame_sigma(sighter: FrameSighter) -> float:
+    """The standard deviation of the frame's rotation (rad) and scale."""
+    belonging = sighter.camera[sighter.belongs]
+    radius_mm = float(np.hypot(*(belonging - belonging.mean(axis=0)).T).mean())
+    return float(np.hypot(sighter.options.film_sigma_mm, sighter.scatter_mm())) / radius_mm
+
+
+def _match_again(sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float) -> None:
+    """Where it was found, with the frame's rotation and scale where it leans on them."""
+    before = sighter.sightings[index]
+    if before is None or before.fit is None:
+        return
+    expected = sighter.expected(index, _SETTLED_PX).moved(before.fit.center_px)
+    after = sight(sighter.scan, expected, options, frame_sigma)
+    if after.fit is not None:
+        sighter.sightings[index] = replace(before, fit=after.fit)

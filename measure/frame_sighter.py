@@ -1,0 +1,255 @@
+"""A frame while its marks are sighted: what was seen of each so far, which of them agree, and the frame they make."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.channels import best_weights
+from measure.constellation import Placement, sign_of
+from measure.fiducial_options import FiducialOptions
+from measure.first_look import strongest
+from measure.frame import CLEAR_LIKENESS, Frame
+from measure.frame_fit import fit_frame, strangers
+from measure.glimpse import Glimpse, glimpse
+from measure.poses import up_from_camera
+from measure.prediction import MarkPrediction
+from measure.refinement import Sighting, sight
+from measure.rendering import extent_px
+from measure.scan import LUMINANCE, Scan
+from measure.shapes import FiducialLayout, FrameCorner
+from measure.surroundings import CLOSE
+from measure.unseen import reason_unseen
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LEAST_LIKENESS = 0.35  # below it texture, text and scratches look like a mark as well
+_LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
+_FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly makes what is seen: contrast there is, at 95 %
+MANY = 6  # marks that agree and tell where a faint one must be
+_CLEAR_RESPONSE = 0.25  # correlation of marks before they are fitted, where likenesses are CLEAR_LIKENESS
+_GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
+_CHANNEL_TRIALS = 6  # marks that the channels are chosen from
+REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
+_CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
+_FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
+_FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
+_LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
+_SAME_PX = 1.0
+_REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
+_NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
+_EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
+_SINGLE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class FrameSighter:
+    """The state of a frame's measurement."""
+
+    def __init__(
+        self,
+        scan: Scan,
+        layout: FiducialLayout,
+        placement: Placement,
+        options: FiducialOptions,
+    ) -> None:
+        self.scan, self.layout, self.placement, self.options = scan, layout, placement, options
+        self.pitch = np.asarray(placement.pitch_mm)
+        self.camera = np.array([mark.xy_mm for mark in layout.marks])
+        self.turn = up_from_camera(placement.pose)
+        self.pixel_from_camera = placement.pixel_from_camera
+        self.sightings: list[Sighting | None] = [None] * len(layout.marks)
+        self.belongs: Mask = np.zeros(len(layout.marks), dtype=bool)
+        self.vouched: Mask = np.zeros(len(layout.marks), dtype=bool)
+        self.weights: tuple[float, ...] | None = None
+        gate_px = options.gate_mm / float(self.pitch.mean())
+        self.first_search_px = REDUCED_PX * placement.reduction + options.search_mm(layout) / float(self.pitch.mean())
+        self.gate_px = gate_px
+
+    def choose_channels(self) -> None:
+        """Of a colour scan: the channel in which some marks are most like their drawings, then from these the best
+        combination."""
+        if self.scan.channels == 1:
+            return
+        step = max(1, len(self.layout.marks) // _CHANNEL_TRIALS)
+        places = []
+        for index in range(0, len(self.layout.marks), step):
+            expected = self.expected(index, self.first_search_px)
+            answers = [strongest(self.scan, replace(expected, weights=weights)) for weights in (LUMINANCE, *_SINGLE)]
+            place, height = max(answers, key=lambda answer: answer[1])
+            if height > _CLEAR_RESPONSE:
+                places.append((expected.mark, expected.moved(place).pixel_from_mark))
+        self.weights = best_weights(self.scan, places)
+
+    def look(self, indices: Sequence[int], search_px: float) -> None:
+        # From below upwards: the search of windows ended there, and what it read last is still decoded.
+        rows = self._predicted_px()[:, 1]
+        upwards = sorted(indices, key=lambda index: -rows[index])
+        sighted = self.scan.each(lambda index: self._sight(index, search_px), upwards)
+        for index, sighting in zip(upwards, sighted, strict=True):
+            self.sightings[index] = sighting
+
+    def look_astray(self, indices: Sequence[int]) -> None:
+        """Look at marks where the others put them, first near by, then as far off as one may lie that keeps the gate:
+        so far only what is plainly there counts."""
+        for index in indices:
+            self.look([index], self.gate_px)
+            near, far_px = self.sightings[index], self._astray_px(index)
+            if not self.clear(index) and far_px > self.gate_px:
+                self.look([index], far_px)
+                self.sightings[index] = self.sightings[index] if self.clear(index) else near
+
+    def _astray_px(self, index: int) -> float:
+        """A mark that is fitted pulls the frame to itself, and the more the fewer the others are: its distance from
+        where they alone put it is its residual times one more than their prediction's variance, a mark's being one."""
+        others = np.flatnonzero(self.belongs & (np.arange(len(self.belongs)) != index))
+        affine = np.column_stack([self.camera, np.ones(len(self.camera))])
+        if np.linalg.matrix_rank(affine[others]) < affine.shape[1]:
+            return self.gate_px
+        variance = float(affine[index] @ np.linalg.inv(affine[others].T @ affine[others]) @ affine[index])
+        return min((1 + variance) * self.gate_px, self.first_search_px)
+
+    def judge(self) -> None:
+        """Which marks found belong together, and the frame through them."""
+        found = np.array([s is not None and s.fit is not None for s in self.sightings])
+        self.belongs = found.copy()
+        if found.sum() < 2:
+            return
+        index = np.flatnonzero(found)
+        up, sigma = self._up_mm(index), self._sigma_mm(index)
+        out = strangers(self.camera[index], up, sigma, self.turn, self.options.gate_mm) & ~self.vouched[index]
+        self.belongs[index[out]] = False
+        fit = fit_frame(self.camera[index[~out]], up[~out], sigma[~out], self.turn)
+        self.pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / self.pitch[:, None]
+
+    def sure(self) -> bool:
+        """Whether so many marks agree, some of them clear ones, that they tell where every other must be."""
+        clear = sum(self.clear(index) for index in np.flatnonzero(self.belongs).tolist())
+        return bool(self.belongs.sum() >= MANY and clear >= MANY / 2)
+
+    def glimpse_faint(self, reach_px: float) -> None:
+        """Look again at every mark that is not clear, or does not lie where the others put it: what stands out of its
+        texture there is this mark, the film being deformed where it lies off. A clear one may be a pattern beside it.
+        """
+        near = self.belongs & (self._misfit_mm() <= _NEAR * self.scatter_mm())
+        faint = [
+            (index, sighting)
+            for index, sighting in enumerate(self.sightings)
+            if sighting is not None and sighting.inside and not (self.clear(index) and near[index])
+            if not isinstance(self.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
+        ]
+        agreeing = [s.fit for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s is not None and s.fit]
+        if not faint or not agreeing:
+            return
+        # The marks that agree tell both better than a faint mark does itself.
+        blur_px = float(np.median([fit.blur_px for fit in agreeing]))
+        usual_dn = float(np.median([abs(fit.contrast_dn) for fit in agreeing]))
+        extremes = np.percentile(self.scan.reduced(self.placement.reduction, self.weights), _EXTREMES)
+        for index, sighting in faint:
+            expected = self.expected(index, reach_px)
+            extreme_dn = float(extremes[int(expected.polarity > 0)])
+            seen = glimpse(self.scan, expected, extreme_dn, blur_px)
+            known = seen is not None and seen.sigma_px <= _FAINT_SIGMA_PX
+            certain = seen is not None and self._certain(seen)
+            ground = self._ground(expected)
+            room_dn = max(expected.polarity * (extreme_dn - float(np.median(ground))), 0.0)
+            light = expected.polarity > 0
+            unseen = reason_unseen(light, room_dn, usual_dn, float(ground.std()), reach_px, seen, certain)
+            self._take(index, sighting, seen if certain and known else None, unseen)
+
+    def doubt(self, index: int, reason: str) -> None:
+        """Say of a mark that was seen why it may be wrong."""
+        sighting = self.sightings[index]
+        if sighting is not None:
+            reasons = [each for each in (sighting.reason, reason) if each]
+            self.sightings[index] = replace(sighting, reason="; ".join(reasons))
+
+    def _ground(self, expected: MarkPrediction) -> Array:
+        """The grey values about a mark's place."""
+        least, greatest = extent_px(expected.mark, expected.pixel_from_mark)
+        low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
+        window = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
+        return np.asarray(window, dtype=float)
+
+    def _take(self, index: int, sighting: Sighting, seen: Glimpse | None, unseen: str) -> None:
+        """Keep a clear fit where the glimpse is of the same; else the glimpse counts, or that there was none."""
+        clear, away = self.clear(index), np.inf
+        if seen is not None and sighting.fit is not None:
+            away = float(np.hypot(*(sighting.fit.center_px - seen.fit.center_px)))
+        # That the same pixels answer twice proves nothing of a clear mark that agreed with the others anyway.
+        again = clear and bool(self.belongs[index]) and away <= _SAME_PX
+        self.vouched[index] = seen is not None and (bool(self.vouched[index]) or not again)
+        if seen is None and not clear:
+            self.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
+        elif seen is not None and (not clear or away > _SAME_PX):
+            reason = f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
+            self.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
+
+    def _certain(self, seen: Glimpse) -> bool:
+        """Whether neither texture nor rounding feigns it."""
+        strong = abs(seen.fit.contrast_dn) >= _FAINT_CONTRAST * self.scan.full_scale_dn
+        return seen.chance <= _CHANCE and strong
+
+    def clear(self, index: int) -> bool:
+        """Whether a mark needs no second look: it is plainly there, be it where the others put it or not."""
+        sighting = self.sightings[index]
+        return sighting is not None and sighting.fit is not None and sighting.fit.likeness >= CLEAR_LIKENESS
+
+    def reach_px(self) -> float:
+        """How far a faint mark can be from where many others put it."""
+        return min(self.gate_px, max(_REACH * self.scatter_mm() / float(self.pitch.mean()), _LEAST_REACH_PX))
+
+    def scatter_mm(self) -> float:
+        return float(np.median(self._misfit_mm()[self.belongs])) if self.belongs.any() else 0.0
+
+    def frame(self) -> Frame:
+        sightings = tuple(sighting for sighting in self.sightings if sighting is not None)
+        return Frame(
+            self.placement,
+            self.camera,
+            sightings,
+            self.belongs,
+            self._misfit_mm(),
+            self.scatter_mm(),
+            self.pixel_from_camera,
+            self.weights,
+        )
+
+    def _misfit_mm(self) -> Array:
+        misfit = np.full(len(self.sightings), np.nan)
+        predicted = self._predicted_px()
+        for index, sighting in enumerate(self.sightings):
+            if sighting is not None and sighting.fit is not None:
+                misfit[index] = np.hypot(*((sighting.fit.center_px - predicted[index]) * self.pitch))
+        return misfit
+
+    def _sight(self, index: int, search_px: float) -> Sighting:
+        """At a closer look a mark may be as faint as what texture feigns, where it hardly ever does so near by."""
+        sighting = sight(self.scan, self.expected(index, search_px), self.options.match)
+        fit, closer = sighting.fit, self.placement.surroundings == CLOSE
+        sure = closer and sighting.chance <= _CHANCE
+        least = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
+        if fit is not None and (fit.likeness < least[0] or fit.significance < least[1]):
+            reason = f"nothing within {search_px:.0f} px of its place looks like it"
+            return Sighting(sighting.predicted_px, True, None, reason)
+        return sighting
+
+    def expected(self, index: int, search_px: float) -> MarkPrediction:
+        mark = self.layout.marks[index].mark
+        start = np.column_stack([self.pixel_from_camera[:, :2], self._predicted_px()[index]])
+        sign = sign_of(mark, self.placement.polarity)
+        return MarkPrediction(mark, start, search_px, sign, self.weights, self.placement.surroundings)
+
+    def _predicted_px(self) -> Array:
+        return self.camera @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2]
+
+    def _up_mm(self, index: NDArray[np.intp]) -> Array:
+        centers = np.array([s.fit.center_px for s in (self.sightings[i] for i in index) if s is not None and s.fit])
+        return np.asarray(centers * self.pitch * (1.0, -1.0))
+
+    def _sigma_mm(self, index: NDArray[np.intp]) -> Array:
+        covariances = [s.fit.covariance_px2 for s in (self.sightings[i] for i in index) if s is not None and s.fit]
+        measured = np.sqrt(np.trace(np.array(covariances), axis1=1, axis2=2) / 2) * self.pitch.mean()
+        given = np.array([min(*self.layout.marks[i].sigma_mm, _GIVEN_SIGMA_MM) for i in index])
+        return np.asarray(np.sqrt(measured**2 + given**2 + self.options.film_sigma_mm**2))
