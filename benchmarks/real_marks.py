@@ -130,7 +130,7 @@ def print_channels(path: Path) -> None:
 def in_channel(scan: Scan, start: Array, weights: tuple[float, ...]) -> Match:
     col0, row0, width, height = window_about(WILD, start, 10.0)
     window = scan.window(col0, row0, width, height, weights)
-    return match(window, (col0, row0), WILD, start, MatchOptions(linear_sigma=0.05))
+    return match(window, (col0, row0), WILD, start, MatchOptions(linear_sigma=0.05), is_lossy=scan.is_lossy)
 
 
 if __name__ == "__main__":

@@ -94,8 +94,8 @@ def match(
     window: (height, width) grey values whose top-left pixel's centre is at origin_px (col, row) of the scan; valid:
     which of its pixels are true ones; clipped: which are at an end of the scanner's range, as `clipped_sides` gives it.
     pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col, row): its last column is the
-    approximate centre, right to a pixel or two. is_lossy: whether the grain in the window was compressed, and tells
-    nothing. Never raises for what the picture holds.
+    approximate centre, right to a pixel or two. is_lossy: whether the window was compressed with loss: then its grain
+    tells nothing, and dust is seen otherwise. Never raises for what the picture holds.
     """
     options = options or MatchOptions()
     grey = np.asarray(window, dtype=float)
@@ -105,7 +105,7 @@ def match(
     blank = np.zeros_like(usable) if is_lossy or isinstance(mark, MarkTemplate) else usable & (sides == 0)
     start = np.array(pixel_from_mark, dtype=float)
     start[:, 2] -= origin_px
-    given = _Window(np.where(usable, grey, 0.0), usable, sides, mark, start)
+    given = _Window(np.where(usable, grey, 0.0), usable, sides, mark, start, is_lossy)
     part, fit = _fitted(given, options)
     if fit.reason or is_textured(fit.model.residuals, fit.telling, fit.floor_dn):
         detail_part, detail = _fitted(given, options, background_px(mark, start))
@@ -126,6 +126,7 @@ class _Window(NamedTuple):
     sides: Sides
     mark: Mark
     start: Array
+    is_lossy: bool
 
 
 class _Part(NamedTuple):
@@ -165,7 +166,9 @@ def _begun(
         # What is left of a clipped grey value without its surroundings is no limit of anything.
         usable, ends = usable & (ends == 0), np.zeros_like(ends)
     return PictureFit(
-        PictureModel(window.grey[rows, cols], ends, window.mark, start, options, coarse_px, state), usable
+        PictureModel(window.grey[rows, cols], ends, window.mark, start, options, coarse_px, state),
+        usable,
+        window.is_lossy,
     )
 
 

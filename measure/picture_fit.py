@@ -8,7 +8,7 @@ from measure.noise import NoiseModel, correlated, robust_scale
 from measure.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.pixel_sums import combined, products
 from measure.rendering import chip_mask, picture
-from measure.robust import damage, grown, solution, tukey_loss, tukey_weights
+from measure.robust import damage, damage_where_lossy, grown, solution, tukey_loss, tukey_weights
 from measure.shapes import MarkTemplate
 from measure.uneven_residuals import covariance_where_uneven
 from measure.weighting import weighted
@@ -29,10 +29,10 @@ _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
 
 class PictureFit:
     """The fit in progress. area: the pixels about the mark that are there; used: those of them that are undamaged;
-    reason: why it failed."""
+    reason: why it failed. is_lossy: whether the picture was compressed with loss."""
 
-    def __init__(self, model: PictureModel, usable: Mask) -> None:
-        self.model, self.usable = model, usable
+    def __init__(self, model: PictureModel, usable: Mask, is_lossy: bool) -> None:
+        self.model, self.usable, self.is_lossy = model, usable, is_lossy
         self.options = model.options
         self.area = self.used = usable
         self.far = np.zeros_like(usable)
@@ -63,7 +63,8 @@ class PictureFit:
             if self.reason:
                 return
             shown = self.area & self.model.tells
-            undamaged = self.area & ~damage(self.model.residuals, shown, self.options.damage_sigmas, self.floor_dn)
+            damaged = damage_where_lossy if self.is_lossy else damage
+            undamaged = self.area & ~damaged(self.model.residuals, shown, self.options.damage_sigmas, self.floor_dn)
             if round_ > 0 and np.array_equal(undamaged, self.used):
                 return
             self.used = undamaged
@@ -164,7 +165,7 @@ class PictureFit:
     @property
     def _clear(self) -> Mask:
         """The pixels used that do not touch damage."""
-        return self.used & ~grown(self.area & ~self.used)
+        return self.used if self.is_lossy else self.used & ~grown(self.area & ~self.used)
 
     def choose_area(self) -> None:
         """The pixels within margin_px of the mark: beyond it the background only disturbs."""

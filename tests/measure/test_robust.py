@@ -1,6 +1,6 @@
 import numpy as np
 
-from measure.robust import damage
+from measure.robust import damage, damage_where_lossy
 
 
 def test_damage_lies_about_its_speck_on_all_sides_alike() -> None:
@@ -16,3 +16,15 @@ def test_damage_lies_about_its_speck_on_all_sides_alike() -> None:
     assert cut[speck > 1.5].all()
     assert not cut[np.hypot(row, col) > 5].any()
     np.testing.assert_array_equal(damage(residuals[::-1, ::-1], area, 3.2, 0.5)[::-1, ::-1], cut)
+
+
+def test_where_compression_is_lossy_a_thin_tail_is_none_of_the_speck_and_its_neighbours_are() -> None:
+    residuals = 0.5 * np.random.default_rng(2).standard_normal((41, 41))
+    residuals[18:23, 18:23] += 60
+    residuals[20, 23:35] += 6
+    area = np.ones_like(residuals, dtype=bool)
+    cut, cut_lossy = damage(residuals, area, 6.0, 0.4), damage_where_lossy(residuals, area, 6.0, 0.4)
+    assert cut[20, 23:34].all()
+    assert not cut_lossy[20, 28:].any()
+    assert cut_lossy[18:23, 16:25].all()
+    assert cut_lossy[:, :24].sum() > cut[:, :24].sum()
