@@ -26,6 +26,7 @@ SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size can
 SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
 WEAK_DAMAGE, MOST_DAMAGE = 0.2, 0.35
 MOST_BLUR = 0.7  # of the shorter half axis
+_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +136,18 @@ def fit_disk(
         softer = fitted(soft)
         return disk if softer.reason else softer
     # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
-    # it does how soft an edge is: what passes with less of it may be the dust itself.
+    # it does how soft an edge is: what passes with less of it, at another place, may be the dust itself.
     if not disk.reason or disk.is_soft or not sure < wide:
         return disk
     narrow = fitted(sure)
-    return replace(narrow, weakness=f"with more ground: {disk.reason}") if disk.is_spoilt else narrow
+    moved = disk.is_spoilt and not _agree(narrow, disk)
+    return replace(narrow, weakness=f"with more ground: {disk.reason}") if moved else narrow
+
+
+def _agree(first: FittedDisk, second: FittedDisk) -> bool:
+    """Whether two fits of a disk may mean one place."""
+    off = first.center_px - second.center_px
+    return bool(off @ np.linalg.solve(first.covariance_px2 + second.covariance_px2, off) < _ODDS)
 
 
 def look_covariance(fit: Match) -> Array:

@@ -55,11 +55,10 @@ def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float) -> Mask
     # Much dust widens even that scale, and hides the fainter specks: what it shows at once is left out of it.
     limit = sigmas * max(robust_scale(smooth[area & (np.abs(smooth) <= limit)]), floor_dn)
     large = np.abs(smooth) > limit
-    # How wide a region is that leaves the area is not known: there it counts as wide.
-    wide = _opened(large | ~area)
+    wide = _opened(large)
     count, regions = cv2.connectedComponents(large.astype(np.uint8), connectivity=4)
     is_damage = np.zeros(count, dtype=bool)
-    is_damage[regions[wide & large]] = True
+    is_damage[regions[wide]] = True
     return np.asarray(is_damage[regions])
 
 
