@@ -50,12 +50,12 @@ def _alike(disks: Sequence[_Disk], coarse_px: float) -> Iterator[tuple[list[_Dis
     leave them a radius of coarse_px."""
     shapes = _shapes(disks)
     reach, radius = _reach_px(shapes), radius_px(shapes)
-    rest = np.argsort(reach, kind="stable").tolist()
+    every_of = np.maximum(radius / coarse_px, 1.0).astype(int)
+    rest = np.lexsort((reach, every_of)).tolist()
     while rest:
-        largest = reach[rest[0]] * SIZE_STEP
-        every = max(int(radius[rest[0]] / coarse_px), 1)
+        largest, every = reach[rest[0]] * SIZE_STEP, int(every_of[rest[0]])
         count = max(int(TOGETHER_PIXELS * every**2 / (2 * largest + 1) ** 2), 1)
-        chosen = [index for index in rest[:count] if reach[index] <= largest]
+        chosen = [index for index in rest[:count] if reach[index] <= largest and every_of[index] == every]
         yield [disks[index] for index in chosen], every
         rest = rest[len(chosen) :]
 
