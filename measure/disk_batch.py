@@ -25,6 +25,7 @@ MARGIN, LEAST_MARGIN_PX = 0.3, 2.5  # of its radius: the ground is not plain for
 SIZE_STEP = 1.3  # from the smallest to the largest that are fitted together
 TOGETHER_PIXELS = 1 << 16  # of all windows: with their derivatives they take some 10 MiB
 COARSE_PX = 3.0  # radius in pixels that are enough for a first look and its steps
+EDGE_SAMPLES = 8  # likewise, of a disk's edge, two blurs wide
 COARSE_STEPS = 2  # before one that is robust
 SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale
 FIRST_BLUR_PX = 1.0
@@ -40,23 +41,29 @@ class _Disk:
 def disks_among(block: Block, patches: Sequence[Candidate]) -> list[Candidate]:
     """Those patches that a disk explains, the strongest first, as fitted: a place within a tenth of a pixel or so."""
     starts = [_Disk(patch, FIRST_BLUR_PX) for patch in patches]
-    hopeful = [disk for group, every in _alike(starts, COARSE_PX) for disk in _hopeful(block, group, every)]
-    fitted = [disk.patch for group, _ in _alike(hopeful, np.inf) for disk in _fitted(block, group)]
+    hopeful = [disk for group, every in _alike(starts, _every(starts)) for disk in _hopeful(block, group, every)]
+    in_all = np.ones(len(hopeful), dtype=np.intp)
+    fitted = [disk.patch for group, _ in _alike(hopeful, in_all) for disk in _fitted(block, group)]
     return sorted(fitted, key=strength)
 
 
-def _alike(disks: Sequence[_Disk], coarse_px: float) -> Iterator[tuple[list[_Disk], int]]:
-    """Disks of about one size, so many that their windows are not too large, and how many pixels apart those are that
-    leave them a radius of coarse_px."""
-    shapes = _shapes(disks)
-    reach, radius = _reach_px(shapes), radius_px(shapes)
-    every_of = np.maximum(radius / coarse_px, 1.0).astype(int)
-    rest = np.lexsort((reach, every_of)).tolist()
+def _every(disks: Sequence[_Disk]) -> NDArray[np.intp]:
+    """(n,) how many pixels apart those are that tell enough of a disk: of its area, and of its edge."""
+    radius = radius_px(_shapes(disks))
+    of_edge = np.sqrt(4 * np.pi * FIRST_BLUR_PX * radius / EDGE_SAMPLES)
+    return np.maximum(np.minimum(radius / COARSE_PX, of_edge), 1.0).astype(np.intp)
+
+
+def _alike(disks: Sequence[_Disk], every: NDArray[np.intp]) -> Iterator[tuple[list[_Disk], int]]:
+    """Disks of about one size that are looked at in every so many columns and rows (n,), and how many these are; so
+    many disks that their windows are not too large. Each is sampled by its own size, whatever it is together with."""
+    reach = _reach_px(_shapes(disks))
+    rest = np.lexsort((reach, every)).tolist()
     while rest:
-        largest, every = reach[rest[0]] * SIZE_STEP, int(every_of[rest[0]])
-        count = max(int(TOGETHER_PIXELS * every**2 / (2 * largest + 1) ** 2), 1)
-        chosen = [index for index in rest[:count] if reach[index] <= largest and every_of[index] == every]
-        yield [disks[index] for index in chosen], every
+        largest, step = reach[rest[0]] * SIZE_STEP, int(every[rest[0]])
+        count = max(int(TOGETHER_PIXELS * step**2 / (2 * largest + 1) ** 2), 1)
+        chosen = [index for index in rest[:count] if reach[index] <= largest and every[index] == step]
+        yield [disks[index] for index in chosen], step
         rest = rest[len(chosen) :]
 
 
