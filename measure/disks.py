@@ -11,6 +11,7 @@ from measure.compression import with_loss
 from measure.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
 from measure.disk_patches import LEAST_SNR
 from measure.matching import Match, MatchOptions, match, window_about
+from measure.noise import may_be_noise
 from measure.picture_model import GREY
 from measure.scan import Scan
 from measure.shapes import Disk, MarkShape
@@ -26,7 +27,6 @@ SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size can
 SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
 WEAK_DAMAGE, MOST_DAMAGE = 0.2, 0.35
 MOST_BLUR = 0.7  # of the shorter half axis
-_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +140,10 @@ def fit_disk(
     if not disk.reason or disk.is_soft or not sure < wide:
         return disk
     narrow = fitted(sure)
-    moved = disk.is_spoilt and not _agree(narrow, disk)
-    return replace(narrow, weakness=f"with more ground: {disk.reason}") if moved else narrow
-
-
-def _agree(first: FittedDisk, second: FittedDisk) -> bool:
-    """Whether two fits of a disk may mean one place."""
-    off = first.center_px - second.center_px
-    return bool(off @ np.linalg.solve(first.covariance_px2 + second.covariance_px2, off) < _ODDS)
+    if narrow.reason or not disk.is_spoilt:
+        return narrow
+    agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
+    return narrow if agree else replace(narrow, weakness=f"with more ground: {disk.reason}")
 
 
 def look_covariance(fit: Match) -> Array:

@@ -9,6 +9,7 @@ from scipy import fft
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
 _TEXTURE = 0.25  # correlation at REACH_PX that grain never has
 
 REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated over 1.5 px, gone beyond 5
@@ -55,6 +56,11 @@ def is_textured(residuals: Array, used: Mask, floor_dn: float) -> bool:
     if not kept.any():
         return False
     return bool(_covariance_along(kept, used, REACH_PX) > _TEXTURE * max((kept**2).sum() / used.sum(), floor_dn**2))
+
+
+def may_be_noise(off: Array, covariance: Array) -> bool:
+    """Whether noise of that covariance (2, 2) may have moved a place by off (2,)."""
+    return bool(off @ np.linalg.solve(covariance, off) < _ODDS)
 
 
 def robust_scale(values: Array) -> float:

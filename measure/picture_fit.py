@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise import NoiseModel, correlated, robust_scale
+from measure.noise import NoiseModel, correlated, may_be_noise, robust_scale
 from measure.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.pixel_sums import combined, products
 from measure.rendering import chip_mask, picture
@@ -22,7 +22,6 @@ _HALVINGS = 4
 _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
 _LEAST_VARIANCE_DN2 = 1e-12
 _WEIGHTED_STEPS, _CLOSE_PX, _SETTLED_PX = 4, 0.002, 0.02
-_ODDS = 13.8  # chi-square of two coordinates: one in a thousand
 _UNSETTLED = "the adjustment did not converge"
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
 
@@ -97,7 +96,7 @@ class PictureFit:
             weighed = self._covariance(weights, smeared)
             # What has more weight now measures the same place, or the noise is not what it was taken for. The plain
             # covariance, which decides, takes its time and is larger than the weighed one, but for approximations.
-            if _is_likely(moved, weighed[0]) or _is_likely(moved, self._plain_covariance(noise)[0]):
+            if may_be_noise(moved, weighed[0][:2, :2]) or may_be_noise(moved, self._plain_covariance(noise)[0][:2, :2]):
                 return weighed
         model.state = before
         model.linearise(self.used)
@@ -238,8 +237,3 @@ class PictureFit:
             free[model.blur] = False
             step = solution(normal, right, free)
         return step
-
-
-def _is_likely(moved: Array, covariance: Array) -> bool:
-    """Whether noise of that covariance may have moved a place so far."""
-    return bool(moved @ np.linalg.solve(covariance[:2, :2], moved) < _ODDS)
