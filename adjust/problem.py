@@ -189,13 +189,6 @@ class Problem:
         return self.network.observations.is_fiducial
 
     @cached_property
-    def rows_by_image(self) -> list[Indices]:
-        """The observations of every image."""
-        order = np.argsort(self.image_numbers, kind="stable")
-        ends = np.cumsum(np.bincount(self.image_numbers, minlength=len(self.network.images)))
-        return np.split(order, ends[:-1])
-
-    @cached_property
     def targets_by_camera(self) -> dict[str, Indices]:
         """The observations of object points by every camera."""
         cameras = np.array([image.camera for image in self.network.images])[self.image_numbers]

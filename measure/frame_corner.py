@@ -256,7 +256,6 @@ def _met(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array) -> Match:
         covariance_is_white=False,
         likeness=min(edge.likeness for edge in edges),
         significance=abs(contrast) / max(noise, 1e-12) * float(np.sqrt(min(edge.count for edge in edges))),
-        residuals_dn=np.zeros((0, 0)),
     )
 
 
@@ -276,5 +275,4 @@ def _missed(pixel_from_mark: Array, reason: str) -> Match:
         covariance_is_white=True,
         likeness=0.0,
         significance=0.0,
-        residuals_dn=np.zeros((0, 0)),
     )

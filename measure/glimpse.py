@@ -156,7 +156,6 @@ class _Field:
             covariance_is_white=False,
             likeness=min(height / float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()])), 1.0),
             significance=height / scatter,
-            residuals_dn=(self.detail[patch] - own[patch]) * self.texture_dn[patch],
         )
         return Glimpse(fit, _chance(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX)))
 

@@ -63,7 +63,6 @@ class Match:
     covariance_is_white: bool
     likeness: float
     significance: float
-    residuals_dn: Array
     blur_sigma: float = np.inf
     size_sigma: float = np.inf
     edges: EdgePlace | None = None
@@ -219,7 +218,6 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         covariance_is_white=noise.is_white,
         likeness=_likeness(fit),
         significance=fit.contrast_dn / gain_sigma,
-        residuals_dn=np.where(fit.area, model.residuals, np.nan),
         blur_sigma=_blur_sigma(model, covariance),
         size_sigma=float(np.sqrt(covariance[2, 2])) if model.tells_size else np.inf,
         edges=edges,
