@@ -1,12 +1,10 @@
-"""Marks measured against their truth: the Cramér-Rao bound, honesty of the standard deviations, other methods.
+"""Marks measured against their truth: the Cramér-Rao bound, honesty of the standard deviations.
 
 PYTHONPATH=.:tests/measure python benchmarks/marks.py [MARKS] [STUDY ...] [--kind KIND ...] [--keep FILE]
-    [--hipp PYTHON]
 
 MARKS: of every cell; 100 where none is given, 2000 for a full run. STUDY: one or more of the names below; all where
 none is given. --keep: rows of the tables are written there, and those that stand in it are not made anew, so that a
-run may be stopped and go on, or be shared out by --kind among processes. --hipp: the interpreter of an environment
-with hipp 0.2, measured beside the others.
+run may be stopped and go on, or be shared out by --kind among processes.
 
 The pictures are drawn by `synthetic_images` (exact areas, blurred before they are averaged over pixels); the bounds are
 from differences of the same pictures. What is measured with is what `reseau measure` calls: `measure.refinement.sight`,
@@ -16,16 +14,14 @@ and `measure.disks.fit_disk` for the ellipse.
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from kept_rows import KeptRows
-from measured_marks import CONTRAST, DUST_SNR, GROUND, Cell, drawn, dusty, dusty_frame, measured, told
+from measured_marks import CONTRAST, GROUND, Cell, drawn, measured
 from numpy.typing import NDArray
-from other_methods import METHODS, Template, hipp
 from true_marks import (
     KIND,
     KINDS,
@@ -45,11 +41,8 @@ SNRS, BLURS_PX = (5.0, 10.0, 20.0, 50.0, 100.0), (0.6, 1.0, 1.6, 2.5)
 SEED = 20
 POOL, FEW = 50, 3  # different marks in a cell; where the bound of each takes seconds
 GRAINS_PX, GRAIN_SNR = (0.7, 1.0, 1.5), 20.0
-DUST = (0.01, 0.03, 0.05)
 BEYOND, CLIPPED_SNR = (0.0, 0.3), 20.0
-LARGE_PX = 0.3
 ROWS = KeptRows(None)
-HIPP = ""  # the interpreter of an environment that has it
 QUALITIES, JPEG_CONTRASTS, JPEG_SNR = (50, 75, 90), (40.0, 120.0), 100.0
 
 
@@ -99,48 +92,6 @@ def grain(kinds: Sequence[Kind], count: int) -> None:
 
     for kind in kinds:
         ROWS.print(f"grain {count} {kind.name}", partial(row, kind))
-
-
-def dust(kinds: Sequence[Kind], count: int) -> None:
-    """Specks of up to 4 px on a part of the mark's window, against the same match with the dust known."""
-    print(f"\ndust at SNR {DUST_SNR:g}, blur 1: rms / that with the dust known, realised / claimed; -n: flagged")
-    print(f"{'':14}" + "".join(f"{f'{100 * share:g} %':>17}" for share in DUST))
-
-    def row(kind: Kind) -> str:
-        rng = np.random.default_rng([SEED, KINDS.index(kind)])
-        marks = [some_mark(kind, 1.0, rng) for _ in range(min(POOL, count))]
-        words = []
-        for share in DUST:
-            cell = Cell()
-            for number in range(count):
-                mark = marks[number % len(marks)]
-                noise = rng.standard_normal((mark.size, mark.size)) / DUST_SNR
-                speckled, seen = dusty(mark, drawn(mark, rng)[0] + CONTRAST * noise, share, rng)
-                known = told(mark, speckled, seen)
-                if known is not None:
-                    error = known.center_px - mark.place[:, 2]
-                    cell.add(mark, measured(mark, speckled, rng), error, known.covariance_px2)
-            words.append(cell.words())
-        return f"{kind.name:14}" + "".join(f"{each:>17}" for each in words)
-
-    for kind in kinds:
-        ROWS.print(f"dust {count} {kind.name}", partial(row, kind))
-
-
-def small_disks(kinds: Sequence[Kind], count: int) -> None:
-    """Disks of 2 to 4 px among dust, in frames: are large errors flagged?"""
-    print(f"\nsmall disks with dust on 0 to 5 % of their windows, SNR 10 to 50: errors above {LARGE_PX:g} px")
-    rng = np.random.default_rng([SEED, 99])
-    frames = (dusty_frame(rng) for _ in range(count))
-    errors, flagged, dusts = (np.concatenate(each) for each in zip(*frames, strict=True))
-    seen, large = np.isfinite(errors), np.nan_to_num(errors) > LARGE_PX
-    missed = errors[large & ~flagged]
-    clean = dusts == 0
-    print(
-        f"{len(errors)} disks, {(~seen).sum()} refused, {(seen & flagged).sum()} weak; of {clean.sum()} without dust "
-        f"{(~seen & clean).sum()} and {(seen & flagged & clean).sum()}; {large.sum()} with large errors, {len(missed)} "
-        f"of them not flagged, the worst {missed.max(initial=0.0):.2f} px"
-    )
 
 
 def bias(kinds: Sequence[Kind], count: int) -> None:
@@ -240,58 +191,12 @@ def compressed(grey: Array, quality: int, rng: np.random.Generator) -> tuple[Arr
     return whole[top : top + grey.shape[0], left : left + grey.shape[1]], rounding_step_dn(data.tobytes())
 
 
-def methods(kinds: Sequence[Kind], count: int) -> None:
-    """Other methods on the same pictures, light marks of blur 1 within 3 mrad and 0.3 % of their templates; these are
-    without noise, but for hipp, whose user cuts it out of a scan."""
-    names = ["reseau", *METHODS, *(["hipp"] if HIPP else [])]
-    print("\nother methods, 16 bit (hipp: 8 bit, less its mean error), blur 1: rms in px of those that gave a place")
-    print(f"{'':14}{'SNR':>5}{'bound':>9}" + "".join(f"{name:>13}" for name in names))
-    for kind in kinds:
-        for snr in (20.0, 100.0):
-            rng = np.random.default_rng([SEED, KINDS.index(kind), int(snr)])
-            base = some_mark(kind, 1.0, rng)
-            center = np.full(2, (base.size - 1) / 2)
-            ideal = TrueMark(kind, np.column_stack([base.place[:, :2], center]), base.size, 1.0)
-            reach = int(np.ceil(max(np.abs(np.argwhere(ideal.picture > 0.01) - center).max(), 5))) + 4
-            middle = slice(base.size // 2 - reach, base.size // 2 + reach + 1)
-            template = Template(GROUND + CONTRAST * ideal.picture[middle, middle], np.full(2, float(reach)))
-            errors: dict[str, list[Array]] = {name: [] for name in names}
-            images, places, bounds = [], [], []
-            for _ in range(count):
-                scale, turn = rng.normal(0, 0.003, 2)
-                linear = np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ base.place[:, :2]
-                mark = TrueMark(kind, np.column_stack([linear, center + rng.uniform(-0.5, 0.5, 2)]), base.size, 1.0)
-                noise = rng.standard_normal((mark.size, mark.size)) / snr
-                grey = GROUND + CONTRAST * (mark.picture + noise)
-                found = measured(mark, grey, rng)
-                if found is not None:
-                    errors["reseau"].append(found.center_px - mark.place[:, 2])
-                for name, method in METHODS.items():
-                    place = method(grey, center, template)
-                    if place is not None:
-                        errors[name].append(place - mark.place[:, 2])
-                images.append(grey)
-                places.append(mark.place[:, 2])
-                bounds.append(np.trace(base.bound(1 / snr)) / 2)
-            if HIPP:
-                scan_noise = rng.standard_normal(template.image.shape)
-                off = hipp(HIPP, images, replace(template, image=template.image + CONTRAST / snr * scan_noise)) - places
-                errors["hipp"] = list(off - off.mean(axis=0))
-            words = [
-                f"{np.sqrt(np.mean(np.square(errors[name]))):13.4f}" if errors[name] else f"{'-':>13}" for name in names
-            ]
-            print(f"{kind.name:14}{snr:5.0f}{np.sqrt(np.mean(bounds)):9.4f}" + "".join(words), flush=True)
-
-
 STUDIES: dict[str, Callable[[Sequence[Kind], int], None]] = {
     "accuracy": accuracy,
     "bias": bias,
     "grain": grain,
-    "dust": dust,
-    "small_disks": small_disks,
     "clipping": clipping,
     "jpeg": jpeg,
-    "methods": methods,
 }
 
 
@@ -300,12 +205,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("marks", type=int, nargs="?", default=100)
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []])
-    parser.add_argument("--hipp", default="")
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--kind", action="append", choices=list(KIND))
     arguments = parser.parse_args()
-    global HIPP, ROWS
-    HIPP, ROWS = arguments.hipp, KeptRows(arguments.keep)
+    global ROWS
+    ROWS = KeptRows(arguments.keep)
     kinds = [KIND[name] for name in arguments.kind] if arguments.kind else KINDS
     print(f"{arguments.marks} marks a cell, seed {SEED}")
     for name in arguments.studies or STUDIES:

@@ -1,27 +1,21 @@
-"""True marks drawn on a ground, spoilt, and measured as `reseau measure` does; cells of a table of their errors."""
+"""True marks drawn on a ground and measured as `reseau measure` does; cells of a table of their errors."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from true_marks import KIND, TrueMark, scan_of, some_mark
+from true_marks import TrueMark, scan_of
 
-from measure.disks import PLAIN_MARGIN_PX, fit_disk
+from measure.disks import fit_disk
 from measure.fiducial_options import FiducialOptions
 from measure.frame import CLEAR_DAMAGE
-from measure.matching import match
 from measure.prediction import MarkPrediction
 from measure.refinement import sight
-from measure.status import Status
-from measure.targets import TargetPrediction, measure_disks
-from synthetic_images.optics import reach_px, seen_coverage
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 GROUND, CONTRAST = 25000.0, 15000.0
 SHIFT_PX, SEARCH_PX = 1.5, 3.0  # of the start, and the radius of the search
-DUST_SNR = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,59 +113,3 @@ def drawn(
     row, col = np.mgrid[: mark.size, : mark.size] / mark.size - 0.5
     slope = contrast / 3 * rng.uniform() * (np.cos(direction) * col + np.sin(direction) * row)
     return ground + (1 - sign) / 2 * contrast + slope + sign * contrast * mark.picture, sign
-
-
-def told(mark: TrueMark, grey: Array, seen: Mask) -> Found | None:
-    """The mark matched where it is seen, the dust being known."""
-    options = FiducialOptions().match
-    if mark.kind.name == "ellipse":
-        options = replace(options, freedom="ellipse", margin_px=PLAIN_MARGIN_PX, margin_blurs=0.0)
-    elif np.isfinite(mark.kind.known):
-        options = replace(options, linear_sigma=mark.kind.known)
-    fit = match(np.rint(grey), (0.0, 0.0), mark.kind.shape, mark.place, options, seen)
-    return Found(fit.center_px, fit.covariance_px2) if fit.converged else None
-
-
-def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> tuple[Array, Mask]:
-    """The picture with dark specks on so much of the pixels near the mark, and which pixels they leave."""
-    speckled, seen = grey.copy(), np.ones(grey.shape, dtype=bool)
-    rows, cols = np.nonzero(mark.near)
-    while (mark.near & ~seen).sum() < share * mark.near.sum():
-        radius = min(float(rng.lognormal(0.3, 0.5)), 4.0) * rng.uniform(0.7, 1.3, 12)
-        angle = np.arange(12) * (2 * np.pi / 12)
-        pixel = rng.integers(len(rows))
-        outline = np.array([cols[pixel], rows[pixel]]) + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-        reach = 6 + reach_px(mark.blur_px)
-        col0, row0 = max(cols[pixel] - reach, 0), max(rows[pixel] - reach, 0)
-        near = np.s_[row0 : rows[pixel] + reach, col0 : cols[pixel] + reach]
-        height, width = speckled[near].shape
-        cover = seen_coverage(((outline,),), int(col0), int(row0), width, height, mark.blur_px)
-        speckled[near] = speckled[near] * (1 - cover) + (GROUND - CONTRAST) * cover
-        seen[near] &= cover < 0.5 / DUST_SNR
-    return speckled, seen
-
-
-def dusty_frame(rng: np.random.Generator) -> tuple[Array, Mask, Array]:
-    """A frame of 25 disks, all light or all dark, their contrasts alike to 5 %, their blur, of 0.6 to 1.4 px, to 10 %,
-    and their forms predicted to 2 % but for a common scale: errors in px, nan where one was refused, which are flagged,
-    and how much dust is on each."""
-    tile, snr, sign, scale = 81, rng.uniform(10, 50), rng.choice((-1, 1)), rng.uniform(0.9, 1.1)
-    blur = rng.uniform(0.6, 1.4)
-    ground = GROUND + (1 - sign) / 2 * CONTRAST
-    frame, places, predictions = np.empty((5 * tile, 5 * tile)), [], []
-    dusts = rng.choice((0.0, 0.01, 0.03, 0.05), 25)
-    for number, share in enumerate(dusts):
-        mark = some_mark(KIND["ellipse"], blur * np.exp(rng.normal(0, 0.1)), rng, tile, 10 * rng.uniform(2.0, 4.0) / 6)
-        contrast = CONTRAST * np.exp(rng.normal(0, 0.05))
-        grey = ground + sign * contrast * mark.picture + CONTRAST / snr * rng.standard_normal((tile, tile))
-        corner = tile * np.array(divmod(number, 5)[::-1])
-        frame[corner[1] :, corner[0] :][:tile, :tile] = dusty(mark, grey, float(share), rng)[0]
-        form = scale * (np.eye(2) + rng.normal(0, 0.02, (2, 2))) @ mark.place[:, :2]
-        places.append(corner + mark.place[:, 2])
-        predictions.append(TargetPrediction(str(number), places[-1] + rng.normal(0, 0.4, 2), form, 3.0))
-    marks = measure_disks(scan_of(frame), predictions)
-    offs = [
-        np.hypot(*(np.asarray(mark.center_px) - place)) if mark.status.is_observation else np.nan
-        for mark, place in zip(marks, places, strict=True)
-    ]
-    return np.array(offs), np.array([mark.status is not Status.MEASURED for mark in marks]), dusts

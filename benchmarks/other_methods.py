@@ -1,12 +1,12 @@
-"""Other ways to measure a mark, each given its best: the right template, turned and scaled as predicted, no search.
+"""Other ways to measure a mark.
 
-Every method takes grey values (height, width) with a light mark, a start (col, row) right to a pixel, and a template
-with the place of the mark in it; it returns the centre, or None.
+Every method takes grey values (height, width) with a light mark, a start (col, row) near it, and a template with the
+place of the mark in it; it returns the centre, or None.
 """
 
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,11 +20,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """A noise-free picture of the mark, center_px (2,) in it, odd and about the middle."""
+    """A picture of the mark, center_px (2,) in it."""
 
     image: Array
     center_px: Array
 
+
+_RIM_PX = 4  # of the ground about a mark, in a template of hipp; its speed depends on it, its errors do not
 
 Method = Callable[[Array, Array, Template], Array | None]
 
@@ -93,23 +95,39 @@ import numpy as np
 from hipp.aerial.core import detect_fiducial
 from hipp.image import resize_img
 data = np.load(sys.argv[1])
-template, places = data["template"], []
-fine = resize_img(template, factor=8)
-margin = 8 * 8
-for image in data["images"]:
-    places.append(detect_fiducial(image, template, fine[margin:-margin, margin:-margin], 8)[0])
-np.save(sys.argv[2], np.array(places, dtype=float))
+rim, factor, places = int(sys.argv[3]), 8, []
+for cut, center, pictures in zip(data["cuts"], data["centers"], data["pictures"]):
+    fine, half = resize_img(cut, factor=factor), factor * (cut.shape[0] // 2 - rim)
+    col, row = np.rint((center + 0.5) * factor - 0.5).astype(int)
+    fine = fine[row - half : row + half, col - half : col + half]
+    places.append([detect_fiducial(picture, cut, fine, factor)[0] for picture in pictures])
+np.save(sys.argv[2], np.array(places, dtype=float) - 0.5)
 """
 
 
-def hipp(python: str, images: list[Array], template: Template) -> Array:
-    """(n, 2) places by hipp, run in its own environment; its template is cut 8 px about the mark's own."""
-    scale = 255 / max(float(image.max()) for image in images)
+def hipp(python: str, templates: Sequence[Template], pictures: Array, reach_px: int) -> Array:
+    """(cameras, n, 2) places by hipp in pictures (cameras, n, height, width), run in its own environment.
+
+    templates: one scan of each camera, with the place of its mark. As in `create_fiducial_templates`, the template is
+    cut about the pixel nearest to that place, and the fine one about the nearest pixel of the cut enlarged eight times;
+    here reach_px, what the mark takes of the picture, and _RIM_PX about. Its places count from the pixel's corner; half
+    a pixel is taken off.
+    """
+    scans = np.stack([template.image for template in templates])
+    to_bytes = 255 / max(float(scans.max()), float(pictures.max()))
+    half = reach_px + 2 * _RIM_PX
+    first = [np.rint(template.center_px).astype(int) - half for template in templates]
+    cuts = [scan[row : row + 2 * half, col : col + 2 * half] for scan, (col, row) in zip(scans, first, strict=True)]
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder) / "marks.npz", Path(folder) / "places.npy"
-        stored = [np.clip(np.rint(image * scale), 0, 255).astype(np.uint8) for image in [template.image, *images]]
-        np.savez(given, template=stored[0], images=np.stack(stored[1:]))
-        subprocess.run([python, "-c", _HIPP, str(given), str(found)], check=True, capture_output=True)
+        np.savez(
+            given,
+            cuts=np.clip(np.rint(np.stack(cuts) * to_bytes), 0, 255).astype(np.uint8),
+            centers=np.stack([template.center_px for template in templates]) - first,
+            pictures=np.clip(np.rint(pictures * to_bytes), 0, 255).astype(np.uint8),
+        )
+        command = [python, "-c", _HIPP, str(given), str(found), str(_RIM_PX)]
+        subprocess.run(command, check=True, capture_output=True)
         return np.asarray(np.load(found), float)
 
 

@@ -1,0 +1,168 @@
+"""Marks and disks with specks of dust, alone and in frames, measured as `reseau measure` does and as they would be if
+the dust were known."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from measured_marks import CONTRAST, GROUND, Found, measured
+from numpy.typing import NDArray
+from true_marks import KIND, Kind, TrueMark, scan_of, some_mark
+
+from measure.constellation import Placement
+from measure.disks import PLAIN_MARGIN_PX
+from measure.fiducial_options import FiducialOptions
+from measure.frame_sighting import measure_frame
+from measure.matching import match
+from measure.picture_scan import WholePicture
+from measure.poses import POSES
+from measure.resolution import NO_TAGS
+from measure.scan import Scan
+from measure.shapes import FiducialLayout, LayoutMark
+from measure.status import Status
+from measure.targets import TargetPrediction, measure_disks
+from synthetic_images.optics import reach_px, seen_coverage
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Range = tuple[float, float]
+
+DUST_SNR, BLUR_PX = 20.0, 1.0
+BLUR_SPREAD = 0.05  # of the logarithms of the blurs of a frame's marks
+FRAME_MM, AT_MM, PX_PER_MM, GIVEN_MM = 230.0, 106.0, 10.0, 0.005
+PLACED_PX, PLACED = 1.0, 1e-3  # standard deviations of a frame's placement: of its middle, of turn and scale
+DISKS_A_SIDE = 5
+FORM_SPREAD, CONTRAST_SPREAD, DISK_BLUR_SPREAD, DISK_OFF_PX = 0.02, 0.05, 0.1, 0.4  # against what is predicted
+
+
+@dataclass(frozen=True, eq=False)
+class DustyMark:
+    """A mark in its window grey (size, size), of which specks leave seen; found: None where no place was given."""
+
+    mark: TrueMark
+    grey: Array
+    seen: Mask
+    found: Found | None
+
+    @property
+    def flagged(self) -> bool:
+        return self.found is None or bool(self.found.flagged)
+
+    @property
+    def error_px(self) -> Array:
+        """(2,), nan where there is none."""
+        return np.full(2, np.nan) if self.found is None else self.found.center_px - self.mark.place[:, 2]
+
+    @cached_property
+    def told(self) -> Found | None:
+        """The mark matched where it is seen, the dust being known; None where it does not converge."""
+        kind, options = self.mark.kind, FiducialOptions().match
+        if kind.name == "ellipse":
+            options = replace(options, freedom="ellipse", margin_px=PLAIN_MARGIN_PX, margin_blurs=0.0)
+        elif np.isfinite(kind.known):
+            options = replace(options, linear_sigma=kind.known)
+        fit = match(np.rint(self.grey), (0.0, 0.0), kind.shape, self.mark.place, options, self.seen)
+        return Found(fit.center_px, fit.covariance_px2) if fit.converged else None
+
+
+def dusty(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> tuple[Array, Mask]:
+    """The picture with dark specks on so much of the pixels near the mark, and which pixels they leave."""
+    speckled, seen = grey.copy(), np.ones(grey.shape, dtype=bool)
+    rows, cols = np.nonzero(mark.near)
+    while (mark.near & ~seen).sum() < share * mark.near.sum():
+        radius = min(float(rng.lognormal(0.3, 0.5)), 4.0) * rng.uniform(0.7, 1.3, 12)
+        angle = np.arange(12) * (2 * np.pi / 12)
+        pixel = rng.integers(len(rows))
+        outline = np.array([cols[pixel], rows[pixel]]) + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+        reach = 6 + reach_px(mark.blur_px)
+        col0, row0 = max(cols[pixel] - reach, 0), max(rows[pixel] - reach, 0)
+        near = np.s_[row0 : rows[pixel] + reach, col0 : cols[pixel] + reach]
+        height, width = speckled[near].shape
+        cover = seen_coverage(((outline,),), int(col0), int(row0), width, height, mark.blur_px)
+        speckled[near] = speckled[near] * (1 - cover) + (GROUND - CONTRAST) * cover
+        seen[near] &= cover < 0.5 / DUST_SNR
+    return speckled, seen
+
+
+def lone_mark(mark: TrueMark, grey: Array, share: float, rng: np.random.Generator) -> DustyMark:
+    """A mark that no frame knows."""
+    noise = rng.standard_normal((mark.size, mark.size)) / DUST_SNR
+    speckled, seen = dusty(mark, grey + CONTRAST * noise, share, rng)
+    return DustyMark(mark, speckled, seen, measured(mark, speckled, rng))
+
+
+def frame_of_marks(kind: Kind, share: float, count: int, rng: np.random.Generator) -> list[DustyMark]:
+    """The first count of a frame's four corner and four side marks, alike but for the blur, from a placement that is
+    about right."""
+    layout = _layout(kind, count)
+    linear = some_mark(kind, BLUR_PX, rng, px_per_mm=PX_PER_MM).place[:, :2]
+    places = np.array([mark.xy_mm for mark in layout.marks])
+    side = int(PX_PER_MM * FRAME_MM * 1.6)
+    middle = side / 2 + rng.uniform(-0.5, 0.5, 2)
+    sign = int(rng.choice((-1, 1)))
+    ground = GROUND + (1 - sign) / 2 * CONTRAST
+    frame, parts = np.full((side, side, 1), ground, np.uint16), []
+    for center in places @ linear.T + middle:
+        some = some_mark(kind, BLUR_PX * float(np.exp(rng.normal(0, BLUR_SPREAD))), rng, px_per_mm=PX_PER_MM)
+        corner = np.rint(center).astype(int) - some.size // 2
+        mark = replace(some, place=np.column_stack([linear, center - corner]))
+        noise = rng.standard_normal((mark.size, mark.size)) / DUST_SNR
+        speckled, seen = dusty(mark, ground + CONTRAST * (sign * mark.picture + noise), share, rng)
+        frame[corner[1] :, corner[0] :, 0][: mark.size, : mark.size] = np.rint(speckled)
+        parts.append((mark, speckled, seen, corner))
+    scan = Scan(Path("dusty.tif"), WholePicture(frame), NO_TAGS)
+    result = measure_frame(scan, layout, _placement(linear, middle, sign, count, rng), FiducialOptions())
+    found = []
+    for index, (sighting, (*_, corner)) in enumerate(zip(result.sightings, parts, strict=True)):
+        status, reason = result.verdict(index)
+        flagged = "" if status is Status.MEASURED else reason
+        fit = sighting.fit
+        found.append(None if fit is None else Found(fit.center_px - corner, fit.covariance_px2, flagged))
+    return [DustyMark(*part[:3], each) for part, each in zip(parts, found, strict=True)]
+
+
+def _layout(kind: Kind, count: int) -> FiducialLayout:
+    at = AT_MM
+    places = [(at, -at), (-at, -at), (-at, at), (at, at), (0.0, -at), (-at, 0.0), (0.0, at), (at, 0.0)]
+    marks = [LayoutMark(str(n), place, (GIVEN_MM, GIVEN_MM), kind.shape) for n, place in enumerate(places[:count])]
+    return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
+
+
+def _placement(linear: Array, middle: Array, sign: int, count: int, rng: np.random.Generator) -> Placement:
+    scale, turn = rng.normal(0, PLACED, 2)
+    about = np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ linear
+    pixel_from_camera = np.column_stack([about, middle + rng.normal(0, PLACED_PX, 2)])
+    return Placement(POSES[0], pixel_from_camera, float(count), count, sign, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
+
+
+def frame_of_disks(
+    shares: Sequence[float], half_axes_px: Range, snrs: Range, blurs_px: Range, rng: np.random.Generator
+) -> tuple[list[DustyMark], Array]:
+    """A frame of 25 disks, all light or all dark, their contrasts alike to 5 %, their blurs to 10 %, and their forms
+    predicted to 2 % but for a common scale; and how much dust is on each (25,), one of the shares."""
+    tile = 81 + 2 * int(max(half_axes_px) - 4)
+    snr, sign, scale = rng.uniform(*snrs), rng.choice((-1, 1)), rng.uniform(0.9, 1.1)
+    blur = rng.uniform(*blurs_px)
+    ground = GROUND + (1 - sign) / 2 * CONTRAST
+    frame, parts, predictions = np.empty((DISKS_A_SIDE * tile, DISKS_A_SIDE * tile)), [], []
+    dusts = rng.choice(shares, DISKS_A_SIDE**2)
+    for number, share in enumerate(dusts):
+        own_blur = blur * float(np.exp(rng.normal(0, DISK_BLUR_SPREAD)))
+        mark = some_mark(KIND["ellipse"], own_blur, rng, tile, 10 * rng.uniform(*half_axes_px) / 6)
+        contrast = CONTRAST * np.exp(rng.normal(0, CONTRAST_SPREAD))
+        grey = ground + sign * contrast * mark.picture + CONTRAST / snr * rng.standard_normal((tile, tile))
+        corner = tile * np.array(divmod(number, DISKS_A_SIDE)[::-1])
+        speckled, seen = dusty(mark, grey, float(share), rng)
+        frame[corner[1] :, corner[0] :][:tile, :tile] = speckled
+        form = scale * (np.eye(2) + rng.normal(0, FORM_SPREAD, (2, 2))) @ mark.place[:, :2]
+        about = corner + mark.place[:, 2] + rng.normal(0, DISK_OFF_PX, 2)
+        predictions.append(TargetPrediction(str(number), about, form, 3.0))
+        parts.append((mark, speckled, seen, corner))
+    found = []
+    for each, (*_, corner) in zip(measure_disks(scan_of(frame), predictions), parts, strict=True):
+        place, flagged = each.center_px, "" if each.status is Status.MEASURED else each.reason
+        given = each.status.is_observation and place is not None and each.covariance_px2 is not None
+        found.append(Found(np.asarray(place) - corner, np.asarray(each.covariance_px2), flagged) if given else None)
+    return [DustyMark(*part[:3], each) for part, each in zip(parts, found, strict=True)], dusts
