@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast: texture and stains are no disks
 SMOOTH = 0.5  # correlation of neighbouring residuals, from which on they are no noise
 MARGIN, LEAST_MARGIN_PX = 0.3, 2.5  # of its radius: the ground is not plain for long, where a target's pad ends, say
-SIZE_STEP = 1.3  # from the smallest to the largest that are fitted together
+SIZE_STEP, COARSE_SIZE_STEP = 1.3, 2.0  # largest over smallest that are fitted together, in all pixels and in a few
 TOGETHER_PIXELS = 1 << 16  # of all windows: with their derivatives they take some 10 MiB
 COARSE_PX = 3.0  # radius in pixels that are enough for a first look and its steps
 EDGE_SAMPLES = 8  # likewise, of a disk's edge, two blurs wide
@@ -41,9 +41,10 @@ class _Disk:
 def disks_among(block: Block, patches: Sequence[Candidate]) -> list[Candidate]:
     """Those patches that a disk explains, the strongest first, as fitted: a place within a tenth of a pixel or so."""
     starts = [_Disk(patch, FIRST_BLUR_PX) for patch in patches]
-    hopeful = [disk for group, every in _alike(starts, _every(starts)) for disk in _hopeful(block, group, every)]
-    in_all = np.ones(len(hopeful), dtype=np.intp)
-    fitted = [disk.patch for group, _ in _alike(hopeful, in_all) for disk in _fitted(block, group)]
+    coarse = _alike(starts, _every(starts), COARSE_SIZE_STEP)
+    hopeful = [disk for group, every in coarse for disk in _hopeful(block, group, every)]
+    fine = _alike(hopeful, np.ones(len(hopeful), dtype=np.intp), SIZE_STEP)
+    fitted = [disk.patch for group, _ in fine for disk in _fitted(block, group)]
     return sorted(fitted, key=strength)
 
 
@@ -54,13 +55,14 @@ def _every(disks: Sequence[_Disk]) -> NDArray[np.intp]:
     return np.maximum(np.minimum(radius / COARSE_PX, of_edge), 1.0).astype(np.intp)
 
 
-def _alike(disks: Sequence[_Disk], every: NDArray[np.intp]) -> Iterator[tuple[list[_Disk], int]]:
-    """Disks of about one size that are looked at in every so many columns and rows (n,), and how many these are; so
-    many disks that their windows are not too large. Each is sampled by its own size, whatever it is together with."""
+def _alike(disks: Sequence[_Disk], every: NDArray[np.intp], size_step: float) -> Iterator[tuple[list[_Disk], int]]:
+    """Disks that differ in size by so much at most and are looked at in every so many columns and rows (n,), and how
+    many these are; so many disks that their windows are not too large. Each is sampled by its own size, whatever it is
+    together with."""
     reach = _reach_px(_shapes(disks))
     rest = np.lexsort((reach, every)).tolist()
     while rest:
-        largest, step = reach[rest[0]] * SIZE_STEP, int(every[rest[0]])
+        largest, step = reach[rest[0]] * size_step, int(every[rest[0]])
         count = max(int(TOGETHER_PIXELS * step**2 / (2 * largest + 1) ** 2), 1)
         chosen = [index for index in rest[:count] if reach[index] <= largest and every[index] == step]
         yield [disks[index] for index in chosen], step

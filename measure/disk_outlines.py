@@ -17,7 +17,7 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Sampled = Callable[[NDArray[np.intp], Array], Image]
 
-RAYS, FEW_RAYS = 32, 16
+RAYS, FEW_RAYS = 32, (8, 16)  # of an outline, and of the looks before: half of the blobs do not outlast the first
 REACH = 3.0  # radii of a blob: where its patch must have ended
 CORE, AROUND = 0.5, (1.5, 2.5)  # radii of a blob: within, that it is as high as; between, that there is ground
 GROUND_SHARE = 1 / 3  # of the rays, that are lower there: other things may stand about
@@ -63,8 +63,10 @@ def outlines_about(image: Image, blobs: Blobs) -> Outlines:
     found = []
     for radius in np.unique(blobs.radius).tolist():
         alike = blobs.part(blobs.radius == radius)
-        ends = [_Profiles(near, some, radius, FEW_RAYS, 1.0).ends for some in _chunks(alike, FEW_RAYS * REACH * radius)]
-        for some in _chunks(alike.part(np.concatenate(ends)), RAYS * REACH * radius / 0.5):
+        for rays in FEW_RAYS:
+            ends = [_Profiles(near, some, radius, rays, 1.0).ends for some in _chunks(alike, rays * REACH * radius)]
+            alike = alike.part(np.concatenate([np.zeros(0, bool), *ends]))
+        for some in _chunks(alike, RAYS * REACH * radius / 0.5):
             profiles = _Profiles(between, some, radius, RAYS, 0.5)
             found.append(_outlines(some.places[profiles.ends], profiles))
     return _joined(found)

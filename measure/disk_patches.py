@@ -114,12 +114,11 @@ class Cells:
         """The cells in which columns lie."""
         return np.searchsorted(self.ends[:-1], columns, side="right")
 
-    def above(self, picture: Image, levels: Array) -> Image:
-        """The picture where it is above its cell's level, 0 elsewhere."""
-        result = np.empty_like(picture)
+    def cut(self, picture: Image, levels: Array) -> Image:
+        """The picture, which from now on is 0 where it is not above its cell's level."""
         for first, last, level in zip((0, *self.ends), self.ends, levels.tolist(), strict=False):
-            cv2.threshold(picture[:, first:last], level, 0.0, cv2.THRESH_TOZERO, result[:, first:last])
-        return result
+            cv2.threshold(picture[:, first:last], level, 0.0, cv2.THRESH_TOZERO, picture[:, first:last])
+        return picture
 
 
 def blobs(
@@ -129,19 +128,22 @@ def blobs(
     stand out of their cells' texture."""
     contrasts: list[Image] = []
     levels: list[Array] = []
+    smooth, blurred = small, 0.0
     for radius in radii:
         sigma = radius / np.sqrt(2)
-        smooth = cv2.GaussianBlur(small, 2 * (2 * int(3 * sigma + 0.5) + 1,), sigma)
+        further = np.sqrt(sigma**2 - blurred**2)
+        smooth = np.asarray(cv2.GaussianBlur(smooth, 2 * (2 * int(3 * further + 0.5) + 1,), further), np.float32)
+        blurred = sigma
         contrast = cv2.Laplacian(smooth, cv2.CV_32F, ksize=1, scale=-(sigma**2) / PEAK_OF_DISK)
         contrasts.append(np.asarray(contrast, np.float32))
         textures = cells.scales(contrasts[-1][::EVERY, ::EVERY]) if is_textured else np.zeros(len(cells.ends))
         levels.append(np.maximum(RESPONSE_SIGMAS * textures, search.least_contrast * full_scale_dn))
     neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * max(int(radii[0]), 1) + 1,))
     margin, width = margin_px(radii), small.shape[1] - 2 * margin_px(radii)
-    for sign, polarity in ((1, "light"), (-1, "dark")):
+    for sign, polarity in ((-1, "dark"), (1, "light")):  # which may use the contrasts up
         if search.polarity in (polarity, "auto"):
             standing = [
-                cells.above(contrast if sign > 0 else -contrast, level)
+                cells.cut(contrast if sign > 0 else -contrast, level)
                 for contrast, level in zip(contrasts, levels, strict=True)
             ]
             strongest = reduce(np.maximum, standing)
