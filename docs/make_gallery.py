@@ -1,6 +1,7 @@
 """Write failure-gallery.md and failure-gallery.png: networks that fail, and what the program says of them.
 
-python docs/make_gallery.py [FOLDER]. The networks are those of tests/adjust/gallery.py; the words are the program's.
+python docs/make_gallery.py [FOLDER]. The networks are those of null_directions.py and mishaps.py in tests/adjust; the
+words are the program's.
 """
 
 import sys
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
 
-from gallery import AXES, CATALOGUE, MISHAPS, Failure, Mishap, sentences  # the tests' own networks
+from mishaps import MISHAPS, Mishap, sentences  # the tests' own networks
+from null_directions import AXES, CATALOGUE, Failure
 
 from adjust.adjustment import adjust
 from adjust.network import Network
@@ -31,9 +33,9 @@ AXIS, ARROW = 600.0, 260.0  # drawn lengths of a camera's axis and of its x', in
 INTRODUCTION = """# Failures, and what is said of them
 
 Networks that leave something undetermined, with the program's own words. This page is written by
-`docs/make_gallery.py` from the networks of `tests/adjust/gallery.py`, where tests count the null directions of each,
-compare the words, and try the remedies: a prior that is asked for ends exactly one direction, a change of the network
-ends those that it is advised for.
+`docs/make_gallery.py` from the networks of `tests/adjust/null_directions.py` and `tests/adjust/mishaps.py`, where tests
+count the null directions of each, compare the words, and try the remedies: a prior that is asked for ends exactly one
+direction, a change of the network ends those that it is advised for.
 
 Every network is simulated without errors. There are four images (or as many as are said) from 1500 m by a camera of
 c = 153 mm with five fiducial marks, film transformations are affine, and nothing is given of fiducials, c, x0', y0'

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gallery import CONVERGENT, FREE, MISHAPS, Setup, given, sentences, vertical
+from mishaps import MISHAPS, sentences
+from setups import CONVERGENT, FREE, Setup, given, vertical
 from simulated import STATIONS
 
 from adjust.adjustment import adjust

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gallery import AXES, CATALOGUE, CONVERGENT, DEFORMATIONS, DISTANCE, MISHAPS, Setup, given, sentences
+from mishaps import MISHAPS, sentences
+from null_directions import AXES, CATALOGUE, DEFORMATIONS, DISTANCE
+from setups import CONVERGENT, Setup, given
 
 from adjust.adjustment import adjust
 from adjust.network import Approximations, Exterior, Network, Prior, Transformation

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from gallery import AXES, DEFORMATIONS, DISTANCE, POINT, UNKNOWN, Array, Setup, vertical
+from null_directions import AXES, DEFORMATIONS, DISTANCE, POINT
+from setups import UNKNOWN, Array, Setup, vertical
 from simulated import field_points
 
 from adjust import null_space

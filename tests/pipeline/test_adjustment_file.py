@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import made_up_calibration
 import numpy as np
 import pytest
-from gallery import Setup, vertical
+from setups import Setup, vertical
 
 from adjust.adjustment import adjust
 from adjust.network import ObjectPoint, Prior
