@@ -27,6 +27,7 @@ SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size can
 SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
 WEAK_DAMAGE, MOST_DAMAGE = 0.2, 0.35
 MOST_BLUR = 0.7  # of the shorter half axis
+SURE, MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may be greater, and what that may add to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +54,24 @@ class FittedDisk:
         return np.asarray(np.linalg.svd(self.pixel_from_disk, compute_uv=False))
 
     @property
+    def is_fitted(self) -> bool:
+        """Whether the fit came to an end, whatever was fitted."""
+        return bool(np.all(np.isfinite(self.covariance_px2)))
+
+    @property
     def is_soft(self) -> bool:
         """Whether it was fitted, and its edge is as soft as that of a spot, which has none."""
-        return bool(np.all(np.isfinite(self.covariance_px2)) and self.blur_px > MOST_BLUR * self.half_axes_px[1])
+        return bool(self.is_fitted and self.blur_px > MOST_BLUR * self.half_axes_px[1])
 
     @property
     def is_spoilt(self) -> bool:
         """Whether it was fitted, and too little about it fits a disk."""
-        return bool(np.all(np.isfinite(self.covariance_px2)) and self.damaged_fraction > MOST_DAMAGE)
+        return bool(self.is_fitted and self.damaged_fraction > MOST_DAMAGE)
+
+    @property
+    def contrast_sigma(self) -> float:
+        """Standard deviation of its contrast, as a share of it."""
+        return float(np.sqrt(self.look_covariance[3, 3]))
 
     @property
     def lone_doubt(self) -> str:
@@ -109,6 +120,7 @@ def fit_disk(
         margin_blurs=0.0,
         plain_px=sure,
         max_shift_px=max(radius, 2.0),
+        linear_sigma=0.2,
     )
     col0, row0, width, height = window_about(shape, start, wide + BESIDE_PX)
     window, valid = scan.window(col0, row0, width, height), inside(scan, col0, row0, width, height)
@@ -128,16 +140,19 @@ def fit_disk(
             look_covariance=look_covariance(fit),
             reason="" if fit.converged else fit.reason,
         )
-        return judged(disk, fit.neighbour_correlation)
+        return judged(disk, fit)
 
     disk = fitted(wide)
     soft = min(MARGIN_BLURS * disk.blur_px, longest_margin_px)
-    if soft > wide and not disk.reason:
+    # In less ground than its blur reaches, a disk's blur, size and contrast may run away together.
+    if soft > wide and not (disk.reason and disk.is_fitted):
         softer = fitted(soft)
-        return disk if softer.reason else softer
+        disk = disk if softer.reason else softer
+    if not disk.reason:
+        return disk
     # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
     # it does how soft an edge is: what passes with less of it, at another place, may be the dust itself.
-    if not disk.reason or disk.is_soft or not sure < wide:
+    if disk.is_soft or not sure < wide:
         return disk
     narrow = fitted(sure)
     if narrow.reason or not disk.is_spoilt:
@@ -162,16 +177,19 @@ def inside(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray
     return np.asarray(in_rows[:, None] & (cols >= 0) & (cols < scan.width_px))
 
 
-def judged(disk: FittedDisk, residual_correlation: float) -> FittedDisk:
+def judged(disk: FittedDisk, fit: Match) -> FittedDisk:
     """The disk with its reason or weakness, where the fit's figures give one; residuals of a picture of something else
     are alike in neighbouring pixels."""
     if disk.reason:
         return disk
     reason = weakness = ""
     contrast, (_, shorter) = abs(disk.contrast_dn), disk.half_axes_px
-    if not np.all(np.isfinite(disk.covariance_px2)) or contrast < LEAST_SNR * disk.noise_dn:
+    # White residuals are noise, which also moves a contrast: as strong as it may be, the disk counts.
+    most = contrast * (1 + min(SURE * disk.contrast_sigma, MOST_FAINTER)) if fit.covariance_is_white else contrast
+    worst = WORST_SMOOTH_MISFIT if fit.neighbour_correlation > SMOOTH else WORST_MISFIT
+    if not disk.is_fitted or most < LEAST_SNR * disk.noise_dn:
         reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
-    elif disk.noise_dn > (WORST_SMOOTH_MISFIT if residual_correlation > SMOOTH else WORST_MISFIT) * contrast:
+    elif disk.noise_dn > worst * contrast and not fit.covariance_is_white:
         reason = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
     elif disk.is_spoilt:
         reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"

@@ -211,6 +211,10 @@ class PictureFit:
                 moved = model.step(step)
                 model.linearise(self.used)
                 cost = self._cost(scale_dn)
+            if cost > cost_before and float(np.hypot(*step[:2])) < tolerance_px:
+                # No part of the step improves the fit: where size, blur and contrast hang together it ends flat.
+                model.state, moved = before, 0.0
+                model.linearise(self.used)
             self.reason = model.ran_away()
             if self.reason or moved < tolerance_px:
                 return

@@ -121,6 +121,8 @@ class PictureModel:
         columns[0], columns[1] = shown.by_col, shown.by_row
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
         moves = np.stack([slope * along for slope in columns[:2] for along in (col, row)])
+        # The blur does not bend with the mark: else a soft disk's size, blur and contrast run away together.
+        moves += self.seen_blur_px**2 * np.stack([shown.by_col_col, *[shown.by_col_row] * 2, shown.by_row_row])
         columns[self.linear] = combined(self.generators.reshape(-1, 4), moves)
         if self.blur is not None:
             columns[self.blur] = -0.5 * shown.laplacian

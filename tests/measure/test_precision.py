@@ -65,6 +65,19 @@ def test_a_disk_on_plain_ground_uses_more_of_it() -> None:
     assert not beside.reason
 
 
+def test_faint_soft_disks_are_at_the_bound() -> None:
+    rng = np.random.default_rng(7)
+    mark = some_mark(KIND["ellipse"], 2.5, rng)
+    beyond = []
+    for _ in range(10):
+        noise = rng.standard_normal((mark.size, mark.size)) / 5
+        start = mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1)
+        disk = fit_disk(scan_of(GROUND + CONTRAST * (mark.picture + noise)), *start)
+        assert not disk.reason
+        beyond.append(disk.center_px - mark.place[:, 2] - mark.best_errors(noise, 1 / 5))
+    assert np.square(beyond).sum() < 10 * 0.3 * np.trace(mark.bound(1 / 5))
+
+
 def test_wings_take_rotation_and_scale_from_their_frame() -> None:
     rng = np.random.default_rng(3)
     places = [(-25.0, 0.0, 90.0), (25.0, 0.0, -90.0), (0.0, 25.0, 0.0), (3.0, -25.0, 180.0)]
