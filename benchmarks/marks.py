@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from kept_rows import KeptRows
-from measured_marks import CONTRAST, GROUND, Cell, drawn, measured
+from measured_marks import CONTRAST, GROUND, Cell, best_errors, drawn, measured, start_off
 from numpy.typing import NDArray
 from true_marks import (
     KIND,
@@ -60,8 +60,9 @@ def accuracy(kinds: Sequence[Kind], count: int) -> None:
                 mark = marks[number % len(marks)]
                 noise = rng.standard_normal((mark.size, mark.size)) / snr
                 grey, sign = drawn(mark, rng)
-                found = measured(mark, grey + CONTRAST * noise, rng)
-                cell.add(mark, found, mark.best_errors(sign * noise, 1 / snr), mark.bound(1 / snr))
+                off = start_off(mark, rng)
+                found = measured(mark, grey + CONTRAST * noise, rng, off=off)
+                cell.add(mark, found, best_errors(mark, sign * noise, 1 / snr, off), mark.bound(1 / snr))
         return f"{kind.name:14}{blur:5.1f}" + "".join(f"{cell.words():>17}" for cell in cells)
 
     for kind in kinds:
@@ -84,9 +85,10 @@ def grain(kinds: Sequence[Kind], count: int) -> None:
                 mark = marks[number % len(marks)]
                 noise = grainy(mark.size, grain_px, rng) / GRAIN_SNR
                 grey, sign = drawn(mark, rng)
-                best = mark.best_errors(sign * noise, 1 / GRAIN_SNR, None, correlation)
+                off = start_off(mark, rng)
+                best = best_errors(mark, sign * noise, 1 / GRAIN_SNR, off, correlation)
                 bound = mark.bound(1 / GRAIN_SNR, None, correlation)
-                cell.add(mark, measured(mark, grey + CONTRAST * noise, rng), best, bound)
+                cell.add(mark, measured(mark, grey + CONTRAST * noise, rng, off=off), best, bound)
             words.append(cell.words())
         return f"{kind.name:14}" + "".join(f"{each:>17}" for each in words)
 
@@ -117,7 +119,7 @@ def bias(kinds: Sequence[Kind], count: int) -> None:
 def clean_error(mark: TrueMark, rng: np.random.Generator, full_scale: int) -> Array:
     """The error without noise, with rotation and scale known exactly where they come from the frame."""
     contrast, ground = (CONTRAST, GROUND) if full_scale > 255 else (120.0, 60.0)
-    found = measured(mark, drawn(mark, rng, contrast, ground)[0], rng, full_scale, exact=True)
+    found = measured(mark, drawn(mark, rng, contrast, ground)[0], rng, full_scale, off=start_off(mark, rng, exact=True))
     if found is None:
         return np.full(2, np.inf)
     return np.asarray(found.center_px - mark.place[:, 2])
@@ -136,17 +138,19 @@ def clipping(kinds: Sequence[Kind], count: int) -> None:
         words = []
         for sign in (-1, 1):
             for beyond in BEYOND:
-                cell, off = Cell(), []
+                cell, clean_off = Cell(), []
                 for number in range(count):
                     mark = marks[number % len(marks)]
                     grey = 65535 + CONTRAST * (beyond + sign * mark.picture - (sign + 1) / 2)
                     noise = rng.standard_normal((mark.size, mark.size)) / CLIPPED_SNR
                     if number < len(marks):
-                        clean = measured(mark, grey, rng, exact=True)
-                        off.append(np.inf if clean is None else np.abs(clean.center_px - mark.place[:, 2]).max())
-                    best, bound = mark.best_errors(sign * noise, 1 / CLIPPED_SNR), mark.bound(1 / CLIPPED_SNR)
-                    cell.add(mark, measured(mark, grey + CONTRAST * noise, rng), best, bound)
-                words.append(f"{max(off):8.4f} {cell.words()}")
+                        clean = measured(mark, grey, rng, off=start_off(mark, rng, exact=True))
+                        clean_off.append(np.inf if clean is None else np.abs(clean.center_px - mark.place[:, 2]).max())
+                    off = start_off(mark, rng)
+                    best = best_errors(mark, sign * noise, 1 / CLIPPED_SNR, off)
+                    found = measured(mark, grey + CONTRAST * noise, rng, off=off)
+                    cell.add(mark, found, best, mark.bound(1 / CLIPPED_SNR))
+                words.append(f"{max(clean_off):8.4f} {cell.words()}")
         return f"{kind.name:14}" + "".join(f"{each:>24}" for each in words)
 
     for kind in kinds:

@@ -58,11 +58,15 @@ class Cell:
 
     @property
     def to_claimed(self) -> float:
-        """rms in units of the standard deviations claimed, likewise."""
-        weights = np.linalg.inv(self.covariances)
-        squares = np.einsum("nij,nij->n", weights, self.bounds)
-        squares += np.einsum("ni,nij,nj->n", self._beyond, weights, self._beyond)
-        return float(np.sqrt(np.mean(squares) / 2))
+        """rms in units of the standard deviations claimed.
+
+        The mean square of the best estimate's errors in units of their bound is 1: by how much that of the errors, in
+        units of what is claimed, differs in the very same noise, is what few marks show. The covariance claimed varies
+        with the noise as well, and the errors with it: a contrast that came out too high makes both smaller.
+        """
+        return float(
+            np.sqrt(1 + np.mean(_squares(self.errors, self.covariances) - _squares(self.best, self.bounds)) / 2)
+        )
 
     @property
     def _beyond(self) -> Array:
@@ -75,22 +79,37 @@ class Cell:
         return f"{self.to_bound:7.3f} {self.to_claimed:5.3f}{lost:<4}"
 
 
+def _squares(errors: list[Array], covariances: list[Array]) -> Array:
+    """(n,) of errors in units of their standard deviations, summed over both coordinates."""
+    return np.asarray(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors))
+
+
+def start_off(mark: TrueMark, rng: np.random.Generator, exact: bool = False) -> Array:
+    """(2,) by how much the scale and the rotation (rad) are off with which a match begins: 0.3 % and 3 mrad or, where
+    the frame gives them, 0.01 % and 0.1 mrad, exact a tenth of that."""
+    return np.asarray(rng.normal(0, min(mark.kind.known * (0.1 if exact else 1), 0.003), 2))
+
+
+def best_errors(mark: TrueMark, noise: Array, sigma: float, off: Array, correlation: Array | None = None) -> Array:
+    """(2,) of the best linear estimate from the same noise (size, size), contrast 1, and what the frame gives."""
+    return mark.best_errors(noise, sigma, None, correlation, off if np.isfinite(mark.kind.known) else None)
+
+
 def measured(
     mark: TrueMark,
     grey: Array,
     rng: np.random.Generator,
     full_scale: int = 65535,
-    exact: bool = False,
     step_dn: float = 0.0,
+    off: Array | None = None,
 ) -> Found | None:
-    """The mark as the program measures it, from a start off by some px, and by 0.3 % and 3 mrad or, exact, no more than
-    0.001 % where the frame gives these."""
+    """The mark as the program measures it, from a start off by some px, and by off (2,), as `start_off` gives it."""
     scan = scan_of(grey, full_scale, step_dn)
     center = mark.place[:, 2] + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
     if mark.kind.name == "ellipse":
         disk = fit_disk(scan, mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1))
         return None if disk.reason else Found(disk.center_px, disk.covariance_px2, disk.weakness)
-    scale, turn = rng.normal(0, min(mark.kind.known * (0.1 if exact else 1), 0.003), 2)
+    scale, turn = start_off(mark, rng) if off is None else off
     start = np.column_stack([np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ mark.place[:, :2], center])
     polarity = 1 if grey_is_light(mark, grey) else -1
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None

@@ -95,41 +95,49 @@ class TrueMark:
 
         seen (size, size): the pixels that show the mark. correlation (2 n + 1, 2 n + 1): of the noise at all lags.
         """
-        return self._best(sigma, seen, correlation)[0]
+        return self._best(sigma, seen, correlation)[0][0]
 
     def best_errors(
-        self, noise: Array, sigma: float, seen: Mask | None = None, correlation: Array | None = None
+        self,
+        noise: Array,
+        sigma: float,
+        seen: Mask | None = None,
+        correlation: Array | None = None,
+        told: Array | None = None,
     ) -> Array:
-        """(2,) the errors that the best linear estimate makes in this very noise (size, size), contrast 1.
+        """(2,) the errors that the best linear estimate makes in this very noise (size, size), contrast 1, and with
+        what the frame tells of its moves being off by told (moves,).
 
         Their mean square is the bound. Beside them, the errors of another method show in few marks what its own mean
         square would show in thousands only.
         """
-        _, by_grey, near = self._best(sigma, seen, correlation)
-        return np.asarray(by_grey @ noise[near])
+        (_, by_grey, by_told), near = self._best(sigma, seen, correlation)
+        errors = by_grey @ noise[near]
+        return np.asarray(errors if told is None else errors + by_told @ told)
 
-    def _best(self, sigma: float, seen: Mask | None, correlation: Array | None) -> tuple[Array, Array, Mask]:
-        """The bound, how the best estimate of the place follows from the pixels (2, pixels), and these."""
+    def _best(self, sigma: float, seen: Mask | None, correlation: Array | None) -> tuple[tuple[Array, ...], Mask]:
+        """The bound, how the best estimate of the place follows from the pixels (2, pixels) and from what the frame
+        tells (2, moves), and which pixels these are."""
         near = self.near if seen is None else self.near & seen
         if correlation is None:
             design = self.design[:, near].T
-            return *self._solved(design, design, sigma), near
+            return self._solved(design, design, sigma), near
         key = (sigma, correlation.tobytes())
         if key not in self._coloured:
             design = self.design[:, near].T
             self._coloured[key] = self._solved(design, cho_solve(cho_factor(_matrix(correlation, near)), design), sigma)
-        return *self._coloured[key], near
+        return self._coloured[key], near
 
-    def _solved(self, design: Array, weighted: Array, sigma: float) -> tuple[Array, Array]:
+    def _solved(self, design: Array, weighted: Array, sigma: float) -> tuple[Array, ...]:
         normal = design.T @ weighted / sigma**2
         moves = np.arange(2, 2 + len(self.kind.unknown))
         normal[moves, moves] += self.kind.known**-2
         size = np.sqrt(np.diag(normal))
         inverse = np.linalg.inv(normal / np.outer(size, size)) / np.outer(size, size)
-        return inverse[:2, :2], inverse[:2] @ weighted.T / sigma**2
+        return inverse[:2, :2], inverse[:2] @ weighted.T / sigma**2, inverse[:2, moves] * self.kind.known**-2
 
     @cached_property
-    def _coloured(self) -> dict[tuple[float, bytes], tuple[Array, Array]]:
+    def _coloured(self) -> dict[tuple[float, bytes], tuple[Array, ...]]:
         return {}
 
     @cached_property
