@@ -30,6 +30,7 @@ _STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is s
 _OUTSTANDING = 2.0  # times what chance finds
 _CERTAIN = 0.01  # constellations expected by chance: no mark need be matched in wrong places to know better
 _BY_CHANCE = 1.0  # constellation expected: chance may have made it
+_ODDS = 1000.0  # times what chance makes of another camera's marks: that one is seen, and not this
 _CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
 _AFFINE = 6  # parameters
 
@@ -132,8 +133,8 @@ def _trials(
     options: FiducialOptions,
     count: Count,
 ) -> list[Trial]:
-    """Of every layout, those first that answer better than chance; the others are measured only where none of these
-    stands out."""
+    """Of every layout, those first that answer better than chance. Once one of these stands out, another is measured
+    only where it answers better than chance too, and may be more than a part of what was found."""
     expected: dict[tuple[str, ...], float] = {}
     groups = _alike(cameras)
     for done, names in enumerate(groups):
@@ -142,7 +143,8 @@ def _trials(
     trials: list[Trial] = []
     for done, names in enumerate(sorted(groups, key=lambda names: expected[names]), len(groups)):
         layout = cameras[names[0]].layout()
-        if expected[names] > _BY_CHANCE and any(trial.stands_out for trial in trials):
+        limits = [_expected_at_most(trial, len(layout.marks)) for trial in trials if trial.stands_out]
+        if limits and expected[names] > min(limits):
             trials.append(_not_measured(names, len(layout.marks), expected[names]))
         else:
             count(", ".join(names), done, 2 * len(groups))
@@ -150,8 +152,15 @@ def _trials(
     return trials
 
 
+def _expected_at_most(seen: Trial, marks: int) -> float:
+    """How many constellations chance may make of a layout of so many marks for it to be measured after a trial that
+    stands out. Where that has more marks, nine crosses of a lattice, say, answer to a lattice of nine; but chance makes
+    nine so much more easily than twenty-five."""
+    return min(_BY_CHANCE, _ODDS * seen.expected) if seen.found > marks else _BY_CHANCE
+
+
 def _not_measured(names: tuple[str, ...], drawn: int, expected: float) -> Trial:
-    reason = f"not measured: chance makes {expected:.0f} constellations in such a scan that answer as well"
+    reason = f"not measured: chance makes {expected:.1g} constellations in such a scan that answer as well"
     return Trial(names, 0, drawn, 0.0, 0.0, 0.0, None, None, None, reason, 0.0, expected)
 
 

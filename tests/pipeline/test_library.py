@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline import camera_trials
 from pipeline.against_truth import compare_with_truth
 from pipeline.camera_file import CameraFile, read_camera
 from pipeline.camera_trials import Identification, Trial, identify
@@ -173,6 +174,20 @@ def test_the_frame_is_told_from_another_camera(frame: Path) -> None:
 
 def trial(cameras: tuple[str, ...], score: float, chance: float | None = 0.0) -> Trial:
     return Trial(cameras, 4, 4, 0.9, 10.0, score, chance, 1.0, 0.01, "", 2.0, 1e-6)
+
+
+@pytest.mark.parametrize(("found", "measured"), [(25, 1), (9, 2)])
+def test_a_part_of_a_lattice_is_no_other_camera(
+    frame: Path, monkeypatch: pytest.MonkeyPatch, found: int, measured: int
+) -> None:
+    """Unless no more of the lattice was found than the other camera has marks."""
+    (scan,) = (frame.parent / "scans").glob("*.tif")
+    two = {name: LIBRARY[name] for name in ("hasselblad-reseau-60", "register-glass-262")}
+    monkeypatch.setattr(camera_trials, "expected_alike", lambda _, layout, *__: 10.0 ** -len(layout.marks))
+    monkeypatch.setattr(
+        camera_trials, "_trial", lambda *_: replace(trial(("lattice",), 0.5), found=found, expected=1e-25)
+    )
+    assert sum(each.cameras == ("lattice",) for each in identify(scan, two, 100.0, Reporter()).trials) == measured
 
 
 def test_what_chance_finds_as_well_does_not_stand_out() -> None:
