@@ -1,105 +1,175 @@
 """Notches, blocks, curves and triangles of real cameras: learned, found in any pose and measured.
 
-PYTHONPATH=. python benchmarks/composed_frames.py MARKS_FOLDER
+PYTHONPATH=.:benchmarks python benchmarks/composed_frames.py MARKS_FOLDER OUT.jsonl [--frames 8] [--first 0]
 
 A folder of four crops (L, T, R, B) is one camera. Frames are put together from them: each crop at its side of a
 textured square, its own landscape (what is lighter than Otsu's threshold) exchanged for another, averaged over a few
 pixels that begin at other ones in every frame, so that the marks move by known parts of a pixel. Templates are learned
-from three frames; the fourth is turned by a quarter, mirrored, and measured as of unknown pose.
+from three frames, then a fourth is measured as of unknown pose: by turns in all eight, beside landscapes as light as
+those that were learned from or not, and with the marks' origins in the middles of the crops or somewhere beside them.
+
+One line a frame is added to OUT.jsonl, and frames that stand there already are left out; then all its lines are told.
 """
 
-import sys
+import argparse
+import json
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from search import OUTCOMES, POSE_OUTCOMES, judged, lines, print_table
+from search_frames import Case
 
-from measure.fiducials import measure_fiducials
 from measure.learned import cut, template_of
 from measure.picture_scan import WholePicture
+from measure.poses import POSES, up_from_camera
 from measure.resolution import NO_TAGS
-from measure.results import FrameMeasurement
 from measure.scan import Scan
 from measure.shapes import FiducialLayout, LayoutMark
 
 Array = NDArray[np.float64]
+Crops = dict[str, NDArray[np.uint8]]
 
 SIDES = {"L": (-1, 0), "T": (0, 1), "R": (1, 0), "B": (0, -1)}
-SIZE_PX, REACH_PX, PITCH_MM = 1200, 450, 0.1
+SIZE_PX, REACH_PX, PITCH_MM = 820, 280, 0.1
 REDUCED_PX = 160  # of a crop's longer side
 NOISE_DN = 1.5
-TRUE = np.array([[1 / PITCH_MM, 0.0], [0.0, -1 / PITCH_MM]])
+MIDDLE_PX = (SIZE_PX - 1) / 2
+FLIP = np.diag([1.0, -1.0])
+# Grey values of the landscape, in the frames that are learned from and in the one that is measured: in turn.
+LANDSCAPES_DN = ((150, 150), (245, 245), (200, 200), (150, 200), (200, 245), (150, 245), (245, 220), (100, 60))
+OFF_PX = (0, 5)  # how far the origins may lie from the crops' middles, in turn
 
 
 def main() -> None:
-    """Print what became of each camera's marks."""
-    for folder in sorted({path.parent for path in Path(sys.argv[1]).rglob("*.*")}):
-        crops = {path.stem: np.asarray(cv2.imread(str(path), 0), np.uint8) for path in folder.iterdir()}
-        if set(SIDES) <= set(crops):
-            print(f"{folder.parent.name + '/' + folder.name:16}", told(*measured(crops)))
+    """Measure the frames that are missing, and print what became of all."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("marks", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--first", type=int, default=0)
+    given = parser.parse_args()
+    cameras = cameras_in(given.marks)
+    done = {(line["kind"], line["frame"]) for line in lines(given.out)}
+    for index in range(given.first, given.first + given.frames):
+        for number, name in enumerate(cameras):
+            if (name, index) not in done:
+                line = judged(draw_case(given.marks / name, index, index + number))
+                with given.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"frame": index, **line, "kind": name}) + "\n")
+    tell(lines(given.out), cameras)
 
 
-def measured(crops: dict[str, NDArray[np.uint8]]) -> tuple[FrameMeasurement, dict[str, Array]]:
-    """The fourth frame, and the true places of its marks, px."""
-    learned = [composed(crops, seed) for seed in (1, 2, 3)]
-    size_mm = {side: PITCH_MM * (min(crops[side].shape) / fold(crops[side]) - 8) for side in SIDES}
-    marks = []
-    for side, (x, y) in SIDES.items():
-        chips = [cut(scan, np.column_stack([TRUE, places[side]]), size_mm[side]) for scan, places in learned]
-        template = template_of(chips, size_mm[side])
-        marks.append(LayoutMark(side, (REACH_PX * PITCH_MM * x, REACH_PX * PITCH_MM * y), (0.05, 0.05), template))
-    scan, places = composed(crops, 4)
-    grey = scan.window(0, 0, SIZE_PX, SIZE_PX).astype(np.uint8)
-    turned = Scan(Path("turned"), WholePicture(np.rot90(grey)[:, ::-1, None]), NO_TAGS)
-    layout = FiducialLayout(tuple(marks), (SIZE_PX * PITCH_MM,) * 2)
-    # Turned counter-clockwise (col, row) goes to (row, side - col); mirrored, to (side - row, side - col).
-    true = {side: SIZE_PX - 1 - place[::-1] for side, place in places.items()}
-    return measure_fiducials(turned, layout, (1000 * PITCH_MM,) * 2), true
+def cameras_in(marks: Path) -> list[str]:
+    """The folders that hold four crops."""
+    folders = sorted({path.parent for path in marks.rglob("*.*")})
+    return [str(each.relative_to(marks)) for each in folders if set(SIDES) <= {path.stem for path in each.iterdir()}]
 
 
-def composed(crops: dict[str, NDArray[np.uint8]], seed: int) -> tuple[Scan, dict[str, Array]]:
-    rng = np.random.default_rng(seed)
-    grey, places = landscape(rng, (SIZE_PX, SIZE_PX)), {}
+def draw_case(camera: Path, index: int, turn: int) -> Case:
+    """The index-th frame of a camera. turn: by which poses and landscapes are taken, other ones for every camera."""
+    learned_dn, seen_dn = LANDSCAPES_DN[turn % len(LANDSCAPES_DN)]
+    round_, pose = index // len(LANDSCAPES_DN), POSES[(3 * index + turn) % len(POSES)]
+    grey, places = composed(crops_of(camera), np.random.default_rng([index, 1]), seen_dn)
+    up, origins = up_from_camera(pose), origins_px(round_)
+    centers = {side: FLIP @ up @ FLIP @ (places[side] + origins[side] - MIDDLE_PX) + MIDDLE_PX for side in SIDES}
+    return Case(
+        kind=camera.name,
+        symmetry="unlike marks",
+        picture=f"{learned_dn}, seen beside {seen_dn}",
+        layout=learned_layout(camera, learned_dn, round_),
+        pose=pose,
+        pitch_um=1000 * PITCH_MM,
+        scan=scan_of("measured", posed(grey, pose)),
+        centers_px=centers,
+        hidden=frozenset(),
+        without_marks=lambda: landscape(np.random.default_rng([index, 2]), (SIZE_PX, SIZE_PX), seen_dn),
+    )
+
+
+@cache
+def crops_of(camera: Path) -> Crops:
+    return {path.stem: np.asarray(cv2.imread(str(path), 0), np.uint8) for path in camera.iterdir()}
+
+
+def origins_px(round_: int) -> dict[str, Array]:
+    """Where the marks' origins lie right and down of the crops' middles."""
+    off = np.random.default_rng([round_, 0]).integers(-1, 2, (len(SIDES), 2)) * OFF_PX[round_ % len(OFF_PX)]
+    return dict(zip(SIDES, off.astype(float), strict=True))
+
+
+@cache
+def learned_layout(camera: Path, learned_dn: float, round_: int) -> FiducialLayout:
+    """The camera's marks, learned from three frames."""
+    crops, origins, marks = crops_of(camera), origins_px(round_), []
+    frames = [composed(crops, np.random.default_rng([round_, 3, seed]), learned_dn) for seed in range(3)]
+    scans = [(scan_of(f"learned {number}", grey), places) for number, (grey, places) in enumerate(frames)]
+    for side, direction in SIDES.items():
+        spare_px = 8 + 2 * float(np.abs(origins[side]).max())
+        size_mm = PITCH_MM * (min(crops[side].shape) / fold(crops[side]) - spare_px)
+        placed = [(scan, np.column_stack([FLIP / PITCH_MM, places[side] + origins[side]])) for scan, places in scans]
+        template = template_of([cut(scan, place, size_mm) for scan, place in placed], size_mm)
+        x, y = PITCH_MM * (REACH_PX * np.array(direction) + FLIP @ origins[side])
+        marks.append(LayoutMark(side, (float(x), float(y)), (0.05, 0.05), template))
+    return FiducialLayout(tuple(marks), (SIZE_PX * PITCH_MM,) * 2)
+
+
+def composed(crops: Crops, rng: np.random.Generator, level_dn: float) -> tuple[NDArray[np.uint8], dict[str, Array]]:
+    """A frame beside a landscape of that grey value, and the places (col, row) of the crops' middles."""
+    grey, places = landscape(rng, (SIZE_PX, SIZE_PX), level_dn), {}
     for side, (x, y) in SIDES.items():
         fine, step = crops[side], fold(crops[side])
         first = rng.integers(step, size=2)  # row and column of the fine pixels that the means begin with
         rows, cols = ((np.array(fine.shape) - first) // step).tolist()
-        part = relandscaped(fine, rng)[first[0] : first[0] + rows * step, first[1] : first[1] + cols * step]
+        part = relandscaped(fine, rng, level_dn)[first[0] : first[0] + rows * step, first[1] : first[1] + cols * step]
         part = part.reshape(rows, step, cols, step).mean(axis=(1, 3))
         top, left = (SIZE_PX // 2 + REACH_PX * np.array([-y, x]) - np.array(fine.shape) // step // 2).tolist()
         grey[top : top + rows, left : left + cols] = part
         middle = np.array(fine.shape) // 2
         places[side] = np.array([left, top]) + ((middle - first + 0.5) / step - 0.5)[::-1]
     grey += rng.normal(0.0, NOISE_DN, grey.shape)
-    picture = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-    return Scan(Path(f"frame {seed}"), WholePicture(picture[..., None]), NO_TAGS), places
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8), places
 
 
-def relandscaped(fine: NDArray[np.uint8], rng: np.random.Generator) -> Array:
+def relandscaped(fine: NDArray[np.uint8], rng: np.random.Generator, level_dn: float) -> Array:
     """The crop with another landscape where it is light, through a soft edge."""
     _, light = cv2.threshold(fine, 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     share = cv2.GaussianBlur(light.astype(np.float64), (0, 0), 1.5)
-    return np.asarray(
-        share * landscape(rng, fine.shape) + (1 - share) * np.where(light > 0, np.median(fine[light == 0]), fine)
-    )
+    dark = np.where(light > 0, np.median(fine[light == 0]), fine)
+    return np.asarray(share * landscape(rng, fine.shape, level_dn) + (1 - share) * dark)
 
 
-def landscape(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+def landscape(rng: np.random.Generator, shape: tuple[int, ...], level_dn: float) -> Array:
     coarse, medium = (cv2.GaussianBlur(rng.normal(0.0, 1.0, shape), (0, 0), blur) * blur for blur in (12.0, 3.0))
-    return np.asarray(150.0 + 40.0 * coarse + 25.0 * medium)
+    return np.asarray(level_dn + 40.0 * coarse + 25.0 * medium)
 
 
 def fold(fine: NDArray[np.uint8]) -> int:
     return max(1, int(max(fine.shape)) // REDUCED_PX)
 
 
-def told(frame: FrameMeasurement, true: dict[str, Array]) -> str:
-    words = [frame.pose.name + (" decided" if frame.pose.decided else " assumed") if frame.pose else "no frame"]
-    for mark in frame.marks:
-        off = "" if mark.center_px is None else f" {np.hypot(*(mark.center_px - true[mark.point])):.2f} px"
-        words.append(f"{mark.point} {mark.status.value}{off}")
-    return ", ".join(words)
+def posed(grey: NDArray[np.uint8], pose: str) -> NDArray[np.uint8]:
+    """The frame as it lies in a scan."""
+    mirrored = grey[:, ::-1] if pose.endswith("m") else grey
+    return np.ascontiguousarray(np.rot90(mirrored, int(pose.removesuffix("m")) // 90))
+
+
+def scan_of(name: str, grey: NDArray[np.uint8]) -> Scan:
+    return Scan(Path(name), WholePicture(grey[..., None]), NO_TAGS)
+
+
+def tell(done: list[dict[str, Any]], cameras: list[str]) -> None:
+    pictures = sorted({line["picture"] for line in done})
+    print_table("pose", "kind", cameras, "pose", POSE_OUTCOMES, done)
+    print_table("pose, learned beside", "picture", pictures, "pose", POSE_OUTCOMES, done)
+    print_table("marks", "kind", cameras, "outcome", OUTCOMES, done)
+    for title, key in (("pose", "pose"), ("mark", "outcome")):
+        print(
+            f"frames with a wrong {title}: {[(line['kind'], line['frame']) for line in done if line[key] == 'WRONG']}"
+        )
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ Json = dict[str, Any]
 WRONG_SIGMAS = 5.0
 WRONG_PX = 0.5  # what is farther off, and by so many standard deviations, is no measurement of this mark
 OUTCOMES = ("all marks", "some marks", "refused", "wrong, weak", "WRONG")
+POSE_OUTCOMES = ("right", "assumed", "WRONG", "none")
 
 
 def main() -> None:
@@ -116,18 +117,19 @@ def pose_outcome(case: Case, result: FrameMeasurement) -> str:
 def print_tables(done: Sequence[Json]) -> None:
     """Outcomes by the marks' kind, poses by what could tell them."""
     print(f"{len(done)} frames, median {np.median([line['seconds'] for line in done]):.2f} s a frame\n")
-    _print_table("marks", "kind", KINDS, "outcome", OUTCOMES, done)
-    _print_table("picture", "picture", sorted({line["picture"] for line in done}), "outcome", OUTCOMES, done)
-    _print_table("pose", "symmetry", SYMMETRIES, "pose", ("right", "assumed", "WRONG", "none"), done)
+    print_table("marks", "kind", KINDS, "outcome", OUTCOMES, done)
+    print_table("picture", "picture", sorted({line["picture"] for line in done}), "outcome", OUTCOMES, done)
+    print_table("pose", "symmetry", SYMMETRIES, "pose", POSE_OUTCOMES, done)
     for name, key in (("frames with a wrong mark", "wrong"),):
         print(f"{name}: {[line['frame'] for line in done if line[key]]}")
     print(f"frames with a wrong pose: {[line['frame'] for line in done if line['pose'] == 'WRONG']}")
     print(f"frames refused: {[line['frame'] for line in done if line['outcome'] == 'refused']}")
 
 
-def _print_table(
+def print_table(
     title: str, row_key: str, rows: Sequence[str], column_key: str, columns: Sequence[str], done: Sequence[Json]
 ) -> None:
+    """How many frames of every row ended in which column."""
     print(f"{title:24}" + "".join(f"{column:>13}" for column in columns) + f"{'frames':>9}")
     for row in rows:
         own = [line[column_key] for line in done if line[row_key] == row]

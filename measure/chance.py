@@ -16,7 +16,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, Frame
 from measure.frame_search import FrameSearch
-from measure.frame_sighter import REDUCED_PX
+from measure.frame_sighter import first_search_px
 from measure.prediction import MarkPrediction
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
@@ -74,9 +74,7 @@ def _by_places_beside(
         expected = MarkPrediction(mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)
         return strongest(scan, expected)[1]
 
-    radius = REDUCED_PX * frame.placement.reduction + options.search_mm(layout) / float(
-        np.mean(frame.placement.pitch_mm)
-    )
+    radius = first_search_px(frame.placement, layout, options)
     places = _beside(scan, frame, inside, radius)
     weakest = min((response(index, place, FITTED_PX) for index, place in clear.items()), default=0.0)
     hits = sum(response(index, place, radius) >= weakest for index, place in places)

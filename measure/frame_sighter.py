@@ -32,7 +32,7 @@ MANY = 6  # marks that agree and tell where a faint one must be
 _CLEAR_RESPONSE = 0.25  # correlation of marks before they are fitted, where likenesses are CLEAR_LIKENESS
 _GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
 _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
-REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
+_REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
 _CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
 _FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
 _FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
@@ -42,6 +42,11 @@ _REACH = 4.0  # times the scatter of the others, a median: nearly five standard 
 _NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
 _EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
 _SINGLE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def first_search_px(placement: Placement, layout: FiducialLayout, options: FiducialOptions) -> float:
+    """How far from where a placement puts it a mark is looked for."""
+    return _REDUCED_PX * placement.reduction + options.search_mm(layout) / float(np.mean(placement.pitch_mm))
 
 
 class FrameSighter:
@@ -64,7 +69,7 @@ class FrameSighter:
         self.vouched: Mask = np.zeros(len(layout.marks), dtype=bool)
         self.weights: tuple[float, ...] | None = None
         gate_px = options.gate_mm / float(self.pitch.mean())
-        self.first_search_px = REDUCED_PX * placement.reduction + options.search_mm(layout) / float(self.pitch.mean())
+        self.first_search_px = first_search_px(placement, layout, options)
         self.gate_px = gate_px
 
     def choose_channels(self) -> None:

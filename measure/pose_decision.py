@@ -17,6 +17,7 @@ from measure.data_strip import Beside, beside_frame, side_in_scan, strip_likelih
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
 from measure.frame_fit import FrameFit, fit_frame
+from measure.frame_sighter import first_search_px
 from measure.matching import Match
 from measure.pose_pictures import SPOILT, Drawings, Shown, Site
 from measure.poses import up_from_camera
@@ -64,10 +65,11 @@ def decide_pose(
     scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(up_from_camera(frame.placement.pose))
     blur_px = float(np.median([fit.blur_px for fit in seen]))
     drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
-    sites = [Site(scan, fit, fit.center_px, frame.weights, drawings) for fit in seen]
+    reach_px = first_search_px(frame.placement, layout, options)
+    sites = [Site(scan, fit, fit.center_px, frame.weights, drawings, reach_px) for fit in seen]
     # Where no mark was found the others tell what one looks like: under another pose there may be one after all.
     usual = sorted(seen, key=lambda fit: abs(fit.contrast_dn))[len(seen) // 2]
-    sites += [Site(scan, usual, place, frame.weights, drawings) for place in missed]
+    sites += [Site(scan, usual, place, frame.weights, drawings, reach_px) for place in missed]
 
     def of_site(index: int) -> Array:
         return sites[index].likelihoods([each.shown(index, layout) for each in named])

@@ -1,8 +1,7 @@
 """What a found mark's picture says of which of the camera's marks it is, in whichever direction a pose shows it."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,7 +17,6 @@ from measure.shapes import Mark, MarkTemplate
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
 
 _ALIKE = 0.05  # of the contrast: pictures that differ nowhere by more are one
 _FINEST_PX = 3.0  # of the finest line on the grid
@@ -31,15 +29,46 @@ _FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
 SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark feigns or hides what tells marks apart
 
 
-_BARE = np.zeros((1, 1)), np.ones((1, 1), dtype=bool)
-
-
 @dataclass(frozen=True, eq=False)
 class Shown:
     """A mark as a pose shows it at a site: turn (2, 2), from its x and y to right and up. None: bare ground."""
 
     mark: Mark | None
     turn: Array
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A mark's picture on the drawings' grid, (size, size) with its origin in the middle. told: where it tells the grey
+    values: a learned chip has the landscape of other scans beside its mark. reached: the chip, which tells nothing
+    beyond its edge; of a drawn mark everything."""
+
+    grey: Array
+    told: Mask
+    reached: Mask
+
+    def turned(self, turn: Array) -> "View":
+        return View(
+            quarter_turned(self.grey, turn), quarter_turned(self.told, turn), quarter_turned(self.reached, turn)
+        )
+
+    def wider(self, spare: int) -> "View":
+        """On a larger grid. A drawing's edge goes on; beyond a chip's there is nothing."""
+        return View(
+            np.pad(self.grey, spare, mode="edge"),
+            np.pad(self.told, spare, mode="edge"),
+            np.pad(self.reached, spare, mode="edge"),
+        )
+
+    def moved(self, cells: tuple[int, int]) -> "View":
+        """Down and right by so many cells, which must be spare about a chip."""
+        return View(
+            np.roll(self.grey, cells, (0, 1)), np.roll(self.told, cells, (0, 1)), np.roll(self.reached, cells, (0, 1))
+        )
+
+
+_EVERYWHERE = np.ones((1, 1), dtype=bool)
+_BARE = View(np.zeros((1, 1)), _EVERYWHERE, _EVERYWHERE)
 
 
 class Drawings:
@@ -56,45 +85,66 @@ class Drawings:
         self.scan_from_grid = scan_from_up @ np.linalg.inv(grid_from_up)
         self._drawn = {mark: _drawn(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}
 
-    def seen(self, shown: Sequence[Shown]) -> list[tuple[Array, Mask]]:
-        """What each pose shows at a place, which is in the middle: the picture (size, size), and where it tells the
-        grey values."""
+    def seen(self, shown: Sequence[Shown], spare: int) -> list[View]:
+        """What each pose shows at a place, which is in the middle, on grids of one size, so many cells larger on every
+        side than the largest picture."""
         drawn = [_BARE if each.mark is None else self._drawn[each.mark] for each in shown]
-        half = max(len(own) // 2 for own, _ in drawn)
+        half = max(len(each.grey) // 2 for each in drawn) + spare
         turns = [_FLIP @ each.turn @ _FLIP for each in shown]
-        return [
-            (_wider(quarter_turned(own, turn), half), _wider(quarter_turned(told, turn), half))
-            for (own, told), turn in zip(drawn, turns, strict=True)
-        ]
+        return [each.turned(turn).wider(half - len(each.grey) // 2) for each, turn in zip(drawn, turns, strict=True)]
 
 
 class Site:
-    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark."""
+    """A place where a mark was found, or where it should be and was not: then like is the fit of another mark.
+
+    reach_px: how far off a chip may lie in another pose than the one it was found in. A drawn mark's origin is its
+    middle in every pose; a chip's is where somebody clicked, and one that shows an edge is found anywhere along it."""
 
     def __init__(
-        self, scan: Scan, like: Match, center_px: Array, weights: Sequence[float] | None, drawings: Drawings
+        self,
+        scan: Scan,
+        like: Match,
+        center_px: Array,
+        weights: Sequence[float] | None,
+        drawings: Drawings,
+        reach_px: float,
     ) -> None:
         self.scan, self.center_px, self.weights, self.drawings = scan, center_px, weights, drawings
+        self.reach_px = reach_px
         self.sign = np.sign(like.contrast_dn)
         self.noise_dn = like.noise_dn / drawings.reduction
 
     def likelihoods(self, shown: Sequence[Shown]) -> Array:
         """The log-likelihood of the picture under what each pose shows here, up to a constant: 0 for the best, and no
         less than the probability that something else spoils the picture."""
-        seen = self.drawings.seen(shown)
-        pictures, picture_of = _distinct([own for own, _ in seen])
-        if len(pictures) == 1:
+        chips = any(isinstance(each.mark, MarkTemplate) for each in shown)
+        spare = int(np.ceil(self.reach_px / self.drawings.reduction)) if chips else 0
+        views, view_of = _distinct(self.drawings.seen(shown, spare))
+        if len(views) == 1:
             return np.zeros(len(shown))
-        told = [seen[picture_of.index(kind)][1] for kind in range(len(pictures))]
-        window = self._window(len(pictures[0]))
-        area = _area(pictures) & np.any(told, axis=0)
-        residuals = [self._residuals(window, each, area & own) for each, own in zip(pictures, told, strict=True)]
+        window = self._window(len(views[0].grey))
+        views = [self._placed(window, view, spare) for view in views]
+        area = _area([view.grey for view in views])
+        residuals = [self._residuals(window, view.grey, area & view.told) for view in views]
         # Where even the best picture leaves much, what is left is no noise, and tells the pictures apart less surely.
         scale = max(self.noise_dn, min(robust_scale(each) for each in residuals), 1e-9)
-        misfits = np.array([np.sum(np.minimum(np.abs(each) / scale, _OUTLIER) ** 2) for each in residuals])
-        misfits += [_OUTLIER**2 * (area.sum() - len(each)) for each in residuals]  # what a chip does not tell it misses
-        relative = np.exp(-(misfits - misfits.min()) / 2 / _PIXELS_PER_DEGREE)
-        return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[picture_of]
+        misfits = np.full((len(views), *window.shape), _OUTLIER**2)  # what a chip does not tell it misses
+        for misfit, view, residual in zip(misfits, views, residuals, strict=True):
+            misfit[area & view.told] = np.minimum(np.abs(residual) / scale, _OUTLIER) ** 2
+        excess = _excess(misfits, np.stack([area & view.reached for view in views]))
+        relative = np.exp(-excess / 2 / _PIXELS_PER_DEGREE)
+        return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[view_of]
+
+    def _placed(self, window: Array, view: View, spare: int) -> View:
+        """A chip moved to where the window is most like it."""
+        if view.reached.all() or not view.told.any():
+            return view
+        core = slice(spare, len(window) - spare)
+        grey, told = (np.asarray(each[core, core], np.float32) for each in (view.grey, view.told))
+        likeness = cv2.matchTemplate(np.asarray(window, np.float32), grey, cv2.TM_CCOEFF_NORMED, mask=told)
+        likeness = np.where(np.isfinite(likeness), self.sign * likeness, -1.0)
+        row, col = np.unravel_index(int(likeness.argmax()), likeness.shape)
+        return view.moved((int(row) - spare, int(col) - spare))
 
     def _window(self, size: int) -> Array:
         """(size, size) grey values of the scan on the drawings' grid, the site in the middle."""
@@ -126,35 +176,38 @@ class Site:
         return _robust(ground, grey)[0]
 
 
-def _drawn(mark: Mark, grid_from_mark: Array, blur_px: float) -> tuple[Array, Mask]:
-    """The mark's picture about its origin, and where it tells the grey values: a chip is only continued beyond its
-    edge, and a learned one has the landscape of other scans beside its mark."""
+def _drawn(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
+    """The mark's picture about its origin."""
     place = np.column_stack([grid_from_mark, np.zeros(2)])
     half = int(np.ceil(np.abs(extent_px(mark, place)).max() + 2 * _ABOUT_PX))
     place[:, 2] = half
     size = 2 * half + 1
-    told = np.ones((size, size), dtype=bool)
+    told = reached = np.ones((size, size), dtype=bool)
     if isinstance(mark, MarkTemplate):
         told = chip_mask(mark, place, size, size)
-    return picture(mark, place, size, size, blur_px, ROUGH_CELLS), told
+        reached = chip_mask(replace(mark, steady=None), place, size, size)
+    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), told, reached)
 
 
-def _wider(image: Grid, half: int) -> Grid:
-    """The image, whose edge goes on until its sides are 2 half + 1."""
-    spare = half - len(image) // 2
-    return np.pad(image, spare, mode="edge") if spare else image
-
-
-def _distinct(pictures: Sequence[Array]) -> tuple[list[Array], list[int]]:
-    """The pictures that differ, and which of them each is."""
-    kinds: list[Array] = []
+def _distinct(views: Sequence[View]) -> tuple[list[View], list[int]]:
+    """The views whose pictures differ, and which of them each is."""
+    kinds: list[View] = []
     index = []
-    for each in pictures:
-        alike = [number for number, kind in enumerate(kinds) if np.abs(kind - each).max() < _ALIKE]
+    for each in views:
+        alike = [number for number, kind in enumerate(kinds) if np.abs(kind.grey - each.grey).max() < _ALIKE]
         index.append(alike[0] if alike else len(kinds))
         if not alike:
             kinds.append(each)
     return kinds, index
+
+
+def _excess(misfits: Array, areas: Mask) -> Array:
+    """(n,) by how much each picture's misfit exceeds the least one, over the area of both: a chip is neither better for
+    being smaller nor for what lies beyond another's edge. misfits, areas: (n, size, size)."""
+    counts = areas.sum(axis=(1, 2)).clip(min=1)
+    best = int(((misfits * areas).sum(axis=(1, 2)) / counts).argmin())
+    excess = ((misfits - misfits[best]) * (areas & areas[best])).sum(axis=(1, 2))
+    return np.asarray(excess - excess.min())
 
 
 def _area(pictures: Sequence[Array]) -> Mask:

@@ -20,7 +20,8 @@ BLOCK[:, :24], BLOCK[18:43, :36], BLOCK[28:40, :45] = 1, 1, 1  # of the border, 
 
 
 def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
-    """A block steady in its chip, in landscapes as rough as it is deep, in each of its four directions."""
+    """A block steady in its chip, in landscapes as rough as it is deep, in each of its four directions; also where the
+    place is another mark's, which slid along an edge that both have."""
     template = MarkTemplate(
         np.where(BLOCK > 0, 20.0, 150.0),
         1000.0,
@@ -31,13 +32,14 @@ def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
     turned = [np.diag([x, y]).astype(float) for x in (1, -1) for y in (-1, 1)]
     for seed in range(2):
         for index, linear in enumerate(turned):
-            site = among_landscape(template, linear, seed)
-            told = site.likelihoods([Shown(template, FLIP @ each) for each in turned])
-            assert told.argmax() == index
-            assert np.sort(told)[-2] < -4.0
+            for slid_px in (0.0, 4.0):
+                site = among_landscape(template, linear, seed, slid_px)
+                told = site.likelihoods([Shown(template, FLIP @ each) for each in turned])
+                assert told.argmax() == index
+                assert np.sort(told)[-2] < -4.0
 
 
-def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: int) -> Site:
+def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: int, slid_px: float) -> Site:
     rng = np.random.default_rng(seed)
     landscape = cv2.GaussianBlur(rng.normal(0.0, 1.0, (3 * SIDE, 3 * SIDE)), (0, 0), 4.0)
     grey = 150.0 + 45.0 * landscape / landscape.std()
@@ -47,4 +49,4 @@ def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: i
     scan = Scan(Path("scan"), WholePicture(grey.astype(np.uint8)[..., None]), NO_TAGS)
     place = np.column_stack([linear, [SIDE + 30.0, SIDE + 30.0]])
     fit = match(grey, (0, 0), template, place, MatchOptions(freedom="shift", estimate_blur=False))
-    return Site(scan, fit, fit.center_px, None, Drawings([template], FLIP, 0.0))
+    return Site(scan, fit, fit.center_px + slid_px, None, Drawings([template], FLIP, 0.0), 5.0)
