@@ -27,13 +27,13 @@ from measure.tie_frame import TieFrame
 Array = NDArray[np.float64]
 Windows = dict[int, tuple[NDArray[np.float32], tuple[int, int]]]
 
-_RADII_PX = (RADIUS_PX, 21)  # of patches: where the texture is too weak for the usual one, of twice its area
+_RADII_PX = (RADIUS_PX, 21, 30)  # of patches: where the texture is too weak for one, of twice its area
 _WIDEST_PX = 2.0 * _RADII_PX[-1]
 _LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
 _FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
 _CHUNK = 16  # points that a worker gets at a time
-_WRONG_PX = 0.5  # a point is measured only where an error larger than that ...
-_CHANCE = 1e-4  # ... is less probable than this, which is also the chance that a test refuses a right point
+_CHANCE = 1e-4  # that a test refuses a right point
+_PRECISE_PX = 0.125  # rms length of the error of the weakest measured point: half a pixel is four times as much
 
 
 @dataclass(eq=False)
@@ -50,6 +50,14 @@ class TiePoint:
         linear = self.matched[frame].scan_from_patch[:, :2]
         own, reference = self.matched[frame].covariance_px2, self.matched[self.candidate.reference].covariance_px2
         return np.asarray(own + linear @ reference @ linear.T)
+
+    def error_px(self, frame: int) -> float:
+        """The rms length of its error in a frame, against the place that defines it."""
+        return float(np.sqrt(np.trace(self.separation(frame))))
+
+    def is_sharp(self, frame: int) -> bool:
+        """Whether the texture fixes it as well as a measured point is to be."""
+        return self.error_px(frame) <= _PRECISE_PX
 
     @property
     def standing(self) -> list[int]:
@@ -85,7 +93,7 @@ def measured_points(
             matched += mapped(workers, partial(_point, fewest), list(zip(chosen, windows, strict=True)), _CHUNK)
             points = _straightened(matched)
             _judge(frames, points)
-            sharp = np.array([sum(map(is_sharp, _sigmas(point))) >= fewest for point in points], dtype=bool)
+            sharp = np.array([sum(map(point.is_sharp, point.standing)) >= fewest for point in points], dtype=bool)
     return points[: int(np.searchsorted(np.cumsum(sharp), wanted)) + 1]
 
 
@@ -246,13 +254,3 @@ def _refuse_contradictions(frames: Sequence[TieFrame], points: Sequence[TiePoint
         wrong = common if len(pairs) > 1 and len(common) == 1 else set(points[k].standing)
         for frame in wrong:
             points[k].refused[frame] = "the point lies off the epipolar lines of the other scans, unlike its neighbours"
-
-
-def _sigmas(point: TiePoint) -> list[float]:
-    """The largest standard deviation of each standing frame's point against the reference's, px."""
-    return [float(np.sqrt(np.linalg.eigvalsh(point.separation(frame))[-1])) for frame in point.standing]
-
-
-def is_sharp(sigma_px: float) -> bool:
-    """Whether the texture rules out an error that is no measurement any more."""
-    return sigma_px * float(norm.isf(_CHANCE / 2)) <= _WRONG_PX

@@ -13,7 +13,7 @@ from measure.results import MarkMeasurement
 from measure.status import Status
 from measure.tie_candidates import Shared, candidates, frame_features, verified
 from measure.tie_frame import TieFrame
-from measure.tie_points import TiePoint, is_sharp, measured_points
+from measure.tie_points import TiePoint, measured_points
 
 Progress = Callable[[str, int, int], None]
 
@@ -108,8 +108,8 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
             Status.REJECTED,
             f"only {len(point.standing)} scans agree on the point, {options.images} are to",
         )
-    elif not is_sharp(sigma):
-        status, reason = Status.WEAK, f"the texture fixes it to {sigma:.2f} px only"
+    elif not point.is_sharp(frame):
+        status, reason = Status.WEAK, f"the texture fixes it to {point.error_px(frame):.2f} px only"
     return MarkMeasurement(name, "tie", piece.center_px, piece.covariance_px2, status, reason, quality)
 
 
