@@ -34,7 +34,13 @@ FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
 def doubt(search: FrameSearch, frame: Frame) -> str:
     """A sentence where chance may have made the frame; empty where it is unlikely to."""
     inside = [index for index, sighting in enumerate(frame.sightings) if sighting.inside]
-    clear = {index: fit.center_px for index, fit in enumerate(frame.fits) if fit and fit.likeness >= CLEAR_LIKENESS}
+    clear = {
+        index: fit.center_px
+        for index, fit in enumerate(frame.fits)
+        if fit
+        and fit.likeness >= CLEAR_LIKENESS
+        and not frame.sightings[index].closer  # those were seen for the others
+    }
     if frame.belongs.sum() >= SURE:
         return ""
     if len(clear) == len(inside):

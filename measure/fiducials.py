@@ -121,8 +121,7 @@ def _in_spite_of_pitch(
     """The same where the pixels are not as given. So much freedom finds false marks too: only a frame counts that
     chance would hardly make in all the hypotheses tried."""
     found = search.anywhere(hypotheses)
-    hopeful = [place for place in (*found[:1], *_others(found)) if tried * search.expected_alike(place) <= _HOPELESS]
-    frames = [_as_its_pictures_say(search, found, place) for place in hopeful]
+    frames = [_as_its_pictures_say(search, found, place) for place in _hopeful(search, found, tried)]
     sure = [frame for frame in frames if frame.accepted and tried * search.expected_as_good(frame) <= _CHANCE]
     return (found, min(sure, key=search.expected_as_good)) if sure else None
 
@@ -131,20 +130,40 @@ def _at_a_closer_look(
     search: FrameSearch, hypotheses: Sequence[PitchHypothesis]
 ) -> tuple[list[Placement], Frame | None]:
     """The same where marks are looked at closer by, as the frame's edge may drown them. Their pictures need not be
-    clear, where chance would hardly make so many that agree in all these hypotheses."""
-    found, tried = search.anywhere(hypotheses), len(hypotheses)
-    if not found or tried * search.expected_alike(found[0]) > _HOPELESS:
-        return [], None
-    frames = [_as_its_pictures_say(search, found, found[0])]
-    if frames[0].belongs.any() and search.options.pose == "auto":
-        # Faint marks are not seen under one another's names, though they say not surely which these are.
-        posed = [_posed(found, frames[0].placement, pose) for pose in POSES]
-        pose = decide_pose(search.scan, search.layout, posed, frames[0], search.options)
-        frames.append(measure_frame(search.scan, search.layout, posed[POSES.index(pose.name)], search.options))
-    frame = max(frames, key=lambda frame: frame.belongs.sum())
-    seen = {index: fit.center_px for index, fit in enumerate(frame.fits) if fit}
-    sure = frame.agrees and tried * search.expected_where_seen(frame, seen) <= _CHANCE
-    return found, frame if sure else None
+    clear, where chance would hardly make so many that agree in all these hypotheses: whether a frame is there is one
+    question, which its pose another."""
+    found, tried, best, least = search.anywhere(hypotheses), len(hypotheses), None, _CHANCE
+    for place in _hopeful(search, found, tried):
+        frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
+        expected = min((tried * search.expected_where_seen(frame, _seen_px(frame)) for frame in frames), default=np.inf)
+        if expected <= least:
+            best, least = max(frames, key=lambda frame: frame.belongs.sum()), expected
+    return found, best
+
+
+def _in_its_likeliest_poses(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> list[Frame]:
+    """The frame in a placement, and in the pose that its pictures like best, for faint marks are not seen under one
+    another's names, though they say not surely which these are."""
+    scan, layout, options = search.scan, search.layout, search.options
+    frame = measure_frame(scan, layout, placement, options)
+    if options.pose != "auto" or not frame.belongs.any():
+        return [frame]
+    posed = [_posed(found, placement, pose) for pose in POSES]
+    pose = decide_pose(scan, layout, posed, frame, options)
+    if pose.name == placement.pose:
+        return [frame]
+    return [frame, measure_frame(scan, layout, posed[POSES.index(pose.name)], options)]
+
+
+def _seen_px(frame: Frame) -> dict[int, Array]:
+    """Where the marks that belong were seen, by index."""
+    return {index: fit.center_px for index, fit in enumerate(frame.fits) if fit}
+
+
+def _hopeful(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
+    """The best placement and those elsewhere, as far as chance would not make many that answer as well."""
+    places = (*found[:1], *_others(found))
+    return [place for place in places if tried * search.expected_alike(place) <= _HOPELESS]
 
 
 def _others(found: Sequence[Placement]) -> list[Placement]:

@@ -13,6 +13,7 @@ from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, Frame
 from measure.frame_fit import fit_frame, strangers
 from measure.glimpse import Glimpse, glimpse
+from measure.matching import Match
 from measure.poses import up_from_camera
 from measure.prediction import MarkPrediction
 from measure.refinement import Sighting, sight
@@ -94,6 +95,17 @@ class FrameSighter:
         sighted = self.scan.each(lambda index: self._sight(index, search_px), upwards)
         for index, sighting in zip(upwards, sighted, strict=True):
             self.sightings[index] = sighting
+
+    def look_closer(self) -> None:
+        """Look closer, where the others put them, at marks that are not clear or do not belong: beside one may lie
+        dust, or the frame's edge. Only what is plainly there counts."""
+        for index in range(len(self.belongs)):
+            if self.clear(index) and self.belongs[index]:
+                continue
+            expected = replace(self.expected(index, self.gate_px), surroundings=CLOSE)
+            seen = sight(self.scan, expected, self.options.match)
+            if seen.fit is not None and seen.chance <= _CHANCE and _is_plain(seen.fit):
+                self.sightings[index] = replace(seen, closer=True)
 
     def look_astray(self, indices: Sequence[int]) -> None:
         """Look at marks where the others put them, first near by, then as far off as one may lie that keeps the gate:
@@ -258,3 +270,7 @@ class FrameSighter:
         measured = np.sqrt(np.trace(np.array(covariances), axis1=1, axis2=2) / 2) * self.pitch.mean()
         given = np.array([min(*self.layout.marks[i].sigma_mm, _GIVEN_SIGMA_MM) for i in index])
         return np.asarray(np.sqrt(measured**2 + given**2 + self.options.film_sigma_mm**2))
+
+
+def _is_plain(fit: Match) -> bool:
+    return fit.likeness >= CLEAR_LIKENESS and fit.significance >= _LEAST_SIGNIFICANCE

@@ -18,6 +18,9 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
     everything = range(len(layout.marks))
     sighter.look(everything, sighter.first_search_px)
     sighter.judge()
+    if sighter.frame().accepted:
+        sighter.look_closer()
+        sighter.judge()
     if sighter.belongs.sum() >= 2 and not sighter.sure():
         if len(layout.marks) > MANY:
             sighter.glimpse_faint(sighter.gate_px)

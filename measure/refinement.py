@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.beyond_edge import beyond_edge
 from measure.blank_film import BESIDE_PX
 from measure.candidates import FAINT
 from measure.clipping import clipped_sides
@@ -16,6 +17,7 @@ from measure.prediction import MarkPrediction
 from measure.rendering import extent_px
 from measure.scan import Scan
 from measure.shapes import Disk, FrameCorner, Mark, MarkShape, Polygon
+from measure.surroundings import CLOSE
 
 Array = NDArray[np.float64]
 
@@ -31,13 +33,15 @@ _SOLID_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart f
 class Sighting:
     """What was seen where a mark was predicted: predicted_px (2,); fit is None where nothing could be fitted, and
     reason says why. inside: whether the predicted place lies in the scan. chance: the expected number of places about
-    it that noise makes look as much like the mark."""
+    it that noise makes look as much like the mark. closer: whether it was seen at a closer look only, where the other
+    marks put it."""
 
     predicted_px: Array
     inside: bool
     fit: Match | None
     reason: str = ""
     chance: float = 1.0
+    closer: bool = False
 
 
 def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None) -> Sighting:
@@ -96,6 +100,9 @@ def _fitted(
     col0, row0, width, tall = window_about(mark, start, options.margin_px + BESIDE_PX)
     window = scan.window(col0, row0, width, tall, weights).astype(float)
     valid = _inside_scan(scan, col0, row0, width, tall)
+    if expected.surroundings == CLOSE and isinstance(mark, MarkShape):
+        inner = np.column_stack([start[:, :2], start[:, 2] - (col0, row0)])
+        valid &= ~beyond_edge(window, mark, inner, expected.polarity)
     clipped = clipped_sides(scan, col0, row0, width, tall, weights)
     own = _options_for(mark, options, frame_sigma)
     return match(window, (col0, row0), mark, start, own, valid, clipped, scan.is_lossy), chance
