@@ -98,8 +98,8 @@ def table(name: str, kinds: Sequence[Kind], count: int, seed: int, rows: KeptRow
 def small_disks(count: int, seed: int) -> None:
     """Disks of 2 to 4 px among dust, in frames: are large errors flagged?"""
     print(f"\nsmall disks with dust on 0 to 5 % of their windows, SNR 10 to 50: errors above {LARGE_PX:g} px")
-    rng = np.random.default_rng([seed, 99])
-    frames = [frame_of_disks((0.0, *DUST), (2.0, 4.0), (10.0, 50.0), (0.6, 1.4), rng) for _ in range(count)]
+    generators = (np.random.default_rng([seed, number]) for number in range(count))
+    frames = [frame_of_disks((0.0, *DUST), (2.0, 4.0), (10.0, 50.0), (0.6, 1.4), rng) for rng in generators]
     errors = np.array([np.hypot(*dusty.error_px) for disks, _ in frames for dusty in disks])
     flagged = np.array([dusty.flagged for disks, _ in frames for dusty in disks])
     clean = np.concatenate([dusts for _, dusts in frames]) == 0

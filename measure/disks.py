@@ -12,6 +12,7 @@ from measure.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WO
 from measure.disk_patches import LEAST_SNR
 from measure.matching import Match, MatchOptions, match, window_about
 from measure.noise import may_be_noise
+from measure.other_place import OtherPlace
 from measure.picture_model import GREY
 from measure.scan import Scan
 from measure.shapes import Disk, MarkShape
@@ -35,7 +36,8 @@ class FittedDisk:
     """An ellipse as fitted. center_px (2,), covariance_px2 (2, 2); pixel_from_disk (2, 2): the unit disk's image, its
     columns two radius vectors, px; contrast_dn: positive for a light disk; look_covariance (5, 5): of the relative
     changes of its size, its stretch along the columns, its shear and its contrast, and of its blur's variance, px².
-    weakness: why it is doubtful; reason: why it is no disk, and then the numbers are the fit's last."""
+    sloping: where it lies if its paint may slope, None where that is not told. weakness: why it is doubtful; reason:
+    why it is no disk, and then the numbers are the fit's last."""
 
     center_px: Array
     covariance_px2: Array
@@ -45,6 +47,7 @@ class FittedDisk:
     blur_px: float
     damaged_fraction: float
     look_covariance: Array
+    sloping: OtherPlace | None = None
     weakness: str = ""
     reason: str = ""
 
@@ -138,6 +141,7 @@ def fit_disk(
             blur_px=fit.blur_px,
             damaged_fraction=fit.damaged_fraction,
             look_covariance=look_covariance(fit),
+            sloping=fit.sloping,
             reason="" if fit.converged else fit.reason,
         )
         return judged(disk, fit)

@@ -7,14 +7,12 @@ whatever is smooth have no part in it, and a mark whose opposite edges are alike
 both places, in part together; what it cannot explain of their difference is damage or a mark unlike its drawing.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from measure.noise import NoiseModel, correlated
+from measure.other_place import OtherPlace
 from measure.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
@@ -24,27 +22,9 @@ _SMOOTHING = 1.5  # times the scan's blur: noise of about 1.3 times the match's,
 _LEAST_SMOOTHING_PX = 1.0  # below it pixels sample the derivative too coarsely
 
 
-@dataclass(frozen=True, eq=False)
-class EdgePlace:
-    """offset_px (2,): the place by the edges less the matched one; covariance_px2 (2, 2): of that difference."""
-
-    offset_px: Array
-    covariance_px2: Array
-
-    @property
-    def sigmas(self) -> float:
-        """The length of the difference in its own standard deviations."""
-        return float(np.sqrt(self.offset_px @ np.linalg.solve(self.covariance_px2, self.offset_px)))
-
-    @property
-    def chance(self) -> float:
-        """The probability that noise alone makes the difference as long."""
-        return float(stats.chi2.sf(self.sigmas**2, 2))
-
-
 def edge_place(
     residuals: Array, used: Mask, design: Array, by_grey: Array, noise: NoiseModel, blur_px: float
-) -> EdgePlace | None:
+) -> OtherPlace | None:
     """The place by the edges, None where they do not give one.
 
     residuals (height, width), where used; design (unknowns, height, width): derivatives of the model by the unknowns,
@@ -64,7 +44,7 @@ def edge_place(
     if not np.all(np.linalg.eigvalsh(covariance) > 0):
         return None
     offset = np.linalg.solve(turned, products(weights, residuals[None])[:, 0])
-    return EdgePlace(np.asarray(offset), np.asarray(covariance))
+    return OtherPlace(np.asarray(offset), np.asarray(covariance))
 
 
 def _weights(slopes: Array, smoothing_px: float) -> Array:

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from measure.centred_frame import is_complete, is_worth_a_look, outermost
 from measure.chance import doubt
 from measure.constellation import Placement
-from measure.edge_place import EdgePlace
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
 from measure.frame_fit import AFFINITY_SIGMA
 from measure.frame_search import FrameSearch
 from measure.frame_sighting import measure_frame
 from measure.learned import honest_covariance
+from measure.other_place import OtherPlace
 from measure.pitches import PitchHypothesis, pitch_hypotheses
 from measure.pose_decision import decide_pose
 from measure.poses import POSES
@@ -264,7 +264,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
 
 
-def _by_edges(edges: EdgePlace | None) -> dict[str, float]:
+def _by_edges(edges: OtherPlace | None) -> dict[str, float]:
     """How far from the matched place the second method puts the mark, and in standard deviations of that."""
     if edges is None:
         return {}

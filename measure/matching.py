@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 
 from measure.blank_film import blank_patches, is_coloured
 from measure.clipping import Sides
-from measure.edge_place import EdgePlace, edge_place
+from measure.edge_place import edge_place
 from measure.grain import grain_model
 from measure.match_options import MatchOptions
 from measure.noise import is_textured, noise_model
+from measure.other_place import OtherPlace
 from measure.picture_fit import PictureFit
 from measure.picture_model import GREY, PictureModel, State, background_px
 from measure.pixel_sums import combined, factors
 from measure.rendering import extent_px
 from measure.shapes import Mark, MarkTemplate
+from measure.sloping_paint import sloping_place
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
 
@@ -46,7 +48,8 @@ class Match:
     less its plane background: 1 for a perfect mark, 0 for none.
     significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
     share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
-    of its range. edges: the mark's place by another method, to compare.
+    of its range. edges: the mark's place by another method, to compare;
+    sloping: an ellipse's, if its paint may grow lighter or darker from side to side.
     """
 
     converged: bool
@@ -65,7 +68,8 @@ class Match:
     significance: float
     blur_sigma: float = np.inf
     size_sigma: float = np.inf
-    edges: EdgePlace | None = None
+    edges: OtherPlace | None = None
+    sloping: OtherPlace | None = None
     covariance: Array | None = None
 
     @property
@@ -194,7 +198,8 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
     model, used = fit.model, fit.telling
     noise = noise_model(model.residuals, used, len(model.design))
     covariance, gain_sigma = np.full((len(model.design),) * 2, np.inf), np.inf
-    edges: EdgePlace | None = None
+    edges: OtherPlace | None = None
+    sloping: OtherPlace | None = None
     if not fit.reason:
         patches = blank_patches(window, free, noise.variance_dn2)
         if not noise.is_white or is_coloured(patches):
@@ -202,6 +207,8 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         covariance, by_grey = fit.weigh(noise)
         gain_sigma = float(np.sqrt(max(covariance[-GREY, -GREY], 1e-12)))
         edges = edge_place(model.residuals, used, model.design, by_grey, noise, model.blur_px)
+        if model.options.freedom == "ellipse" and model.background_px is None:
+            sloping = sloping_place(model.residuals, used, model.design, by_grey, noise)
     state = model.state
     return Match(
         converged=not fit.reason,
@@ -221,6 +228,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         blur_sigma=_blur_sigma(model, covariance),
         size_sigma=float(np.sqrt(covariance[2, 2])) if model.tells_size else np.inf,
         edges=edges,
+        sloping=sloping,
         covariance=covariance,
     )
 

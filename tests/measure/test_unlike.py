@@ -5,6 +5,7 @@ import pytest
 from drawn import drawn, ellipse, scan_of, whitened
 
 from measure.disks import FittedDisk
+from measure.other_place import OtherPlace
 from measure.status import Status
 from measure.targets import TargetPrediction, measure_disks
 from measure.unlike import doubts
@@ -59,8 +60,9 @@ def test_small_disks_whose_edges_are_as_soft_as_a_spots_are_measured_where_all_a
 @pytest.mark.parametrize(("share", "doubted"), [(0.0, 0.04), (0.2, 0.15)])
 def test_targets_are_odd_by_more_than_noise_and_what_all_differ_by(share: float, doubted: float) -> None:
     """Looks drawn as the comparison takes them to be, 5 % in contrast and 2 % in form, in noise of half to five times
-    that variance; a share of them changed by 20 standard deviations."""
-    rng = np.random.default_rng(3)
+    that variance; a share of them changed by 20 standard deviations; their paint slopes by no more than
+    noise of 0.1 px."""
+    rng, of_slope = np.random.default_rng(3), np.random.default_rng(4)
     spread = np.array([0.014, 0.014, 0.014, 0.05, 0.1])
     weak, odd = [], []
     for _ in range(25):
@@ -73,7 +75,8 @@ def test_targets_are_odd_by_more_than_noise_and_what_all_differ_by(share: float,
             values, vectors = np.linalg.eigh([[look[0] + look[1], look[2]], [look[2], look[0] - look[1]]])
             shape, blur = 3 * (vectors * np.exp(values)) @ vectors.T, float(np.sqrt(max(1.5 + look[4], 0.1)))
             contrast = float(np.exp(look[3])) * CONTRAST
-            disks.append(FittedDisk(np.zeros(2), 0.001 * np.eye(2), shape, contrast, 100.0, blur, 0.0, noise))
+            sloping = OtherPlace(of_slope.normal(0, 0.1, 2), 0.01 * np.eye(2))
+            disks.append(FittedDisk(np.zeros(2), 0.001 * np.eye(2), shape, contrast, 100.0, blur, 0.0, noise, sloping))
         weak += [bool(reason) for reason in doubts(disks, [3 * np.eye(2)] * 25)]
         odd += is_odd.tolist()
     assert np.mean(np.array(weak)[~np.array(odd)]) < doubted
