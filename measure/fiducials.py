@@ -32,6 +32,7 @@ _SET = ("set in the project.",)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
+_TWO_COUNTS = 2  # of the marks as they were measured, and as they answer: the better one is taken
 _HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
@@ -130,12 +131,15 @@ def _at_a_closer_look(
     search: FrameSearch, hypotheses: Sequence[PitchHypothesis]
 ) -> tuple[list[Placement], Frame | None]:
     """The same where marks are looked at closer by, as the frame's edge may drown them. Their pictures need not be
-    clear, where chance would hardly make so many that agree in all these hypotheses: whether a frame is there is one
-    question, which its pose another."""
+    clear, where chance would hardly make so many that agree in all these hypotheses, or a placement that answers as
+    well at reduced size: whether a frame is there is one question, which its pose another."""
     found, tried, best, least = search.anywhere(hypotheses), len(hypotheses), None, _CHANCE
     for place in _hopeful(search, found, tried):
         frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
-        expected = min((tried * search.expected_where_seen(frame, _seen_px(frame)) for frame in frames), default=np.inf)
+        if not frames:
+            continue
+        as_measured = min(search.expected_where_seen(frame, _seen_px(frame)) for frame in frames)
+        expected = _TWO_COUNTS * tried * min(as_measured, search.expected_alike(place))
         if expected <= least:
             best, least = max(frames, key=lambda frame: frame.belongs.sum()), expected
     return found, best
