@@ -18,6 +18,7 @@ from measure.frame_sighting import measure_frame
 from measure.matching import match
 from measure.picture_scan import WholePicture
 from measure.poses import POSES
+from measure.refinement import options_for
 from measure.resolution import NO_TAGS
 from measure.scan import Scan
 from measure.shapes import FiducialLayout, LayoutMark
@@ -61,8 +62,8 @@ class DustyMark:
         kind, options = self.mark.kind, FiducialOptions().match
         if kind.name == "ellipse":
             options = replace(options, freedom="ellipse", margin_px=PLAIN_MARGIN_PX, margin_blurs=0.0)
-        elif np.isfinite(kind.known):
-            options = replace(options, linear_sigma=kind.known)
+        else:
+            options = options_for(kind.shape, options, kind.known if np.isfinite(kind.known) else None)
         fit = match(np.rint(self.grey), (0.0, 0.0), kind.shape, self.mark.place, options, self.seen)
         return Found(fit.center_px, fit.covariance_px2) if fit.converged else None
 

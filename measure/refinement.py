@@ -26,6 +26,7 @@ _MOST_CONTRAST = (
     2.0  # times the scanner's range: more than that no light takes, and lines are hardly twice as wide as drawn
 )
 _SURE = 3.0  # standard deviations
+_SOLID_MARGIN_PX = 7.0  # of ground: with 6 a sharp dot loses a hundredth and a notch two, and they cost little
 _SOLID_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
 
 
@@ -104,7 +105,7 @@ def _fitted(
         inner = np.column_stack([start[:, :2], start[:, 2] - (col0, row0)])
         valid &= ~beyond_edge(window, mark, inner, expected.polarity)
     clipped = clipped_sides(scan, col0, row0, width, tall, weights)
-    own = _options_for(mark, options, frame_sigma)
+    own = options_for(mark, options, frame_sigma)
     return match(window, (col0, row0), mark, start, own, valid, clipped, scan.is_lossy), chance
 
 
@@ -114,11 +115,15 @@ def _inside_scan(scan: Scan, col0: int, row0: int, width: int, height: int) -> N
     return inside_row[:, None] & inside_col[None, :]
 
 
-def _options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
+def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
     """A solid mark gets more ground. Where the mark leans on the frame, its rotation and scale stay as predicted, or
     near it."""
     if _is_solid(mark):
-        options = replace(options, margin_blurs=max(options.margin_blurs, _SOLID_MARGIN_BLURS))
+        options = replace(
+            options,
+            margin_px=max(options.margin_px, _SOLID_MARGIN_PX),
+            margin_blurs=max(options.margin_blurs, _SOLID_MARGIN_BLURS),
+        )
     if not leans_on_frame(mark):
         return options
     if frame_sigma is None:
