@@ -64,7 +64,8 @@ def doubt_sizes(sighter: FrameSighter) -> None:
         sizes = odd_sizes([fits[index] for index in indices], sighter.pixel_from_camera[:, :2])
         for index, size in zip(indices, sizes, strict=True):
             if size is not None:
-                sighter.doubt(index, f"it is {size:.2f} times as large as the other marks: dust may cover it")
+                reason = f"it is {size:.2f} times as large as the other marks: something may cover or touch it"
+                sighter.doubt(index, reason)
 
 
 def _drawn(sighter: FrameSighter) -> dict[int, Match]:

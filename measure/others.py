@@ -1,5 +1,6 @@
 """What the other marks of a frame tell of a figure that all of them share, and whether one mark's own is another."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 Array = NDArray[np.float64]
+# The standard deviation of a figure from mark to mark, by the variance that so many marks show beyond their own.
+Spread = Callable[[float, int], float]
 
 _FEWEST = 3  # other marks
 _CHANCE = 0.01  # of doubting any good mark of a frame
@@ -22,32 +25,31 @@ class Told:
     differs: bool
 
 
-def told_by_others(own: Array, sigma: Array, least_spread: float) -> list[Told | None]:
+def told_by_others(own: Array, sigma: Array, spread: Spread) -> list[Told | None]:
     """For each mark what the others tell, None where they are too few.
 
-    own, sigma (n,): each mark's figure and its standard deviation, infinite where it has none. least_spread: standard
-    deviation of the figure from mark to mark, where too few of them show by how much they differ.
+    own, sigma (n,): each mark's figure and its standard deviation, infinite where it has none.
     """
-    return [_told(own, sigma, index, least_spread) for index in range(len(own))]
+    return [_told(own, sigma, index, spread) for index in range(len(own))]
 
 
-def _told(own: Array, sigma: Array, index: int, least_spread: float) -> Told | None:
+def _told(own: Array, sigma: Array, index: int, spread: Spread) -> Told | None:
     others = np.isfinite(sigma) & (np.arange(len(own)) != index)
     if others.sum() < _FEWEST:
         return None
-    mean, mean_sigma, spread = _mean(own[others], sigma[others], least_spread)
-    predicted = float(np.hypot(mean_sigma, spread))
+    mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
+    predicted = float(np.hypot(mean_sigma, apart))
     off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
     return Told(mean, predicted, bool(2 * stats.norm.sf(off) * len(own) < _CHANCE))
 
 
-def _mean(values: Array, sigma: Array, least_spread: float) -> tuple[float, float, float]:
+def _mean(values: Array, sigma: Array, spread: Spread) -> tuple[float, float, float]:
     """The weighted mean of values that differ by more than their standard deviations, its own standard deviation, and
     by how much more: by the moments of what they leave (DerSimonian and Laird, 1986)."""
     weights = 1 / sigma**2
     rest = values - weights @ values / weights.sum()
     beyond = weights @ rest**2 - (len(values) - 1)
     between = max(beyond / (weights.sum() - (weights**2).sum() / weights.sum()), 0.0)
-    spread = float(np.hypot(np.sqrt(between), least_spread))
-    weights = 1 / (sigma**2 + spread**2)
-    return float(weights @ values / weights.sum()), float(1 / np.sqrt(weights.sum())), spread
+    apart = spread(float(between), len(values))
+    weights = 1 / (sigma**2 + apart**2)
+    return float(weights @ values / weights.sum()), float(1 / np.sqrt(weights.sum())), apart

@@ -18,18 +18,19 @@ from measure.disks import FittedDisk
 
 Array = NDArray[np.float64]
 
-LARGE_PX, LARGE_CHANCE = 0.3, 0.001  # the error that a small target must not have, and the chance of it that is borne
+LARGE_PX = 0.3  # the error that a small target must not have
+LARGE_CHANCE = 0.0015  # of it, that is borne: of 223 such errors in 500 rendered frames it leaves two unflagged
 # What dust that moves a disk by more does to it, rms of 148 rendered disks: to size, stretch, shear, px of the radius
 # (one edge is moved by twice as much as the disk), the contrast's logarithm, and the blur's variance, px².
 # Then to the place with sloping paint against the matched one, px, which less dust does not move.
 DUST_LOOK, DUST_SLOPING_PX = (0.2, 0.2, 0.2, 0.3, 0.4), 0.5
 DUST = (0.0, 1 / 3, 1.5, 6.0)  # times that: none, some, and what moves a disk by 0.3 px, or is something else
+DUST_MOVES_PX = np.array([0.0, 0.08, 0.3, 0.6])  # each of these a coordinate, rms
 # The shares of these, as if of so many disks they had been seen before; most dust beside a disk is cut out.
 BEFORE, WHOLE, DAMAGED = 20.0, (0.9, 0.085, 0.0125, 0.0025), (0.56, 0.36, 0.07, 0.01)
 _MUCH = slice(2, None)
 FEWEST = 8  # that tell how much targets differ
 DUST_PX = 4.0  # the shorter half axis up to which dust may pass for a disk or hide its edge: it is seldom larger
-_LARGE_SIGMAS = float(stats.chi2.isf(LARGE_CHANCE, 2) ** 0.5)
 _SHOWN = 0.05  # the probability of much dust that has the disk called unlike the others
 _FORM = slice(0, 3)  # size, stretch and shear among a look's figures
 _ROUNDS, _SETTLED = 60, 1e-4
@@ -45,19 +46,20 @@ def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[str]
     looks = np.array([_look(disk, shape) for disk, shape in zip(disks, predicted, strict=True)])
     common = _common(looks, disks)
     return [
-        _doubt(disk, look - common.look, dusty) if disk.is_soft or disk.half_axes_px[1] < DUST_PX else ""
-        for disk, look, dusty in zip(disks, looks, common.dusty.tolist(), strict=True)
+        _doubt(disk, look - common.look, kinds) if disk.is_soft or disk.half_axes_px[1] < DUST_PX else ""
+        for disk, look, kinds in zip(disks, looks, common.kinds, strict=True)
     ]
 
 
-def _doubt(disk: FittedDisk, off: Array, dusty: float) -> str:
-    """Of one that dust may look like; off (5,): how far its look is from that of the others; dusty: the probability
-    that so much dust is on it that its place is wrong."""
-    sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
-    if dusty < _SHOWN:
-        if sigma * _LARGE_SIGMAS > LARGE_PX:
+def _doubt(disk: FittedDisk, off: Array, kinds: Array) -> str:
+    """Of one that dust may look like; off (5,): how far its look is from that of the others; kinds (kinds,): the
+    probability of each kind of dust."""
+    if kinds[_MUCH].sum() < _SHOWN:
+        sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
+        chances = stats.chi2.sf(LARGE_PX**2 / (sigma**2 + DUST_MOVES_PX**2), 2)
+        if chances[0] > LARGE_CHANCE:
             return f"faint: good to {sigma:.2f} px only"
-        return f"dust that puts it {LARGE_PX} px off may hide in it" if dusty > LARGE_CHANCE else ""
+        return f"dust that puts it {LARGE_PX} px off may hide in it" if chances @ kinds > LARGE_CHANCE else ""
     size, *form, contrast, variance = off
     return (
         f"unlike the other targets: {np.exp(size):.2f} times their size, {np.exp(contrast):.2f} times their "
@@ -85,10 +87,10 @@ def _power(matrix: Array, exponent: float) -> Array:
 
 
 class _Common(NamedTuple):
-    """look (figures,): what targets look like that have no dust; dusty (n,): the probability that each has much."""
+    """look (figures,): targets without dust; kinds (n, kinds): the probabilities of dust on each."""
 
     look: Array
-    dusty: Array
+    kinds: Array
 
 
 def _common(looks: Array, disks: Sequence[FittedDisk]) -> _Common:
@@ -124,7 +126,7 @@ def _common(looks: Array, disks: Sequence[FittedDisk]) -> _Common:
         spread = np.maximum(spread, _LEAST_SPREAD)
         if np.abs(kinds - last).max() < _SETTLED:
             break
-    return _Common(look, kinds[_MUCH].sum(axis=0))
+    return _Common(look, kinds.T)
 
 
 def _dust_variances(disks: Sequence[FittedDisk]) -> Array:
