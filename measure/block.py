@@ -34,12 +34,17 @@ class Block:
         """Width and height, its margin included."""
         return self.samples.shape[1], self.samples.shape[0]
 
-    def windows(self, corners: NDArray[np.int64], side: int, every: int = 1) -> Image:
-        """(n, side, side) grey values from columns and rows (n, 2) of the scan on, all of them in the block, or every
-        so many of their columns and rows."""
-        firsts = (corners - self.place_px).tolist()
-        cut = [self.samples[top : top + side : every, left : left + side : every] for left, top in firsts]
-        return weighted(np.stack(cut), self.scan.weights)
+    def holds(self, places: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which columns and rows, places (n, 2, count), of the scan are not beyond its edge and in the block."""
+        first = np.maximum(self.place_px, 0)
+        end = np.minimum(np.add(self.place_px, self.size_px), (self.scan.width_px, self.scan.height_px))
+        return np.asarray((places >= first[:, None]) & (places < end[:, None]))
+
+    def grey_at(self, col: NDArray[np.intp], row: NDArray[np.intp]) -> Image:
+        """Grey values at columns and rows of the scan; of those beyond the block, any of its values."""
+        width, height = self.size_px
+        at = (row - self.row0) * width + (col - self.col0)
+        return weighted(self.samples.reshape(width * height, -1).take(at, axis=0, mode="clip"), self.scan.weights)
 
     def reductions(self, factors: Iterable[int]) -> dict[int, Image]:
         """Its grey values area-averaged by each factor, from the coarsest of the others that divides it; each

@@ -57,11 +57,9 @@ def radius_px(shapes: Array) -> Array:
 
 
 class _Edges(NamedTuple):
-    """Each (n, rows, cols) but col (n, 1, cols) and row (n, rows, 1), px from the centres.
-
-    along_col, along_row, length: a vector at right angles to the ellipse, and its length; distance: from the edge, px,
-    positive inside; place: distance in blurs; density: of the normal distribution there, over its largest; share: of
-    the disk in the pixel.
+    """Each (n, pixels): col, row: px from the centres; along_col, along_row, length: a vector at right angles to the
+    ellipse, and its length; distance: from the edge, px, positive inside; place: distance in blurs; density: of the
+    normal distribution there, over its largest; share: of the disk in the pixel.
     """
 
     col: Image
@@ -76,14 +74,14 @@ class _Edges(NamedTuple):
 
 
 class DiskModel:
-    """n disks at a state, in windows of side x side pixels, or every so many of their columns and rows."""
+    """n disks at a state, in pixels whose columns and rows are col, row (n, pixels)."""
 
-    def __init__(self, state: DiskStates, side: int, every: int = 1) -> None:
+    def __init__(self, state: DiskStates, col: NDArray[np.intp], row: NDArray[np.intp]) -> None:
         self.state = state
-        self._side, self._every = side, every
+        self._col, self._row = col, row
 
     def at(self, state: DiskStates) -> "DiskModel":
-        return DiskModel(state, self._side, self._every)
+        return DiskModel(state, self._col, self._row)
 
     def with_greys(self, greys: Array) -> "DiskModel":
         model = copy(self)
@@ -92,11 +90,11 @@ class DiskModel:
 
     @cached_property
     def _edges(self) -> _Edges:
-        state, along = self.state, np.arange(0, self._side, self._every)
-        col = (along - state.centers[:, :1]).astype(np.float32)[:, None, :]
-        row = (along - state.centers[:, 1:]).astype(np.float32)[:, :, None]
+        state = self.state
+        col = (self._col - state.centers[:, :1]).astype(np.float32)
+        row = (self._row - state.centers[:, 1:]).astype(np.float32)
         inverse = np.linalg.inv(state.shapes)
-        form = (inverse.swapaxes(1, 2) @ inverse).astype(np.float32)[..., None, None]  # col, row: squares of radii
+        form = (inverse.swapaxes(1, 2) @ inverse).astype(np.float32)[..., None]  # col, row: squares of radii
         along_col = form[:, 0, 0] * col + form[:, 0, 1] * row
         along_row = form[:, 1, 0] * col + form[:, 1, 1] * row
         radius = np.sqrt(np.maximum(along_col * col + along_row * row, np.float32(0)))
@@ -106,23 +104,18 @@ class DiskModel:
         density = np.exp(np.float32(-0.5) * place * place)
         return _Edges(col, row, along_col, along_row, length, distance, place, density, normal_share(place, density))
 
-    @property
-    def distance(self) -> Image:
-        """(n, rows, cols) from the edge, px, positive inside."""
-        return self._edges.distance
-
     def grey(self) -> Image:
-        """(n, rows, cols) as modelled."""
+        """(n, pixels) as modelled."""
         gain, offset, by_col, by_row = (each(greys) for greys in self.state.greys.T)
         size, edges = each(self.state.radius), self._edges
         return np.asarray(gain * edges.share + (offset + by_col / size * edges.col + by_row / size * edges.row))
 
     def design(self) -> Image:
-        """(n, unknowns, rows, cols): columns and rows of the centres, the shapes' scale, stretch and shear in radii,
+        """(n, unknowns, pixels): columns and rows of the centres, the shapes' scale, stretch and shear in radii,
         the blur, the greys."""
         gain, blur, size = (each(of) for of in (self.state.greys[:, 0], self.state.blur, self.state.radius))
         edges = self._edges
-        design = np.empty((len(gain), UNKNOWNS, *edges.share.shape[1:]), np.float32)
+        design = np.empty((len(gain), UNKNOWNS, edges.share.shape[1]), np.float32)
         steepness = gain / (np.float32(np.sqrt(2 * np.pi)) * blur) * edges.density
         moved = steepness / edges.length
         outward_col = np.multiply(moved, edges.along_col, out=design[:, 0])
@@ -137,9 +130,9 @@ class DiskModel:
         return design
 
     def grey_design(self) -> Image:
-        """(n, GREYS, rows, cols): that of the greys alone."""
+        """(n, GREYS, pixels): that of the greys alone."""
         size, edges = each(self.state.radius), self._edges
-        design = np.empty((len(size), GREYS, *edges.share.shape[1:]), np.float32)
+        design = np.empty((len(size), GREYS, edges.share.shape[1]), np.float32)
         design[:, 0], design[:, 1], design[:, 2], design[:, 3] = edges.share, 1, edges.col / size, edges.row / size
         return design
 
@@ -158,16 +151,15 @@ def normal_share(place: Image, density: Image) -> Image:
 
 
 def each(values: Array) -> Image:
-    """(n, 1, 1)"""
-    return np.asarray(values, np.float32)[:, None, None]
+    """(n, 1)"""
+    return np.asarray(values, np.float32)[:, None]
 
 
 def solved(design: Image, residuals: Image, weights: Image) -> Array:
-    """(n, unknowns) of weighted least squares, for design (n, unknowns, rows, cols)."""
-    flat = design.reshape(*design.shape[:2], -1)
-    weighted = flat * weights.reshape(len(weights), 1, -1)
-    normal = (weighted @ flat.swapaxes(1, 2)).astype(float)
-    right = (weighted @ residuals.reshape(len(residuals), -1, 1)).astype(float)
+    """(n, unknowns) of weighted least squares, for design (n, unknowns, pixels)."""
+    weighted = design * weights[:, None]
+    normal = (weighted @ design.swapaxes(1, 2)).astype(float)
+    right = (weighted @ residuals[..., None]).astype(float)
     size = np.sqrt(np.maximum(np.einsum("nuu->nu", normal), 1e-12))
     scaled = normal / (size[:, :, None] * size[:, None]) + DAMPING * np.eye(normal.shape[1])
     return np.asarray(np.linalg.solve(scaled, right / size[..., None])[..., 0] / size)
