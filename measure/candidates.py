@@ -147,14 +147,14 @@ def _within(response: Map, shape: tuple[int, ...]) -> Map:
 
 
 def _reduction(scan: Scan, looks: Sequence[Look]) -> int:
-    """The largest that leaves every mark large enough and every line thick enough to be seen."""
+    """The largest that leaves every mark large enough, every line thick enough to be seen, and of the scan a pixel."""
     limits = []
     for look in looks:
         least, greatest = extent_px(look.mark, _centred(look.linear))
         scale = float(np.sqrt(abs(np.linalg.det(look.linear))))
         limits.append(min((greatest - least).max() / _EXTENT_PX, scale * thinnest_mm(look.mark) / _THINNEST_PX))
     needed = max(scan.width_px, scan.height_px) / _LARGEST_PX
-    return max(1, int(min(limits)), int(np.ceil(needed)))
+    return min(max(1, int(min(limits)), int(np.ceil(needed))), scan.width_px, scan.height_px)
 
 
 def _reduced_detail_px(look: Look, reduction: int) -> float:

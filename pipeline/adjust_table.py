@@ -64,7 +64,10 @@ def _robust(table: Table) -> bool | WeightFunction:
     """Huber's weights are those of `true`."""
     if "robust" not in table or table.is_flag("robust"):
         return table.flag("robust", False)
-    return cast(WeightFunction, table.text("robust", choices=get_args(WeightFunction)))
+    name = table.text("robust")
+    if name not in get_args(WeightFunction):
+        raise table.error("robust", f"is {name!r}; possible are true, false, {', '.join(get_args(WeightFunction))}.")
+    return cast(WeightFunction, name)
 
 
 def _variance_components(table: Table) -> bool | tuple[str, ...]:

@@ -6,9 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, get_args
 
+import numpy as np
+
 from adjust import network
 from adjust.families import FAMILY_NAMES, family, parameter_names
 from measure import shapes
+from measure.rendering import extent_px
 from pipeline.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.errors import InputError
 from pipeline.images_file import image_name
@@ -190,18 +193,32 @@ def _check_units(
     table: Table, frame_mm: tuple[float, float], distance_mm: float | None, fiducials: Sequence[GivenFiducial]
 ) -> None:
     """Refuse lengths that beside the frame's cannot be mm: metres or um taken for them are off by a thousand."""
+    frame = f"the frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm"
     half_diagonal = math.hypot(*frame_mm) / 2
     if distance_mm is not None and not 1 / FIELD_RATIO < distance_mm / half_diagonal < FIELD_RATIO:
         raise table.error(
             "principal_distance_mm",
-            f"{distance_mm:g} mm is impossible for a frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm. Give both in mm.",
+            f"{distance_mm:g} mm is impossible for {frame}. Give both in mm.",
         )
+    apart_mm = float(np.ptp([one.xy_mm for one in fiducials], axis=0).max()) if len(fiducials) > 1 else math.inf
     for entry, fiducial in zip(table.tables("fiducial"), fiducials, strict=True):
         if max(map(abs, fiducial.xy_mm)) > 2 * max(frame_mm):
+            raise entry.error("xy_mm", f"lies far outside of {frame}. Give mm from its middle.")
+        if apart_mm < max(frame_mm) / FIELD_RATIO:
+            raise entry.error("xy_mm", f"all fiducials lie within {apart_mm:.3g} mm, in {frame}. Give mm.")
+        if _size_mm(fiducial.mark) > min(frame_mm) / 2:
             raise entry.error(
-                "xy_mm",
-                f"lies far outside of the frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm. Give mm from its middle.",
+                "mark", f"is drawn {_size_mm(fiducial.mark):.4g} mm large, in {frame}. Give its sizes in mm."
             )
+
+
+def _size_mm(mark: shapes.Mark | shapes.LearnedMark | None) -> float:
+    """Width or height, whichever is larger; 0 where nothing is drawn, or the frame's edges themselves are."""
+    if mark is None or isinstance(mark, shapes.FrameCorner):
+        return 0.0
+    if isinstance(mark, shapes.LearnedMark):
+        return mark.size_mm
+    return float(np.ptp(extent_px(mark, np.eye(2, 3)), axis=0).max())
 
 
 def _side(table: Table, key: str) -> shapes.Side | None:
@@ -240,6 +257,9 @@ def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
         xy = entry.pair("xy_mm")
         sigma = entry.sigma_pair("sigma_mm", (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM))
         drawn = None if mark is None or mark not in marks else _placed(*marks[mark], xy)
+        for other in fiducials.values():
+            if other.xy_mm == xy:
+                raise entry.error("xy_mm", f"fiducial {other.id!r} has the same place. Every mark has one of its own.")
         fiducials[id] = GivenFiducial(id, xy, sigma, drawn, mark == NO_MARK and drawn is None)
         entry.done()
     return tuple(fiducials.values())

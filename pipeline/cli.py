@@ -3,6 +3,7 @@
 import json
 import traceback
 from collections.abc import Callable, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -22,7 +23,7 @@ from pipeline.design.run import run_design
 from pipeline.errors import InputError
 from pipeline.library import PREFIX, library_json, library_path, print_library, read_library
 from pipeline.progress import Reporter
-from pipeline.project_file import Project, read_project
+from pipeline.project_file import FINEST_PITCH_UM, Project, read_project
 from pipeline.scene_file import render_project
 from pipeline.summary import Summary, print_summary
 
@@ -54,6 +55,12 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _message(error.format_message(), WRONG_INPUT)
     except (InputError, MeasurementError, AdjustmentError) as error:
         return _message(str(error), WRONG_INPUT)
+    except BrokenProcessPool:
+        return _message(
+            "a process that measures was ended from outside, most likely because the memory was full; nothing was "
+            "written. Close other programs, or name one scan at a time.",
+            WRONG_INPUT,
+        )
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         return _message(
@@ -181,7 +188,7 @@ def cameras(
     ] = None,
     pitch_um: Annotated[
         float | None,
-        typer.Option("--pitch", metavar="UM", min=0.1, help="The scan's pixel in um, if its file is mute."),
+        typer.Option("--pitch", metavar="UM", min=FINEST_PITCH_UM, help="The scan's pixel in um, if its file is mute."),
     ] = None,
     as_json: AsJson = False,
 ) -> int:

@@ -81,7 +81,8 @@ def _line(image: str, mark: MarkMeasurement, pitch_um: tuple[float, float]) -> s
 
 
 def _quoted(cell: str) -> str:
-    return '"' + cell.replace('"', '""') + '"' if any(c in cell for c in ',"\n') else cell
+    """The cell as CSV; in quotes, too, where a line that begins with it would be a comment."""
+    return '"' + cell.replace('"', '""') + '"' if cell.startswith("#") or any(c in cell for c in ',"\n') else cell
 
 
 def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:

@@ -67,6 +67,9 @@ def _vertices(table: Table) -> tuple[shapes.Point, ...]:
     vertices = table.pairs("vertices_mm")
     if len(vertices) < 3:
         raise table.error("vertices_mm", f"a polygon needs at least three vertices, not {len(vertices)}.")
+    x, y = np.transpose(vertices)
+    if np.isclose(x @ np.roll(y, 1), y @ np.roll(x, 1), rtol=1e-9, atol=0.0):
+        raise table.error("vertices_mm", "the polygon encloses no area. Give its corners in the order of its outline.")
     return vertices
 
 
@@ -80,6 +83,8 @@ def _part(table: Table) -> shapes.Part:
         part = shapes.Ring(center, radius, table.number("line_mm", above=0.0))
     elif shape == "bar":
         part = shapes.Bar(table.pair("from_mm"), table.pair("to_mm"), table.number("line_mm", above=0.0))
+        if part.from_mm == part.to_mm:
+            raise table.error("to_mm", "is the same as from_mm: the bar has no length.")
     else:
         part = shapes.Polygon(_vertices(table))
     table.done()
@@ -93,6 +98,8 @@ def _template(table: Table, folder: Path) -> shapes.MarkTemplate:
             image = chip.window(0, 0, chip.width_px, chip.height_px).astype(np.float64)
     except MeasurementError as error:
         raise table.error("image", str(error)) from error
+    if np.ptp(image) == 0.0:
+        raise table.error("image", f"{path} shows nothing: all its pixels are alike. Cut out the mark with its ground.")
     return shapes.MarkTemplate(
         image,
         table.number("pitch_um", above=0.0),

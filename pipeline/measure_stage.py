@@ -41,6 +41,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     if project.targets is not None and project.targets.code is not None:
         CodedSheet.of(project, project.targets)
     check_tie_names(project)
+    _check_marks(project)
     _check_readable(list(project.scans.values()))
     with worker_pool(len(project.scans)) as workers:
         learned = learn_marks(project, reporter, workers)
@@ -96,6 +97,16 @@ def _one_definition(project: Project, measured: Sequence[MeasuredScan]) -> tuple
         for scan, marks in zip(own, one_definition([scan.frame.marks for scan in own]), strict=True):
             frames[scan.scan] = replace(scan.frame, marks=marks)
     return tuple(replace(scan, frame=frames[scan.scan]) for scan in measured)
+
+
+def _check_marks(project: Project) -> None:
+    """One mark by itself tells neither the turn nor the scale of a frame."""
+    for camera in project.cameras.values():
+        if len(camera.drawn) + len(camera.learned) == 1:
+            raise InputError(
+                f"{camera.path} has one fiducial mark, and a frame is found by two or more. Add the others, or pass it "
+                'over with mark = "none".'
+            )
 
 
 def _check_readable(paths: Sequence[Path]) -> None:

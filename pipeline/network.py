@@ -23,6 +23,7 @@ from pipeline.adjust_table import AdjustSettings
 from pipeline.camera_file import CameraFile
 from pipeline.comparator_file import ComparatorPoint
 from pipeline.errors import InputError
+from pipeline.fiducial_check import check_fiducials
 from pipeline.project_file import UNITS_MM, Project
 from pipeline.spelling import did_you_mean
 from pipeline.wording import listed
@@ -44,7 +45,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
             f"{project.comparator}: holds no observation: no mark has the status measured or weak. "
             "See the reasons in its last column."
         )
-    _check_fiducials(project, used)
+    check_fiducials(project, used)
     _check_points(project, used)
     used, lonely = _locatable(project, used)
     used, left_out = _orientable(project, used)
@@ -71,6 +72,12 @@ def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bo
     return _expects_targets(project) or any(
         _has_film_transformation(_image(project, name), count) for name, count in fiducials.items()
     )
+
+
+def check_transformation(project: Project) -> None:
+    """Raises InputError where the film transformation that is asked for needs fiducials that a camera does not have."""
+    for camera in project.cameras.values():
+        _transformation(project, camera)
 
 
 def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
@@ -164,19 +171,6 @@ def _transformation(project: Project, camera: CameraFile) -> Transformation:
             'Write transformation = "none" for a digital camera, or add the fiducials.'
         )
     return given
-
-
-def _check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None:
-    for mark in marks:
-        if mark.kind != "fiducial":
-            continue
-        camera = project.camera_of(mark.image)
-        ids = [fiducial.id for fiducial in camera.fiducials]
-        if mark.point not in ids:
-            raise InputError(
-                f"{project.comparator}, line {mark.line}: image {mark.image!r}: {camera.path} has no fiducial "
-                f"{mark.point!r}. It has {', '.join(ids) or 'none'}."
-            )
 
 
 def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:

@@ -19,6 +19,7 @@ from pipeline.target_table import TargetSettings, read_targets
 from pipeline.tie_table import TieSettings, read_ties
 
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
+FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 
 
@@ -130,6 +131,7 @@ def read_project(path: Path) -> Project:
             f"{path}: there are no scans and no comparator coordinates. Give scans = [...] to measure, or comparator = "
             f'"..." with the coordinates; looked for {project.comparator.resolve()}.'
         )
+    _check_written(table, project, named)
     return project
 
 
@@ -154,6 +156,32 @@ def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, 
     ]
     if missing:
         raise InputError("\n".join(missing))
+
+
+def _check_written(table: Table, project: Project, named: Mapping[str, Path]) -> None:
+    """Refuse to write results over a file that the project is made from."""
+    for camera in project.cameras.values():
+        earlier = camera.calibration
+        if earlier is not None and earlier.path.resolve() == project.adjustment_path.resolve():
+            raise table.error(
+                "output",
+                f"the adjustment would be written over the earlier calibration that it starts from, {earlier.path}. "
+                "Name another folder.",
+            )
+    if not project.scans:
+        return
+    if project.comparator.is_dir():
+        raise table.error("comparator", f"{project.comparator} is a folder. Name a file to be written there.")
+    cameras = {f"the camera of {camera.name}": camera.path for camera in project.cameras.values()}
+    scans = {f"the scan {name}": path for name, path in project.scans.items()}
+    given = {"the project itself": project.path, **{f"[object] {key}": path for key, path in named.items()}}
+    for what, path in (given | cameras | scans).items():
+        if project.comparator.resolve() == path.resolve():
+            raise table.error(
+                "comparator",
+                f"the measured coordinates would be written over {what}, {path}. Name another file, such as "
+                '"comparator.csv".',
+            )
 
 
 def _cameras(table: Table, default: str, images: GivenImages | None) -> Mapping[str, CameraFile]:
@@ -181,6 +209,8 @@ def _scans(table: Table, patterns: Sequence[str]) -> Mapping[str, Path]:
             raise table.error("scans", _nothing_found(pattern, folder / pattern))
         for file in found:
             name = image_name(file.name)
+            if not name.isprintable():
+                raise table.error("scans", f"the file name {file.name!a} is not text in UTF-8 on one line. Rename it.")
             if scans.get(name, file) != file:
                 raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
             scans[name] = file
@@ -199,6 +229,8 @@ def _found(pattern: str, folder: Path) -> list[Path]:
 
 def _nothing_found(pattern: str, whole: Path) -> str:
     folder = whole.parent
+    if whole.is_dir():
+        return f"{pattern!r} is a folder. Name the files in it by a pattern, such as {f'{pattern}/*.tif'!r}."
     if glob.has_magic(str(Path(pattern).parent)):
         return f"{pattern!r} finds no file. Looked for {whole}."
     if not folder.is_dir():
@@ -214,4 +246,6 @@ def _pitch(table: Table) -> tuple[float, float] | None:
     pitch = table.number_or_pair("pitch_um")
     if not all(0.0 < value < math.inf for value in pitch):
         raise table.error("pitch_um", f"must be positive, not {list(pitch)}.")
+    if min(pitch) < FINEST_PITCH_UM:
+        raise table.error("pitch_um", f"{min(pitch):g} um is finer than any scanner. Give um: 20.0, not 0.02.")
     return pitch

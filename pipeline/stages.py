@@ -16,7 +16,7 @@ from pipeline.comparator_file import ComparatorPoint, read_comparator, write_com
 from pipeline.errors import InputError
 from pipeline.measure_stage import measure_scans
 from pipeline.measurement_file import MeasuredScan, read_measurement, write_measurement
-from pipeline.network import anything_to_adjust
+from pipeline.network import anything_to_adjust, check_transformation
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
 from pipeline.report.data import ReportData
@@ -32,6 +32,7 @@ def run_all(project: Project, reporter: Reporter) -> Summary:
     """Measure (where there are scans), adjust, visit the scans again, check, report."""
     scans: tuple[MeasuredScan, ...] = ()
     _check_writable(project)
+    check_transformation(project)
     if project.scans:
         scans = measure_scans(project, reporter)
         _write_marks(project, scans)

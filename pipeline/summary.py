@@ -13,6 +13,7 @@ from rich.text import Text
 
 from measure.status import Status
 from pipeline.report.data import ReportData
+from pipeline.report.marks import current_scans
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.verdict import Verdict, camera_is_calibrated, judge
 
@@ -53,8 +54,7 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     for mark in data.comparator:
         counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
         counts[mark.status] += 1
-    scans = data.measurement["images"] if data.measurement else {}
-    poses = {name: scan["pose"] for name, scan in scans.items() if scan.get("pose")}
+    poses = {name: scan["pose"] for name, scan in current_scans(data).items() if scan.get("pose")}
     return Summary(judge(data), frames, poses, data.adjustment, data.check, files)
 
 

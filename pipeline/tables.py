@@ -20,13 +20,13 @@ def read_toml(path: Path) -> "Table":
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a TOML file is needed here.") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: is not a text file (UTF-8); a TOML file is needed here.") from None
+        raise InputError(f"{path}: is not text in UTF-8; a TOML file, saved as such, is needed here.") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: is not valid TOML: {error}. Mend that line.") from None
     except OSError as error:
@@ -207,7 +207,7 @@ class Table:
     def _line_of(self, key: str) -> int | None:
         """The line where the key, or the table of that name, stands inside this table; this table's own if nowhere."""
         try:
-            lines = self.file.read_text(encoding="utf-8").splitlines()
+            lines = self.file.read_text(encoding="utf-8-sig").splitlines()
         except (OSError, UnicodeDecodeError):
             return None
         name, _, count = self.place.partition("[")

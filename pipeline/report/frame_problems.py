@@ -43,7 +43,8 @@ def _problems_of(frame: Frame) -> Iterator[Problem]:
         found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
         yield Problem(
             f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured ({_reasons(lost)}).",
-            "Look at their pictures in the report. The frame is used; its film transformation is less certain.",
+            "Look at their pictures in the report."
+            + (" The frame is used; its film transformation is less certain." if found else ""),
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     if targets and not any(mark.status.is_observation for mark in targets):

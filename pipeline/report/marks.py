@@ -58,7 +58,7 @@ class Frame:
 
 def frames(data: ReportData) -> list[Frame]:
     """Every image that any of the files names, in the order of their names."""
-    scans: dict[str, Json] = data.measurement["images"] if data.measurement else {}
+    scans = current_scans(data)
     marks: dict[str, dict[tuple[bool, str], Mark]] = defaultdict(dict)
     for mark in _marks(data, scans):
         marks[mark.image][mark.is_fiducial, mark.point] = mark
@@ -67,6 +67,13 @@ def frames(data: ReportData) -> list[Frame]:
         Frame(name, tuple(sorted(marks[name].values(), key=_order)), scans.get(name, {}))
         for name in sorted(names, key=natural)
     ]
+
+
+def current_scans(data: ReportData) -> dict[str, Json]:
+    """The scans of measurement.json by image name; those left out whose marks comparator.csv no longer has."""
+    images = {row.image for row in data.comparator}
+    scans: dict[str, Json] = data.measurement["images"] if data.measurement else {}
+    return {name: scan for name, scan in scans.items() if name in images or not images or not scan.get("marks")}
 
 
 def natural(name: str) -> list[tuple[int, str]]:

@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+import os
 import re
 import resource
 import signal
@@ -28,6 +29,12 @@ def replaced(path: Path, old: str, new: str) -> None:
     text = path.read_text(encoding="utf-8")
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def rewritten_scans(folder: Path, pattern: str) -> None:
+    path = folder / "project.toml"
+    text = re.sub(r"^scans = .*$", f'scans = ["{pattern}"]', path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    path.write_text(text, encoding="utf-8")
 
 
 def results(folder: Path) -> dict[str, bytes]:
@@ -86,6 +93,47 @@ def no_folder_for_results(folder: Path) -> None:
     replaced(folder / "project.toml", 'output = "out"', 'output = "points.csv/out"')
 
 
+def no_pattern(folder: Path) -> None:
+    rewritten_scans(folder, "scans")
+
+
+def name_in_another_encoding(folder: Path) -> None:
+    scans = os.fsencode(folder / "scans")
+    os.rename(scans + b"/frame1.tif", scans + b"/fl\xfcg.tif")
+    rewritten_scans(folder, "scans/*.tif")
+
+
+def pitch_in_mm(folder: Path) -> None:
+    replaced(folder / "project.toml", "output =", "pitch_um = 0.045\noutput =")
+
+
+def marks_over_points(folder: Path) -> None:
+    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "points.csv"')
+
+
+def marks_over_a_scan(folder: Path) -> None:
+    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "scans/../scans/frame2.tif"')
+
+
+def marks_over_a_folder(folder: Path) -> None:
+    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "out"')
+
+
+def calibration_that_is_written_anew(folder: Path) -> None:
+    replaced(folder / "camera.toml", "[sigma]", '[sigma]\ncalibration = "out/adjustment.json"')
+
+
+def no_fiducials(folder: Path) -> None:
+    (folder / "camera.toml").write_text('name = "bare"\n', encoding="utf-8")
+
+
+def one_fiducial(folder: Path) -> None:
+    camera = (folder / "camera.toml").read_text(encoding="utf-8")
+    head, first, *_ = camera.split("[[fiducial]]")
+    marks = camera[camera.index("[mark.") :]
+    (folder / "camera.toml").write_text(f"{head}[[fiducial]]{first}{marks}", encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -100,6 +148,15 @@ def no_folder_for_results(folder: Path) -> None:
         (two_files_missing, ["line 2: camera: there is no such file", "line 12: [object] points: there is no such"]),
         (duplicated_point, ["points.csv", "'103'", "line 4"]),
         (no_folder_for_results, ["cannot be written"]),
+        (no_pattern, ["line 3: scans: 'scans' is a folder", "'scans/*.tif'"]),
+        (name_in_another_encoding, ["line 3: scans:", "is not text in UTF-8", "Rename it"]),
+        (pitch_in_mm, ["line 5: pitch_um: 0.045 um is finer than any scanner"]),
+        (marks_over_points, ["line 4: comparator:", "written over [object] points"]),
+        (marks_over_a_scan, ["line 4: comparator:", "written over the scan frame2"]),
+        (marks_over_a_folder, ["line 4: comparator:", "is a folder"]),
+        (calibration_that_is_written_anew, ["line 5: output:", "over the earlier calibration", "another folder"]),
+        (no_fiducials, ["transformation is 'affine'", "has no fiducials for it"]),
+        (one_fiducial, ["camera.toml has one fiducial mark", "two or more"]),
     ],
 )
 def test_wrong_input_gets_one_message_and_code_2_and_leaves_earlier_results(
@@ -191,6 +248,24 @@ def test_measured_point_that_nobody_gave_is_named_with_its_line(project: Path, c
         assert word in said
 
 
+def test_coordinates_in_pixels_are_refused(project: Path, capsys: SAID) -> None:
+    lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    rows = [line.split(",") for line in lines if line.startswith("frame")]
+    pixels = [",".join([*row[:3], row[8], row[9], *row[5:]]) for row in rows if row[8]]
+    head = next(line for line in lines if line.startswith("image,"))
+    code, _, said = adjusted(project, capsys, "\n".join([head, *pixels]) + "\n")
+    assert code == 2
+    assert "comparator.csv, line 2: the fiducials of image 'frame1' stand 22.4 times as far apart" in said
+
+
+def test_frames_that_the_coordinates_no_longer_hold_are_not_counted(project: Path, capsys: SAID) -> None:
+    lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if not line.startswith(("frame2", "frame3"))]
+    _, summary, _ = adjusted(project, capsys, "\n".join(kept) + "\n")
+    assert "in 3 frames" in summary["sentence"]
+    assert set(summary["poses"]) == {"frame1", "frame4", "frame5"}
+
+
 def test_image_with_two_targets_is_left_out_and_named(project: Path, capsys: SAID) -> None:
     lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
     targets = [line for line in lines if line.startswith("frame1,") and ",target," in line and ",measured," in line]
@@ -222,9 +297,7 @@ def test_scan_of_another_camera_is_said_to_be_one(project: Path, capsys: SAID) -
     tifffile.imwrite(
         project / "scans" / "frame4.tif", picture, resolution=(1e4 / 90, 1e4 / 90), resolutionunit="CENTIMETER"
     )
-    text = (project / "project.toml").read_text(encoding="utf-8")
-    alone = re.sub(r"^scans = .*$", 'scans = ["scans/frame4.tif"]', text, flags=re.MULTILINE)
-    (project / "project.toml").write_text(alone, encoding="utf-8")
+    rewritten_scans(project, "scans/frame4.tif")
     code = run(["measure", str(project / "project.toml"), "--json"])
     summary = json.loads(capsys.readouterr().out)
     assert code == 1

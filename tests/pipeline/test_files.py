@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.shapes import MarkShape, Polygon
@@ -49,6 +50,10 @@ line_mm = 0.1
 gap_mm = 0.5
 rotate = "radial"
 """
+
+
+DRAWN = 'kind = "cross"\narm_mm = 1.0\nline_mm = 0.1\ngap_mm = 0.5'
+OTHER = '[[fiducial]]\nid = "2"\n'
 
 
 def written(folder: Path, name: str, text: str) -> Path:
@@ -117,6 +122,10 @@ def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
         ("principal_distance_mm = 153.0", "principal_distance_mm = -153.0", ["greater than 0"]),
         ("principal_distance_mm = 153.0", "principal_distance_mm = 0.153", ["line 4", "impossible", "Give both in mm"]),
         ("xy_mm = [0.0, 106.0]", "xy_mm = [0.0, 106000.0]", ["line 14", "far outside of the frame"]),
+        ("[[fiducial]]", f"{OTHER}xy_mm = [0.0, 106.0]\n[[fiducial]]", ["line 17", "'2' has the same place"]),
+        ("xy_mm = [0.0, 106.0]", f"xy_mm = [0.0, 0.106]\n{OTHER}xy_mm = [0.1, 0.0]", ["line 14", "within 0.106 mm"]),
+        ("arm_mm = 1.0", "arm_mm = 1000", ["line 16", "2000 mm large", "sizes in mm"]),
+        (DRAWN, 'kind = "polygon"\nvertices_mm = [[0, 0], [1, 1], [2, 2]]', ["line 19", "encloses no area"]),
         ('mark = "side"', 'mark = "sid"', ["Did you mean 'side'"]),
         ("arm_mm = 1.0", "arm_m = 1.0", ["arm_mm", "'arm_m'"]),
         ("gap_mm = 0.5", "gap_mm = 1.5", ["smaller than arm_mm"]),
@@ -140,6 +149,17 @@ def test_a_self_calibration_set_without_a_frame_is_told_what_it_needs(tmp_path: 
     message = refused(read_camera, written(tmp_path, "camera.toml", text))
     assert "line 8: [distortion] family: ebner counts in halves of the frame" in message
     assert "Give the camera's frame_mm, or half_mm in this table." in message
+
+
+def test_a_byte_order_mark_is_no_mistake(tmp_path: Path) -> None:
+    assert read_camera(written(tmp_path, "camera.toml", f"\ufeff{CAMERA}")).name == "C"
+
+
+def test_a_chip_that_shows_nothing_is_no_mark(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "chip.tif", np.full((20, 20), 90, np.uint8))
+    chip = 'kind = "template"\nimage = "chip.tif"\npitch_um = 20\norigin_px = [10, 10]'
+    message = refused(read_camera, written(tmp_path, "camera.toml", CAMERA.replace(DRAWN, chip)))
+    assert "all its pixels are alike" in message
 
 
 def test_missing_file_is_named_with_the_place_looked_for(tmp_path: Path) -> None:
@@ -201,8 +221,9 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
         MarkMeasurement("7", "target", None, None, Status.ABSENT, 'outside, "far" off'),
     )
     path = tmp_path / "comparator.csv"
-    write_comparator(path, [FrameMeasurement("f", marks)], {"f": (20.0, 10.0)})
+    write_comparator(path, [FrameMeasurement("#1", marks)], {"#1": (20.0, 10.0)})
     first, second = read_comparator(path)
+    assert first.image == "#1"  # a line that begins with # would be a comment
     assert first.xy_mm is not None
     assert first.sigma_mm is not None
     np.testing.assert_allclose(first.xy_mm, [2.005, -2.005], atol=1e-9)
