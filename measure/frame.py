@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from measure.constellation import Placement
 from measure.matching import Match
@@ -16,7 +17,7 @@ Mask = NDArray[np.bool_]
 CLEAR_LIKENESS = 0.5
 CLEAR_DAMAGE = 0.25
 _CLEAR_SNR = 3.0
-_CLEAR_SIGMA_PX = 0.3
+_WRONG_PX, _WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 
 
@@ -89,7 +90,7 @@ class Frame:
         if fit.damaged_fraction > CLEAR_DAMAGE:
             reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
-        if sigma_px > _CLEAR_SIGMA_PX:
+        if stats.chi2.sf((_WRONG_PX / sigma_px) ** 2, 2) > _WRONG_CHANCE:
             reasons.append(f"its standard deviation is {sigma_px:.2f} px")
         if self.misfit_mm[index] > _FAR * max(self.scatter_mm, 0.01):
             reasons.append(f"it lies {self.misfit_mm[index]:.2f} mm from where the others put it: the film is deformed")

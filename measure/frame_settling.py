@@ -5,13 +5,17 @@ from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from measure.frame_sighter import FrameSighter
 from measure.match_options import MatchOptions
 from measure.matching import Match
+from measure.picture_model import is_round
 from measure.refinement import leans_on_frame, sight, strained_px
-from measure.shapes import Mark, MarkShape
-from measure.shared_looks import odd_sizes, shared_blurs
+from measure.shapes import Disk, Mark, MarkShape, Ring
+from measure.shared_looks import shared_blurs, shared_sizes
+
+Array = NDArray[np.float64]
 
 _STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
 _SETTLED_PX = 1.5  # about a mark that was matched already
@@ -52,20 +56,31 @@ def share_blur(sighter: FrameSighter) -> None:
     sighter.judge()
 
 
-def doubt_sizes(sighter: FrameSighter) -> None:
-    """Doubt marks of another size than the others that are drawn alike: dust, say, that covers one."""
+def compare_sizes(sighter: FrameSighter) -> None:
+    """Doubt marks of another size than the others that are drawn alike: dust, say, that covers one. A round mark is
+    known no better than its size says."""
     alike: dict[Mark, list[int]] = defaultdict(list)
     fits = _adjusted(sighter)
     for index in fits:
         mark = sighter.layout.marks[index].mark
         if not leans_on_frame(mark):
             alike[mark].append(index)
-    for indices in alike.values():
-        sizes = odd_sizes([fits[index] for index in indices], sighter.pixel_from_camera[:, :2])
+    for mark, indices in alike.items():
+        sizes = shared_sizes([fits[index] for index in indices], sighter.pixel_from_camera[:, :2])
         for index, size in zip(indices, sizes, strict=True):
-            if size is not None:
-                reason = f"it is {size:.2f} times as large as the other marks: something may cover or touch it"
+            if size is not None and size.differs:
+                reason = f"it is {size.ratio:.2f} times as large as the other marks: something may cover or touch it"
                 sighter.doubt(index, reason)
+            if size is not None and is_round(mark):
+                radius_px = _radius_px(mark, fits[index].pixel_from_mark[:, :2])
+                sighter.widen(index, size.touched_px2(radius_px, fits[index].damaged_fraction > 0))
+
+
+def _radius_px(mark: Mark, linear: Array) -> float:
+    """Of a round mark's outline; linear: (2, 2) px per mm."""
+    parts = mark.parts if isinstance(mark, MarkShape) else ()
+    radius_mm = max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
+    return float(radius_mm * np.sqrt(abs(np.linalg.det(linear))))
 
 
 def _drawn(sighter: FrameSighter) -> dict[int, Match]:

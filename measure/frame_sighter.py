@@ -182,6 +182,13 @@ class FrameSighter:
             reasons = [each for each in (sighting.reason, reason) if each]
             self.sightings[index] = replace(sighting, reason="; ".join(reasons))
 
+    def widen(self, index: int, variance_px2: float) -> None:
+        """Add a variance, along each coordinate, to what is known of the place of a mark that was seen."""
+        sighting = self.sightings[index]
+        if sighting is not None and sighting.fit is not None:
+            covariance = sighting.fit.covariance_px2 + variance_px2 * np.eye(2)
+            self.sightings[index] = replace(sighting, fit=replace(sighting.fit, covariance_px2=covariance))
+
     def _ground(self, expected: MarkPrediction) -> Array:
         """The grey values about a mark's place."""
         least, greatest = extent_px(expected.mark, expected.pixel_from_mark)

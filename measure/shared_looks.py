@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from measure.matching import Match
 from measure.others import told_by_others
@@ -22,8 +23,13 @@ Array = NDArray[np.float64]
 _BLUR_SPREAD = 0.05  # of the logarithm: so much blur differs within a field
 _TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no more where its blur is known so well
 # Of the logarithm: so much exposure spreads the marks of a frame, as if two marks had shown it before. In three frames
-# of ring-crosses it was 0.005 to 0.008, in four of a réseau 0.014 to 0.021.
-_SIZE_SPREAD, _BEFORE = 0.03, 2
+# of ring-crosses it was 0.005 to 0.008, in four of a réseau 0.014 to 0.021: this is their root mean square.
+_SIZE_SPREAD, _BEFORE = 0.014, 2
+# What covers or touches a round mark moves its radius by so much, rms, and the share of marks that something touches:
+# of those with nothing cut out beside them, and with something.
+_TOUCHED_PX, _WHOLE, _DAMAGED = 0.3, 0.01, 0.1
+# What moves one place of an outline by d moves the mean radius by a share of d, and the centre by twice that share.
+_AS_MUCH = 2.0
 
 
 @dataclass(frozen=True)
@@ -50,14 +56,38 @@ def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
     ]
 
 
-def odd_sizes(fits: Sequence[Match], linear: Array) -> list[float | None]:
-    """How many times the others' size each mark has, of marks that are drawn alike and tell their own size; None where
-    that is one, or where they are too few. linear: (2, 2) px per mm, of the frame."""
+@dataclass(frozen=True)
+class SharedSize:
+    """A mark's size beside that of the others: ratio, and sigma, the standard deviation of the difference of their
+    logarithms. differs: whether it is another by more than chance."""
+
+    ratio: float
+    sigma: float
+    differs: bool
+
+    def touched_px2(self, radius_px: float, is_damaged: bool) -> float:
+        """The mean square of how far what may touch one side of a round mark has moved it, along a coordinate: of one
+        that is touched, times the probability that it is. is_damaged: whether something was cut out beside it."""
+        off_px, sigma_px = radius_px * np.log(self.ratio), radius_px * self.sigma
+        widened_px = np.hypot(sigma_px, _TOUCHED_PX)
+        share = _DAMAGED if is_damaged else _WHOLE
+        touched = share * stats.norm.pdf(off_px, scale=widened_px)
+        untouched = (1 - share) * stats.norm.pdf(off_px, scale=sigma_px)
+        return float((_AS_MUCH * off_px) ** 2 / 2 * touched / (touched + untouched))
+
+
+def shared_sizes(fits: Sequence[Match], linear: Array) -> list[SharedSize | None]:
+    """The size of each mark beside the others', of marks that are drawn alike and tell their own; None where they are
+    too few. linear: (2, 2) px per mm, of the frame."""
     own = np.array([np.log(np.linalg.det(fit.pixel_from_mark[:, :2]) / np.linalg.det(linear)) / 2 for fit in fits])
-    told = told_by_others(own, np.array([fit.size_sigma for fit in fits]), _size_spread)
+    sigma = np.array([fit.size_sigma for fit in fits])
     return [
-        None if each is None or not each.differs else float(np.exp(size - each.value))
-        for size, each in zip(own.tolist(), told, strict=True)
+        None
+        if told is None
+        else SharedSize(float(np.exp(size - told.value)), float(np.hypot(told.sigma, own_sigma)), told.differs)
+        for size, own_sigma, told in zip(
+            own.tolist(), sigma.tolist(), told_by_others(own, sigma, _size_spread), strict=True
+        )
     ]
 
 

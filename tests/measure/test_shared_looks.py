@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from measure.shared_looks import odd_sizes, shared_blurs
+from measure.shared_looks import SharedSize, shared_blurs, shared_sizes
 
 PIXEL = 1 / 12
 
@@ -48,13 +48,36 @@ def test_marks_of_one_size_are_rarely_doubted_and_another_size_is() -> None:
     doubted, found = 0, 0
     for _ in range(300):
         sigmas = rng.uniform(0.005, 0.05, 5)
-        sizes = 1.08 * np.exp(rng.normal(0, np.hypot(sigmas, 0.03)))  # of all alike: the drawing's fault
-        doubted += any(size is not None for size in odd_sizes(sized(sizes, sigmas, linear), linear))
+        sizes = 1.08 * np.exp(rng.normal(0, np.hypot(sigmas, 0.014)))  # of all alike: the drawing's fault
+        told = shared_sizes(sized(sizes, sigmas, linear), linear)
+        doubted += any(size is not None and size.differs for size in told)
         sizes[0], sigmas[0] = 0.85, 0.02
-        odd = odd_sizes(sized(sizes, sigmas, linear), linear)[0]
-        found += odd is not None and abs(odd - 0.79) < 0.08
+        odd = shared_sizes(sized(sizes, sigmas, linear), linear)[0]
+        found += odd is not None and odd.differs and abs(odd.ratio - 0.79) < 0.08
     assert doubted <= 12
     assert found > 270
+
+
+def test_what_touches_one_side_of_a_dot_widens_its_variance_and_chance_hardly_does() -> None:
+    rng, angle = np.random.default_rng(3), np.radians(np.arange(360.0))
+    radius_px, known_px = 5.4, 0.05
+    outline = np.column_stack([np.ones(360), np.cos(angle), np.sin(angle)])
+    off, widened, chance = [], [], []
+    for _ in range(500):
+        # One side of the outline lies elsewhere: the circle through it is what least squares make of it.
+        moved = np.where(angle < rng.uniform(0.5, 2.0), rng.normal(0.0, 2.0), 0.0)
+        size, *place = np.linalg.lstsq(outline, moved, rcond=None)[0] + rng.normal(0.0, known_px, 3)
+        off.append(np.hypot(*place))
+        widened.append(touched(1 + size / radius_px, known_px / radius_px, radius_px))
+        chance.append(touched(np.exp(rng.normal(0.0, known_px / radius_px)), known_px / radius_px, radius_px))
+    sigmas = np.array(off) / np.hypot(known_px, np.sqrt(widened))
+    assert np.mean(np.array(off) > 0.5) > 0.2
+    assert sigmas[np.array(off) > 0.5].max() < 5.0
+    assert np.mean(chance) < 0.05 * known_px**2
+
+
+def touched(ratio: float, sigma: float, radius_px: float) -> float:
+    return SharedSize(ratio, sigma, differs=False).touched_px2(radius_px, is_damaged=False)
 
 
 def sized(sizes: Any, sigmas: Any, linear: Any) -> list[Any]:
