@@ -27,7 +27,7 @@ def settle(sighter: FrameSighter) -> None:
     linear = sighter.pixel_from_camera[:, :2]
     unsettled = [
         index
-        for index, fit in _drawn(sighter).items()
+        for index, fit in _clear(sighter).items()
         if leans_on_frame(mark := sighter.layout.marks[index].mark)
         or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
     ]
@@ -83,19 +83,22 @@ def _radius_px(mark: Mark, linear: Array) -> float:
     return float(radius_mm * np.sqrt(abs(np.linalg.det(linear))))
 
 
-def _drawn(sighter: FrameSighter) -> dict[int, Match]:
-    """The fits of marks that belong, are plainly there and drawn: a picture of a mark has a blur of its own."""
+def _clear(sighter: FrameSighter) -> dict[int, Match]:
+    """The fits of marks that belong and are plainly there."""
     return {
         index: sighting.fit
-        for index, (mark, sighting) in enumerate(zip(sighter.layout.marks, sighter.sightings, strict=True))
-        if sighter.belongs[index] and sighter.clear(index) and isinstance(mark.mark, MarkShape)
-        if sighting is not None and sighting.fit is not None
+        for index, sighting in enumerate(sighter.sightings)
+        if sighter.belongs[index] and sighter.clear(index) and sighting is not None and sighting.fit is not None
     }
 
 
 def _adjusted(sighter: FrameSighter) -> dict[int, Match]:
-    """Those of them that are no glimpses."""
-    return {index: fit for index, fit in _drawn(sighter).items() if fit.covariance is not None}
+    """Those of them that are drawn, for a picture of a mark has a blur of its own, and no glimpses."""
+    return {
+        index: fit
+        for index, fit in _clear(sighter).items()
+        if fit.covariance is not None and isinstance(sighter.layout.marks[index].mark, MarkShape)
+    }
 
 
 def _frame_sigma(sighter: FrameSighter) -> float:

@@ -31,6 +31,7 @@ _NOISE_FLOOR = 0.002  # of the mean's range: under a picture's noise, for clean 
 _LEAST_WEIGHT = 1e-6  # of a pixel that lies off in all pictures
 _SMOOTH_PX = 0.7  # before slopes are taken: they are then free of most noise
 _ROOM_PX = 10  # about the chip, to move in
+_SPREAD_PX = 1.0  # over which it is averaged, for a few pictures alone hardly tell it, yet it changes at the edges
 _GRAIN_PX = 1.0  # taken where one picture cannot tell how far its grain reaches
 
 
@@ -87,6 +88,7 @@ def template_of(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
         noise_dn=float(np.median([_noise_dn(chip.grey) for chip in chips])),
         shares={chip.scan: float(share) for chip, share in zip(chips, shares, strict=True)},
         steady=steady,
+        steadiness=_steadiness(levelled, image, steady) if len(chips) > 1 else None,
     )
 
 
@@ -126,6 +128,15 @@ def _weighed(stack: Array) -> tuple[Array, Array, Mask]:
             alike[index] = tukey_weights(residual, scale)
             weights[index] = (alike[index] + _LEAST_WEIGHT) / scale**2
     return levelled, weights, cv2.GaussianBlur(alike.mean(axis=0), (0, 0), _SMOOTH_PX) > 0.5
+
+
+def _steadiness(levelled: Array, image: Array, steady: Mask) -> Array:
+    """(side, side) standard deviation of noise, which is what most of the steady pixels have, over that of the
+    differences between the pictures (n, side, side) and their mean."""
+    squares = ((levelled - image) ** 2).mean(axis=0)
+    about = np.sqrt(cv2.GaussianBlur(squares, (0, 0), _SPREAD_PX))
+    noise = max(float(np.median(about[steady])) if steady.any() else 0.0, _NOISE_FLOOR * float(np.ptp(image)), 1e-9)
+    return np.asarray(noise / np.maximum(about, noise))
 
 
 def _mean(stack: Array, weights: Array) -> Array:

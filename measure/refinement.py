@@ -16,7 +16,7 @@ from measure.matching import Match, MatchOptions, match, window_about
 from measure.prediction import MarkPrediction
 from measure.rendering import extent_px
 from measure.scan import Scan
-from measure.shapes import Disk, FrameCorner, Mark, MarkShape, Polygon
+from measure.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
 from measure.surroundings import CLOSE
 
 Array = NDArray[np.float64]
@@ -137,9 +137,9 @@ def _is_solid(mark: Mark) -> bool:
 
 
 def leans_on_frame(mark: Mark) -> bool:
-    """Whether the mark's own picture does not tell its scale from its place, as of a wedge's or a notch's edges: then
-    rotation and scale come from the other marks."""
-    return isinstance(mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.parts)
+    """Whether the mark's own picture may not tell its scale from its place, as a wedge's or a notch's edges do not, nor
+    a chip of them: then rotation and scale come from the other marks."""
+    return isinstance(mark, MarkTemplate) or all(isinstance(part, Polygon) for part in mark.parts)
 
 
 def strained_px(mark: Mark, fitted: Array, linear: Array) -> float:

@@ -105,6 +105,14 @@ def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: in
     return np.asarray(inside)
 
 
+def chip_steadiness(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> Array:
+    """(height, width): the chip's steadiness, 1 where it is not known."""
+    if mark.steadiness is None:
+        return np.ones((height, width))
+    col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
+    return np.asarray(ndimage.map_coordinates(mark.steadiness, [row, col], order=1, mode="nearest"))
+
+
 @dataclass(frozen=True, eq=False)
 class _Drawing:
     """A mark without blur: sharp (rows, columns) in cells, so many along a pixel's side. first: pixel (col, row) of the

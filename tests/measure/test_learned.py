@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from brute_marks import brute_picture
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
 
 from measure.learned import Chip, honest_covariance, template_of
 from measure.matching import MatchOptions, match
@@ -89,3 +91,27 @@ def test_what_recurs_is_found_among_what_changes() -> None:
     assert found.excess > 0.3
     np.testing.assert_allclose(found.offset_mm, (0.55, 0.65), atol=0.11)  # its middle, (41.5, 29.5), from (36, 36)
     assert recurrence(windows[0], [rng.normal(0, 1, (73, 73)).astype(np.float32)] * 3, 2.4).excess < 0.15
+
+
+def test_a_corner_of_the_border_beside_a_lighter_landscape_is_known_less_surely() -> None:
+    """Learned beside a landscape of 150, seen beside one of 230, each rough in its own way, whose glow on the border
+    does not grow with it: both edges seem to lie elsewhere, as the standard deviations have to say."""
+    rng = np.random.default_rng(6)
+    template = template_of([corner(rng, 150.0, 30 + rng.uniform(-0.5, 0.5, 2)) for _ in range(3)], SIZE_MM)
+    for place in 30 + rng.uniform(-0.5, 0.5, (4, 2)):
+        seen = corner(rng, 230.0, place)
+        start = np.column_stack([seen.pixel_from_mark[:, :2], np.rint(place)])
+        fit = match(seen.grey, (0, 0), template, start, MatchOptions(freedom="shift"))
+        error = fit.center_px - place
+        assert fit.converged
+        assert np.abs(error).max() < 0.6
+        assert error @ np.linalg.solve(fit.covariance_px2, error) < 3.0**2
+
+
+def corner(rng: np.random.Generator, level_dn: float, place: Array) -> Chip:
+    """A landscape's corner, right of and below a place, in a border on which it glows."""
+    right, below = np.arange(SIDE) - place[0], (np.arange(SIDE) - place[1])[:, None]
+    share, glow = (ndtr(right / blur_px) * ndtr(below / blur_px) for blur_px in (0.8, 3.0))
+    landscape = level_dn + 13.0 * gaussian_filter(rng.normal(0, 6.0, share.shape), 1.7)
+    grey = (1 - share) * (30.0 + 80.0 * glow) + share * landscape + rng.normal(0, 1.5, share.shape)
+    return Chip("frame", grey, (0, 0), np.column_stack([PX_PER_MM * np.diag([1.0, -1.0]), place]))
