@@ -2,6 +2,7 @@
 look so."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -19,20 +20,20 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 _CHANCE = 0.05  # of noise as coarse as the window's: what is likelier is not worth a fit
+_SURE = 1e-6  # what is less likely is the mark, however soft: there are many marks
 _HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows it as well
 _SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
 
 
 def seen(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None:
-    """Column and row of the scan within the search radius where the mark correlates best, drawn sharp or else soft, to
-    a part of a pixel, and the expected number of places there that noise makes answer so well; None where noise would
-    do so."""
-    for blur_px in (_SHARP_PX, _SOFT_PX):
-        look = _Look(scan, expected, blur_px)
-        chance = look.chance()
-        if chance <= _CHANCE:
-            return look.center_px, chance
-    return None
+    """Column and row of the scan within the search radius where the mark correlates best, to a part of a pixel, and the
+    expected number of places there that noise makes answer so well; None where noise would do so. Drawn sharp or soft,
+    whichever noise is less likely to answer so: a soft faint mark, drawn sharp, is no more than its noise."""
+    looks = [_Look(scan, expected, _SHARP_PX)]
+    if looks[0].chance > _SURE:
+        looks.append(_Look(scan, expected, _SOFT_PX))
+    best = min(looks, key=lambda look: look.chance)
+    return (best.center_px, best.chance) if best.chance <= _CHANCE else None
 
 
 def strongest(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
@@ -77,6 +78,7 @@ class _Look:
         self.center_px = (top + np.array([col0, row0]) - low) * reduction + shift_px
         self.height = float(response[self._best])
 
+    @cached_property
     def chance(self) -> float:
         """The expected number of places that noise makes answer so well. The correlation of two rows of numbers, each
         with its own autocorrelation, varies by the sum of the products of these over how many they are (Bartlett,
