@@ -143,14 +143,6 @@ class Factor:
             result[block.own] = np.linalg.solve(block.triangle, root - block.border @ shared[block.shared])
         return result / self.scale[:, None]
 
-    def row_roots(self, blocks: Iterable[Blocks]) -> Iterator[Array]:
-        """G (b, m, k) of blocks as these were factorised: G G' are the cofactor matrices of each one's adjusted rows.
-
-        The adjusted rows are the matrix times the unknowns.
-        """
-        for rows in self.reduced_rows(blocks):
-            yield np.concatenate([rows.own, rows.through @ self.triangle.root_of(rows.shared)], axis=2)
-
     def reduced_rows(self, blocks: Iterable[Blocks]) -> Iterator["ReducedRows"]:
         """The adjusted rows of blocks that own and share what those factorised do, one after the other."""
         for rows, block in zip(blocks, self.blocks, strict=True):

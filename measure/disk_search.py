@@ -1,5 +1,4 @@
-"""Round targets found in the whole frame, in one pass over its blocks: patches of a disk's shape, then least-squares
-matching of each."""
+"""Round targets found in the whole frame, in one pass over its blocks: patches that a disk explains, not yet fitted."""
 
 from dataclasses import dataclass
 
@@ -10,7 +9,6 @@ from measure.block import Block
 from measure.block_search import search_blocks
 from measure.disk_batch import disks_among
 from measure.disk_patches import Candidate, DiskSearch, margin_px, patches
-from measure.disks import FittedDisk, fit_disk
 from measure.scan import Scan
 
 Array = NDArray[np.float64]
@@ -20,25 +18,6 @@ SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk sta
 SIZE_TOLERANCE = 1.4  # of what is found, to the sizes that are looked for
 WIDEST_PX = 12288  # of what is looked at in one piece
 SEARCH_RADIUS_PX = 2.0  # reduced so far that the smallest disk of an octave has at least this radius
-
-
-def find_disks(scan: Scan, search: DiskSearch) -> tuple[FittedDisk, ...]:
-    """All disks of the frame that the fit does not refuse and that are no spots, from top to bottom."""
-    patches = disk_candidates(scan, search)
-    fitted = scan.each(lambda patch: fit_disk(scan, patch.center_px, patch.pixel_from_disk), patches)
-    sharp = (disk for disk in fitted if not (disk.reason or disk.is_soft))
-    kept = [disk for disk in sharp if disk.half_axes_px[0] < search.diameter_px[1]]
-    return tuple(sorted(without_doubles(kept), key=lambda disk: (disk.center_px[1], disk.center_px[0])))
-
-
-def without_doubles(disks: list[FittedDisk]) -> list[FittedDisk]:
-    """Of disks found twice, one."""
-    kept: list[FittedDisk] = []
-    for disk in disks:
-        reach = disk.half_axes_px[1]
-        if all(np.hypot(*(disk.center_px - other.center_px)) > reach for other in kept):
-            kept.append(disk)
-    return kept
 
 
 def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:

@@ -25,7 +25,6 @@ EXTERIOR = {
     "phi_deg": ("angles_deg", 1),
     "kappa_deg": ("angles_deg", 2),
 }
-COUNTS = ("field.points", "images", "camera.fiducials")
 PLANNING_PITCH_UM = 20.0  # a scene that is only planned need not say how it is scanned
 
 

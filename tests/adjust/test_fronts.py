@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from null_directions import AXES
 from numpy.typing import NDArray
+from row_roots import row_roots
 from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 from simulated import Truth, simulated
@@ -104,7 +105,7 @@ def test_a_strip_in_fronts_has_the_inverse_of_its_sparse_normal_equations(
     found = factor.cofactors(images) * scale[images][:, :, None] * scale[images][:, None, :]
     unit = sigma[images][:, :, None] * sigma[images][:, None, :]
     np.testing.assert_allclose(found / unit, expected / unit, atol=tolerance)
-    for block, roots in zip(at.rows, factor.row_roots(at.rows), strict=True):
+    for block, roots in zip(at.rows, row_roots(factor, at.rows), strict=True):
         columns = np.concatenate([block.own, block.shared], axis=1)
         matrix = block.matrix / scale[columns][:, None, :]
         expected = matrix @ inverse[columns[:, :, None], columns[:, None, :]] @ matrix.swapaxes(1, 2)
@@ -170,7 +171,7 @@ def test_variances_along_a_line_are_those_of_its_differences(
     factor, blocks = levelled(count, weight)
     assert len(factor.triangle.fronts) == count - 1
     np.testing.assert_allclose(factor.variances(), weight**-2 + 0.5 * np.arange(count), rtol=1e-9)
-    (roots,) = factor.row_roots(blocks)
+    (roots,) = row_roots(factor, blocks)
     np.testing.assert_allclose(roots @ roots.swapaxes(1, 2), np.full((count - 1, 2, 2), 0.5), atol=1e-9)
 
 

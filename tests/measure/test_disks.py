@@ -8,8 +8,9 @@ from scipy.ndimage import gaussian_filter
 
 from measure.block_search import search_blocks
 from measure.disk_patches import DiskSearch
-from measure.disk_search import disk_candidates, find_disks, octaves_of
-from measure.disks import fit_disk
+from measure.disk_search import disk_candidates, octaves_of
+from measure.disks import FittedDisk, fit_disk
+from measure.scan import Scan
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 600.0, 12000.0
@@ -70,9 +71,16 @@ def field(rng: np.random.Generator, count: int) -> tuple[Array, list[Array]]:
     return picture, centers
 
 
+def fitted_disks(scan: Scan, search: DiskSearch) -> list[FittedDisk]:
+    """What is found in the whole frame, fitted, less what the fit refuses and soft spots."""
+    found = disk_candidates(scan, search)
+    fitted = (fit_disk(scan, candidate.center_px, candidate.pixel_from_disk) for candidate in found)
+    return [disk for disk in fitted if not (disk.reason or disk.is_soft)]
+
+
 def test_all_disks_of_a_frame_and_nothing_else() -> None:
     picture, centers = field(np.random.default_rng(3), 32)
-    found = find_disks(scan_of(picture), DiskSearch((5.0, 30.0), "light"))
+    found = fitted_disks(scan_of(picture), DiskSearch((5.0, 30.0), "light"))
     nearest = [min(float(np.hypot(*(disk.center_px - center))) for center in centers) for disk in found]
     hit = {int(np.argmin([np.hypot(*(disk.center_px - center)) for center in centers])) for disk in found}
     assert max(nearest) < 0.5
@@ -85,7 +93,7 @@ def test_a_disk_on_the_border_of_two_blocks_is_found_once() -> None:
     picture = GROUND + rng.normal(0, NOISE, (1700, 120))
     center = np.array([60.2, 1535.9])
     picture[1500:1570] += CONTRAST * drawn(ellipse(center - (0, 1500), np.eye(2) * 7), 120, 70, 0.9)
-    found = find_disks(scan_of(picture), DiskSearch((8.0, 24.0)))
+    found = fitted_disks(scan_of(picture), DiskSearch((8.0, 24.0)))
     assert len(found) == 1
     assert np.abs(found[0].center_px - center).max() < 0.03
 
@@ -99,7 +107,7 @@ def test_texture_holds_hardly_any_disks() -> None:
     disks = disk_candidates(scan, search)
     assert len(patches) > 20
     assert len(disks) <= len(patches) / 2
-    assert len(find_disks(scan, search)) <= len(patches) / 5
+    assert len(fitted_disks(scan, search)) <= len(patches) / 5
 
 
 @pytest.mark.parametrize(("snr", "blur_px"), [(10.0, 0.7), (50.0, 1.5)])
