@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
+PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images")
 
 
 def test_every_name_in_the_theory_exists() -> None:
@@ -75,3 +76,11 @@ def script(name: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def test_every_module_stands_on_the_map_of_the_code() -> None:
+    page = (DOCS / "code.md").read_text(encoding="utf-8")
+    told = re.findall(r"^- `([\w.]+)`: ", page, flags=re.MULTILINE)
+    root = DOCS.parent
+    files = [path for package in PACKAGES for path in (root / package).rglob("*.py") if path.name != "__init__.py"]
+    assert sorted(told) == sorted(".".join(path.relative_to(root).with_suffix("").parts) for path in files)
