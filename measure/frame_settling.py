@@ -12,8 +12,9 @@ from measure.match_options import MatchOptions
 from measure.matching import Match
 from measure.picture_model import is_round
 from measure.refinement import leans_on_frame, sight, strained_px
+from measure.rendering import reach_px
 from measure.shapes import Disk, Mark, MarkShape, Ring
-from measure.shared_looks import shared_blurs, shared_sizes
+from measure.shared_looks import round_moves_px, shared_blurs, shared_shapes, shared_sizes
 
 Array = NDArray[np.float64]
 
@@ -73,7 +74,31 @@ def compare_sizes(sighter: FrameSighter) -> None:
                 sighter.doubt(index, reason)
             if size is not None and is_round(mark):
                 radius_px = _radius_px(mark, fits[index].pixel_from_mark[:, :2])
-                sighter.widen(index, size.touched_px2(radius_px, fits[index].damaged_fraction > 0))
+                moved_px = round_moves_px(size, radius_px)
+                sighter.widen(index, size.touched_px2(moved_px, radius_px, fits[index].damaged_fraction > 0))
+
+
+def compare_shapes(sighter: FrameSighter) -> None:
+    """The same of marks that do not tell their own rotation and scale from their place: what their pictures say of
+    these beside the frame's, and beside what the others say."""
+    fits = _adjusted(sighter)
+    own = {
+        index: fit.own_shape
+        for index, fit in fits.items()
+        if fit.own_shape is not None and leans_on_frame(sighter.layout.marks[index].mark)
+    }
+    for (index, shape), other in zip(own.items(), shared_shapes(list(own.values())), strict=True):
+        if other is None:
+            continue
+        if other.differs:
+            turn_deg = np.degrees(other.off[1])
+            reason = (
+                f"its edges make it {other.ratio:.2f} times as large as the other marks, and turned by {turn_deg:.1f}"
+            )
+            sighter.doubt(index, f"{reason} degrees: something may cover or touch it")
+        middle_px = reach_px(sighter.layout.marks[index].mark, fits[index].pixel_from_mark[:, :2]) / 2
+        moved_px = float(np.hypot(*(shape.on_place @ other.off)))
+        sighter.widen(index, other.touched_px2(moved_px, middle_px, fits[index].damaged_fraction > 0))
 
 
 def _radius_px(mark: Mark, linear: Array) -> float:

@@ -3,7 +3,7 @@
 from measure.constellation import Placement
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
-from measure.frame_settling import compare_sizes, settle, share_blur
+from measure.frame_settling import compare_shapes, compare_sizes, settle, share_blur
 from measure.frame_sighter import MANY, FrameSighter
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
@@ -35,4 +35,5 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
     settle(sighter)
     share_blur(sighter)
     compare_sizes(sighter)
+    compare_shapes(sighter)
     return sighter.frame()

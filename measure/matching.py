@@ -21,8 +21,9 @@ from measure.grain import grain_model
 from measure.match_options import MatchOptions
 from measure.noise import is_textured, noise_model
 from measure.other_place import OtherPlace
+from measure.own_shape import OwnShape, own_shape
 from measure.picture_fit import PictureFit
-from measure.picture_model import GREY, PictureModel, State, background_px
+from measure.picture_model import GREY, PictureModel, State, background_px, is_round
 from measure.pixel_sums import combined, factors
 from measure.rendering import extent_px
 from measure.shapes import Mark, MarkTemplate
@@ -50,7 +51,8 @@ class Match:
     significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
     share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
     of its range. edges: the mark's place by another method, to compare;
-    sloping: an ellipse's, if its paint may grow lighter or darker from side to side.
+    sloping: an ellipse's, if its paint may grow lighter or darker from side to side. own_shape: what the picture says
+    of rotation and scale, where the frame gave them.
     """
 
     converged: bool
@@ -71,6 +73,7 @@ class Match:
     size_sigma: float = np.inf
     edges: OtherPlace | None = None
     sloping: OtherPlace | None = None
+    own_shape: OwnShape | None = None
     covariance: Array | None = None
 
     @property
@@ -201,6 +204,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
     covariance, gain_sigma = np.full((len(model.design),) * 2, np.inf), np.inf
     edges: OtherPlace | None = None
     sloping: OtherPlace | None = None
+    own: OwnShape | None = None
     if not fit.reason:
         patches = blank_patches(window, free, noise.variance_dn2)
         if not noise.is_white or is_coloured(patches):
@@ -213,6 +217,8 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         edges = edge_place(model.residuals, used, model.design, by_grey, noise, model.blur_px)
         if model.options.freedom == "ellipse" and model.background_px is None:
             sloping = sloping_place(model.residuals, used, model.design, by_grey, noise)
+        if model.options.freedom == "similarity" and not is_round(model.mark):
+            own = own_shape(model.residuals, used, model.design, by_grey, noise, model.linear, model.departures())
     state = model.state
     return Match(
         converged=not fit.reason,
@@ -233,6 +239,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         size_sigma=float(np.sqrt(covariance[2, 2])) if model.tells_size else np.inf,
         edges=edges,
         sloping=sloping,
+        own_shape=own,
         covariance=covariance,
     )
 

@@ -16,16 +16,18 @@ from scipy import stats
 
 from measure.matching import Match
 from measure.others import told_by_others
+from measure.own_shape import OwnShape
 from measure.picture_model import PIXEL_VARIANCE_PX2
 
 Array = NDArray[np.float64]
 
 _BLUR_SPREAD = 0.05  # of the logarithm: so much blur differs within a field
 _TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no more where its blur is known so well
-# Of the logarithm: so much exposure spreads the marks of a frame, as if two marks had shown it before. In three frames
-# of ring-crosses it was 0.005 to 0.008, in four of a réseau 0.014 to 0.021: this is their root mean square.
+# Of the logarithm, and of the rotation that edges of uneven exposure give: so much it the marks of a frame, as
+# if two marks had shown it before. In three frames of ring-crosses it was 0.005 to 0.008, in four of a réseau 0.014 to
+# 0.021: this is their root mean square.
 _SIZE_SPREAD, _BEFORE = 0.014, 2
-# What covers or touches a round mark moves its radius by so much, rms, and the share of marks that something touches:
+# What touches a mark on one side moves its mean outline by so much, rms, and the share of marks that something touches:
 # of those with nothing cut out beside them, and with something.
 _TOUCHED_PX, _WHOLE, _DAMAGED = 0.3, 0.01, 0.1
 # What moves one place of an outline by d moves the mean radius by a share of d, and the centre by twice that share.
@@ -56,39 +58,63 @@ def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
     ]
 
 
-@dataclass(frozen=True)
-class SharedSize:
-    """A mark's size beside that of the others: ratio, and sigma, the standard deviation of the difference of their
-    logarithms. differs: whether it is another by more than chance."""
+@dataclass(frozen=True, eq=False)
+class SharedShape:
+    """A mark's shape beside that of the others: off (k,), the logarithm of its size less theirs, and its rotation (rad)
+    too where the frame gave it; sigma (k,): standard deviations of these. differs: whether it is another by more than
+    chance."""
 
-    ratio: float
-    sigma: float
+    off: Array
+    sigma: Array
     differs: bool
 
-    def touched_px2(self, radius_px: float, is_damaged: bool) -> float:
-        """The mean square of how far what may touch one side of a round mark has moved it, along a coordinate: of one
-        that is touched, times the probability that it is. is_damaged: whether something was cut out beside it."""
-        off_px, sigma_px = radius_px * np.log(self.ratio), radius_px * self.sigma
-        widened_px = np.hypot(sigma_px, _TOUCHED_PX)
+    @property
+    def ratio(self) -> float:
+        """How many times the others' size it has."""
+        return float(np.exp(self.off[0]))
+
+    def touched_px2(self, moved_px: float, reach_px: float, is_damaged: bool) -> float:
+        """The mean square of how far what may touch one side of the mark has moved it, along a coordinate: of a mark
+        that is touched, times the probability that it is.
+
+        moved_px: how far a mark of such a shape is moved; reach_px: from its middle to its outline. is_damaged: whether
+        something was cut out beside it.
+        """
         share = _DAMAGED if is_damaged else _WHOLE
-        touched = share * stats.norm.pdf(off_px, scale=widened_px)
-        untouched = (1 - share) * stats.norm.pdf(off_px, scale=sigma_px)
-        return float((_AS_MUCH * off_px) ** 2 / 2 * touched / (touched + untouched))
+        touched = share * np.prod(stats.norm.pdf(self.off, scale=np.hypot(self.sigma, _TOUCHED_PX / reach_px)))
+        untouched = (1 - share) * np.prod(stats.norm.pdf(self.off, scale=self.sigma))
+        return moved_px**2 / 2 * float(touched) / max(float(touched + untouched), 1e-300)
 
 
-def shared_sizes(fits: Sequence[Match], linear: Array) -> list[SharedSize | None]:
+def round_moves_px(shape: SharedShape, radius_px: float) -> float:
+    """How far what touches one side of a round mark moves it, where it gives it such a size."""
+    return _AS_MUCH * radius_px * abs(float(shape.off[0]))
+
+
+def shared_sizes(fits: Sequence[Match], linear: Array) -> list[SharedShape | None]:
     """The size of each mark beside the others', of marks that are drawn alike and tell their own; None where they are
     too few. linear: (2, 2) px per mm, of the frame."""
     own = np.array([np.log(np.linalg.det(fit.pixel_from_mark[:, :2]) / np.linalg.det(linear)) / 2 for fit in fits])
-    sigma = np.array([fit.size_sigma for fit in fits])
-    return [
-        None
-        if told is None
-        else SharedSize(float(np.exp(size - told.value)), float(np.hypot(told.sigma, own_sigma)), told.differs)
-        for size, own_sigma, told in zip(
-            own.tolist(), sigma.tolist(), told_by_others(own, sigma, _size_spread), strict=True
-        )
-    ]
+    return _beside_others(own[:, None], np.array([[fit.size_sigma] for fit in fits]))
+
+
+def shared_shapes(shapes: Sequence[OwnShape]) -> list[SharedShape | None]:
+    """The same of marks whose sizes and rotations the frame gave, by what their own pictures say of them."""
+    return _beside_others(np.array([shape.change for shape in shapes]), np.array([shape.sigma for shape in shapes]))
+
+
+def _beside_others(own: Array, sigma: Array) -> list[SharedShape | None]:
+    """own, sigma (n, k): each mark's figures."""
+    told = [told_by_others(*pair, _size_spread) for pair in zip(own.T, sigma.T, strict=True)]
+    result: list[SharedShape | None] = []
+    for figures, sigmas, each in zip(own, sigma, zip(*told, strict=True), strict=True):
+        known = [one for one in each if one is not None]
+        if len(known) < len(figures):
+            result.append(None)
+            continue
+        off, beside = figures - [one.value for one in known], np.hypot(sigmas, [one.sigma for one in known])
+        result.append(SharedShape(off, beside, any(one.differs for one in known)))
+    return result
 
 
 def _blur_spread(shown: float, marks: int) -> float:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from measure.shared_looks import SharedSize, shared_blurs, shared_sizes
+from measure.shared_looks import SharedShape, round_moves_px, shared_blurs, shared_sizes
 
 PIXEL = 1 / 12
 
@@ -77,7 +77,8 @@ def test_what_touches_one_side_of_a_dot_widens_its_variance_and_chance_hardly_do
 
 
 def touched(ratio: float, sigma: float, radius_px: float) -> float:
-    return SharedSize(ratio, sigma, differs=False).touched_px2(radius_px, is_damaged=False)
+    shape = SharedShape(np.log([ratio]), np.array([sigma]), differs=False)
+    return shape.touched_px2(round_moves_px(shape, radius_px), radius_px, is_damaged=False)
 
 
 def sized(sizes: Any, sigmas: Any, linear: Any) -> list[Any]:
