@@ -6,12 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, get_args
 
-import numpy as np
-
 from adjust import network
 from adjust.families import FAMILY_NAMES, family, parameter_names
 from measure import shapes
-from measure.rendering import extent_px
+from pipeline.camera_units import check_units
 from pipeline.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.errors import InputError
 from pipeline.images_file import image_name
@@ -22,7 +20,6 @@ from pipeline.tables import Table, read_toml
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
 LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
 CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
-FIELD_RATIO = 50.0  # of principal distance and half the diagonal, either way: 2.3 degrees of field to 178
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
 
 
@@ -169,7 +166,8 @@ def parse_camera(table: Table) -> CameraFile:
     if frame is not None and min(frame) <= 0.0:
         raise table.error("frame_mm", f"must be two positive lengths, [width, height], not {list(frame)}.")
     if frame is not None:
-        _check_units(table, frame, distance, fiducials)
+        entries = zip(table.tables("fiducial"), fiducials, strict=True)
+        check_units(table, frame, distance, [(entry, one.xy_mm, one.mark) for entry, one in entries])
     camera = CameraFile(
         path=table.file,
         name=table.text("name", table.file.stem),
@@ -187,38 +185,6 @@ def parse_camera(table: Table) -> CameraFile:
     camera = replace(camera, calibration=read_calibration(sigma, camera.camera()))
     sigma.done()
     return camera
-
-
-def _check_units(
-    table: Table, frame_mm: tuple[float, float], distance_mm: float | None, fiducials: Sequence[GivenFiducial]
-) -> None:
-    """Refuse lengths that beside the frame's cannot be mm: metres or um taken for them are off by a thousand."""
-    frame = f"the frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm"
-    half_diagonal = math.hypot(*frame_mm) / 2
-    if distance_mm is not None and not 1 / FIELD_RATIO < distance_mm / half_diagonal < FIELD_RATIO:
-        raise table.error(
-            "principal_distance_mm",
-            f"{distance_mm:g} mm is impossible for {frame}. Give both in mm.",
-        )
-    apart_mm = float(np.ptp([one.xy_mm for one in fiducials], axis=0).max()) if len(fiducials) > 1 else math.inf
-    for entry, fiducial in zip(table.tables("fiducial"), fiducials, strict=True):
-        if max(map(abs, fiducial.xy_mm)) > 2 * max(frame_mm):
-            raise entry.error("xy_mm", f"lies far outside of {frame}. Give mm from its middle.")
-        if apart_mm < max(frame_mm) / FIELD_RATIO:
-            raise entry.error("xy_mm", f"all fiducials lie within {apart_mm:.3g} mm, in {frame}. Give mm.")
-        if _size_mm(fiducial.mark) > min(frame_mm) / 2:
-            raise entry.error(
-                "mark", f"is drawn {_size_mm(fiducial.mark):.4g} mm large, in {frame}. Give its sizes in mm."
-            )
-
-
-def _size_mm(mark: shapes.Mark | shapes.LearnedMark | None) -> float:
-    """Width or height, whichever is larger; 0 where nothing is drawn, or the frame's edges themselves are."""
-    if mark is None or isinstance(mark, shapes.FrameCorner):
-        return 0.0
-    if isinstance(mark, shapes.LearnedMark):
-        return mark.size_mm
-    return float(np.ptp(extent_px(mark, np.eye(2, 3)), axis=0).max())
 
 
 def _side(table: Table, key: str) -> shapes.Side | None:
