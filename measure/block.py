@@ -40,10 +40,12 @@ class Block:
         end = np.minimum(np.add(self.place_px, self.size_px), (self.scan.width_px, self.scan.height_px))
         return np.asarray((places >= first[:, None]) & (places < end[:, None]))
 
-    def grey_at(self, col: NDArray[np.intp], row: NDArray[np.intp]) -> Image:
-        """Grey values at columns and rows of the scan; of those beyond the block, any of its values."""
+    def grey_at(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Image:
+        """(n, count) grey values at columns and rows (n, count) from places corners (n, 2) of the scan on; beyond the
+        block any of its values."""
         width, height = self.size_px
-        at = (row - self.row0) * width + (col - self.col0)
+        at = row * width + col
+        at += (corners - self.place_px) @ np.array([[1], [width]])
         return weighted(self.samples.reshape(width * height, -1).take(at, axis=0, mode="clip"), self.scan.weights)
 
     def reductions(self, factors: Iterable[int]) -> dict[int, Image]:
@@ -59,7 +61,7 @@ class Block:
         return known
 
 
-def nearly_means(samples: Samples, factor: int) -> Image:
+def nearly_means(samples: Samples, factor: int) -> Samples | Image:
     """(height / factor, width / factor, channels) means over squares, by an even factor from means of four rounded to
     whole grey values, again and again: in a quarter of the time, and a grey value is no matter in a search."""
     while factor % 2 == 0:
@@ -67,4 +69,4 @@ def nearly_means(samples: Samples, factor: int) -> Image:
         half = cv2.resize(samples, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
         samples = half.astype(samples.dtype, copy=False).reshape(height // 2, width // 2, channels)
         factor //= 2
-    return means(samples, factor)
+    return samples if factor == 1 else means(samples, factor)

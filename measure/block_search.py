@@ -96,9 +96,11 @@ def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Candidate]:
         for col0 in range(0, width // factor, part):
             first, last = spare + col0, spare + min(col0 + part, width // factor) + 2 * margin
             place = np.array([block.col0, block.row0]) + factor * np.array([first, spare]) + (factor - 1) / 2
-            for patch in octave.patches(small[rows, first:last]):
-                center = patch.center_px * factor + place
-                if center[0] < block.scan.width_px - 0.5 and center[1] < block.scan.height_px - 0.5:
+            found = octave.patches(small[rows, first:last])
+            centers = np.array([patch.center_px for patch in found]).reshape(-1, 2) * factor + place
+            are_inside = (centers < np.array([block.scan.width_px, block.scan.height_px]) - 0.5).all(axis=1)
+            for patch, center, is_inside in zip(found, centers, are_inside.tolist(), strict=True):
+                if is_inside:
                     yield Candidate(center, patch.pixel_from_disk * factor, patch.contrast_dn)
 
 
@@ -107,7 +109,8 @@ def separate(found: list[Candidate]) -> list[Candidate]:
     found = sorted(found, key=strength)
     centers = np.array([patch.center_px for patch in found]).reshape(-1, 2)
     radii = np.array([patch.radius_px for patch in found])
-    kept = np.zeros(len(found), bool)
+    kept: set[int] = set()
     for index, near in enumerate(cKDTree(centers).query_ball_point(centers, 0.7 * radii) if found else ()):
-        kept[index] = not kept[near].any()
-    return [patch for patch, is_kept in zip(found, kept, strict=True) if is_kept]
+        if kept.isdisjoint(near):
+            kept.add(index)
+    return [found[index] for index in sorted(kept)]

@@ -44,8 +44,7 @@ class DiskPixels:
 
     def grey(self, block: Block) -> Image:
         """(n, pixels)"""
-        col, row = self.places
-        return block.grey_at(self.corners[:, :1] + col, self.corners[:, 1:] + row)
+        return block.grey_at(self.corners, *self.places)
 
     def correlation(self, residuals: Image) -> Array:
         """(n,) of residuals (n, pixels) with those beside and below."""

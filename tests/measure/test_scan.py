@@ -305,8 +305,10 @@ def test_a_block_is_a_part_of_the_scan_and_of_its_reductions(tmp_path: Path, cha
     tifffile.imwrite(tmp_path / "s.tif", picture(np.uint16, channels), tile=(32, 48), compression="lzw")
     with open_scan(tmp_path / "s.tif") as scan:
         block = Block(scan, 12, 0, 12, scan.samples(12, 0, 72, 60))
-        cols, rows = np.arange(20, 60), np.arange(3, 43)[:, None]
-        np.testing.assert_array_equal(block.grey_at(cols, rows), scan.window(20, 3, 40, 40))
+        rows, cols = np.indices((40, 40)).reshape(2, 1, -1)
+        for col0, row0 in ((20, 3), (31, 4)):
+            grey = block.grey_at(np.array([[col0, row0]]), cols, rows)
+            np.testing.assert_array_equal(grey.reshape(40, 40), scan.window(col0, row0, 40, 40))
         for factor, small in block.reductions({2, 3, 4}).items():
             row, col, height, width = 0, 12 // factor, 60 // factor, 72 // factor
             part = scan.reduced(factor)[row : row + height, col : col + width]
