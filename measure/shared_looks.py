@@ -29,7 +29,7 @@ _TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no
 _SIZE_SPREAD, _BEFORE = 0.014, 2
 # What touches a mark on one side moves its mean outline by so much, rms, and the share of marks that something touches:
 # of those with nothing cut out beside them, and with something.
-_TOUCHED_PX, _WHOLE, _DAMAGED = 0.3, 0.01, 0.1
+_TOUCHED_PX, _WHOLE, _DAMAGED = 0.3, 0.01, 0.03
 # What moves one place of an outline by d moves the mean radius by a share of d, and the centre by twice that share.
 _AS_MUCH = 2.0
 
