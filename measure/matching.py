@@ -114,9 +114,11 @@ def match(
     start[:, 2] -= origin_px
     given = _Window(np.where(usable, grey, 0.0), usable, sides, mark, start, is_lossy)
     part, fit = _fitted(given, options)
-    if fit.reason or is_textured(fit.model.residuals, fit.telling, fit.floor_dn):
+    if not _is_right(fit):
         detail_part, detail = _fitted(given, options, background_px(mark, start))
-        part, fit = (part, fit) if detail.reason else (detail_part, detail)
+        if not detail.reason:
+            whole = _with_ground(given, detail_part, detail) if fit.reason else fit
+            part, fit = detail_part, whole if _is_right(whole) else detail
     free = blank.copy()
     free[part.rows, part.cols] &= ~fit.area
     result = _result(fit, given.grey, free)
@@ -161,6 +163,21 @@ def _fitted(window: _Window, options: MatchOptions, coarse_px: float | None = No
         fit.choose_area()
     fit.refine()
     return part, fit
+
+
+def _is_right(fit: PictureFit) -> bool:
+    """Whether it came to an end and leaves no landscape."""
+    return not fit.reason and not is_textured(fit.model.residuals, fit.telling, fit.floor_dn)
+
+
+def _with_ground(window: _Window, part: _Part, detail: PictureFit) -> PictureFit:
+    """The mark fitted with its ground from where its detail alone was fitted: a large speck carries the first steps,
+    which are plain least squares, away from a mark, and not those of its detail."""
+    state = detail.model.state.moved(np.zeros(2))
+    fit = _begun(window, part, detail.options, None, state)
+    fit.choose_area()
+    fit.refine()
+    return fit
 
 
 def _begun(

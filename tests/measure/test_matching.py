@@ -158,6 +158,20 @@ def test_dust_is_cut_out() -> None:
     assert 0.02 < np.mean(fractions) < 0.25
 
 
+def test_a_large_speck_costs_what_it_covers() -> None:
+    """Even where it carries plain least squares away from the mark."""
+    rng = np.random.default_rng(31)
+    for index in range(24):
+        shown, place = drawn("cross", 1.0)[index % PHASES]
+        speck = brute_picture(MarkShape(dot(0.4)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 1.0)
+        clean = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / 20, shown.shape)
+        grey = clean + 2 * CONTRAST * speck
+        found = match(grey, (0, 0), MARKS["cross"], place + np.array([0, 0, 0.5]))
+        told = match(grey, (0, 0), MARKS["cross"], place, valid=speck < 0.01)
+        assert found.sigma_px < 1.1 * told.sigma_px
+        assert np.hypot(*(found.center_px - told.center_px)) < told.sigma_px
+
+
 @pytest.mark.parametrize("grain_px", [0.8, 1.3])
 def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
     rng = np.random.default_rng(17)
