@@ -6,12 +6,11 @@ from pathlib import Path
 from pipeline.errors import InputError
 from pipeline.progress import Reporter
 from pipeline.project_file import read_project
-from pipeline.scene_file import render_project
+from pipeline.scene_file import TRUTH, render_project
 from pipeline.stages import run_all
 from pipeline.summary import Summary
 
 SCENE = ("scenes", "demo.toml")
-TRUTH = "truth.json"
 
 
 def run_demo(folder: Path, reporter: Reporter) -> Summary:

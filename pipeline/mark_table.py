@@ -84,7 +84,7 @@ def _part(table: Table) -> shapes.Part:
     elif shape == "bar":
         part = shapes.Bar(table.pair("from_mm"), table.pair("to_mm"), table.number("line_mm", above=0.0))
         if part.from_mm == part.to_mm:
-            raise table.error("to_mm", "is the same as from_mm: the bar has no length.")
+            raise table.error("to_mm", "is the same as from_mm: a bar needs two different ends.")
     else:
         part = shapes.Polygon(_vertices(table))
     table.done()

@@ -21,6 +21,9 @@ from synthetic_images.render import Progress, render_scene
 
 Made = TypeVar("Made")
 
+TRUTH = "truth.json"
+WRITTEN = ("project.toml", "camera.toml", "points.csv", "images.csv")
+
 
 def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = None) -> None:
     """`reseau render`: scans, truth.json and the project's files. Raises InputError.
@@ -28,6 +31,7 @@ def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = 
     progress: called with the image's name, the steps done and the steps of the whole scene.
     """
     scene_file = read_scene(scene_path)
+    _check_free(out_dir)
     try:
         render_scene(scene_file.scene, out_dir, progress)
     except OSError as error:
@@ -35,6 +39,16 @@ def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = 
             f"{out_dir}: cannot be written ({error.strerror or error}). Make room, or choose another folder."
         ) from error
     write_project(scene_file, out_dir)
+
+
+def _check_free(out_dir: Path) -> None:
+    """Refuse a folder with somebody's own project: one that was rendered has its truth beside it."""
+    own = [name for name in WRITTEN if (out_dir / name).exists()]
+    if own and not (out_dir / TRUTH).exists():
+        raise InputError(
+            f"{out_dir}: holds {' and '.join(own)}, which would be overwritten, and nothing says that they were "
+            "rendered. Name another folder."
+        )
 
 
 def read_scene(path: Path) -> SceneFile:

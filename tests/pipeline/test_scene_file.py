@@ -342,3 +342,10 @@ def true_comparator(scene_file: SceneFile, frames: Sequence[FrameTruth], noise_p
                     f"{image.name},{id},{kind},{col * pitch_mm},{-row * pitch_mm},{sigma},{sigma},0,,,measured,"
                 )
     return "\n".join(lines) + "\n"
+
+
+def test_a_project_of_somebodys_own_is_not_rendered_over(tmp_path: Path) -> None:
+    (tmp_path / "camera.toml").write_text('name = "mine"', encoding="utf-8")
+    with pytest.raises(InputError, match=r"holds camera.toml, which would be overwritten.*Name another folder"):
+        render_project(written(tmp_path, TEMPLATE), tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"camera.toml", "scene.toml"}
