@@ -31,14 +31,15 @@ class NoiseModel:
         return self.autocovariance_dn2.size == 1
 
 
-def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
-    """The noise model of residuals (height, width), where used, after a fit of so many unknowns.
+def noise_model(residuals: Array, used: Mask, unknowns: int, told: float | None = None) -> NoiseModel:
+    """The noise model of residuals (height, width), where used, after a fit of so many unknowns. told: of how many
+    ordinary pixels they have the information, where some are clipped and residuals are their scores.
 
     Noise counts as white where the correlation of neighbours is within three standard errors of nothing.
     """
     count = int(used.sum())
     kept = np.where(used, residuals, 0.0)
-    variance = float((kept**2).sum() / max(count - unknowns, 1))
+    variance = float((kept**2).sum() / max((count if told is None else told) - unknowns, 1))
     if variance == 0.0:
         return NoiseModel(0.0, np.zeros((1, 1)), 0.0)
     by_residuals = float((kept**2).sum() / count)

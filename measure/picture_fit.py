@@ -1,11 +1,10 @@
 """One mark's adjustment: plain, then robust, then on what is undamaged, and at last weighed by the grain."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.clipping import noise_scale
 from measure.noise import NoiseModel, correlated, may_be_noise, robust_scale
 from measure.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.pixel_sums import combined, products
@@ -110,8 +109,10 @@ class PictureFit:
     def _plain_covariance(self, noise: NoiseModel) -> tuple[Array, Array]:
         """As `weigh` gives them, of an adjustment that took the noise as white."""
         variance = max(noise.variance_dn2, _LEAST_VARIANCE_DN2)
-        plain = self.model.design * self.used / variance
-        return self._covariance(plain, plain * variance if noise.is_white else correlated(plain, noise) * self.used)
+        design, bent = self.model.design * self.used, np.sqrt(self.model.curvature)
+        plain = design * bent / variance  # of residuals that are as large as their information says
+        smeared = plain * variance if noise.is_white else correlated(plain, noise) * self.used
+        return self._covariance(plain * bent, smeared / bent)
 
     def _covariance(self, weights: Array, smeared: Array) -> tuple[Array, Array]:
         """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these."""
@@ -173,9 +174,7 @@ class PictureFit:
         height, width = self.model.grey.shape
         mark, place = self.model.mark, self.model.place_drawn()
         if isinstance(mark, MarkTemplate):
-            # Where it is known how steady each pixel is, those count by it that are not.
-            shown = mark if mark.steadiness is None else replace(mark, steady=None)
-            near = chip_mask(shown, place, width, height)
+            near = chip_mask(mark, place, width, height)
         else:
             outside = (picture(mark, place, width, height, _OUTLINE_BLUR_PX) < _SHOWN).astype(np.uint8)
             distance = cv2.distanceTransform(outside, cv2.DIST_L2, 5)
@@ -190,7 +189,11 @@ class PictureFit:
         """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""
         model = self.model
         if model.is_clipped:
-            model.noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
+            noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
+            if self.used is not self.area:  # damage is cut out: what is left is noise
+                least_dn = max(self.floor_dn, ROUNDING_DN)
+                noise_dn = noise_scale(model.uncensored[self.used], model.clipped[self.used], noise_dn, least_dn)
+            model.take_noise(noise_dn)
         model.linearise(self.used)
         tukey_dn = self._tukey_scale()
         self.variance_dn2 = tukey_dn**2

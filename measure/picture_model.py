@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from measure.clipping import Sides, censored, tells
 from measure.match_options import Freedom, MatchOptions
 from measure.pixel_sums import combined, factors
-from measure.rendering import Rendering, chip_steadiness, reach_px, render
+from measure.rendering import Rendering, reach_px, render
 from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
 
 Array = NDArray[np.float64]
@@ -27,6 +27,7 @@ _GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]]
 }
 ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values adds
 _AS_NOISY = 0.02
+_LEAST = 1e-300  # squared slope of a clipped grey value that tells nothing
 _BLUR_RANGE_PX = (0.3, 6.0)
 BENT, ROUGHLY_BENT = 0.075, 0.4  # of the mark's outline, times the blur: so far a series replaces a new drawing
 PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur
@@ -59,9 +60,9 @@ class PictureModel:
     start: where the mark is expected, and state, if given, what an earlier fit made of it.
     ground (3, height, width): offset and slopes of the background.
     clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
-    values need; tells (height, width): False where a clipped one says nothing of it.
-    Of a chip (height, width): steadiness, as `chip_steadiness` gives it, which weighs residuals and design; half_tones,
-    as `covariance_of_changed_tone` needs it."""
+    values need; tells (height, width): False where a clipped one says nothing of it. slopes and information (height,
+    width), 1 where a grey value is ordinary: as `censored` gives them. uncensored (height, width): residuals as if
+    none were clipped, where some are."""
 
     def __init__(
         self,
@@ -78,6 +79,8 @@ class PictureModel:
         self.clipped, self.noise_dn = clipped, ROUNDING_DN
         self.is_clipped = bool(clipped.any())
         self.tells = np.ones(grey.shape, dtype=bool)
+        self.slopes, self.information = np.ones(grey.shape), np.ones(grey.shape)
+        self.uncensored = np.zeros(grey.shape)
         is_chip = isinstance(mark, MarkTemplate)
         self.smoothed_px2 = _CHIP_SMOOTHED_PX**2 if is_chip else 0.0
         seen = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), dtype=float) if is_chip else grey
@@ -89,14 +92,13 @@ class PictureModel:
         # A chip already has its scan's blur: where none is estimated, none is added.
         added_px2 = 0.0 if is_chip and not options.estimate_blur else options.blur_px**2
         self.state = state or State(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
-        # The state and the noise that the design is of, and its residuals.
-        self._linearised: tuple[State, float, Array] | None = None
+        # The state that the design is of, and its residuals.
+        self._linearised: tuple[State, Array] | None = None
         self.bent = BENT
         self._draw(start[:, :2])
         self.reach_px = reach_px(mark, start[:, :2])
         self.mark_from_start: Array = np.linalg.inv(start[:, :2]).astype(float)
         self.ground = _planes(*grey.shape)
-        self.steadiness, self.half_tones = np.ones(grey.shape), np.zeros(grey.shape)
         self.residuals = np.zeros_like(grey)
         self.design = np.zeros((2 + len(self.generators) + options.estimate_blur + GREY, *grey.shape))
 
@@ -104,13 +106,9 @@ class PictureModel:
         """Design and residuals of the present state; the greys from a linear fit to what is used, at first. Close to
         where the design was last computed it stays, and the residuals follow from it."""
         if self._linearised is not None:
-            at, noise_dn, residuals = self._linearised
+            at, residuals = self._linearised
             change = self._change(at)
-            if (
-                self._length_px(change) < _LINEAR * self.seen_blur_px
-                and not self._is_bent()
-                and self._as_noisy(noise_dn)
-            ):
+            if self._length_px(change) < _LINEAR * self.seen_blur_px and not self._is_bent():
                 self.residuals = residuals - combined(change, self.design)
                 return
         height, width = self.grey.shape
@@ -134,16 +132,12 @@ class PictureModel:
         columns *= -self.state.greys[0]
         self.residuals = self.grey - combined(self.state.greys, greys)
         self._censor()
-        if isinstance(self.mark, MarkTemplate):
-            self.half_tones = self.state.greys[0] * self._detail(4 * shown.value * (1 - shown.value))
-            self.steadiness = chip_steadiness(self.mark, place, width, height)
-            for each in (self.residuals, self.design, self.half_tones):
-                each *= self.steadiness
-        self._linearised = self.state, self.noise_dn, self.residuals
+        self._linearised = self.state, self.residuals
 
-    def _as_noisy(self, noise_dn: float) -> bool:
-        """Whether another noise would change no clipped grey value's part in the fit."""
-        return abs(self.noise_dn / noise_dn - 1) < _AS_NOISY or not self.is_clipped
+    def take_noise(self, noise_dn: float) -> None:
+        """Judge clipped grey values by noise of that standard deviation, unless it changes nothing of their part."""
+        if abs(noise_dn / self.noise_dn - 1) > _AS_NOISY:
+            self.noise_dn, self._linearised = noise_dn, None
 
     def _change(self, before: State) -> Array:
         """(unknowns,) from a state before to the present one, both alike."""
@@ -172,9 +166,22 @@ class PictureModel:
         """Clipped grey values hold the model on their side of the limit only."""
         at = self.clipped != 0
         if at.any():
-            self.residuals[at], slopes = censored(self.residuals[at], self.clipped[at], self.noise_dn)
-            self.design[:, at] *= slopes
-            self.tells[at] = tells(slopes)
+            self.uncensored = self.residuals.copy()
+            said = censored(self.residuals[at], self.clipped[at], self.noise_dn)
+            self.residuals[at], self.slopes[at], self.information[at] = said
+            self.design[:, at] *= said.slopes
+            self.tells[at] = tells(said.slopes)
+
+    @property
+    def scores(self) -> Array:
+        """(height, width) the residuals times their slopes: what each pixel adds to the normal equations. They are 0 on
+        average and vary with the information."""
+        return self.residuals * self.slopes
+
+    @property
+    def curvature(self) -> Array:
+        """(height, width) the information over the square of the slopes, one to two: what a residual's bend adds."""
+        return np.maximum(self.information / np.maximum(self.slopes**2, _LEAST), 1.0)
 
     @property
     def tells_size(self) -> bool:

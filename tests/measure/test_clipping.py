@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from true_marks import KIND, TrueMark, scan_of, some_mark, whitened_rms
 
-from measure.clipping import censored, clipped_sides
+from measure.clipping import censored, clipped_sides, noise_scale
 from measure.fiducial_options import FiducialOptions
 from measure.matching import Match
 from measure.prediction import MarkPrediction
@@ -56,12 +56,38 @@ def test_the_sigma_of_a_clipped_mark_says_what_was_lost(name: str) -> None:
 def test_a_censored_residual_is_twice_the_log_probability_and_derivatives_agree() -> None:
     residuals, step = np.array([-30.0, -2.0, -0.3, 0.0, 0.8, 5.0, 300.0]), 1e-6
     upper = np.ones(len(residuals), np.int8)
-    value, slope = censored(residuals, upper, 2.0)
-    more, less = censored(residuals + step, upper, 2.0)[0], censored(residuals - step, upper, 2.0)[0]
+    value, slope, information = censored(residuals, upper, 2.0)
+    (more, steeper, _), (less, flatter, _) = (censored(residuals + off, upper, 2.0) for off in (step, -step))
     np.testing.assert_allclose(slope, (more - less) / (2 * step), atol=1e-5)
+    np.testing.assert_allclose(information, (more * steeper - less * flatter) / (2 * step), atol=1e-3)
     assert value[3] == pytest.approx(2.0 * np.sqrt(2 * np.log(2)))
     np.testing.assert_allclose((value[0], value[-1]), (0.0, 300.0), atol=0.1)
     np.testing.assert_allclose(censored(-residuals, np.negative(upper), 2.0)[0], -value)
+
+
+@pytest.mark.parametrize("within", [-1.0, 0.0, 1.0])
+def test_noise_is_told_from_what_is_seen_of_it_and_little_dust_does_not_change_that(within: float) -> None:
+    noise = 3 * np.random.default_rng(4).standard_normal(20000)
+    sides = (noise >= 3 * within).astype(np.int8)
+    residuals = np.minimum(noise, 3 * within)
+    assert noise_scale(residuals, sides, 4.0, 0.3) == pytest.approx(3.0, rel=0.02)
+    residuals[:200], sides[:200] = -40.0, 0
+    assert noise_scale(residuals, sides, 4.0, 0.3) == pytest.approx(3.0, rel=0.02)
+
+
+def test_the_sigma_of_a_mark_on_ground_just_at_the_end_of_the_range_is_honest() -> None:
+    rng = np.random.default_rng(5)
+    mark = some_mark(KIND["ring-dot"], 1.0, rng)
+    errors, covariances, best = [], [], []
+    for _ in range(24):
+        noise = rng.standard_normal((mark.size, mark.size)) / 20
+        fit = sighted(mark, FULL + CONTRAST * (noise - mark.picture))
+        errors.append(fit.center_px - mark.place[:, 2])
+        covariances.append(fit.covariance_px2)
+        best.append(mark.best_errors(-noise, 1 / 20))
+    claimed = np.sqrt(np.trace(np.mean(covariances, axis=0)) / np.trace(mark.bound(1 / 20)))
+    assert 0.97 < claimed < 1.08
+    assert np.mean(np.square(np.subtract(errors, best))) < 0.05 * np.trace(mark.bound(1 / 20)) / 2
 
 
 def test_ends_of_the_range_are_those_of_the_converter() -> None:
