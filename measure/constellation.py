@@ -19,6 +19,7 @@ from measure.surroundings import WIDE, Surroundings
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+NARROW = 0.25  # of the tolerance: marks on film that is hardly deformed agree as well
 _LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
 _PAIRS = 60  # of marks that hypotheses are made from
 _KEPT = 12  # placements of a pose that are refined
@@ -30,11 +31,15 @@ _OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
 
 @dataclass(frozen=True)
 class Bounds:
-    """What is known of the placement: scale is 1 within scale_tolerance for the pitch at hand."""
+    """What is known of the placement: scale is 1 within scale_tolerance for the pitch at hand; it is turned by turn_rad
+    (from right to up), within rotation_rad; and the camera's middle lies within off_mm of middle_mm."""
 
     scale_tolerance: float
     rotation_rad: float
     misfit_mm: float
+    turn_rad: float = 0.0
+    middle_mm: complex = 0j
+    off_mm: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,10 +214,12 @@ class _Constellation:
             base = self.camera[second] - self.camera[first]
             scale = (of_second[None, :] - of_first[:, None]) / base
             size = np.abs(scale)
-            allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (scale.real > upright * size)
-            i, j = np.nonzero(allowed)
-            scales.append(scale[i, j])
-            offsets.append(of_first[i] - scale[i, j] * self.camera[first])
+            turned = (scale * np.exp(-1j * self.bounds.turn_rad)).real
+            allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (turned > upright * size)
+            offset = of_first[:, None] - scale * self.camera[first]
+            allowed &= np.abs(offset - self.bounds.middle_mm) < self.bounds.off_mm
+            scales.append(scale[allowed])
+            offsets.append(offset[allowed])
         return np.concatenate(scales), np.concatenate(offsets)
 
     def _pairs(self) -> list[tuple[int, int]]:

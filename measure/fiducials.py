@@ -1,6 +1,6 @@
 """Fiducial marks of one scan: found by their constellation, named by the frame's pose, measured at full resolution."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +32,7 @@ _SET = ("set in the project.",)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
-_TWO_COUNTS = 2  # of the marks as they were measured, and as they answer: the better one is taken
+_LOOKS = 2  # in the whole scan, and where the frame's edges put the marks
 _HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
@@ -130,19 +130,33 @@ def _in_spite_of_pitch(
 def _at_a_closer_look(
     search: FrameSearch, hypotheses: Sequence[PitchHypothesis]
 ) -> tuple[list[Placement], Frame | None]:
-    """The same where marks are looked at closer by, as the frame's edge may drown them. Their pictures need not be
-    clear, where chance would hardly make so many that agree in all these hypotheses, or a placement that answers as
-    well at reduced size: whether a frame is there is one question, which its pose another."""
-    found, tried, best, least = search.anywhere(hypotheses), len(hypotheses), None, _CHANCE
+    """The same where marks are looked at closer by, as the frame's edge may drown them: in the whole scan, and then
+    about where the edges of the exposed frame put them. What the second look tries counts with the first's."""
+    found, tried = search.anywhere(hypotheses), len(hypotheses)
+    frame = _hardly_chance(search, found, tried, search.expected_alike)
+    if frame is None:
+        found = search.within_its_edges(hypotheses)
+        frame = _hardly_chance(search, found, _LOOKS * tried)
+    return found, frame
+
+
+def _hardly_chance(
+    search: FrameSearch, found: Sequence[Placement], tried: int, *others: Callable[[Placement], float]
+) -> Frame | None:
+    """The frame in the best placement, if chance would hardly make so many marks that agree, or a placement as good by
+    one of the other counts. Their pictures need not be clear: whether a frame is there is one question, which its pose
+    another."""
+    best, least = None, _CHANCE
     for place in _hopeful(search, found, tried):
         frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
         if not frames:
             continue
         as_measured = min(search.expected_where_seen(frame, _seen_px(frame)) for frame in frames)
-        expected = _TWO_COUNTS * tried * min(as_measured, search.expected_alike(place))
+        counts = [as_measured, *(count(place) for count in others)]
+        expected = len(counts) * tried * min(counts)
         if expected <= least:
             best, least = max(frames, key=lambda frame: frame.belongs.sum()), expected
-    return found, best
+    return best
 
 
 def _in_its_likeliest_poses(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> list[Frame]:

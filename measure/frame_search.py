@@ -7,13 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import comb
 
-from measure.candidates import Look, Responses, respond, respond_about
+from measure.candidates import Look, Responses, detail_px, respond, respond_about
 from measure.centred_frame import centred_places_px, reach_mm
-from measure.constellation import Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
+from measure.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
+from measure.exposed_frame import ExposedFrame, exposed_frame
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
 from measure.pitches import PitchHypothesis, pitch_hypotheses
 from measure.poses import POSES, up_from_camera
+from measure.rendering import extent_px
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
 from measure.status import Status
@@ -24,17 +26,31 @@ Pair = tuple[float, float]
 
 _COMPARED = 8  # best placements: the one that chance makes least is among them
 _TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
-_NARROW = 0.25  # of the tolerance: marks on film that is hardly deformed agree as well
+_OFF_MIDDLE_MM = (
+    0.5  # of the marks' middle from that of the exposed frame: one body carries both, but a gate is no datum
+)
+_TURNED_RAD = 0.01  # of the marks against the exposed frame's edges, and what these leave open
 
 
 @dataclass(frozen=True, eq=False)
 class _Searched:
     """One hypothesis searched. looks: by pose, the kind of response of every mark; differ: poses whose marks do not
-    lie within the tolerance of another pose's."""
+    lie within the tolerance of another pose's. whole: the search in the whole scan and its looks, if this one is only
+    about where the frame's edges put the marks."""
 
     search: PlacementSearch
     looks: dict[str, tuple[int, ...]]
     differ: int
+    whole: "_Searched | None" = None
+
+    def share(self, pose: str, index: int, sign: int, place: Array, tolerance_px: float) -> float:
+        """Of all places, those that look as much like a mark as one does within the tolerance of a place (2,) of the
+        reduced scan. About the frame's edges more may than elsewhere: the more frequent of both counts."""
+        reach = self.search.layers[self.looks[pose][index], sign].within(tolerance_px)
+        if self.whole is None:
+            return reach.share(place)
+        everywhere = self.whole.share(pose, index, sign, place, tolerance_px)
+        return max(everywhere, reach.share_elsewhere(place, reach.height(place)))
 
 
 def expected_alike(
@@ -67,9 +83,9 @@ class FrameSearch:
         found: list[Placement] = []
         for hypothesis in hypotheses:
             if self._drawn is None or self._drawn[0] != hypothesis.drawn_mm:
-                looks = self._looks(hypothesis)
+                looks = self._looks(hypothesis, self.poses)
                 self._drawn = (hypothesis.drawn_mm, *respond(self.scan, looks, self._signs, self.surroundings))
-            found += self._placements(hypothesis, *self._drawn[1:])
+            found += self._everywhere(hypothesis, *self._drawn[1:])
         return _best_first(found)
 
     def in_the_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
@@ -77,8 +93,55 @@ class FrameSearch:
         linear = _flip(hypothesis.mm)
         places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
         reach_px = reach_mm(self.layout) / max(hypothesis.mm)
-        about = respond_about(self.scan, self._looks(hypothesis), np.concatenate(places), reach_px, self._signs)
-        return _best_first(self._placements(hypothesis, *about))
+        about = respond_about(
+            self.scan, self._looks(hypothesis, self.poses), np.concatenate(places), reach_px, self._signs
+        )
+        return _best_first(self._everywhere(hypothesis, *about))
+
+    def within_its_edges(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
+        """The same of a frame whose edges are seen, its marks lying about the middle of what is exposed; it counts on
+        the whole scan having been searched under these hypotheses."""
+        found: list[Placement] = []
+        for hypothesis in hypotheses:
+            whole, edges = self._searched[hypothesis.mm], self._edges(hypothesis)
+            if edges is None:
+                continue
+            frame, poses = edges
+            linear = frame.rotation @ _flip(hypothesis.mm)
+            places = [self._camera_mm @ (linear @ up_from_camera(pose)).T + frame.center_px for pose in poses]
+            kinds = [kind for pose in poses for kind in whole.looks[pose]]
+            reach_px = (_OFF_MIDDLE_MM + self._slack_mm()) / float(np.mean(hypothesis.mm))
+            responses, look_of = whole.search.responses.about(kinds, np.concatenate(places), reach_px)
+            looks = self._looks(hypothesis, poses)
+            responses = _beside_edges(responses, dict(zip(look_of, looks, strict=True)), frame)
+            right, down = frame.center_px * hypothesis.mm
+            bounds = replace(
+                whole.search.bounds,
+                rotation_rad=_TURNED_RAD,
+                turn_rad=-frame.turn_rad,
+                middle_mm=complex(right, -down),
+                off_mm=_OFF_MIDDLE_MM,
+            )
+            found += self._placements(hypothesis, responses, look_of, poses, bounds, whole)
+        return _best_first(found)
+
+    def _edges(self, hypothesis: PitchHypothesis) -> tuple[ExposedFrame, tuple[str, ...]] | None:
+        """The frame that is seen by its edges, and the poses in which it is as wide and as high."""
+        of_size: dict[Pair, list[str]] = {}
+        for pose in self.poses:
+            width, height = np.abs(up_from_camera(pose)) @ self.layout.frame_mm / hypothesis.mm
+            of_size.setdefault((round(float(width), 3), round(float(height), 3)), []).append(pose)
+        turn = float(np.deg2rad(self.options.rotation_deg))
+        seen = [
+            (frame, tuple(poses))
+            for size, poses in of_size.items()
+            if (frame := exposed_frame(self.scan, size, hypothesis.tolerance, turn))
+        ]
+        return max(seen, key=lambda each: each[0].share, default=None)
+
+    def _slack_mm(self) -> float:
+        """How far from its place a mark may lie by turn, film and the given places."""
+        return _TURNED_RAD * float(np.hypot(*self._camera_mm.T).max()) + self.options.search_mm(self.layout)
 
     def expected_alike(self, placement: Placement) -> float:
         """How many placements that answer as well chance would find in a scan like this without any frame, by this
@@ -114,7 +177,7 @@ class FrameSearch:
         tolerance: those that a similarity fits better are the less likely, the more of them there are."""
         placement, inside = frame.placement, sum(sighting.inside for sighting in frame.sightings)
         widest_px = self._searched[placement.pitch_mm].search.tolerance_px
-        tolerances = (widest_px, _NARROW * widest_px)
+        tolerances = (widest_px, NARROW * widest_px)
         kept = [each for each in tolerances if each == widest_px or self._misfit_px(placement, seen_px) <= each]
         return len(tolerances) * min(self._expected(placement, seen_px, inside, each) for each in kept)
 
@@ -133,10 +196,9 @@ class FrameSearch:
         searched, shares, same_px = self._searched[placement.pitch_mm], [], 1
         for index, place in seen_px.items():
             sign = sign_of(self.layout.marks[index].mark, placement.polarity)
-            layer = searched.search.layers[searched.looks[placement.pose][index], sign]
-            reach = layer.within(tolerance_px)
-            shares.append(reach.share(searched.search.responses.reduced_px(place)))
-            same_px = reach.area_px
+            reduced = searched.search.responses.reduced_px(place)
+            shares.append(searched.share(placement.pose, index, sign, reduced, tolerance_px))
+            same_px = searched.search.layers[searched.looks[placement.pose][index], sign].within(tolerance_px).area_px
         counts = np.arange(min(3, inside), len(shares) + 1)
         if len(counts) == 0:
             return np.inf
@@ -149,7 +211,8 @@ class FrameSearch:
         span_px = (
             float(np.hypot(*np.ptp(self._camera_mm, axis=0))) / float(search.pitch.mean()) / search.responses.reduction
         )
-        places = self.scan.width_px * self.scan.height_px / search.responses.reduction**2
+        middles_px = np.pi * search.bounds.off_mm**2 / float(np.prod(search.pitch))
+        places = min(self.scan.width_px * self.scan.height_px, middles_px) / search.responses.reduction**2
         of_other = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
         polarities = 2 if len(self._signs) > 1 else 1
         return places / same_px * of_other / same_px * searched.differ * polarities
@@ -158,20 +221,33 @@ class FrameSearch:
     def _signs(self) -> set[int]:
         return signs_of(self.layout.marks)
 
-    def _looks(self, hypothesis: PitchHypothesis) -> list[Look]:
+    def _looks(self, hypothesis: PitchHypothesis, poses: Sequence[str]) -> list[Look]:
         linear = _flip(hypothesis.drawn_mm)
-        return [Look(mark.mark, linear @ up_from_camera(pose)) for pose in self.poses for mark in self.layout.marks]
+        return [Look(mark.mark, linear @ up_from_camera(pose)) for pose in poses for mark in self.layout.marks]
 
-    def _placements(
+    def _everywhere(
         self, hypothesis: PitchHypothesis, responses: Responses, look_of: tuple[int, ...]
     ) -> list[Placement]:
-        marks, options, count = self.layout.marks, self.options, len(self.layout.marks)
-        bounds = Bounds(hypothesis.tolerance, float(np.deg2rad(options.rotation_deg)), options.search_mm(self.layout))
+        """The placements of a frame that may lie anywhere in the scan."""
+        rotation_rad = float(np.deg2rad(self.options.rotation_deg))
+        bounds = Bounds(hypothesis.tolerance, rotation_rad, self.options.search_mm(self.layout))
+        return self._placements(hypothesis, responses, look_of, self.poses, bounds)
+
+    def _placements(
+        self,
+        hypothesis: PitchHypothesis,
+        responses: Responses,
+        look_of: tuple[int, ...],
+        poses: Sequence[str],
+        bounds: Bounds,
+        whole: _Searched | None = None,
+    ) -> list[Placement]:
+        marks, count = self.layout.marks, len(self.layout.marks)
         search = PlacementSearch(marks, responses, hypothesis.mm, bounds)
         looks: dict[str, tuple[int, ...]] = {}
         found: dict[str, list[Placement]] = {}
         differ = 0
-        for number, pose in enumerate(self.poses):
+        for number, pose in enumerate(poses):
             own = look_of[number * count : (number + 1) * count]
             twin, like = (
                 next((name for name in found if same_picture(marks, (name, looks[name]), (pose, own), within_mm)), "")
@@ -180,8 +256,23 @@ class FrameSearch:
             looks[pose] = own
             found[pose] = [place.posed(pose) for place in found[twin]] if twin else search.of_pose(pose, own)
             differ += not like
-        self._searched[hypothesis.mm] = _Searched(search, looks, differ)
+        self._searched[hypothesis.mm] = _Searched(search, looks, differ, whole)
         return [placement for of_pose in found.values() for placement in of_pose]
+
+
+def _beside_edges(responses: Responses, looks: dict[int, Look], frame: ExposedFrame) -> Responses:
+    """The responses, of a look by kind each, that the frame's edges have no part in: its four corners are like one
+    another, and answer as well as four marks, wherever these are sought."""
+    maps, around = {}, responses.surroundings
+    for kind, look in looks.items():
+        margin_px = (around.beside + around.coarse / 2) * detail_px(look.mark, look.linear)
+        least, greatest = extent_px(look.mark, np.column_stack([look.linear, np.zeros(2)]))
+        for key in ((kind, sign) for sign in (1, -1) if (kind, sign) in responses.maps):
+            row, col = np.indices(responses.maps[key].shape)
+            places = responses.scan_px(np.stack([col, row], axis=-1) + responses.origin(kind).astype(float))
+            free = frame.free_of_edges(places, least - margin_px, greatest + margin_px)
+            maps[key] = np.where(free, responses.maps[key], np.float32(0.0))
+    return replace(responses, maps=maps)
 
 
 def _flip(pitch_mm: Pair) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.channels import best_weights
-from measure.constellation import Placement, sign_of
+from measure.constellation import NARROW, Placement, sign_of
 from measure.fiducial_options import FiducialOptions
 from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, Frame
@@ -45,9 +45,12 @@ _EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey value
 _SINGLE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def first_search_px(placement: Placement, layout: FiducialLayout, options: FiducialOptions) -> float:
-    """How far from where a placement puts it a mark is looked for."""
-    return _REDUCED_PX * placement.reduction + options.search_mm(layout) / float(np.mean(placement.pitch_mm))
+def first_search_px(
+    placement: Placement, layout: FiducialLayout, options: FiducialOptions, tolerance: float = 1.0
+) -> float:
+    """How far from where a placement puts it a mark is looked for; tolerance: a share of how far it may lie off."""
+    search_px = tolerance * options.search_mm(layout) / float(np.mean(placement.pitch_mm))
+    return _REDUCED_PX * placement.reduction + search_px
 
 
 class FrameSighter:
@@ -71,6 +74,9 @@ class FrameSighter:
         self.weights: tuple[float, ...] | None = None
         gate_px = options.gate_mm / float(self.pitch.mean())
         self.first_search_px = first_search_px(placement, layout, options)
+        self.near_px = first_search_px(placement, layout, options, NARROW)
+        # Where the frame is hardly known to be there, texture must not feign a mark of it so far off.
+        self.faint_px = self.near_px if placement.surroundings == CLOSE else gate_px
         self.gate_px = gate_px
 
     def choose_channels(self) -> None:
@@ -249,6 +255,14 @@ class FrameSighter:
         return misfit
 
     def _sight(self, index: int, search_px: float) -> Sighting:
+        """At a closer look what is not seen is looked for nearer by, too: noise feigns fewer marks there."""
+        sighting = self._sight_within(index, search_px)
+        if sighting.fit is None and self.placement.surroundings == CLOSE and self.near_px < search_px:
+            near = self._sight_within(index, self.near_px)
+            return near if near.fit is not None else sighting
+        return sighting
+
+    def _sight_within(self, index: int, search_px: float) -> Sighting:
         """At a closer look a mark may be as faint as what texture feigns, where it hardly ever does so near by."""
         sighting = sight(self.scan, self.expected(index, search_px), self.options.match)
         fit, closer = sighting.fit, self.placement.surroundings == CLOSE

@@ -23,7 +23,7 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
         sighter.judge()
     if sighter.belongs.sum() >= 2 and not sighter.sure():
         if len(layout.marks) > MANY:
-            sighter.glimpse_faint(sighter.gate_px)
+            sighter.glimpse_faint(sighter.faint_px)
             sighter.vouched[:] = False  # so far from its place a mark still has to agree with the others
         else:
             sighter.look_astray([index for index in everything if not sighter.clear(index)])

@@ -1,0 +1,83 @@
+"""The exposed frame's edges, and faint marks that are found by where these put them."""
+
+import numpy as np
+import pytest
+from brute_marks import brute_picture
+from drawn import drawn, scan_of
+from numpy.typing import NDArray
+
+from measure.exposed_frame import exposed_frame
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.shapes import FiducialLayout, LayoutMark, MarkShape, dot
+from measure.status import Status
+
+Array = NDArray[np.float64]
+
+CENTER = np.array([233.4, 218.7])
+SIZE = (360.0, 300.0)
+PX_PER_MM = 30.0
+PLACES = [(x, y) for x in (-4.2, 4.2) for y in (-3.9, 3.9)]
+DOT = MarkShape(dot(0.15), "light")
+
+
+def frame(turn_rad: float, inside_dn: float, outside_dn: float) -> Array:
+    """A frame turned from the columns toward the rows."""
+    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+
+    def inside(col: Array, row: Array) -> Array:
+        right, down = col - CENTER[0], row - CENTER[1]
+        along, down = cos * right + sin * down, cos * down - sin * right
+        return np.asarray((np.abs(along) < SIZE[0] / 2) & (np.abs(down) < SIZE[1] / 2))
+
+    return outside_dn + (inside_dn - outside_dn) * drawn(inside, 470, 440, 0.8, fineness=4)
+
+
+@pytest.mark.parametrize(("turn_rad", "inside_dn", "outside_dn"), [(0.03, 52000.0, 9000.0), (-0.055, 9000.0, 52000.0)])
+def test_a_frame_is_found_by_its_edges(turn_rad: float, inside_dn: float, outside_dn: float) -> None:
+    grey = frame(turn_rad, inside_dn, outside_dn)
+    grey[300:360, 20:120] = 30000.0  # a label over an edge
+    grey += np.random.default_rng(1).normal(0.0, 1500.0, grey.shape)
+    found = exposed_frame(scan_of(grey), (SIZE[0] * 1.006, SIZE[1] * 1.006), 0.015, 0.1)
+    assert found is not None
+    assert np.hypot(*(found.center_px - CENTER)) < 1.5
+    assert np.abs(found.size_px - SIZE).max() < 3.0
+    assert found.turn_rad == pytest.approx(turn_rad, abs=0.004)
+
+
+def test_a_picture_without_edges_shows_no_frame() -> None:
+    grey = np.random.default_rng(2).normal(30000.0, 3000.0, (440, 470))
+    assert exposed_frame(scan_of(grey), SIZE, 0.015, 0.1) is None
+
+
+@pytest.mark.parametrize("contrast_dn", [3500.0, 0.0])
+def test_faint_dots_are_found_where_the_edges_put_them(contrast_dn: float) -> None:
+    rng = np.random.default_rng(2)
+    grey = frame(0.0, 50000.0, 8000.0) + rng.normal(0.0, 2000.0, (440, 470))
+    centers = [CENTER + PX_PER_MM * np.array([x, -y]) for x, y in PLACES]
+    for center in centers:
+        col0, row0 = np.rint(center).astype(int) - 15
+        place = np.column_stack([np.diag([PX_PER_MM, -PX_PER_MM]), center - (col0, row0)])
+        grey[row0 : row0 + 31, col0 : col0 + 31] += contrast_dn * brute_picture(DOT, place, 31, 31, 0.9)
+    marks = tuple(LayoutMark(str(k), place, (0.01, 0.01), DOT) for k, place in enumerate(PLACES))
+    layout = FiducialLayout(marks, (SIZE[0] / PX_PER_MM, SIZE[1] / PX_PER_MM))
+    options = FiducialOptions(pose="0", pitch_is_right=True)
+    result = measure_fiducials(scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, options)
+    if not contrast_dn:
+        assert {mark.status for mark in result.marks} == {Status.ABSENT}
+        return
+    for found, center in zip(result.marks, centers, strict=True):
+        assert found.status is Status.WEAK, found
+        assert found.center_px is not None
+        assert np.hypot(*(found.center_px - center)) < 1.0
+
+
+def test_the_edges_themselves_are_no_marks() -> None:
+    grey = frame(0.03, 50000.0, 8000.0)
+    found = exposed_frame(scan_of(grey), SIZE, 0.015, 0.1)
+    assert found is not None
+    corner = CENTER + found.rotation @ (np.array(SIZE) / 2)
+    inward = found.rotation @ (np.array([-20.0, -20.0]))
+    reach = np.array([10.0, 10.0])
+    free = found.free_of_edges(np.stack([corner, corner + inward, corner - inward]), -reach, reach)
+    assert free.tolist() == [False, True, True]
