@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.blank_film import blank_patches, is_coloured
+from measure.changed_tone import covariance_of_changed_tone
 from measure.clipping import Sides
 from measure.edge_place import edge_place
 from measure.grain import grain_model
@@ -226,6 +227,9 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         if not noise.is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
         covariance, by_grey = fit.weigh(noise)
+        if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
+            change = fit.contrast_dn / float(np.ptp(model.mark.image))
+            covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
         gain_sigma = float(np.sqrt(max(covariance[-GREY, -GREY], 1e-12)))
         edges = edge_place(model.residuals, used, model.design, by_grey, noise, model.blur_px)
         if model.options.freedom == "ellipse" and model.background_px is None:
@@ -264,7 +268,8 @@ def _blur_sigma(model: PictureModel, covariance: Array) -> float:
 
 
 def _likeness(fit: PictureFit) -> float:
-    background, grey = fit.model.ground * fit.used, fit.model.grey * fit.used
+    counts = fit.used * fit.model.steadiness
+    background, grey = fit.model.ground * counts, fit.model.grey * counts
     if fit.used.sum() <= len(background):
         return 0.0
     without = grey - combined(factors(background, grey), background)

@@ -1,5 +1,7 @@
 """One mark's adjustment: plain, then robust, then on what is undamaged, and at last weighed by the grain."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -174,7 +176,9 @@ class PictureFit:
         height, width = self.model.grey.shape
         mark, place = self.model.mark, self.model.place_drawn()
         if isinstance(mark, MarkTemplate):
-            near = chip_mask(mark, place, width, height)
+            # Where it is known how steady each pixel is, those count by it that are not.
+            shown = mark if mark.steadiness is None else replace(mark, steady=None)
+            near = chip_mask(shown, place, width, height)
         else:
             outside = (picture(mark, place, width, height, _OUTLINE_BLUR_PX) < _SHOWN).astype(np.uint8)
             distance = cv2.distanceTransform(outside, cv2.DIST_L2, 5)

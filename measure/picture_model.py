@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from measure.clipping import Sides, censored, tells
 from measure.match_options import Freedom, MatchOptions
 from measure.pixel_sums import combined, factors
-from measure.rendering import Rendering, reach_px, render
+from measure.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
 
 Array = NDArray[np.float64]
@@ -62,7 +62,9 @@ class PictureModel:
     clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
     values need; tells (height, width): False where a clipped one says nothing of it. slopes and information (height,
     width), 1 where a grey value is ordinary: as `censored` gives them. uncensored (height, width): residuals as if
-    none were clipped, where some are."""
+    none were clipped, where some are.
+    Of a chip (height, width): steadiness, as `chip_steadiness` gives it, which weighs residuals and design; half_tones,
+    as `covariance_of_changed_tone` needs it."""
 
     def __init__(
         self,
@@ -99,6 +101,7 @@ class PictureModel:
         self.reach_px = reach_px(mark, start[:, :2])
         self.mark_from_start: Array = np.linalg.inv(start[:, :2]).astype(float)
         self.ground = _planes(*grey.shape)
+        self.steadiness, self.half_tones = np.ones(grey.shape), np.zeros(grey.shape)
         self.residuals = np.zeros_like(grey)
         self.design = np.zeros((2 + len(self.generators) + options.estimate_blur + GREY, *grey.shape))
 
@@ -132,6 +135,11 @@ class PictureModel:
         columns *= -self.state.greys[0]
         self.residuals = self.grey - combined(self.state.greys, greys)
         self._censor()
+        if isinstance(self.mark, MarkTemplate):
+            self.half_tones = self.state.greys[0] * self._detail(4 * shown.value * (1 - shown.value))
+            self.steadiness = chip_steadiness(self.mark, place, width, height)
+            for each in (self.residuals, self.design, self.half_tones):
+                each *= self.steadiness
         self._linearised = self.state, self.residuals
 
     def take_noise(self, noise_dn: float) -> None:
