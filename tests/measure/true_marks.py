@@ -27,7 +27,7 @@ Moves = tuple[tuple[float, float, float, float], ...]
 TURN, SCALE = (0.0, -1.0, 1.0, 0.0), (1.0, 0.0, 0.0, 1.0)
 STRETCH, SHEAR = (1.0, 0.0, 0.0, -1.0), (0.0, 1.0, 1.0, 0.0)
 GREYS = 4  # gain, offset, two slopes
-MARGIN_PX = 8
+MARGIN_PX, MARGIN_BLURS = 8, 4  # of ground about a mark: px, or so many standard deviations of the blur
 _FOLD = 8  # pixels of a quarter leave bars that cross almost along the pixels 0.001 px off
 WHITE = 0.1  # of the variance of grain: the scanner's own noise
 
@@ -142,14 +142,15 @@ class TrueMark:
 
     @cached_property
     def near(self) -> Mask:
-        """Within MARGIN_PX of the mark's bounds."""
+        """Within the margin of the mark's bounds: no less than a fit takes in, or it could do better than the bound."""
+        margin = max(MARGIN_PX, int(np.ceil(MARGIN_BLURS * self.blur_px)))
         col0, row0, width, height = areas.bounds(areas_of(self.kind.shape, self.place))
         row, col = np.mgrid[: self.size, : self.size]
         return np.asarray(
-            (col >= col0 - MARGIN_PX)
-            & (col < col0 + width + MARGIN_PX)
-            & (row >= row0 - MARGIN_PX)
-            & (row < row0 + height + MARGIN_PX)
+            (col >= col0 - margin)
+            & (col < col0 + width + margin)
+            & (row >= row0 - margin)
+            & (row < row0 + height + margin)
         )
 
     def _by_move(self, generator: Array) -> Array:
