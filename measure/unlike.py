@@ -19,7 +19,7 @@ from measure.disks import FittedDisk
 Array = NDArray[np.float64]
 
 LARGE_PX = 0.3  # the error that a small target must not have
-LARGE_CHANCE = 0.0015  # of it, that is borne: of 310 such errors in 660 rendered frames it leaves none unflagged
+LARGE_CHANCE = 0.0015  # of it, that is borne: of 384 such errors in 840 rendered frames it leaves two unflagged
 # What dust that moves a disk by more does to it, rms of 148 rendered disks: to size, stretch, shear, px of the radius
 # (one edge is moved by twice as much as the disk), the contrast's logarithm, and the blur's variance, px².
 # Then to the place with sloping paint against the matched one, px, which less dust does not move.
