@@ -26,9 +26,8 @@ Pair = tuple[float, float]
 
 _COMPARED = 8  # best placements: the one that chance makes least is among them
 _TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
-_OFF_MIDDLE_MM = (
-    0.5  # of the marks' middle from that of the exposed frame: one body carries both, but a gate is no datum
-)
+# Of the marks' middle from that of the exposed frame: one body carries both, but a gate is no datum.
+_OFF_MIDDLE_MM = 0.5
 _TURNED_RAD = 0.01  # of the marks against the exposed frame's edges, and what these leave open
 
 

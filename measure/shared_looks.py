@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 
 _BLUR_SPREAD = 0.05  # of the logarithm: so much blur differs within a field
 _TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no more where its blur is known so well
-# Of the logarithm, and of the rotation that edges of uneven exposure give: so much it the marks of a frame, as
-# if two marks had shown it before. In three frames of ring-crosses it was 0.005 to 0.008, in four of a réseau 0.014 to
-# 0.021: this is their root mean square.
+# By so much exposure spreads the marks of a frame in the logarithm of their size and, its edges being uneven, in
+# rotation, as if two marks had shown it before. In three frames of ring-crosses it was 0.005 to 0.008, in four of a
+# réseau 0.014 to 0.021: this is their root mean square.
 _SIZE_SPREAD, _BEFORE = 0.014, 2
 # What touches a mark on one side moves its mean outline by so much, rms, and the share of marks that something touches:
 # of those with nothing cut out beside them, and with something.
