@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from measure.picture_scan import WholePicture
 from measure.radiometry import Samples
@@ -27,7 +27,9 @@ Moves = tuple[tuple[float, float, float, float], ...]
 TURN, SCALE = (0.0, -1.0, 1.0, 0.0), (1.0, 0.0, 0.0, 1.0)
 STRETCH, SHEAR = (1.0, 0.0, 0.0, -1.0), (0.0, 1.0, 1.0, 0.0)
 GREYS = 4  # gain, offset, two slopes
-MARGIN_PX, MARGIN_BLURS = 8, 4  # of ground about a mark: px, or so many standard deviations of the blur
+MARGIN_PX = 8  # of ground about a mark's bounds
+MARGIN_BLURS = 4.0  # standard deviations of the blur, about its outline
+_OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
 _FOLD = 8  # pixels of a quarter leave bars that cross almost along the pixels 0.001 px off
 WHITE = 0.1  # of the variance of grain: the scanner's own noise
 
@@ -142,15 +144,17 @@ class TrueMark:
 
     @cached_property
     def near(self) -> Mask:
-        """Within the margin of the mark's bounds: no less than a fit takes in, or it could do better than the bound."""
-        margin = max(MARGIN_PX, int(np.ceil(MARGIN_BLURS * self.blur_px)))
+        """Within MARGIN_PX of the mark's bounds and, so that no fit does better than the bound, at least what
+        one takes in of a soft picture."""
         col0, row0, width, height = areas.bounds(areas_of(self.kind.shape, self.place))
         row, col = np.mgrid[: self.size, : self.size]
+        outside = self._seen(self.place, _OUTLINE_BLUR_PX) < _SHOWN
         return np.asarray(
-            (col >= col0 - margin)
-            & (col < col0 + width + margin)
-            & (row >= row0 - margin)
-            & (row < row0 + height + margin)
+            (col >= col0 - MARGIN_PX)
+            & (col < col0 + width + MARGIN_PX)
+            & (row >= row0 - MARGIN_PX)
+            & (row < row0 + height + MARGIN_PX)
+            | (np.asarray(distance_transform_edt(outside)) <= MARGIN_BLURS * self.blur_px)
         )
 
     def _by_move(self, generator: Array) -> Array:
