@@ -126,7 +126,7 @@ def fit_disk(
         linear_sigma=0.2,
     )
     col0, row0, width, height = window_about(shape, start, wide + BESIDE_PX)
-    window, valid = scan.window(col0, row0, width, height), inside(scan, col0, row0, width, height)
+    window, valid = scan.window(col0, row0, width, height), scan.inside(col0, row0, width, height)
     clipped = clipped_sides(scan, col0, row0, width, height, None)
 
     def fitted(margin_px: float) -> FittedDisk:
@@ -172,13 +172,6 @@ def look_covariance(fit: Match) -> Array:
     look = [2, 3, 4, gain, gain - 1]
     per = np.array([1.0, 1.0, 1.0, fit.contrast_dn or 1.0, 1.0])
     return np.asarray(fit.covariance[np.ix_(look, look)] / np.outer(per, per))
-
-
-def inside(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
-    """(height, width): which pixels of a window are pixels of the scan."""
-    cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
-    in_rows = (rows >= 0) & (rows < scan.height_px)
-    return np.asarray(in_rows[:, None] & (cols >= 0) & (cols < scan.width_px))
 
 
 def judged(disk: FittedDisk, fit: Match) -> FittedDisk:

@@ -102,13 +102,14 @@ class _Field:
         side = self.half + int(np.ceil(max(expected.search_px, _RING)))
         first = np.floor(self.predicted).astype(int) - side
         self.origin = first.astype(float)
-        grey = scan.window(int(first[0]), int(first[1]), 2 * side + 1, 2 * side + 1, expected.weights)
-        inside = self._inside(scan, first, 2 * side + 1)
+        window = (int(first[0]), int(first[1]), 2 * side + 1, 2 * side + 1)
+        grey = scan.window(*window, expected.weights)
         ground = cv2.GaussianBlur(grey, (0, 0), self.coarse_px)
         detail = grey - ground
         spread = cv2.GaussianBlur(detail**2, (0, 0), _TEXTURE * self.coarse_px)
         self.texture_dn: Array = np.sqrt(spread + (FAINT * scan.full_scale_dn) ** 2)
-        self.room_dn = np.where(inside, np.maximum(self.polarity * (extreme_dn - ground), 0.0), 0.0).astype(np.float32)
+        room_dn = np.maximum(self.polarity * (extreme_dn - ground), 0.0)
+        self.room_dn = np.where(scan.inside(*window), room_dn, 0.0).astype(np.float32)
         self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
         self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
 
@@ -167,13 +168,6 @@ class _Field:
         whole[self.half : -self.half, self.half : -self.half] = True
         alone = np.abs(signal) < _SELF * signal[place]
         return np.asarray(near & whole & alone & (response.norm > _SHOWN * response.norm[place]))
-
-    @staticmethod
-    def _inside(scan: Scan, first: NDArray[np.int_], size: int) -> Mask:
-        col, row = first[0] + np.arange(size), first[1] + np.arange(size)
-        return np.asarray(
-            ((row >= 0) & (row < scan.height_px))[:, None] & ((col >= 0) & (col < scan.width_px))[None, :]
-        )
 
 
 def _chance(strength: float, slopes: Array, radius_px: float) -> float:

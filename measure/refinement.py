@@ -100,19 +100,13 @@ def _fitted(
     start = expected.moved(center_px).pixel_from_mark
     col0, row0, width, tall = window_about(mark, start, options.margin_px + BESIDE_PX)
     window = scan.window(col0, row0, width, tall, weights).astype(float)
-    valid = _inside_scan(scan, col0, row0, width, tall)
+    valid = scan.inside(col0, row0, width, tall)
     if expected.surroundings == CLOSE and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - (col0, row0)])
         valid &= ~beyond_edge(window, mark, inner, expected.polarity)
     clipped = clipped_sides(scan, col0, row0, width, tall, weights)
     own = options_for(mark, options, frame_sigma)
     return match(window, (col0, row0), mark, start, own, valid, clipped, scan.is_lossy), chance
-
-
-def _inside_scan(scan: Scan, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
-    col, row = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
-    inside_col, inside_row = (col >= 0) & (col < scan.width_px), (row >= 0) & (row < scan.height_px)
-    return inside_row[:, None] & inside_col[None, :]
 
 
 def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:

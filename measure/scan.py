@@ -119,6 +119,12 @@ class Scan:
         samples[:above], samples[above + len(rows) :] = rows[0], rows[-1]
         return samples
 
+    def inside(self, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
+        """(height, width): which pixels of a window are the scan's, and do not repeat its edge."""
+        cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
+        in_rows = (rows >= 0) & (rows < self.height_px)
+        return np.asarray(in_rows[:, None] & (cols >= 0) & (cols < self.width_px))
+
     def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
         """The whole scan, area-averaged by an integer factor: pixel (i, j) is the mean over factor x factor pixels,
         its centre at column factor * j + (factor - 1) / 2. The last partial row and column are dropped.
