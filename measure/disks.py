@@ -12,9 +12,9 @@ from measure.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WO
 from measure.disk_patches import LEAST_SNR
 from measure.matching import Match, MatchOptions, match, window_about
 from measure.noise import may_be_noise
-from measure.other_place import OtherPlace
 from measure.picture_model import GREY
 from measure.scan import Scan
+from measure.second_place import SecondPlace
 from measure.shapes import Disk, MarkShape
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class FittedDisk:
     blur_px: float
     damaged_fraction: float
     look_covariance: Array
-    sloping: OtherPlace | None = None
+    sloping: SecondPlace | None = None
     weakness: str = ""
     reason: str = ""
 

@@ -15,12 +15,12 @@ from measure.frame_fit import AFFINITY_SIGMA
 from measure.frame_search import FrameSearch
 from measure.frame_sighting import measure_frame
 from measure.learned import honest_covariance
-from measure.other_place import OtherPlace
 from measure.pitches import PitchHypothesis, pitch_hypotheses
 from measure.pose_decision import decide_pose
 from measure.poses import POSES
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scan import Scan
+from measure.second_place import SecondPlace
 from measure.shapes import FiducialLayout, LayoutMark, MarkTemplate
 from measure.status import Status
 from measure.surroundings import CLOSE
@@ -282,7 +282,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
 
 
-def _by_edges(edges: OtherPlace | None) -> dict[str, float]:
+def _by_edges(edges: SecondPlace | None) -> dict[str, float]:
     """How far from the matched place the second method puts the mark, and in standard deviations of that."""
     if edges is None:
         return {}

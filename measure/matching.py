@@ -16,18 +16,17 @@ from numpy.typing import NDArray
 from measure.blank_film import blank_patches, is_coloured
 from measure.changed_tone import covariance_of_changed_tone
 from measure.clipping import Sides
-from measure.edge_place import edge_place
 from measure.grain import grain_model
+from measure.linear_fit import LinearFit
 from measure.match_options import MatchOptions
 from measure.noise import is_textured, noise_model
-from measure.other_place import OtherPlace
 from measure.own_shape import OwnShape, own_shape
 from measure.picture_fit import PictureFit
 from measure.picture_model import GREY, PictureModel, State, background_px, is_round
 from measure.pixel_sums import combined, factors
 from measure.rendering import extent_px
+from measure.second_place import SecondPlace, edge_place, sloping_place
 from measure.shapes import Mark, MarkTemplate
-from measure.sloping_paint import sloping_place
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
 
@@ -71,8 +70,8 @@ class Match:
     significance: float
     blur_sigma: float = np.inf
     size_sigma: float = np.inf
-    edges: OtherPlace | None = None
-    sloping: OtherPlace | None = None
+    edges: SecondPlace | None = None
+    sloping: SecondPlace | None = None
     own_shape: OwnShape | None = None
     covariance: Array | None = None
 
@@ -219,8 +218,8 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
     model, used = fit.model, fit.telling
     noise = noise_model(model.scores, fit.used, len(model.design), float(model.information[fit.used].sum()))
     covariance, gain_sigma = np.full((len(model.design),) * 2, np.inf), np.inf
-    edges: OtherPlace | None = None
-    sloping: OtherPlace | None = None
+    edges: SecondPlace | None = None
+    sloping: SecondPlace | None = None
     own: OwnShape | None = None
     if not fit.reason:
         patches = blank_patches(window, free, noise.variance_dn2)
@@ -231,11 +230,12 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
             change = fit.contrast_dn / float(np.ptp(model.mark.image))
             covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
         gain_sigma = float(np.sqrt(max(covariance[-GREY, -GREY], 1e-12)))
-        edges = edge_place(model.residuals, used, model.design, by_grey, noise, model.blur_px)
+        linear = LinearFit(model.residuals, used, model.design, by_grey, noise)
+        edges = edge_place(linear, model.blur_px)
         if model.options.freedom == "ellipse" and model.background_px is None:
-            sloping = sloping_place(model.residuals, used, model.design, by_grey, noise)
+            sloping = sloping_place(linear)
         if model.options.freedom == "similarity" and not is_round(model.mark):
-            own = own_shape(model.residuals, used, model.design, by_grey, noise, model.linear, model.departures())
+            own = own_shape(linear, model.linear, model.departures())
     state = model.state
     return Match(
         converged=not fit.reason,

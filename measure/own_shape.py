@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.noise import NoiseModel, correlated
+from measure.linear_fit import LinearFit
 from measure.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _OWN = 0.9  # of what is known of rotation and scale: where the picture gives so much, little is the frame's
 
@@ -28,25 +27,20 @@ class OwnShape:
     on_place: Array
 
 
-def own_shape(
-    residuals: Array, used: Mask, design: Array, by_grey: Array, noise: NoiseModel, shape: slice, departures: Array
-) -> OwnShape | None:
+def own_shape(fit: LinearFit, shape: slice, departures: Array) -> OwnShape | None:
     """What the picture says of the two unknowns of a shape, None where they were its own anyway, or it says nothing.
 
-    residuals (height, width), where used; design (unknowns, height, width): derivatives of the model by the unknowns,
-    the first two by column and row; by_grey, alike: derivatives of the unknowns by the grey values; departures
-    (unknowns,): of the match from the frame.
+    shape: which unknowns of the fit these are; departures (unknowns,): of the match from what the frame gave.
     """
-    told = products(by_grey, design)
+    told = products(fit.by_grey, fit.design)
     if np.diag(told)[shape].min() > _OWN:
         return None
     try:
-        by_noise = combined(np.asarray(np.linalg.inv(told), float)[shape], by_grey)
+        by_noise = combined(np.asarray(np.linalg.inv(told), float)[shape], fit.by_grey)
     except np.linalg.LinAlgError:
         return None
-    smeared = noise.variance_dn2 * by_noise if noise.is_white else correlated(by_noise, noise)
-    variance = np.diag(products(by_noise, smeared))
+    variance = np.diag(fit.covariance(by_noise))
     if not np.all(variance > 0):
         return None
-    change = products(by_noise, np.where(used, residuals, 0.0)[None])[:, 0]
+    change = products(by_noise, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
     return OwnShape(change + departures[shape], np.sqrt(variance), -told[:2, shape])
