@@ -89,6 +89,7 @@ def template_of(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
         shares={chip.scan: float(share) for chip, share in zip(chips, shares, strict=True)},
         steady=steady,
         steadiness=_steadiness(levelled, image, steady) if len(chips) > 1 else None,
+        learned_mm=size_mm,
     )
 
 

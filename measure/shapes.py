@@ -96,6 +96,7 @@ class MarkTemplate:
     made of, by whose names shares says how much of the chip is each one's own picture. steady: which of its pixels
     look alike in all of them, None where all do. steadiness: (rows, columns), 1 where a picture differs from the chip
     by noise, and less where it differs by more: the ratio of the standard deviations; None where that is not known.
+    learned_mm: the side of the square that was learned, 0 of a chip that somebody cut out.
     """
 
     image: Array
@@ -108,6 +109,7 @@ class MarkTemplate:
     shares: Mapping[str, float] = field(default_factory=dict)
     steady: NDArray[np.bool_] | None = None
     steadiness: NDArray[np.float64] | None = None
+    learned_mm: float = 0.0
 
 
 Mark = MarkShape | MarkTemplate

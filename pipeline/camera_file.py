@@ -1,7 +1,7 @@
 """camera.toml: the camera as it is given, for the measurement (its marks) and for the adjustment (its priors)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, get_args
@@ -12,7 +12,7 @@ from measure import shapes
 from pipeline.camera_units import check_units
 from pipeline.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.errors import InputError
-from pipeline.images_file import image_name
+from pipeline.learned_table import Clicks, LearnedFrom, read_clicks, read_learned_from
 from pipeline.mark_table import read_mark
 from pipeline.spelling import did_you_mean
 from pipeline.tables import Table, read_toml
@@ -25,21 +25,29 @@ DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a 
 
 @dataclass(frozen=True)
 class GivenFiducial:
-    """A fiducial of the camera file; mark None: it can be adjusted but not measured. passed_over: and need not be."""
+    """A fiducial of the camera file; mark None: it can be adjusted but not measured. passed_over: and need not be.
+    seen_mm: where a learned mark's template has its origin in the scan that it was first cut from."""
 
     id: str
     xy_mm: shapes.Point
     sigma_mm: shapes.Point
     mark: shapes.Mark | shapes.LearnedMark | None
     passed_over: bool = False
+    seen_mm: shapes.Point | None = None
 
     @property
     def prior_sigma_mm(self) -> tuple[float, float]:
         """For the adjustment: a learned mark is measured where its template has its origin, somewhere on the mark. What
         the file fixes stays fixed."""
-        origin = self.mark.size_mm * LEARNED_ORIGIN if isinstance(self.mark, shapes.LearnedMark) else 0.0
-        sx, sy = (sigma and math.hypot(sigma, origin) for sigma in self.sigma_mm)
+        sx, sy = (sigma and math.hypot(sigma, LEARNED_ORIGIN * self._learned_mm) for sigma in self.sigma_mm)
         return sx, sy
+
+    @property
+    def _learned_mm(self) -> float:
+        """A learned mark's size; 0 of others."""
+        if isinstance(self.mark, shapes.MarkTemplate):
+            return self.mark.learned_mm
+        return self.mark.size_mm if isinstance(self.mark, shapes.LearnedMark) else 0.0
 
 
 @dataclass(frozen=True)
@@ -48,28 +56,6 @@ class Source:
 
     text: str
     reports: int
-
-
-@dataclass(frozen=True)
-class Clicks:
-    """Where somebody saw the marks in one scan: px by fiducial, column and row."""
-
-    scan: str
-    px: Mapping[str, shapes.Point]
-
-
-@dataclass(frozen=True)
-class LearnedFrom:
-    """The scan whose pictures the learned marks were first found by, the pose in which it lies, and whether clicks
-    show that."""
-
-    scan: str
-    pose: str
-    clicked: bool
-
-    def shows_pose_of(self, scan: str) -> bool:
-        """Whether a scan lies like it: itself; and all, where the marks were found by recurring in one place."""
-        return scan == self.scan or not self.clicked
 
 
 @dataclass(frozen=True)
@@ -106,7 +92,7 @@ class CameraFile:
     def drawn(self) -> tuple[shapes.LayoutMark, ...]:
         """The fiducials that can be found in a scan."""
         return tuple(
-            shapes.LayoutMark(one.id, one.xy_mm, one.sigma_mm, one.mark)
+            shapes.LayoutMark(one.id, one.seen_mm or one.xy_mm, one.sigma_mm, one.mark)
             for one in self.fiducials
             if isinstance(one.mark, shapes.Mark)
         )
@@ -168,6 +154,7 @@ def parse_camera(table: Table) -> CameraFile:
     if frame is not None:
         entries = zip(table.tables("fiducial"), fiducials, strict=True)
         check_units(table, frame, distance, [(entry, one.xy_mm, one.mark) for entry, one in entries])
+    learned = [one.id for one in fiducials if isinstance(one.mark, shapes.LearnedMark)]
     camera = CameraFile(
         path=table.file,
         name=table.text("name", table.file.stem),
@@ -180,7 +167,8 @@ def parse_camera(table: Table) -> CameraFile:
         fiducials=fiducials,
         data_strip=_side(table, "data_strip"),
         source=_source(table.table("source")) if "source" in table else None,
-        clicks=_clicks(table.table("clicks"), fiducials) if "clicks" in table else None,
+        clicks=read_clicks(table.table("clicks"), learned) if "clicks" in table else None,
+        learned_from=read_learned_from(table.table("learned_from")) if "learned_from" in table else None,
     )
     camera = replace(camera, calibration=read_calibration(sigma, camera.camera()))
     sigma.done()
@@ -197,21 +185,6 @@ def _source(table: Table) -> Source:
     return source
 
 
-def _clicks(table: Table, fiducials: Sequence[GivenFiducial]) -> Clicks:
-    clicks = Clicks(image_name(table.text("scan")), {})
-    places = table.table("px")
-    learned = [one.id for one in fiducials if isinstance(one.mark, shapes.LearnedMark)]
-    px = {id: places.pair(id) for id in learned if id in places}
-    places.done()
-    table.done()
-    missing = [id for id in learned if id not in px]
-    if missing or not px:
-        raise table.error(
-            "px", f"says nothing of {', '.join(missing) or 'any mark'}. Click all learned marks, or none."
-        )
-    return replace(clicks, px=px)
-
-
 def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
     marks = _marks(table.table("mark"))
     fiducials: dict[str, GivenFiducial] = {}
@@ -226,7 +199,8 @@ def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
         for other in fiducials.values():
             if other.xy_mm == xy:
                 raise entry.error("xy_mm", f"fiducial {other.id!r} has the same place. Every mark has one of its own.")
-        fiducials[id] = GivenFiducial(id, xy, sigma, drawn, mark == NO_MARK and drawn is None)
+        seen = entry.pair("seen_mm") if "seen_mm" in entry else None
+        fiducials[id] = GivenFiducial(id, xy, sigma, drawn, mark == NO_MARK and drawn is None, seen)
         entry.done()
     return tuple(fiducials.values())
 
@@ -236,7 +210,7 @@ def _marks(table: Table) -> Mapping[str, tuple[shapes.Mark | shapes.LearnedMark,
     marks = {}
     for name in table.names():
         entry = table.table(name)
-        mark = read_mark(entry, table.file.parent)
+        mark = read_mark(entry)
         radial = entry.text("rotate", "none", ("none", "radial")) == "radial"
         entry.done()
         marks[name] = (mark, radial)

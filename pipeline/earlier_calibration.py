@@ -33,6 +33,10 @@ class EarlierCalibration:
     covariance: Array
     held: Mapping[str, float]
 
+    @property
+    def tells_fiducials(self) -> bool:
+        return any(name.startswith("FID.") for name in (*self.names, *self.held))
+
     def applied(self, camera: Camera) -> tuple[Camera, Calibration]:
         """The camera without priors where the calibration takes their place, and the calibration for the network."""
         given = dict(zip(self.names, self.values.tolist(), strict=True))

@@ -4,9 +4,11 @@ Where the marks are is shown by clicks in one scan, or by what all scans have in
 scan's pictures then find the marks in every other, and the mean over all of them is the template.
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +24,13 @@ from measure.recurring import Recurrence, Window, about, recurrence
 from measure.results import FrameMeasurement
 from measure.scan import Scan, open_scan
 from pipeline.atomic import write_atomically
-from pipeline.camera_file import CameraFile, Clicks, GivenFiducial, LearnedFrom
+from pipeline.camera_file import CameraFile, GivenFiducial, read_camera
 from pipeline.camera_text import camera_text
 from pipeline.errors import InputError
+from pipeline.learned_table import Clicks, LearnedFrom
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
-from pipeline.scene_project import save_chip
+from pipeline.template_table import saved_in
 
 Array = NDArray[np.float64]
 Places = Mapping[str, Array]  # (2,) px by fiducial
@@ -42,10 +45,24 @@ def learn_marks(project: Project, reporter: Reporter, workers: Executor) -> Proj
     """The project with templates in the place of marks that are to be learned; out/learned then holds the templates
     and a camera file that names them. Raises InputError or MeasurementError where they cannot be learned."""
     cameras = {
-        name: _learned(project, camera, reporter, workers) if camera.learned else camera
+        name: _learned(project, camera, reporter, workers) if camera.learned else _known(project, camera)
         for name, camera in project.cameras.items()
     }
     return replace(project, cameras=cameras)
+
+
+def _known(project: Project, camera: CameraFile) -> CameraFile:
+    """A camera whose marks were learned before, or drawn. Another scan may have the name of the one they were learned
+    from: then that tells nothing of how this project's scans lie."""
+    learned = camera.learned_from
+    if learned is None or (learned.scan in project.scans and _digest(project.scans[learned.scan]) == learned.sha256):
+        return camera
+    return replace(camera, learned_from=None)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _learned(project: Project, camera: CameraFile, reporter: Reporter, workers: Executor) -> CameraFile:
@@ -61,8 +78,7 @@ def _learned(project: Project, camera: CameraFile, reporter: Reporter, workers: 
         chips = _chips(project, camera.learned, names, start, workers)
         count(camera.name, 2, 3)
         mean = _averaged(start, camera.learned, chips, workers)
-    _write(project, mean)
-    return mean
+    return _stored(project, mean)
 
 
 def _clicked(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile:
@@ -82,7 +98,7 @@ def _clicked(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile
         placement = _drawn_placement(project, camera, scan)
         if placement is None:
             placement = _through_clicks(project, camera, scan, px)
-        return _start(camera, scan, placement, px)
+        return _start(camera, scan, placement, px, alike=(scan.name,))
 
 
 def _in_common(project: Project, camera: CameraFile, names: Sequence[str], workers: Executor) -> CameraFile:
@@ -115,7 +131,7 @@ def _in_common(project: Project, camera: CameraFile, names: Sequence[str], worke
         for one, each in zip(camera.learned, found, strict=True)
     }
     with open_scan(project.scans[name]) as scan:
-        return _start(camera, scan, matrix, px)
+        return _start(camera, scan, matrix, px, alike=tuple(names))
 
 
 _NOT_COMMON = (
@@ -186,21 +202,21 @@ def _through_clicks(project: Project, camera: CameraFile, scan: Scan, px: Places
     return np.asarray(np.diag([1.0, -1.0]) @ best.up_from_camera / pitch[:, None])
 
 
-def _start(camera: CameraFile, scan: Scan, placement: Array, px: Places) -> CameraFile:
-    """One scan's pictures of the marks, which lie in the layout where this scan has them."""
+def _start(camera: CameraFile, scan: Scan, placement: Array, px: Places, alike: tuple[str, ...]) -> CameraFile:
+    """One scan's pictures of the marks, which lie in the layout where this scan has them. alike: the scans that are
+    known, or taken, to lie like it."""
     inverse = np.linalg.inv(placement[:, :2])
     fiducials = []
     for one in camera.fiducials:
         if isinstance(one.mark, shapes.LearnedMark):
             chip = cut(scan, np.column_stack([placement[:, :2], px[one.id]]), one.mark.size_mm)
             x, y = inverse @ (px[one.id] - placement[:, 2])
-            one = replace(one, xy_mm=(float(x), float(y)), mark=template_of([chip], one.mark.size_mm))
+            one = replace(one, seen_mm=(float(x), float(y)), mark=template_of([chip], one.mark.size_mm))
         fiducials.append(one)
     given = _up_from_camera(placement)
     pose = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
-    return replace(
-        camera, fiducials=tuple(fiducials), learned_from=LearnedFrom(scan.name, pose, camera.clicks is not None)
-    )
+    learned_from = LearnedFrom(scan.name, _digest(scan.path), pose, camera.clicks is not None, alike)
+    return replace(camera, fiducials=tuple(fiducials), learned_from=learned_from)
 
 
 def _up_from_camera(placement: Array) -> Array:
@@ -249,7 +265,7 @@ def pose_of(project: Project, camera: CameraFile, scan: str) -> str:
     learned = camera.learned_from
     if learned is None or project.pose != "auto":
         return project.pose
-    return learned.pose if learned.shows_pose_of(scan) else "auto"
+    return learned.pose if scan in learned.alike else "auto"
 
 
 def _averaged(
@@ -261,14 +277,12 @@ def _averaged(
     return replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
 
 
-def _write(project: Project, camera: CameraFile) -> None:
-    """The camera with its templates, as a file that can be used instead."""
-    folder = project.output / "learned"
-
-    def save(name: str, template: shapes.MarkTemplate) -> str:
-        return save_chip(folder, f"{camera.path.stem}-{name}", template)
-
-    write_atomically(folder / f"{camera.path.stem}.toml", camera_text(camera, save))
+def _stored(project: Project, camera: CameraFile) -> CameraFile:
+    """The camera with its templates written as a file that can be used instead, and as that file has them: so what is
+    measured with it is what is measured now."""
+    path = project.output / "learned" / f"{camera.path.stem}.toml"
+    write_atomically(path, camera_text(replace(camera, path=path), saved_in(path.parent, f"{camera.path.stem}-")))
+    return replace(camera, fiducials=read_camera(path).fiducials)
 
 
 def _size(one: GivenFiducial) -> float:

@@ -1,15 +1,13 @@
 """Fiducial marks as the camera file draws them: `[mark.NAME]`, a kind and its sizes, to what `measure` knows."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import cast
 
 import numpy as np
 
 from measure import shapes
-from measure.errors import MeasurementError
-from measure.scan import open_scan
 from pipeline.tables import Table
+from pipeline.template_table import read_template
 
 KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template", "learned", "frame-corner")
 
@@ -17,7 +15,7 @@ KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template
 _ANY_CORNER = (-1.0, -1.0)  # which one it is says the fiducial's place
 
 
-def read_mark(table: Table, folder: Path) -> shapes.Mark | shapes.LearnedMark:
+def read_mark(table: Table) -> shapes.Mark | shapes.LearnedMark:
     """One mark. Raises InputError naming the key that is wrong."""
     kind = table.text("kind", choices=KINDS)
     if kind == "learned":
@@ -29,7 +27,7 @@ def read_mark(table: Table, folder: Path) -> shapes.Mark | shapes.LearnedMark:
             raise table.error("radius_mm", f"must be smaller than reach_mm ({reach:g}), not {radius:g}.")
         return shapes.frame_corner(_ANY_CORNER, reach, radius, polarity)
     if kind == "template":
-        return replace(_template(table, folder), polarity=polarity)
+        return replace(read_template(table), polarity=polarity)
     return shapes.MarkShape(_parts(kind, table), polarity)
 
 
@@ -89,20 +87,3 @@ def _part(table: Table) -> shapes.Part:
         part = shapes.Polygon(_vertices(table))
     table.done()
     return part
-
-
-def _template(table: Table, folder: Path) -> shapes.MarkTemplate:
-    path = folder / table.text("image")
-    try:
-        with open_scan(path) as chip:
-            image = chip.window(0, 0, chip.width_px, chip.height_px).astype(np.float64)
-    except MeasurementError as error:
-        raise table.error("image", str(error)) from error
-    if np.ptp(image) == 0.0:
-        raise table.error("image", f"{path} shows nothing: all its pixels are alike. Cut out the mark with its ground.")
-    return shapes.MarkTemplate(
-        image,
-        table.number("pitch_um", above=0.0),
-        table.pair("origin_px"),
-        detail_mm=table.number("detail_mm", 0.0, least=0.0),
-    )

@@ -18,10 +18,11 @@ from measure.pitch_check import pitch_problem
 from measure.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scan import Scan, open_scan
-from pipeline.camera_file import CameraFile, LearnedFrom
+from pipeline.camera_file import CameraFile
 from pipeline.coded_sheet import CodedSheet
 from pipeline.errors import InputError
 from pipeline.learn_stage import learn_marks, pose_of
+from pipeline.learned_table import LearnedFrom
 from pipeline.measurement_file import MeasuredScan
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
@@ -149,12 +150,7 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
         wrong = pitch_problem(measured, layout, pitch, source)
         measured = replace(measured, problems=(*measured.problems, wrong) if wrong else measured.problems)
     learned = camera.learned_from
-    if (
-        learned is not None
-        and project.pose == "auto"
-        and learned.shows_pose_of(scan.name)
-        and measured.pose is not None
-    ):
+    if learned is not None and project.pose == "auto" and scan.name in learned.alike and measured.pose is not None:
         measured = replace(measured, pose=_as_learned(learned, scan))
     return replace(measured, image=name, marks=_with_sizes(measured, camera, scan, pitch))
 

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from adjust.network import Prior
 from measure import shapes
-from pipeline.atomic import atomic_path, write_atomically
+from pipeline.atomic import write_atomically
 from pipeline.camera_file import CameraFile, GivenFiducial
 from pipeline.camera_text import camera_text
 from pipeline.design.settings import DesignSettings
 from pipeline.field_table import UNITS_MM
+from pipeline.template_table import saved_in
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, FilmKind, RingFigure, Scene, SceneImage
 from synthetic_images.targets import Target, field_targets
 
@@ -64,12 +64,8 @@ class SceneFile:
 def write_project(scene_file: SceneFile, out_dir: Path) -> None:
     """Write camera.toml, points.csv, images.csv and project.toml. Raises InputError where that cannot be done."""
     generator = np.random.default_rng([scene_file.scene.seed, 20])
-    camera = _given_camera(scene_file, generator)
-
-    def save(name: str, template: shapes.MarkTemplate) -> str:
-        return save_chip(out_dir, name, template)
-
-    write_atomically(out_dir / "camera.toml", camera_text(camera, save))
+    camera = replace(_given_camera(scene_file, generator), path=out_dir / "camera.toml")
+    write_atomically(camera.path, camera_text(camera, saved_in(out_dir)))
     targets = field_targets(scene_file.scene.field)
     if targets:
         write_atomically(out_dir / "points.csv", _points_csv(scene_file, targets, generator))
@@ -122,15 +118,6 @@ def _given_fiducial(fiducial: GivenFiducial, scene_file: SceneFile, generator: n
 def _pair(values: Array) -> tuple[float, float]:
     """To a tenth of a micrometre, as calibration reports are typed."""
     return (round(float(values[0]), 4), round(float(values[1]), 4))
-
-
-def save_chip(out_dir: Path, name: str, template: shapes.MarkTemplate) -> str:
-    """Write a template's picture and return its file's name."""
-    low, high = float(template.image.min()), float(template.image.max())
-    grey = np.rint((template.image - low) * (65535 / (high - low if high > low else 1.0))).astype(np.uint16)
-    with atomic_path(out_dir / f"{name}.tif") as temporary:
-        tifffile.imwrite(temporary, grey, metadata=None)
-    return f"{name}.tif"
 
 
 def _points_csv(scene_file: SceneFile, targets: tuple[Target, ...], generator: np.random.Generator) -> str:

@@ -11,7 +11,7 @@ import pytest
 import tifffile
 
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.shapes import MarkShape, Polygon
+from measure.shapes import MarkShape, MarkTemplate, Polygon
 from measure.status import Status
 from pipeline.atomic import atomic_path, write_atomically
 from pipeline.camera_file import read_camera
@@ -26,6 +26,7 @@ from pipeline.errors import InputError
 from pipeline.images_file import read_images
 from pipeline.points_file import read_points
 from pipeline.tables import read_toml
+from pipeline.template_table import saved_in
 
 CAMERA = """
 name = "C"
@@ -94,8 +95,21 @@ def test_self_calibration_sets_count_in_halves_of_the_frame(tmp_path: Path) -> N
     own = text.replace("family =", "half_mm = [100.0, 90.0]\nfamily =")
     camera = read_camera(written(tmp_path, "camera.toml", own))
     assert camera.distortion.half_mm == (100.0, 90.0)
-    again = camera_text(camera, lambda _, __: "")
+    again = camera_text(camera, saved_in(tmp_path))
     assert read_camera(written(tmp_path, "again.toml", again)).distortion == camera.distortion
+
+
+def test_a_template_that_is_turned_stays_so_in_a_written_camera(tmp_path: Path) -> None:
+    chip = 'kind = "template"\nimage = "chip.tif"\npitch_um = 20.0\norigin_px = [3, 4]'
+    grey = np.arange(80, dtype=np.uint16).reshape(10, 8)
+    tifffile.imwrite(tmp_path / "chip.tif", grey)
+    camera = read_camera(written(tmp_path, "camera.toml", CAMERA.replace(DRAWN, chip)))
+    again = read_camera(written(tmp_path, "again.toml", camera_text(camera, saved_in(tmp_path))))
+    for each in (camera, again):
+        mark = each.fiducials[0].mark
+        assert isinstance(mark, MarkTemplate)
+        assert (mark.turn_deg, mark.origin_px) == (90.0, (3.0, 4.0))
+        np.testing.assert_allclose(np.ptp(mark.image) * grey / 79, mark.image - mark.image.min(), atol=1.0)
 
 
 def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
