@@ -14,7 +14,7 @@ from true_marks import KIND, Kind, TrueMark, scan_of, some_mark
 from measure.constellation import Placement
 from measure.disks import PLAIN_MARGIN_PX
 from measure.fiducial_options import FiducialOptions
-from measure.frame_sighting import measure_frame
+from measure.frame_measurement import measure_frame
 from measure.matching import match
 from measure.picture_scan import WholePicture
 from measure.poses import POSES

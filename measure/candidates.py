@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.correlation import WIDE, Map, Surroundings
 from measure.rendering import ROUGH_CELLS, extent_px, picture
 from measure.scan import Scan
 from measure.shapes import Mark, MarkTemplate, thinnest_mm
-from measure.surroundings import WIDE, Map, Surroundings
 
 Array = NDArray[np.float64]
 Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])

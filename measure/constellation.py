@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.candidates import Responses
+from measure.correlation import WIDE, Surroundings
 from measure.poses import up_from_camera
 from measure.response_layers import Layer, Reach, narrowed
 from measure.shapes import LayoutMark, Mark
-from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.candidates import FAINT
+from measure.correlation import Map
 from measure.noise import robust_scale
 from measure.scan import Scan
-from measure.surroundings import Map
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from measure.centred_frame import is_complete, is_worth_a_look, outermost
 from measure.chance import doubt
 from measure.constellation import Placement
+from measure.correlation import CLOSE
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
 from measure.frame_fit import AFFINITY_SIGMA
+from measure.frame_measurement import measure_frame
 from measure.frame_search import FrameSearch
-from measure.frame_sighting import measure_frame
 from measure.learned import honest_covariance
 from measure.pitches import PitchHypothesis, pitch_hypotheses
 from measure.pose_decision import decide_pose
@@ -23,7 +24,6 @@ from measure.scan import Scan
 from measure.second_place import SecondPlace
 from measure.shapes import FiducialLayout, LayoutMark, MarkTemplate
 from measure.status import Status
-from measure.surroundings import CLOSE
 
 Array = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ from scipy.special import comb
 from measure.candidates import Look, Responses, detail_px, respond, respond_about
 from measure.centred_frame import centred_places_px, reach_mm
 from measure.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
+from measure.correlation import WIDE, Surroundings
 from measure.exposed_frame import ExposedFrame, exposed_frame
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
@@ -19,7 +20,6 @@ from measure.rendering import extent_px
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
 from measure.status import Status
-from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]

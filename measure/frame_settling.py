@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.frame_sighter import FrameSighter
+from measure.mark_comparison import round_moves_px, shared_blurs, shared_shapes, shared_sizes
 from measure.match_options import MatchOptions
 from measure.matching import Match
 from measure.picture_model import is_round
 from measure.refinement import leans_on_frame, sight, strained_px
 from measure.rendering import reach_px
 from measure.shapes import Disk, Mark, MarkShape, Ring
-from measure.shared_looks import round_moves_px, shared_blurs, shared_shapes, shared_sizes
 
 Array = NDArray[np.float64]
 
@@ -118,7 +118,7 @@ def _clear(sighter: FrameSighter) -> dict[int, Match]:
 
 
 def _adjusted(sighter: FrameSighter) -> dict[int, Match]:
-    """Those of them that are drawn, for a picture of a mark has a blur of its own, and no glimpses."""
+    """Those of them that were matched, not only seen as faint marks, and are drawn: a chip has a blur of its own."""
     return {
         index: fit
         for index, fit in _clear(sighter).items()

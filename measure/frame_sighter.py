@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from measure.channels import best_weights
 from measure.constellation import NARROW, Placement, sign_of
+from measure.correlation import CLOSE
+from measure.faint_marks import FaintMark, find_faint
 from measure.fiducial_options import FiducialOptions
 from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, Frame
 from measure.frame_fit import fit_frame, strangers
-from measure.glimpse import Glimpse, glimpse
 from measure.matching import Match
 from measure.poses import up_from_camera
 from measure.prediction import MarkPrediction
@@ -20,8 +21,7 @@ from measure.refinement import Sighting, sight
 from measure.rendering import extent_px
 from measure.scan import LUMINANCE, Scan
 from measure.shapes import FiducialLayout, FrameCorner
-from measure.surroundings import CLOSE
-from measure.unseen import reason_unseen
+from measure.unseen import Ground, reason_unseen
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -151,7 +151,7 @@ class FrameSighter:
         clear = sum(self.clear(index) for index in np.flatnonzero(self.belongs).tolist())
         return bool(self.belongs.sum() >= MANY and clear >= MANY / 2)
 
-    def glimpse_faint(self, reach_px: float) -> None:
+    def look_for_faint(self, reach_px: float) -> None:
         """Look again at every mark that is not clear, or does not lie where the others put it: what stands out of its
         texture there is this mark, the film being deformed where it lies off. A clear one may be a pattern beside it.
         """
@@ -172,13 +172,10 @@ class FrameSighter:
         for index, sighting in faint:
             expected = self.expected(index, reach_px)
             extreme_dn = float(extremes[int(expected.polarity > 0)])
-            seen = glimpse(self.scan, expected, extreme_dn, blur_px)
+            seen = find_faint(self.scan, expected, extreme_dn, blur_px)
             known = seen is not None and seen.sigma_px <= _FAINT_SIGMA_PX
             certain = seen is not None and self._certain(seen)
-            ground = self._ground(expected)
-            room_dn = max(expected.polarity * (extreme_dn - float(np.median(ground))), 0.0)
-            light = expected.polarity > 0
-            unseen = reason_unseen(light, room_dn, usual_dn, float(ground.std()), reach_px, seen, certain)
+            unseen = reason_unseen(self._ground(expected, extreme_dn), usual_dn, reach_px, seen, certain)
             self._take(index, sighting, seen if certain and known else None, unseen)
 
     def doubt(self, index: int, reason: str) -> None:
@@ -195,15 +192,16 @@ class FrameSighter:
             covariance = sighting.fit.covariance_px2 + variance_px2 * np.eye(2)
             self.sightings[index] = replace(sighting, fit=replace(sighting.fit, covariance_px2=covariance))
 
-    def _ground(self, expected: MarkPrediction) -> Array:
-        """The grey values about a mark's place."""
+    def _ground(self, expected: MarkPrediction, extreme_dn: float) -> Ground:
+        """About a mark's place; extreme_dn: the grey value that the mark cannot pass."""
         least, greatest = extent_px(expected.mark, expected.pixel_from_mark)
         low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
-        window = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
-        return np.asarray(window, dtype=float)
+        grey = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights).astype(float)
+        room_dn = max(expected.polarity * (extreme_dn - float(np.median(grey))), 0.0)
+        return Ground(expected.polarity > 0, room_dn, float(grey.std()))
 
-    def _take(self, index: int, sighting: Sighting, seen: Glimpse | None, unseen: str) -> None:
-        """Keep a clear fit where the glimpse is of the same; else the glimpse counts, or that there was none."""
+    def _take(self, index: int, sighting: Sighting, seen: FaintMark | None, unseen: str) -> None:
+        """Keep a clear fit where what was seen is the same mark; else what was seen counts, or that nothing was."""
         clear, away = self.clear(index), np.inf
         if seen is not None and sighting.fit is not None:
             away = float(np.hypot(*(sighting.fit.center_px - seen.fit.center_px)))
@@ -216,7 +214,7 @@ class FrameSighter:
             reason = f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
             self.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
 
-    def _certain(self, seen: Glimpse) -> bool:
+    def _certain(self, seen: FaintMark) -> bool:
         """Whether neither texture nor rounding feigns it."""
         strong = abs(seen.fit.contrast_dn) >= _FAINT_CONTRAST * self.scan.full_scale_dn
         return seen.chance <= _CHANCE and strong

@@ -12,8 +12,8 @@ from measure.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.pixel_sums import combined, products
 from measure.rendering import chip_mask, picture
 from measure.robust import damage, damage_where_lossy, grown, solution, tukey_loss, tukey_weights
+from measure.sandwich_covariance import sandwich_covariance
 from measure.shapes import MarkTemplate
-from measure.uneven_residuals import covariance_where_uneven
 from measure.weighting import weighted
 
 Array = NDArray[np.float64]
@@ -124,7 +124,7 @@ class PictureFit:
         if not np.all(np.linalg.eigvalsh(covariance[:2, :2] + covariance[:2, :2].T) > 0):
             covariance = inverse  # lags that are noise themselves: as if it were white
         if isinstance(self.model.mark, MarkTemplate):
-            uneven = covariance_where_uneven(inverse, weights, self.model.residuals, self.used)
+            uneven = sandwich_covariance(inverse, weights, self.model.residuals, self.used)
             covariance = max(covariance, uneven, key=lambda each: float(np.trace(each[:2, :2])))
         return np.asarray((covariance + covariance.T) / 2), combined(inverse, weights)
 

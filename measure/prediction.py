@@ -7,8 +7,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.correlation import WIDE, Surroundings
 from measure.shapes import Mark
-from measure.surroundings import WIDE, Surroundings
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from measure.candidates import FAINT
+from measure.correlation import WIDE
 from measure.scan import Scan
-from measure.surroundings import WIDE
 
 Array = NDArray[np.float64]
 Window = NDArray[np.float32]

@@ -10,6 +10,7 @@ from measure.blank_film import BESIDE_PX
 from measure.candidates import FAINT
 from measure.clipping import clipped_sides
 from measure.compression import with_loss
+from measure.correlation import CLOSE
 from measure.first_look import seen
 from measure.frame_corner import corner_of_edges
 from measure.matching import Match, MatchOptions, match, window_about
@@ -17,7 +18,6 @@ from measure.prediction import MarkPrediction
 from measure.rendering import extent_px
 from measure.scan import Scan
 from measure.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
-from measure.surroundings import CLOSE
 
 Array = NDArray[np.float64]
 

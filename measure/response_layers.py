@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.candidates import peaks
-from measure.surroundings import Map
+from measure.correlation import Map
 
 Array = NDArray[np.float64]
 

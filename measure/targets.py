@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from measure.assignment import Links, assign
 from measure.disks import SMALLEST_RADIUS_PX, UNIT_DISK, FittedDisk
+from measure.dusty_disks import doubts
 from measure.results import MarkMeasurement
 from measure.scan import Scan
 from measure.shapes import MarkShape, cross
 from measure.status import Status
 from measure.target_search import search_targets
-from measure.unlike import doubts
 
 Array = NDArray[np.float64]
 Polarity = Literal["light", "dark", "auto"]

@@ -6,13 +6,13 @@ from drawn import scan_of
 from numpy.typing import NDArray
 
 from measure.beyond_edge import beyond_edge
+from measure.correlation import CLOSE
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.match_options import MatchOptions
 from measure.prediction import MarkPrediction
 from measure.refinement import sight
 from measure.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon
-from measure.surroundings import CLOSE
 
 Array = NDArray[np.float64]
 

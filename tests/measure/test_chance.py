@@ -12,8 +12,8 @@ from measure.constellation import Placement
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.frame import Frame
+from measure.frame_measurement import measure_frame
 from measure.frame_search import FrameSearch
-from measure.frame_sighting import measure_frame
 from measure.pose_decision import decide_pose
 from measure.poses import POSES, up_from_camera
 from measure.scan import Scan

@@ -1,4 +1,4 @@
-"""What marks tell of one another's blur and size, against such drawn at random about the scan's own."""
+"""What marks tell of one another's blur, size and rotation, against such drawn at random about the scan's own."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from measure.shared_looks import SharedShape, round_moves_px, shared_blurs, shared_sizes
+from measure.mark_comparison import SharedShape, round_moves_px, shared_blurs, shared_shapes, shared_sizes
+from measure.own_shape import OwnShape
 
 PIXEL = 1 / 12
 
@@ -88,3 +89,16 @@ def sized(sizes: Any, sigmas: Any, linear: Any) -> list[Any]:
         SimpleNamespace(pixel_from_mark=np.column_stack([size * turn @ linear, np.zeros(2)]), size_sigma=sigma)
         for size, turn, sigma in zip(sizes, turns, sigmas, strict=True)
     ]
+
+
+def test_a_mark_with_another_shape_than_the_others_is_told_apart() -> None:
+    rng, found, doubted = np.random.default_rng(7), 0, 0
+    for _ in range(100):
+        sigmas = rng.uniform(0.002, 0.01, (8, 2))
+        changes = rng.normal(0.03, np.hypot(sigmas, 0.01))  # of all alike: the drawing's fault
+        shapes = [OwnShape(*each, np.eye(2)) for each in zip(changes, sigmas, strict=True)]
+        doubted += any(shape is not None and shape.differs for shape in shared_shapes(shapes))
+        odd = shared_shapes([OwnShape(changes[0] + (0.0, 0.1), sigmas[0], np.eye(2)), *shapes[1:]])[0]
+        found += odd is not None and odd.differs
+    assert doubted <= 6
+    assert found > 95

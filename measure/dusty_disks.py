@@ -1,5 +1,5 @@
-"""Targets that may be as far off as only dust is: on a small disk it may leave no residual that shows it, and be taken
-for another size, form, contrast or blur of the disk.
+"""Disks that may have dust on them, which may put them far off: on a small disk it may leave no residual that shows it,
+and be taken for another size, form, contrast or blur of the disk.
 
 How the targets of a frame differ by themselves, in their paint, their light and what is known of their form, is told by
 all of them; the rest is noise, whose covariance each fit gives. Which of them have dust on them, how many, the frame

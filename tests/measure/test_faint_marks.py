@@ -6,7 +6,7 @@ import numpy as np
 from brute_marks import Array, brute_picture, scan_of
 from scipy.ndimage import gaussian_filter
 
-from measure.glimpse import Glimpse, glimpse
+from measure.faint_marks import FaintMark, find_faint
 from measure.prediction import MarkPrediction
 from measure.shapes import MarkShape, cross
 
@@ -28,10 +28,10 @@ def places(seed: int) -> Array:
     return np.asarray(grid + rng.uniform(-0.5, 0.5, grid.shape))
 
 
-def seen_at(grey: Array, predicted: Array, folder: Path) -> list[Glimpse | None]:
+def seen_at(grey: Array, predicted: Array, folder: Path) -> list[FaintMark | None]:
     with scan_of(grey, folder) as scan:
         return [
-            glimpse(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1), 0.0, 0.7)
+            find_faint(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1), 0.0, 0.7)
             for place in predicted
         ]
 

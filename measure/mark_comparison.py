@@ -1,5 +1,5 @@
-"""The looks that the marks of a scan share: one lens and one scanner blur them alike, and marks of one drawing have one
-size.
+"""Each mark of a frame compared with the others: in blur, for one lens and one scanner blur them alike, and in size and
+rotation, for marks of one drawing have one size.
 
 A faint mark, or one on rough ground, hardly tells its own blur. Where noise makes its edges look sharp, its standard
 deviation comes out as small as a sharp mark's. So it is matched with the others' blur as an observation, and where its
@@ -7,7 +7,7 @@ own is not theirs something else than noise is in its picture. A speck that cove
 size.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from measure.matching import Match
-from measure.others import told_by_others
 from measure.own_shape import OwnShape
 from measure.picture_model import PIXEL_VARIANCE_PX2
 
 Array = NDArray[np.float64]
+# The standard deviation of a figure from mark to mark, by the variance that so many marks show beyond their own.
+_Spread = Callable[[float, int], float]
 
+_FEWEST = 3  # other marks: of fewer nobody knows by how much they differ
+_CHANCE = 0.01  # of doubting any good mark of a frame
 _BLUR_SPREAD = 0.05  # of the logarithm: so much blur differs within a field
 _TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no more where its blur is known so well
 # By so much exposure spreads the marks of a frame in the logarithm of their size and, its edges being uneven, in
@@ -54,7 +57,7 @@ def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
         None
         if told is None or not (told.differs or own_sigma > _TELLING)
         else SharedBlur(_without_pixel(told.value), told.sigma, told.differs)
-        for told, own_sigma in zip(told_by_others(own, sigma, _blur_spread), sigma.tolist(), strict=True)
+        for told, own_sigma in zip(_told_by_others(own, sigma, _blur_spread), sigma.tolist(), strict=True)
     ]
 
 
@@ -105,7 +108,7 @@ def shared_shapes(shapes: Sequence[OwnShape]) -> list[SharedShape | None]:
 
 def _beside_others(own: Array, sigma: Array) -> list[SharedShape | None]:
     """own, sigma (n, k): each mark's figures."""
-    told = [told_by_others(*pair, _size_spread) for pair in zip(own.T, sigma.T, strict=True)]
+    told = [_told_by_others(*pair, _size_spread) for pair in zip(own.T, sigma.T, strict=True)]
     result: list[SharedShape | None] = []
     for figures, sigmas, each in zip(own, sigma, zip(*told, strict=True), strict=True):
         known = [one for one in each if one is not None]
@@ -127,3 +130,43 @@ def _size_spread(shown: float, marks: int) -> float:
 
 def _without_pixel(log_seen_px: float) -> float:
     return float(np.sqrt(max(np.exp(2 * log_seen_px) - PIXEL_VARIANCE_PX2, 0.0)))
+
+
+@dataclass(frozen=True)
+class _Told:
+    """value: what the others tell, and sigma, its standard deviation for one more mark. differs: whether the mark's own
+    figure is another, by more than chance."""
+
+    value: float
+    sigma: float
+    differs: bool
+
+
+def _told_by_others(own: Array, sigma: Array, spread: _Spread) -> list[_Told | None]:
+    """For each mark what the others tell, None where they are too few.
+
+    own, sigma (n,): each mark's figure and its standard deviation, infinite where it has none.
+    """
+    return [_told(own, sigma, index, spread) for index in range(len(own))]
+
+
+def _told(own: Array, sigma: Array, index: int, spread: _Spread) -> _Told | None:
+    others = np.isfinite(sigma) & (np.arange(len(own)) != index)
+    if others.sum() < _FEWEST:
+        return None
+    mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
+    predicted = float(np.hypot(mean_sigma, apart))
+    off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
+    return _Told(mean, predicted, bool(2 * stats.norm.sf(off) * len(own) < _CHANCE))
+
+
+def _mean(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:
+    """The weighted mean of values that differ by more than their standard deviations, its own standard deviation, and
+    by how much more: by the moments of what they leave (DerSimonian and Laird, 1986)."""
+    weights = 1 / sigma**2
+    rest = values - weights @ values / weights.sum()
+    beyond = weights @ rest**2 - (len(values) - 1)
+    between = max(beyond / (weights.sum() - (weights**2).sum() / weights.sum()), 0.0)
+    apart = spread(float(between), len(values))
+    weights = 1 / (sigma**2 + apart**2)
+    return float(weights @ values / weights.sum()), float(1 / np.sqrt(weights.sum())), apart

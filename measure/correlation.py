@@ -1,4 +1,4 @@
-"""What about a mark counts where it is looked for: a picture freed of its ground, and the correlation with it."""
+"""Normalised correlation with a mark's picture: in a scan freed of its ground, and of what lies beside the mark."""
 
 from dataclasses import dataclass
 

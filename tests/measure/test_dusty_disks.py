@@ -5,10 +5,10 @@ import pytest
 from drawn import drawn, ellipse, scan_of, whitened
 
 from measure.disks import FittedDisk
+from measure.dusty_disks import doubts
 from measure.second_place import SecondPlace
 from measure.status import Status
 from measure.targets import TargetPrediction, measure_disks
-from measure.unlike import doubts
 
 CONTRAST, GROUND = 15000.0, 25000.0
 

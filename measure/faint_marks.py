@@ -34,7 +34,7 @@ _LEAST_PLACES = 200  # of the texture that a covariance can be taken from
 
 
 @dataclass(frozen=True, eq=False)
-class Glimpse:
+class FaintMark:
     """fit: the mark; its significance is in standard deviations of what the texture about it answers, and its
     covariance comes from that texture. chance: how many answers as strong and as near the texture alone would give."""
 
@@ -47,7 +47,7 @@ class Glimpse:
         return float(np.sqrt(np.linalg.eigvalsh(self.fit.covariance_px2)[-1]))
 
 
-def glimpse(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> Glimpse | None:
+def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
     """The strongest response to the mark within the search radius of its predicted place, None where there is no
     contrast.
 
@@ -122,7 +122,7 @@ class _Field:
         norm = np.sqrt(np.maximum(_correlated(self.room**2, template**2), 0.0) + 1e-6)
         return _Response(_correlated(self.detail * self.room, template) / norm, norm, template, fraction)
 
-    def seen(self, response: _Response, center: Array, blur_px: float) -> Glimpse | None:
+    def seen(self, response: _Response, center: Array, blur_px: float) -> FaintMark | None:
         """What the response at the mark's place is worth, against what the texture about it answers."""
         col, row = (int(index) for index in np.rint(center - response.fraction))
         patch = np.s_[row - self.half : row + self.half + 1, col - self.half : col + self.half + 1]
@@ -158,7 +158,7 @@ class _Field:
             likeness=min(height / float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()])), 1.0),
             significance=height / scatter,
         )
-        return Glimpse(fit, _chance(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX)))
+        return FaintMark(fit, _chance(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX)))
 
     def _texture(self, response: _Response, signal: Array, place: tuple[int, int]) -> Mask:
         """Where about the mark responses are the texture's alone: on ground where the mark could show."""

@@ -23,14 +23,14 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
         sighter.judge()
     if sighter.belongs.sum() >= 2 and not sighter.sure():
         if len(layout.marks) > MANY:
-            sighter.glimpse_faint(sighter.faint_px)
+            sighter.look_for_faint(sighter.faint_px)
             sighter.vouched[:] = False  # so far from its place a mark still has to agree with the others
         else:
             sighter.look_astray([index for index in everything if not sighter.clear(index)])
         sighter.judge()
     for _ in range(_ROUNDS):
         if sighter.sure():
-            sighter.glimpse_faint(sighter.reach_px())
+            sighter.look_for_faint(sighter.reach_px())
             sighter.judge()
     settle(sighter)
     share_blur(sighter)

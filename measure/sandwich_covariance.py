@@ -1,4 +1,4 @@
-"""How well a fit is known where its residuals are larger in one place than in another.
+"""The sandwich covariance of a fit: how well it is known where its residuals are larger in one place than in another.
 
 What a chip leaves of another picture is no noise alone: detail that was sampled too coarsely returns at the edges,
 which are what tells the place. A covariance that takes residuals as alike everywhere promises too much there. This one
@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 _ALIKE_PX = 1.0  # standard deviation of the weights by distance: what is sampled too coarsely is alike no farther
 
 
-def covariance_where_uneven(inverse: Array, weights: Array, residuals: Array, used: Mask) -> Array:
+def sandwich_covariance(inverse: Array, weights: Array, residuals: Array, used: Mask) -> Array:
     """(unknowns, unknowns) covariance of an adjustment that has `sum weights * residuals = 0` over the pixels used.
 
     inverse: (unknowns, unknowns) of its normal matrix; weights: (unknowns, height, width), weighted derivatives;
