@@ -1,4 +1,6 @@
-"""The camera library's files from calibration reports: run as `camera_library.py REPORTS_FOLDER OUT_FOLDER`.
+"""The camera library's files, made from calibration reports.
+
+python benchmarks/camera_library.py REPORTS_FOLDER OUT_FOLDER
 
 The folder holds usgs_reports.csv (a line a report: camera, focal length, coordinates and separations of the marks),
 cameras.json and OSL_1785.json (single cameras, written out). What is typed there has errors, and some cameras of a

@@ -1,6 +1,6 @@
 """Marks measured by reseau and by other methods in the same pictures, against their truth.
 
-PYTHONPATH=.:tests/measure python benchmarks/compared.py [MARKS] [SETTING ...] [--kind KIND ...] [--blur BLUR ...]
+PYTHONPATH=tests/measure python benchmarks/compared.py [MARKS] [SETTING ...] [--kind KIND ...] [--blur BLUR ...]
     [--hipp PYTHON] [--keep FILE]
 
 MARKS: of every cell, those of cameras of eight; 104 where none is given. SETTING: of the names below; all where none is

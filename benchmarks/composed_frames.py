@@ -1,6 +1,6 @@
 """Notches, blocks, curves and triangles of real cameras: learned, found in any pose and measured.
 
-PYTHONPATH=.:benchmarks python benchmarks/composed_frames.py MARKS_FOLDER OUT.jsonl [--frames 8] [--first 0]
+python benchmarks/composed_frames.py MARKS_FOLDER OUT.jsonl [--frames 8] [--first 0]
 
 A folder of four crops (L, T, R, B) is one camera. Frames are put together from them: each crop at its side of a
 textured square, its own landscape (what is lighter than Otsu's threshold) exchanged for another, averaged over a few

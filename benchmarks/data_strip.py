@@ -1,6 +1,6 @@
 """What writing beside the frame tells of the pose, in rendered frames, against their truth.
 
-PYTHONPATH=.:benchmarks python benchmarks/data_strip.py [FRAMES] [FIRST]
+python benchmarks/data_strip.py [FRAMES] [FIRST]
 
 The frames are those of the study of search and pose, with marks alike: a strip of text and dials is written on one side
 of them, over whatever stands there, and the camera says on which. Each is also measured without the strip, though the

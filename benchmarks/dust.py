@@ -1,6 +1,6 @@
 """Marks and disks among dust: against those whose dust is known, alone and in frames, and small ones.
 
-PYTHONPATH=.:tests/measure python benchmarks/dust.py [MARKS] [STUDY ...] [--kind KIND ...] [--seed SEED] [--keep FILE]
+PYTHONPATH=tests/measure python benchmarks/dust.py [MARKS] [STUDY ...] [--kind KIND ...] [--seed SEED] [--keep FILE]
 
 MARKS: of every cell, of small disks frames of 25; 160 where none is given. STUDY: one or more of the names below; all
 where none is given. --keep: rows of the tables are written there, and those that stand in it are not made anew.

@@ -1,6 +1,6 @@
 """How often a scan without the camera's marks is taken for one of its frames.
 
-PYTHONPATH=.:benchmarks python benchmarks/false_frames.py [--frames 60] [--first 0] [--seed 11]
+python benchmarks/false_frames.py [--frames 60] [--first 0] [--seed 11]
 
 The frames of `search.py`, every other one painted without its marks and searched for its own camera, and the rest with
 their marks, but searched for a camera with marks of another kind. Whatever is found is false. The pitch is given, right

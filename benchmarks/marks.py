@@ -1,6 +1,6 @@
 """Marks measured against their truth: the Cramér-Rao bound, honesty of the standard deviations.
 
-PYTHONPATH=.:tests/measure python benchmarks/marks.py [MARKS] [STUDY ...] [--kind KIND ...] [--keep FILE]
+PYTHONPATH=tests/measure python benchmarks/marks.py [MARKS] [STUDY ...] [--kind KIND ...] [--keep FILE]
 
 MARKS: of every cell; 100 where none is given, 2000 for a full run. STUDY: one or more of the names below; all where
 none is given. --keep: rows of the tables are written there, and those that stand in it are not made anew, so that a

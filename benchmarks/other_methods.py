@@ -1,4 +1,4 @@
-"""Other ways to measure a mark.
+"""Other ways to measure a mark: what `reseau` is compared with.
 
 Every method takes grey values (height, width) with a light mark, a start (col, row) near it, and a template with the
 place of the mark in it; it returns the centre, or None.

@@ -1,6 +1,6 @@
 """Search and pose in rendered frames, against their truth.
 
-PYTHONPATH=.:benchmarks python benchmarks/search.py OUT.jsonl [--frames 600] [--first 0] [--seed 1]
+python benchmarks/search.py OUT.jsonl [--frames 600] [--first 0] [--seed 1]
 
 One line a frame is added to OUT.jsonl, and frames that stand there already are left out, so that a run can be
 continued; two runs, each with frames of its own, may share the file. Then the tables of all its lines are printed. With

@@ -1,6 +1,6 @@
 """Which marks of the study of the search anybody can see, from the pictures' own truth and without `measure`.
 
-PYTHONPATH=.:benchmarks python benchmarks/visible_marks.py OUT.jsonl [--seed 1]
+python benchmarks/visible_marks.py OUT.jsonl [--seed 1]
 
 Every frame of `search.py`'s OUT.jsonl is painted once more without its marks: the difference is what the marks add to
 the picture, and what is left is the ground that hides them. A filter matched to a mark's own picture, at its known

@@ -34,10 +34,10 @@ SURE, MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may be 
 @dataclass(frozen=True, eq=False)
 class FittedDisk:
     """An ellipse as fitted. center_px (2,), covariance_px2 (2, 2); pixel_from_disk (2, 2): the unit disk's image, its
-    columns two radius vectors, px; contrast_dn: positive for a light disk; look_covariance (5, 5): of the relative
-    changes of its size, its stretch along the columns, its shear and its contrast, and of its blur's variance, px².
-    sloping: where it lies if its paint may slope, None where that is not told. weakness: why it is doubtful; reason:
-    why it is no disk, and then the numbers are the fit's last."""
+    columns two radius vectors, px; contrast_dn: positive for a light disk; appearance_covariance (5, 5): of the
+    relative changes of its size, its stretch along the columns, its shear and its contrast, and of its blur's variance,
+    px². sloping: where it lies if its paint may slope, None where that is not told. weakness: why it is doubtful;
+    reason: why it is no disk, and then the numbers are the fit's last."""
 
     center_px: Array
     covariance_px2: Array
@@ -46,7 +46,7 @@ class FittedDisk:
     noise_dn: float
     blur_px: float
     damaged_fraction: float
-    look_covariance: Array
+    appearance_covariance: Array
     sloping: SecondPlace | None = None
     weakness: str = ""
     reason: str = ""
@@ -74,7 +74,7 @@ class FittedDisk:
     @property
     def contrast_sigma(self) -> float:
         """Standard deviation of its contrast, as a share of it."""
-        return float(np.sqrt(self.look_covariance[3, 3]))
+        return float(np.sqrt(self.appearance_covariance[3, 3]))
 
     @property
     def lone_doubt(self) -> str:
@@ -140,7 +140,7 @@ def fit_disk(
             noise_dn=fit.noise_dn,
             blur_px=fit.blur_px,
             damaged_fraction=fit.damaged_fraction,
-            look_covariance=look_covariance(fit),
+            appearance_covariance=appearance_covariance(fit),
             sloping=fit.sloping,
             reason="" if fit.converged else fit.reason,
         )
@@ -165,13 +165,13 @@ def fit_disk(
     return narrow if agree else replace(narrow, weakness=f"with more ground: {disk.reason}")
 
 
-def look_covariance(fit: Match) -> Array:
+def appearance_covariance(fit: Match) -> Array:
     """(5, 5) as a fitted disk has it."""
     assert fit.covariance is not None
     gain = len(fit.covariance) - GREY
-    look = [2, 3, 4, gain, gain - 1]
+    figures = [2, 3, 4, gain, gain - 1]
     per = np.array([1.0, 1.0, 1.0, fit.contrast_dn or 1.0, 1.0])
-    return np.asarray(fit.covariance[np.ix_(look, look)] / np.outer(per, per))
+    return np.asarray(fit.covariance[np.ix_(figures, figures)] / np.outer(per, per))
 
 
 def judged(disk: FittedDisk, fit: Match) -> FittedDisk:
@@ -194,4 +194,4 @@ def judged(disk: FittedDisk, fit: Match) -> FittedDisk:
         reason = f"too small: half axis {shorter:.1f} px"
     elif disk.damaged_fraction > WEAK_DAMAGE:
         weakness = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
-    return FittedDisk(**{**vars(disk), "reason": reason, "weakness": weakness})
+    return replace(disk, reason=reason, weakness=weakness)

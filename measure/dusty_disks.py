@@ -23,7 +23,7 @@ LARGE_CHANCE = 0.0015  # of it, that is borne: of 384 such errors in 840 rendere
 # What dust that moves a disk by more does to it, rms of 148 rendered disks: to size, stretch, shear, px of the radius
 # (one edge is moved by twice as much as the disk), the contrast's logarithm, and the blur's variance, px².
 # Then to the place with sloping paint against the matched one, px, which less dust does not move.
-DUST_LOOK, DUST_SLOPING_PX = (0.2, 0.2, 0.2, 0.3, 0.4), 0.5
+DUST_APPEARANCE, DUST_SLOPING_PX = (0.2, 0.2, 0.2, 0.3, 0.4), 0.5
 DUST = (0.0, 1 / 3, 1.5, 6.0)  # times that: none, some, and what moves a disk by 0.3 px, or is something else
 # Each of these a coordinate. A few disks of each kind are moved by far more and make the rms 0.16, 0.5 and 0.6: with
 # those the errors of all, and which are large, are far less likely (docs/precision.md).
@@ -34,7 +34,7 @@ _MUCH = slice(2, None)
 FEWEST = 8  # that tell how much targets differ
 DUST_PX = 4.0  # the shorter half axis up to which dust may pass for a disk or hide its edge: it is seldom larger
 _SHOWN = 0.05  # the probability of much dust that has the disk called unlike the others
-_FORM = slice(0, 3)  # size, stretch and shear among a look's figures
+_FORM = slice(0, 3)  # size, stretch and shear among the figures of an appearance
 _ROUNDS, _SETTLED = 60, 1e-4
 _LEAST_SPREAD = 1e-4  # no frame's targets are alike to better than 1 %, nor is the linearisation of their noise
 
@@ -45,16 +45,16 @@ def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[str]
     a factor common to all. Fewer than FEWEST tell nothing: then every one that dust may look like is doubted."""
     if len(disks) < FEWEST:
         return [disk.lone_doubt for disk in disks]
-    looks = np.array([_look(disk, shape) for disk, shape in zip(disks, predicted, strict=True)])
-    common = _common(looks, disks)
+    appearances = np.array([_appearance(disk, shape) for disk, shape in zip(disks, predicted, strict=True)])
+    common = _common(appearances, disks)
     return [
-        _doubt(disk, look - common.look, kinds) if disk.is_soft or disk.half_axes_px[1] < DUST_PX else ""
-        for disk, look, kinds in zip(disks, looks, common.kinds, strict=True)
+        _doubt(disk, appearance - common.appearance, kinds) if disk.is_soft or disk.half_axes_px[1] < DUST_PX else ""
+        for disk, appearance, kinds in zip(disks, appearances, common.kinds, strict=True)
     ]
 
 
 def _doubt(disk: FittedDisk, off: Array, kinds: Array) -> str:
-    """Of one that dust may look like; off (5,): how far its look is from that of the others; kinds (kinds,): the
+    """Of one that dust may look like; off (5,): how far its appearance is from that of the others; kinds (kinds,): the
     probability of each kind of dust."""
     if kinds[_MUCH].sum() < _SHOWN:
         sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
@@ -69,7 +69,7 @@ def _doubt(disk: FittedDisk, off: Array, kinds: Array) -> str:
     )
 
 
-def _look(disk: FittedDisk, predicted: Array) -> Array:
+def _appearance(disk: FittedDisk, predicted: Array) -> Array:
     """(5,) logarithm of size, stretch and shear against the predicted ellipse, those of the symmetric change that makes
     the one ellipse the other, and of contrast; the blur's variance, px²."""
     root = _power(predicted @ predicted.T, 0.5)
@@ -89,29 +89,29 @@ def _power(matrix: Array, exponent: float) -> Array:
 
 
 class _Common(NamedTuple):
-    """look (figures,): targets without dust; kinds (n, kinds): the probabilities of dust on each."""
+    """appearance (figures,): targets without dust; kinds (n, kinds): the probabilities of dust on each."""
 
-    look: Array
+    appearance: Array
     kinds: Array
 
 
-def _common(looks: Array, disks: Sequence[FittedDisk]) -> _Common:
-    """Of looks (n, figures).
+def _common(appearances: Array, disks: Sequence[FittedDisk]) -> _Common:
+    """Of appearances (n, figures).
 
-    Those without dust are normal about one look, with a spread of their own beside their noise. Form has no direction:
-    stretch and shear spread alike. Damage that was seen makes more of it likely.
+    Those without dust are normal about one appearance, with a spread of their own beside their noise. Form has no
+    direction: stretch and shear spread alike. Damage that was seen makes more of it likely.
     """
-    noise = np.array([disk.look_covariance for disk in disks])
+    noise = np.array([disk.appearance_covariance for disk in disks])
     dust, by_slope = _dust_variances(disks), _by_slope(disks)
     damaged = np.array([disk.damaged_fraction > 0 for disk in disks])
     before = np.array([WHOLE, DAMAGED])
     shares = before
-    look = np.median(looks, axis=0)
-    spread = np.maximum((1.4826 * np.median(np.abs(looks - look), axis=0)) ** 2, _LEAST_SPREAD)
+    appearance = np.median(appearances, axis=0)
+    spread = np.maximum((1.4826 * np.median(np.abs(appearances - appearance), axis=0)) ** 2, _LEAST_SPREAD)
     kinds = np.zeros((len(DUST), len(disks)))
     for _ in range(_ROUNDS):
         weights = np.linalg.inv(noise + np.diag(spread) + dust)
-        last, off = kinds, looks - look
+        last, off = kinds, appearances - appearance
         logs = np.log(shares[damaged.astype(int)].T) + by_slope + _log_density(off, weights)
         kinds = np.exp(logs - logs.max(axis=0))
         kinds /= kinds.sum(axis=0)
@@ -119,29 +119,29 @@ def _common(looks: Array, disks: Sequence[FittedDisk]) -> _Common:
         shares = (seen + BEFORE * before) / (seen.sum(axis=1, keepdims=True) + BEFORE)
         clean, weights = kinds[0], weights[0]
         weighed = clean[:, None, None] * weights
-        look = np.linalg.solve(weighed.sum(axis=0), np.einsum("nij,nj->i", weighed, looks))
+        appearance = np.linalg.solve(weighed.sum(axis=0), np.einsum("nij,nj->i", weighed, appearances))
         # What of each difference is the target's own, and the variance with which noise leaves that open.
-        own = spread * np.einsum("nij,nj->ni", weights, looks - look)
+        own = spread * np.einsum("nij,nj->ni", weights, appearances - appearance)
         unknown = spread - spread**2 * np.einsum("nii->ni", weights)
         spread = np.average(own**2 + unknown, axis=0, weights=clean)
         spread[1:3] = spread[1:3].mean()
         spread = np.maximum(spread, _LEAST_SPREAD)
         if np.abs(kinds - last).max() < _SETTLED:
             break
-    return _Common(look, kinds.T)
+    return _Common(appearance, kinds.T)
 
 
 def _dust_variances(disks: Sequence[FittedDisk]) -> Array:
-    """(kinds, n, figures, figures): what each kind of dust adds to the variances of the looks."""
+    """(kinds, n, figures, figures): what each kind of dust adds to the variances of the appearances."""
     radius = np.array([np.sqrt(np.prod(disk.half_axes_px)) for disk in disks])
-    look = np.tile(DUST_LOOK, (len(disks), 1))
-    look[:, _FORM] /= radius[:, None]
-    return np.asarray(np.multiply.outer(np.square(DUST), look[..., None] ** 2 * np.eye(len(DUST_LOOK))))
+    appearance = np.tile(DUST_APPEARANCE, (len(disks), 1))
+    appearance[:, _FORM] /= radius[:, None]
+    return np.asarray(np.multiply.outer(np.square(DUST), appearance[..., None] ** 2 * np.eye(len(DUST_APPEARANCE))))
 
 
 def _by_slope(disks: Sequence[FittedDisk]) -> Array:
     """(kinds, n) the logarithms of the probability densities of the places with sloping paint: these are independent of
-    the looks, for they are told by residuals. 0 where a disk has none."""
+    the appearances, for they are told by residuals. 0 where a disk has none."""
     logs = np.zeros((len(DUST), len(disks)))
     for index, disk in enumerate(disks):
         if disk.sloping is not None:

@@ -1,5 +1,6 @@
 """The pages of docs/ that speak of the code: what they name exists, and what they quote is what the program says."""
 
+import ast
 import importlib
 import importlib.util
 import re
@@ -78,9 +79,16 @@ def script(name: str) -> ModuleType:
     return module
 
 
-def test_every_module_stands_on_the_map_of_the_code() -> None:
+def test_every_module_stands_on_the_map_of_the_code_with_its_own_words() -> None:
     page = (DOCS / "code.md").read_text(encoding="utf-8")
-    told = re.findall(r"^- `([\w.]+)`: ", page, flags=re.MULTILINE)
-    root = DOCS.parent
-    files = [path for package in PACKAGES for path in (root / package).rglob("*.py") if path.name != "__init__.py"]
-    assert sorted(told) == sorted(".".join(path.relative_to(root).with_suffix("").parts) for path in files)
+    told = dict(re.findall(r"^- `([\w.]+)`: (.+)$", page, flags=re.MULTILINE))
+    files = [path for folder in (*PACKAGES, "benchmarks") for path in (DOCS.parent / folder).rglob("*.py")]
+    modules = {
+        ".".join(path.relative_to(DOCS.parent).with_suffix("").parts): path
+        for path in files
+        if path.name != "__init__.py"
+    }
+    assert sorted(told) == sorted(modules)
+    for name, path in modules.items():
+        own = " ".join((ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split())
+        assert own.startswith(told[name]), name
