@@ -79,63 +79,60 @@ def _chunks(blobs: Blobs, samples: float) -> Iterator[Blobs]:
 
 
 class _Profiles:
-    """Grey values along rays from blobs of one radius, at steps of so many px; ends (n,): whether all fall below half
-    of the blob's height."""
+    """Grey values (steps, rays, n) along rays from blobs of one radius, at steps of so many px; ends (n,): whether all
+    fall below half of the blob's height."""
 
     def __init__(self, sampled: Sampled, blobs: Blobs, radius: float, rays: int, step_px: float) -> None:
         self.step_px = step_px
         along = step_px * np.arange(int(np.ceil(REACH * radius / step_px)) + 1)
         angle = 2 * np.pi * np.arange(rays) / rays
         self.directions = np.stack([np.cos(angle), np.sin(angle)])
-        self.values = sampled(blobs.places, self.directions[..., None] * along)
+        self.values = sampled(blobs.places, along[:, None] * self.directions[:, None])
         core, around = (along <= CORE * radius), (along >= AROUND[0] * radius) & (along <= AROUND[1] * radius)
-        shares = np.stack([core / core.sum(), around / around.sum()], axis=1).astype(np.float32)
-        inner, outer = (self.values.reshape(-1, len(along)) @ shares).T.reshape(2, -1, rays)
-        top, ground = inner.mean(axis=1), np.partition(outer, int(GROUND_SHARE * rays), axis=1)
-        self.ground = ground[:, int(GROUND_SHARE * rays)]
+        top, outer = self.values[core].mean(axis=(0, 1)), self.values[around].mean(axis=0)
+        self.ground = np.partition(outer, int(GROUND_SHARE * rays), axis=0)[int(GROUND_SHARE * rays)]
         self.height = top - self.ground
         self.level = (top + self.ground) / 2
-        below = self.values < self.level[:, None, None]
-        self.first_below = below.argmax(axis=2)
-        self.ends = (self.first_below > 0).all(axis=1) & (self.height >= LEAST_HEIGHT * blobs.contrast)
+        is_below = (self.values[1:].min(axis=0) < self.level).all(axis=0)
+        self.ends = (self.values[0, 0] >= self.level) & is_below & (self.height >= LEAST_HEIGHT * blobs.contrast)
 
     def radii(self) -> Image:
-        """(those that end, rays) px to where the rays fall below half of the height."""
-        patch, ray = np.flatnonzero(self.ends)[:, None], np.arange(self.values.shape[1])
-        last = self.first_below[self.ends] - 1
-        inner, outer = self.values[patch, ray, last], self.values[patch, ray, last + 1]
-        share = (inner - self.level[self.ends, None]) / np.maximum(inner - outer, np.float32(1e-9))
-        return np.asarray(self.step_px * (last + np.clip(share, 0.0, 1.0)), np.float32)
+        """(rays, those that end) px to where the rays fall below half of the height."""
+        values, level = self.values[..., self.ends], self.level[self.ends]
+        last = (values < level).argmax(axis=0)[None] - 1
+        inner, outer = np.take_along_axis(values, last, axis=0)[0], np.take_along_axis(values, last + 1, axis=0)[0]
+        share = (inner - level) / np.maximum(inner - outer, np.float32(1e-9))
+        return np.asarray(self.step_px * (last[0] + np.clip(share, 0.0, 1.0)), np.float32)
 
 
 def _nearest(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
-    """(n, rays, steps) pixels nearest to offsets (2, rays, steps) from places (n, 2), within the image."""
+    """(steps, rays, n) pixels nearest to offsets (2, steps, rays) from places (n, 2), within the image."""
     col, row = np.rint(offsets).astype(np.intp)
     width = image.shape[1]
-    at = (places @ (1, width))[:, None, None] + (col + width * row)
+    at = (col + width * row)[..., None] + places @ (1, width)
     return np.asarray(image.ravel().take(at), np.float32)
 
 
 def _interpolated(image: Image, places: NDArray[np.intp], offsets: Array) -> Image:
-    """(n, rays, steps) grey values at offsets (2, rays, steps) from places (n, 2)."""
-    at, off = places.astype(np.float32), offsets.reshape(2, -1).astype(np.float32)
-    values = cv2.remap(image, at[:, :1] + off[0], at[:, 1:] + off[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, np.float32).reshape(len(places), *offsets.shape[1:])
+    """(steps, rays, n) grey values at offsets (2, steps, rays) from places (n, 2)."""
+    at, off = places.T.astype(np.float32), offsets.reshape(2, -1, 1).astype(np.float32)
+    values = cv2.remap(image, at[0] + off[0], at[1] + off[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, np.float32).reshape(*offsets.shape[1:], len(places))
 
 
 def _outlines(places: NDArray[np.intp], profiles: _Profiles) -> Outlines:
     """Of the patches that end: the moments of the polygons that the rays' ends make, by Green's theorem."""
-    x, y = profiles.directions[:, None].astype(np.float32) * profiles.radii()
-    x1, y1 = (np.concatenate([each[:, 1:], each[:, :1]], axis=1) for each in (x, y))
+    x, y = profiles.directions[..., None].astype(np.float32) * profiles.radii()
+    x1, y1 = (np.roll(each, -1, axis=0) for each in (x, y))
     twice = x * y1 - x1 * y
-    area = twice.sum(axis=1) / 2
-    col, row = ((twice * (a + b)).sum(axis=1) / (6 * area) for a, b in ((x, x1), (y, y1)))
-    xx, yy = ((twice * (a * a + a * b + b * b)).sum(axis=1) / (12 * area) for a, b in ((x, x1), (y, y1)))
-    xy = (twice * (2 * (x * y + x1 * y1) + x * y1 + x1 * y)).sum(axis=1) / (24 * area)
+    area = twice.sum(axis=0) / 2
+    col, row = ((twice * (a + b)).sum(axis=0) / (6 * area) for a, b in ((x, x1), (y, y1)))
+    xx, yy = ((twice * (a * a + a * b + b * b)).sum(axis=0) / (12 * area) for a, b in ((x, x1), (y, y1)))
+    xy = (twice * (2 * (x * y + x1 * y1) + x * y1 + x1 * y)).sum(axis=0) / (24 * area)
     xx, xy, yy = xx - col * col, xy - col * row, yy - row * row
-    x, y = x - col[:, None], y - row[:, None]
-    squares = (yy[:, None] * x * x - 2 * xy[:, None] * x * y + xx[:, None] * y * y) / (4 * (xx * yy - xy * xy))[:, None]
-    misfit = np.sqrt(np.mean((np.sqrt(np.maximum(squares, 0.0)) - 1) ** 2, axis=1))
+    x, y = x - col, y - row
+    squares = (yy * x * x - 2 * xy * x * y + xx * y * y) / (4 * (xx * yy - xy * xy))
+    misfit = np.sqrt(np.mean((np.sqrt(np.maximum(squares, 0.0)) - 1) ** 2, axis=0))
     center, moments = np.stack([col, row], axis=1), np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     height = profiles.height[profiles.ends]
     return Outlines(places + center.astype(float), moments.astype(float), misfit.astype(float), height.astype(float))
