@@ -19,7 +19,7 @@ class Status(StrEnum):
 
 MEANING = {
     Status.MEASURED: "Found, fitted and consistent with all checks.",
-    Status.WEAK: "Fitted, but damaged, faint or partly covered; its larger standard deviation says by how much.",
+    Status.WEAK: "Fitted, but damaged, faint, partly covered or not well known; its standard deviation says how well.",
     Status.PREDICTED: "Not seen; the coordinates are where the other marks say it should be.",
     Status.REJECTED: "Something was found and measured, but a check says that it is not this mark.",
     Status.ABSENT: "Not found, outside the scan or unreadable.",
