@@ -7,9 +7,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from drawn import scan_of
 from measured_marks import CONTRAST, GROUND, Found, measured
 from numpy.typing import NDArray
-from true_marks import KIND, Kind, TrueMark, scan_of, some_mark
+from true_marks import KIND, Kind, TrueMark, some_mark
 
 from measure.constellation import Placement
 from measure.disks import PLAIN_MARGIN_PX

@@ -12,8 +12,9 @@ import time
 
 import cv2
 import numpy as np
+from drawn import scan_of
 from numpy.typing import NDArray
-from true_marks import areas_of, scan_of
+from true_marks import areas_of
 
 from measure.fiducials import measure_fiducials
 from measure.scan import Scan

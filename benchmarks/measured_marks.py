@@ -3,8 +3,9 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from drawn import scan_of
 from numpy.typing import NDArray
-from true_marks import TrueMark, scan_of
+from true_marks import TrueMark
 
 from measure.disks import fit_disk
 from measure.fiducial_options import FiducialOptions

@@ -75,8 +75,8 @@ def placed(px_per_mm: float, center_px: tuple[float, float], turn_rad: float = 0
     return np.column_stack([px_per_mm * np.array([[c, -s], [-s, -c]]), center_px])
 
 
-def scan_of(grey: Array, folder: Path, name: str = "scan.tif") -> Scan:
-    """The grey values, rounded to 16 bits (8 where they are bytes), as an opened scan."""
+def written_scan(grey: Array, folder: Path, name: str = "scan.tif") -> Scan:
+    """The grey values, rounded to 16 bits (8 where they are bytes), written to a file and opened."""
     stored = grey if grey.dtype == np.uint8 else np.clip(np.rint(grey), 0, 65535).astype(np.uint16)
     tifffile.imwrite(folder / name, stored)
     return open_scan(folder / name)

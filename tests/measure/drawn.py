@@ -7,16 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.picture_scan import WholePicture
+from measure.radiometry import Samples
 from measure.resolution import NO_TAGS
 from measure.scan import Scan
 
 Array = NDArray[np.float64]
 
 
-def scan_of(grey: Array) -> Scan:
-    """A scan of 16 bits in memory."""
-    stored = np.clip(np.round(grey), 0, 65535).astype(np.uint16)
-    return Scan(Path("drawn.tif"), WholePicture(stored[..., None]), NO_TAGS)
+def scan_of(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0) -> Scan:
+    """Grey values (height, width), rounded and cut off, as a scan of 16 or 8 bits in memory."""
+    rounded = np.clip(np.rint(grey), 0, full_scale)[..., None]
+    stored: Samples = rounded.astype(np.uint16) if full_scale > 255 else rounded.astype(np.uint8)
+    return Scan(Path("drawn.tif"), WholePicture(stored, rounding_step_dn), NO_TAGS)
 
 
 def drawn(

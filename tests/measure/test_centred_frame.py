@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from brute_marks import Array, scan_of
+from brute_marks import Array, written_scan
 from test_fiducials import CORNERS, NUMBERED, assert_right, frame_picture, layout_of, pixel_from_camera
 
 from measure import fiducials
@@ -37,7 +37,7 @@ def measured(
         return anywhere(search, *given)
 
     monkeypatch.setattr(fiducials, "_anywhere", noted)
-    with scan_of(grey, folder) as scan:
+    with written_scan(grey, folder) as scan:
         return measure_fiducials(scan, layout, PITCH_UM), bool(searches)
 
 

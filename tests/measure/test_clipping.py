@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from true_marks import KIND, TrueMark, scan_of, some_mark, whitened_rms
+from drawn import scan_of
+from true_marks import KIND, TrueMark, some_mark, whitened_rms
 
 from measure.clipping import censored, clipped_sides, noise_scale
 from measure.fiducial_options import FiducialOptions

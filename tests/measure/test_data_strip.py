@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from brute_marks import Array, scan_of
+from brute_marks import Array, written_scan
 from scipy.ndimage import gaussian_filter
 from test_fiducials import ALIKE, PITCH_UM, frame_picture, pixel_from_camera
 
@@ -55,7 +55,7 @@ def posed(grey: Array, pose: str) -> Array:
 
 
 def pose_of(grey: Array, folder: Path) -> Pose:
-    with scan_of(grey, folder) as scan:
+    with written_scan(grey, folder) as scan:
         pose = measure_fiducials(scan, LAYOUT, (PITCH_UM, PITCH_UM)).pose
     assert pose is not None
     return pose
@@ -75,7 +75,7 @@ def test_without_writing_nothing_is_said(tmp_path: Path) -> None:
 
 
 def test_only_writing_counts(tmp_path: Path) -> None:
-    with scan_of(written_frame(), tmp_path) as scan:
+    with written_scan(written_frame(), tmp_path) as scan:
         beside = beside_frame(scan, LAYOUT, pixel_from_camera("0", 0.004, (MIDDLE, MIDDLE)), "0")
     assert beside["left"].written > 0.4 * beside["left"].seen
     assert all(beside[side].written < 0.15 * beside[side].seen for side in ("right", "top", "bottom"))

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from brute_marks import Array, brute_picture, scan_of
+from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
 from measure.faint_marks import FaintMark, find_faint
@@ -29,7 +29,7 @@ def places(seed: int) -> Array:
 
 
 def seen_at(grey: Array, predicted: Array, folder: Path) -> list[FaintMark | None]:
-    with scan_of(grey, folder) as scan:
+    with written_scan(grey, folder) as scan:
         return [
             find_faint(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1), 0.0, 0.7)
             for place in predicted

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from brute_marks import Array, brute_picture, scan_of
+from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
@@ -76,7 +76,7 @@ def paint(grey: Array, mark: Mark, xy_mm: tuple[float, float], matrix: Array, co
 def measured(
     grey: Array, layout: FiducialLayout, folder: Path, options: FiducialOptions | None = None, pitch: bool = True
 ) -> FrameMeasurement:
-    with scan_of(grey, folder) as scan:
+    with written_scan(grey, folder) as scan:
         result = measure_fiducials(scan, layout, (PITCH_UM, PITCH_UM) if pitch else None, options)
     assert [mark.point for mark in result.marks] == [mark.id for mark in layout.marks]
     return result
@@ -168,7 +168,7 @@ def test_zero_marks_give_no_silent_identity(tmp_path: Path) -> None:
         assert "no fiducial was measured" in result.problems[0]
 
 
-def test_a_scan_of_another_camera_is_refused_with_a_count(tmp_path: Path) -> None:
+def test_a_written_scan_another_camera_is_refused_with_a_count(tmp_path: Path) -> None:
     smaller = layout_of([MarkShape(RING_CROSS)] * 4, ((8.0, -8.0), (-8.0, -8.5), (-7.0, 8.0), (8.3, 8.0)))
     result = measured(frame_picture(smaller, pixel_from_camera("0")), ALIKE, tmp_path)
     assert result.pixel_from_camera is None

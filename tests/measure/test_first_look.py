@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from drawn import scan_of
 from scipy.ndimage import gaussian_filter
-from true_marks import KIND, scan_of, some_mark
+from true_marks import KIND, some_mark
 
 from measure.fiducial_options import FiducialOptions
 from measure.first_look import seen

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from brute_marks import scan_of
+from brute_marks import written_scan
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
@@ -65,7 +65,7 @@ def test_corners_of_the_frame_are_where_its_edges_meet(
     tmp_path: Path, radius_mm: float, neighbour: bool, negative: bool
 ) -> None:
     grey = picture(1, radius_mm, neighbour, negative)
-    with scan_of(grey, tmp_path) as scan:
+    with written_scan(grey, tmp_path) as scan:
         frame = measure_fiducials(scan, layout(radius_mm), (50.0, 50.0), FiducialOptions(pose="0"))
     scores = []
     for mark in frame.marks:
@@ -81,7 +81,7 @@ def test_corners_of_the_frame_are_where_its_edges_meet(
 def test_no_corner_is_seen_in_a_landscape(tmp_path: Path) -> None:
     land = 15000 + 3000 * gaussian_filter(np.random.default_rng(3).normal(0, 1, (400, 400)), 3.0) / 0.09
     start = np.column_stack([MATRIX[:, :2], (200.0, 200.0)])
-    with scan_of(np.asarray(land), tmp_path) as scan:
+    with written_scan(np.asarray(land), tmp_path) as scan:
         corner = frame_corner((-10.0, 10.0), 5.0)
         fit = corner_of_edges(scan, corner, MarkPrediction(corner, start, 10.0, 1))
     assert not fit.converged

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from drawn import scan_of
 from true_marks import (
     KIND,
     WING,
@@ -9,7 +10,6 @@ from true_marks import (
     TrueMark,
     grain_correlation,
     grainy,
-    scan_of,
     some_mark,
     whitened_rms,
 )

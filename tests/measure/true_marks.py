@@ -4,17 +4,12 @@ places from differences of those pictures. Nothing of `measure` draws here."""
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from measure.picture_scan import WholePicture
-from measure.radiometry import Samples
-from measure.resolution import NO_TAGS
-from measure.scan import Scan
 from measure.shapes import Bar, Disk, MarkShape, Part, Ring, cross, dot, polygon, ring_cross, ring_dot
 from synthetic_images import areas
 from synthetic_images.optics import reach_px, seen_coverage
@@ -220,13 +215,6 @@ def _matrix(correlation: Array, seen: Mask) -> Array:
     lag = place[:, None] - place[None]
     far = np.abs(lag).max(axis=2) > reach
     return np.where(far, 0.0, correlation[tuple(np.moveaxis(np.clip(lag, -reach, reach) + reach, -1, 0))])
-
-
-def scan_of(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0) -> Scan:
-    """Grey values as a scan of 16 or 8 bits in memory."""
-    rounded = np.clip(np.rint(grey), 0, full_scale)[..., None]
-    stored: Samples = rounded.astype(np.uint16) if full_scale > 255 else rounded.astype(np.uint8)
-    return Scan(Path("true.tif"), WholePicture(stored, rounding_step_dn), NO_TAGS)
 
 
 def grainy(size: int, grain_px: float, rng: np.random.Generator) -> Array:
