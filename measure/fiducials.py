@@ -11,29 +11,26 @@ from measure.chance import doubt
 from measure.constellation import Placement
 from measure.correlation import CLOSE
 from measure.fiducial_options import FiducialOptions
+from measure.fiducial_rows import absent_frame, present_frame
 from measure.frame import Frame
 from measure.frame_fit import AFFINITY_SIGMA
 from measure.frame_measurement import measure_frame
 from measure.frame_search import FrameSearch
-from measure.learned import honest_covariance
 from measure.pitches import PitchHypothesis, pitch_hypotheses
 from measure.pose_decision import decide_pose
 from measure.poses import POSES
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.results import FrameMeasurement, Pose
 from measure.scan import Scan
-from measure.second_place import SecondPlace
-from measure.shapes import FiducialLayout, LayoutMark, MarkTemplate
-from measure.status import Status
+from measure.shapes import FiducialLayout
 
 Array = NDArray[np.float64]
 
-_FAINT = "the frame was found at a closer look only, its marks being faint beside what surrounds them"
 _SET = ("set in the project.",)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
+_HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 _LOOKS = 2  # in the whole scan, and where the frame's edges put the marks
-_HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
 
@@ -52,7 +49,34 @@ def measure_fiducials(
     options = options or FiducialOptions()
     search = FrameSearch(scan, layout, options)
     hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
-    found, frame = _in_the_middle(search, hypotheses[0][0]) if pitch_um is not None else ([], None)
+    found, frame = _at_first_look(search, hypotheses, pitch_um is not None)
+    if frame is None or not frame.accepted:
+        reason = frame.misfit() if frame else "nothing in the scan looks like two or more of the camera's marks"
+        search = FrameSearch(scan, layout, options, CLOSE)
+        limit = np.inf if pitch_um is None else _STRETCH
+        closer = [replace(each, tolerance=min(each.tolerance, limit)) for each in hypotheses[0]]
+        found, frame = _at_a_closer_look(search, closer)
+    if frame is None:
+        return absent_frame(scan, layout, reason)
+    found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
+    pose = Pose(options.pose, True, _SET)
+    if options.pose == "auto":
+        pose, placement = _named(search, found, frame)
+        if pose.name != frame.placement.pose:
+            frame = measure_frame(scan, layout, placement, options)
+    chance = doubt(search, frame)
+    problems = [f"{sentence}." for sentence in (*_rivals(found, frame.placement), chance) if sentence]
+    if problems and options.pose == "auto":
+        pose = Pose(pose.name, False, (*pose.evidence, *problems))
+    return present_frame(scan, layout, frame, pose, problems, chance)
+
+
+def _at_first_look(
+    search: FrameSearch, hypotheses: Sequence[Sequence[PitchHypothesis]], is_given: bool
+) -> tuple[list[Placement], Frame | None]:
+    """The placements, best first, and the frame in one of them, None where there is none: in the middle of a scan whose
+    pitch is given, or anywhere, and under other pitches where that may be no frame of the camera."""
+    found, frame = _in_the_middle(search, hypotheses[0][0]) if is_given else ([], None)
     if frame is None or not is_complete(frame):
         found, frame = _anywhere(search, hypotheses[0])
     tried = len(hypotheses[0])
@@ -61,22 +85,7 @@ def measure_fiducials(
             break
         tried += len(others)
         found, frame = _in_spite_of_pitch(search, others, tried) or (found, frame)
-    if frame is None or not frame.accepted:
-        reason = frame.misfit() if frame else "nothing in the scan looks like two or more of the camera's marks"
-        search = FrameSearch(scan, layout, options, CLOSE)
-        limit = np.inf if pitch_um is None else _STRETCH
-        closer = [replace(each, tolerance=min(each.tolerance, limit)) for each in hypotheses[0]]
-        found, frame = _at_a_closer_look(search, closer)
-    if frame is None:
-        return _nothing(scan, layout, reason)
-    found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
-    pose = Pose(options.pose, True, _SET)
-    if options.pose == "auto":
-        posed = [_posed(found, frame.placement, pose) for pose in POSES]
-        pose = decide_pose(scan, layout, posed, frame, options)
-        if pose.name != frame.placement.pose:
-            frame = measure_frame(scan, layout, posed[POSES.index(pose.name)], options)
-    return _measurement(scan, layout, frame, pose, _rivals(found, frame.placement), doubt(search, frame))
+    return found, frame
 
 
 def _in_the_middle(search: FrameSearch, given: PitchHypothesis) -> tuple[list[Placement], Frame | None]:
@@ -106,14 +115,13 @@ def _anywhere(search: FrameSearch, hypotheses: Sequence[PitchHypothesis]) -> tup
 def _as_its_pictures_say(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> Frame:
     """The frame in a placement. At the right place in a wrong pose unlike marks are not found under one another's
     names: where that is so, the pictures there decide the pose, and the frame is measured in it."""
-    scan, layout, options = search.scan, search.layout, search.options
-    frame = measure_frame(scan, layout, placement, options)
-    if frame.accepted or not frame.belongs.any() or options.pose != "auto":
+    frame = measure_frame(search.scan, search.layout, placement, search.options)
+    if frame.accepted or not frame.belongs.any() or search.options.pose != "auto":
         return frame
-    pose = decide_pose(scan, layout, [_posed(found, placement, pose) for pose in POSES], frame, options)
+    pose, renamed = _named(search, found, frame)
     if not pose.decided or pose.name == placement.pose:
         return frame
-    return measure_frame(scan, layout, _posed(found, placement, pose.name), options)
+    return measure_frame(search.scan, search.layout, renamed, search.options)
 
 
 def _in_spite_of_pitch(
@@ -162,15 +170,13 @@ def _hardly_chance(
 def _in_its_likeliest_poses(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> list[Frame]:
     """The frame in a placement, and in the pose that its pictures like best, for faint marks are not seen under one
     another's names, though they say not surely which these are."""
-    scan, layout, options = search.scan, search.layout, search.options
-    frame = measure_frame(scan, layout, placement, options)
-    if options.pose != "auto" or not frame.belongs.any():
+    frame = measure_frame(search.scan, search.layout, placement, search.options)
+    if search.options.pose != "auto" or not frame.belongs.any():
         return [frame]
-    posed = [_posed(found, placement, pose) for pose in POSES]
-    pose = decide_pose(scan, layout, posed, frame, options)
+    pose, renamed = _named(search, found, frame)
     if pose.name == placement.pose:
         return [frame]
-    return [frame, measure_frame(scan, layout, posed[POSES.index(pose.name)], options)]
+    return [frame, measure_frame(search.scan, search.layout, renamed, search.options)]
 
 
 def _seen_px(frame: Frame) -> dict[int, Array]:
@@ -196,6 +202,13 @@ def _others(found: Sequence[Placement]) -> list[Placement]:
     return others
 
 
+def _named(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> tuple[Pose, Placement]:
+    """The pose that what is seen of the frame speaks for, and the frame's placement in it."""
+    posed = [_posed(found, frame.placement, pose) for pose in POSES]
+    pose = decide_pose(search.scan, search.layout, posed, frame, search.options)
+    return pose, posed[POSES.index(pose.name)]
+
+
 def _posed(found: Sequence[Placement], best: Placement, pose: str) -> Placement:
     """The placement of a pose at the place of the best one: as it was found, or else the best one's, renamed."""
     return next(
@@ -218,77 +231,3 @@ def _rivals(found: Sequence[Placement], best: Placement) -> list[str]:
                 f"{other.supported} marks against {best.supported}: the marks' names are not certain"
             )
     return problems[:3]
-
-
-def _nothing(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasurement:
-    marks = tuple(
-        MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}") for mark in layout.marks
-    )
-    problem = f"no fiducial was measured: {reason}; look whether the camera is that of the scan, and the pitch right."
-    return FrameMeasurement(scan.name, marks, None, None, (problem,))
-
-
-def _measurement(
-    scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, rivals: Sequence[str], chance: str
-) -> FrameMeasurement:
-    """rivals, chance: why the frame may lie elsewhere, sentences; if it may be chance none of its marks is certain, nor
-    if it was found at a closer look."""
-    marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
-    weak = chance or (_FAINT if frame.placement.surroundings == CLOSE else "")
-    if weak:
-        marks = tuple(
-            replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
-        )
-    problems = [f"{sentence}." for sentence in (*rivals, *([chance] if chance else []))]
-    if problems and pose.evidence != _SET:
-        pose = Pose(pose.name, False, (*pose.evidence, *problems))
-    per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
-    if abs(per_mm[0] / per_mm[1] - 1) > 2 * AFFINITY_SIGMA:
-        problems.append(
-            f"by the marks a pixel is {1000 / per_mm[0]:.1f} um wide and {1000 / per_mm[1]:.1f} um tall: film is never "
-            "stretched so much. Look whether the scanner, or the camera file, is to blame."
-        )
-    used = int(frame.belongs.sum())
-    if used <= 3:
-        problems.append(f"an affine transformation on {used} fiducials has no redundancy: no check.")
-    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, tuple(problems))
-
-
-def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasurement:
-    sighting = frame.sightings[index]
-    fit = sighting.fit
-    if not sighting.inside:
-        return MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, sighting.reason)
-    if fit is None:
-        return MarkMeasurement(mark.id, "fiducial", sighting.predicted_px, None, Status.PREDICTED, sighting.reason)
-    quality = {
-        "snr": fit.snr,
-        "contrast_dn": fit.contrast_dn,
-        "noise_dn": fit.noise_dn,
-        "blur_px": fit.blur_px,
-        "damaged_fraction": fit.damaged_fraction,
-        "likeness": fit.likeness,
-        "significance": fit.significance,
-        "redundancy": float(fit.redundancy),
-        "neighbour_correlation": fit.neighbour_correlation,
-        **_by_edges(fit.edges),
-    }
-    status, reason = frame.verdict(index)
-    covariance = fit.covariance_px2
-    if isinstance(mark.mark, MarkTemplate):
-        covariance = honest_covariance(mark.mark, scan, fit)
-        if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:
-            status, reason = Status.WEAK, "its template is its own picture: nothing checks its place"
-    return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
-
-
-def _by_edges(edges: SecondPlace | None) -> dict[str, float]:
-    """How far from the matched place the second method puts the mark, and in standard deviations of that."""
-    if edges is None:
-        return {}
-    col, row = edges.offset_px
-    return {
-        "second_method_col_px": float(col),
-        "second_method_row_px": float(row),
-        "second_method_sigmas": edges.sigmas,
-    }
