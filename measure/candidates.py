@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from measure.correlation import WIDE, Map, Surroundings
 from measure.rendering import ROUGH_CELLS, extent_px, picture
-from measure.scan import Scan
+from measure.scan import SINGLE_CHANNELS, Scan
 from measure.shapes import Mark, MarkTemplate, thinnest_mm
 
 Array = NDArray[np.float64]
@@ -21,6 +21,8 @@ Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
 
 _EXTENT_PX = 14.0  # of the reduced mark
 _THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns
+_BLUR_PX = 0.6  # of the reduced mark: the averaging's own 0.3, and what is left of the scan's
+_RIM_PX = 2  # of the reduced scan, about the drawing: so far the blur takes it
 _LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
 _SHARED_PX = 16  # of the reduced scan: places so near to one another share a window
 _ALIKE = 0.8  # correlation above which two pictures of marks share one response
@@ -214,9 +216,9 @@ def _is_quarter(turn: Array) -> bool:
 def _template(look: Look, reduction: int) -> Array:
     linear = _centred(look.linear) / reduction
     least, greatest = extent_px(look.mark, linear)
-    half = int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + 2
+    half = int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + _RIM_PX
     linear[:, 2] = half
-    return picture(look.mark, linear, 2 * half + 1, 2 * half + 1, 0.6, ROUGH_CELLS)
+    return picture(look.mark, linear, 2 * half + 1, 2 * half + 1, _BLUR_PX, ROUGH_CELLS)
 
 
 def _centred(linear: Array) -> Array:
@@ -251,4 +253,4 @@ def _likeness(templates: Sequence[Array]) -> Array:
 def _channel_weights(scan: Scan) -> tuple[tuple[float, ...], ...]:
     if scan.channels == 1:
         return ((1.0,),)
-    return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return SINGLE_CHANNELS

@@ -12,6 +12,8 @@ from measure.shapes import Mark
 
 Array = NDArray[np.float64]
 
+_MARGIN_PX = 4.0  # of ground about a mark, from which its offset and slopes are told
+_BLUR_PX = 0.8  # of a mark's picture: what a match begins with
 _SHRINK = 0.1  # of the noise covariance towards a multiple of the unit matrix: few pixels know it badly
 
 
@@ -25,13 +27,13 @@ def best_weights(scan: Scan, marks: Sequence[tuple[Mark, Array]]) -> tuple[float
         return None
     contrast, covariance = np.zeros(scan.channels), np.zeros((scan.channels, scan.channels))
     for mark, pixel_from_mark in marks:
-        col0, row0, width, height = window_about(mark, pixel_from_mark, 4.0)
+        col0, row0, width, height = window_about(mark, pixel_from_mark, _MARGIN_PX)
         channels = np.stack(
             [scan.window(col0, row0, width, height, unit).ravel() for unit in np.eye(scan.channels).tolist()]
         )
         shifted = np.array(pixel_from_mark)
         shifted[:, 2] -= (col0, row0)
-        value = picture(mark, shifted, width, height, 0.8).ravel()
+        value = picture(mark, shifted, width, height, _BLUR_PX).ravel()
         row, col = np.mgrid[:height, :width].reshape(2, -1).astype(float)
         design = np.stack([value, np.ones_like(value), col, row], axis=1)
         solution, *_ = np.linalg.lstsq(design, channels.T, rcond=None)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from measure.candidates import Responses
 from measure.correlation import WIDE, Surroundings
 from measure.poses import up_from_camera
-from measure.response_layers import Layer, Reach, narrowed
+from measure.response_layers import LEAST_TOLERANCE_PX, Layer, Reach, narrowed
 from measure.shapes import LayoutMark, Mark
 
 Array = NDArray[np.float64]
@@ -22,10 +22,13 @@ Complex = NDArray[np.complex128]
 NARROW = 0.25  # of the tolerance: marks on film that is hardly deformed agree as well
 _LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
 _PAIRS = 60  # of marks that hypotheses are made from
+_FAR = 0.4  # of the largest distance of two marks: nearer ones tell turn and scale badly
 _KEPT = 12  # placements of a pose that are refined
 _SLID = 3  # of them, in a lattice, that are moved by its steps
 _NEIGHBOURS = 4  # of a mark of a lattice
 _ALIKE = 0.5  # of the marks that a step takes to others: they are a lattice
+_SAME_PX = 10  # of the reduced scan: placements no farther apart put a mark on itself, which is some 14 px large there
+_SAME_SIZE = 0.01  # the same at the frame's edge, a thousand of these pixels off the middle
 _OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
 
 
@@ -63,7 +66,7 @@ class Placement:
         """Whether both put the frame at the same place and size, however its marks are named."""
         shift = np.hypot(*(self.pixel_from_camera[:, 2] - other.pixel_from_camera[:, 2]))
         sizes = [np.sqrt(abs(np.linalg.det(each.pixel_from_camera[:, :2]))) for each in (self, other)]
-        return bool(shift < 10 * self.reduction and abs(sizes[0] / sizes[1] - 1) < 0.01)
+        return bool(shift < _SAME_PX * self.reduction and abs(sizes[0] / sizes[1] - 1) < _SAME_SIZE)
 
     def posed(self, pose: str) -> "Placement":
         """The same place of the frame, its marks named as in another pose."""
@@ -117,7 +120,7 @@ class PlacementSearch:
     ) -> None:
         self.marks, self.responses, self.bounds = marks, responses, bounds
         self.pitch = np.asarray(pitch_mm)
-        self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, 1.5)
+        self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
         self.layers = {
             key: Layer(map_, responses.origin(key[0]), self.tolerance_px) for key, map_ in responses.maps.items()
         }
@@ -226,7 +229,7 @@ class _Constellation:
         """Pairs of marks far apart, spread evenly over all marks where there are too many."""
         first, second = np.triu_indices(len(self.camera), 1)
         length = np.abs(self.camera[first] - self.camera[second])
-        far = np.flatnonzero(length >= 0.4 * length.max())
+        far = np.flatnonzero(length >= _FAR * length.max())
         step = max(1.0, len(far) / _PAIRS)
         chosen = far[(np.arange(min(len(far), _PAIRS)) * step).astype(int)]
         return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))

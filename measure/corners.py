@@ -17,14 +17,14 @@ from scipy.special import erf, ndtr, owens_t
 
 from measure.junction import junction
 from measure.noise import NoiseModel, correlated, noise_model, robust_scale
+from measure.picture_model import PIXEL_VARIANCE_PX2
 from measure.pixel_sums import products
+from measure.robust import tukey_weights
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Surface = Callable[[Array, Array, float], tuple[Array, Array, Array, Array]]
 
-PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur
-TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
 MAX_ITERATIONS = 30
 LARGEST_WINDOW_PX = 3.5  # the standard deviation of the gradients' window about a crossing
@@ -32,6 +32,10 @@ UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
 # Plain, then thrice robust: the scale of the residuals is taken once before each, so that it settles.
 STAGES_TOLERANCE_PX = (0.05, 0.05, 0.01, 0.001)
 SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
+MOST_SHIFT = 0.6  # of the reach: farther off, another corner's edges are nearer
+MOST_TURN_RAD = 0.35  # of an edge: twenty degrees, which no approximate place is wrong by
+START_BLUR_PX, LEAST_BLUR_PX = 0.8, 0.3  # the pixel's share included
+LONGEST_TURN_RAD = 0.15  # of an edge in a step: its picture is no longer linear in more
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +125,8 @@ class _CornerFit:
         mirrored = np.linalg.det(steps_px) < 0
         self.edges = np.arctan2(steps_px[1], steps_px[0]) + np.pi / 2 + np.pi * np.array([mirrored, not mirrored])
         self.start_edges = self.edges.copy()
-        self.max_shift_px, self.max_turn_rad = 0.6 * float(reach_px.min()), 0.35
-        self.variance = 0.8**2
+        self.max_shift_px = MOST_SHIFT * float(reach_px.min())
+        self.variance = START_BLUR_PX**2
         self.max_variance = (float(reach_px.min()) / 2) ** 2 + PIXEL_VARIANCE_PX2
         self.bends = surface is crossing
         self.linear = np.zeros(5 if self.bends else 4)  # half the contrast, offset, gradient (2), bend
@@ -181,8 +185,7 @@ class _CornerFit:
             if self.reason:
                 return
             design, residuals = self._linearised()
-            relative = np.clip(np.abs(residuals) / (TUKEY * self.scale_dn), 0.0, 1.0)
-            self.weights = self._area() * (1 - relative**2) ** 2
+            self.weights = self._area() * tukey_weights(residuals, self.scale_dn)
             if self._step(design, residuals) < tolerance_px:
                 return
         self.reason = self.reason or "the fit does not settle"
@@ -237,13 +240,13 @@ class _CornerFit:
             return 0.0
         scaled = normal / np.outer(size, size) + 1e-9 * np.eye(self.unknowns)
         step = np.linalg.solve(scaled, np.tensordot(weighted, residuals, axes=2) / size) / size
-        step /= max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / 0.15, 1.0)
+        step /= max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / LONGEST_TURN_RAD, 1.0)
         self.center += step[:2]
         self.edges += step[2:4]
         variance = np.clip(self.variance + step[4], self.variance / 2, self.variance * 2)
-        self.variance = float(np.clip(variance, 0.3**2, self.max_variance))
+        self.variance = float(np.clip(variance, LEAST_BLUR_PX**2, self.max_variance))
         if np.hypot(*(self.center - self.start)) > self.max_shift_px:
             self.reason = "the fit ran away to something else"
-        elif np.abs(self.edges - self.start_edges).max() > self.max_turn_rad:
+        elif np.abs(self.edges - self.start_edges).max() > MOST_TURN_RAD:
             self.reason = "the edges here run otherwise than they should"
         return float(np.hypot(*step[:2]))

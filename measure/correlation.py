@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.noise import SIGMA_OF_DEVIATION
+
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
@@ -14,7 +16,6 @@ _MEAN = 0.3  # of the coarse: the side of the squares whose median is background
 _DRAWN = 0.05  # of the mark's own contrast: what differs by more from the ground is the mark
 _SMOOTHED_PX = 3.0  # the standard deviation of a Gaussian that a reduced picture still shows
 _EVEN = 1e-5  # mean square in units of the local contrast: a three hundredth of it is rounding
-_SIGMA = 1.4826  # standard deviations to a median deviation
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Surroundings:
         coarse_px = self.coarse * detail_px
         detail = image - _median(image, coarse_px)
         if self.robust:
-            variance = (_SIGMA * _median(np.abs(detail), coarse_px)) ** 2
+            variance = (SIGMA_OF_DEVIATION * _median(np.abs(detail), coarse_px)) ** 2
         else:
             variance = _smoothed(detail**2, 2 * coarse_px)
         contrast = np.sqrt(variance + faint_dn**2)

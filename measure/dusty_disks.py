@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from measure.disks import FittedDisk
+from measure.noise import SIGMA_OF_DEVIATION
 
 Array = NDArray[np.float64]
 
@@ -107,7 +108,7 @@ def _common(appearances: Array, disks: Sequence[FittedDisk]) -> _Common:
     before = np.array([WHOLE, DAMAGED])
     shares = before
     appearance = np.median(appearances, axis=0)
-    spread = np.maximum((1.4826 * np.median(np.abs(appearances - appearance), axis=0)) ** 2, _LEAST_SPREAD)
+    spread = np.maximum((SIGMA_OF_DEVIATION * np.median(np.abs(appearances - appearance), axis=0)) ** 2, _LEAST_SPREAD)
     kinds = np.zeros((len(DUST), len(disks)))
     for _ in range(_ROUNDS):
         weights = np.linalg.inv(noise + np.diag(spread) + dust)

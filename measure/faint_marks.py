@@ -29,6 +29,8 @@ _SELF = 0.1  # of the mark's own response: what is below it tells of the texture
 _SHOWN = 0.2  # of the mark's own weight: elsewhere the ground is too dark to tell
 _LINE = 0.25  # of the strongest: what counts as the mark's lines
 _ROUNDS = 3  # of rendering the mark anew where it was found
+_AGAIN_PX = 1.5  # about the place where it was found, for that
+_VERTEX_PX = 0.7  # of a paraboloid's top from the highest pixel, along either axis
 _LEAST_DISTANCE_PX = 1.0  # predictions are no better
 _LEAST_PLACES = 200  # of the texture that a covariance can be taken from
 
@@ -62,7 +64,7 @@ def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px:
         place = response.highest(center, reach_px)
         if place is None:
             return None
-        center, reach_px = place, 1.5
+        center, reach_px = place, _AGAIN_PX
     return field.seen(response, center, blur_px)
 
 
@@ -87,7 +89,7 @@ class _Response:
         top: Array = np.array([col, row]) + self.fraction
         if not np.all(np.linalg.eigvalsh(hessian) < 0):
             return top
-        return np.asarray(top + np.clip(-np.linalg.solve(hessian, gradient), -0.7, 0.7))
+        return np.asarray(top + np.clip(-np.linalg.solve(hessian, gradient), -_VERTEX_PX, _VERTEX_PX))
 
 
 class _Field:

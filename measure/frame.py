@@ -14,11 +14,13 @@ from measure.status import Status
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-CLEAR_LIKENESS = 0.5
-CLEAR_DAMAGE = 0.25
+CLEAR_LIKENESS = 0.5  # below it a mark's picture has more in it that is not the mark
+CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be another's
 _CLEAR_SNR = 3.0
+_AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
 _WRONG_PX, _WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
+_LEAST_SCATTER_MM = 0.01  # of few marks, which may agree by chance better than film keeps them
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +59,7 @@ class Frame:
     def agrees(self) -> bool:
         """Whether enough marks agree, clear or not: three, and three in ten of those in the scan."""
         inside = sum(sighting.inside for sighting in self.sightings)
-        return int(self.belongs.sum()) >= max(self._least, int(np.ceil(0.3 * inside)))
+        return int(self.belongs.sum()) >= max(self._least, int(np.ceil(_AGREEING_SHARE * inside)))
 
     @property
     def accepted(self) -> bool:
@@ -67,7 +69,7 @@ class Frame:
 
     @property
     def _least(self) -> int:
-        return max(min(3, len(self.sightings)), 2)
+        return max(min(_AGREEING, len(self.sightings)), 2)
 
     def misfit(self) -> str:
         """A sentence for a frame that is not accepted."""
@@ -92,6 +94,6 @@ class Frame:
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
         if stats.chi2.sf((_WRONG_PX / sigma_px) ** 2, 2) > _WRONG_CHANCE:
             reasons.append(f"its standard deviation is {sigma_px:.2f} px")
-        if self.misfit_mm[index] > _FAR * max(self.scatter_mm, 0.01):
+        if self.misfit_mm[index] > _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM):
             reasons.append(f"it lies {self.misfit_mm[index]:.2f} mm from where the others put it: the film is deformed")
         return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")

@@ -19,7 +19,7 @@ from measure.poses import up_from_camera
 from measure.prediction import MarkPrediction
 from measure.refinement import Sighting, sight
 from measure.rendering import extent_px
-from measure.scan import LUMINANCE, Scan
+from measure.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 from measure.shapes import FiducialLayout, FrameCorner
 from measure.unseen import Ground, reason_unseen
 
@@ -42,7 +42,6 @@ _SAME_PX = 1.0
 _REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
 _EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
-_SINGLE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def first_search_px(
@@ -88,7 +87,9 @@ class FrameSighter:
         places = []
         for index in range(0, len(self.layout.marks), step):
             expected = self.expected(index, self.first_search_px)
-            answers = [strongest(self.scan, replace(expected, weights=weights)) for weights in (LUMINANCE, *_SINGLE)]
+            answers = [
+                strongest(self.scan, replace(expected, weights=weights)) for weights in (LUMINANCE, *SINGLE_CHANNELS)
+            ]
             place, height = max(answers, key=lambda answer: answer[1])
             if height > _CLEAR_RESPONSE:
                 places.append((expected.mark, expected.moved(place).pixel_from_mark))

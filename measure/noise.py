@@ -11,6 +11,7 @@ Mask = NDArray[np.bool_]
 
 _ODDS = 13.8  # chi-square of two coordinates: one in a thousand
 _TEXTURE = 0.25  # correlation at REACH_PX that grain never has
+SIGMA_OF_DEVIATION = 1.4826  # the standard deviation of normal values over their median absolute deviation
 
 REACH_PX = 5  # the coarsest grain that matters at scanning pitch: correlated over 1.5 px, gone beyond 5
 
@@ -68,14 +69,14 @@ def robust_scale(values: Array) -> float:
     """The standard deviation of normal values, from their median absolute deviation."""
     if values.size == 0:
         return 0.0
-    return 1.4826 * _median(np.abs(values - _median(values)))
+    return SIGMA_OF_DEVIATION * _median(np.abs(values - _median(values)))
 
 
 def robust_scales(values: NDArray[np.floating]) -> Array:
     """(n,) that of each row of many values (n, many), at once."""
     middle = values.shape[1] // 2
     off = np.abs(values - np.partition(values, middle, axis=1)[:, middle, None])
-    return np.asarray(1.4826 * np.partition(off, middle, axis=1)[:, middle], float)
+    return np.asarray(SIGMA_OF_DEVIATION * np.partition(off, middle, axis=1)[:, middle], float)
 
 
 def _median(values: Array) -> float:

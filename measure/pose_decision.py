@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 _DECIDED = 7.0  # log-odds: a thousand to one
 _TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence
+_NAMED = 4.0  # times the gate: how far from where a pose's placement puts a mark it still has its name
+_FREE_MM = 1e3  # the standard deviation of a place that is not given
 _FILM_DEGREES = 4.0  # of freedom that the standard deviations of film and given places are known with: to a third
 
 
@@ -125,7 +127,7 @@ class _Named:
         centers = np.array([*(fit.center_px for fit in seen), *missed])
         distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
         nearest = distance.argmin(axis=0)
-        near = distance.min(axis=0) < 4 * options.gate_mm
+        near = distance.min(axis=0) < _NAMED * options.gate_mm
         names = np.where(near, nearest, -1)
         if len(np.unique(names[near])) < near.sum():
             return None
@@ -134,7 +136,7 @@ class _Named:
             alone = cls(placement.pose, tuple(names.tolist()), None)
             return alone if len(seen) < 2 else None
         own = names[: len(seen)][near]
-        given = np.array([min(max(layout.marks[name].sigma_mm), 1e3) for name in own])
+        given = np.array([min(max(layout.marks[name].sigma_mm), _FREE_MM) for name in own])
         measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in seen])[near] * pitch.mean()
         sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
         up = centers[near] * pitch * (1.0, -1.0)

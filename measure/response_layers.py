@@ -15,11 +15,14 @@ Array = NDArray[np.float64]
 _LEAST_RESPONSE = 0.2  # of a candidate
 _CANDIDATES = 100  # of each look
 _NARROWED = 0.7  # of the tolerance, once a placement is refined
+LEAST_TOLERANCE_PX = 1.5  # of the reduced scan: where a response is highest is known no better
+_CHANCE_PERCENT = 95  # of places that stay below what chance is said to answer
+_SAMPLED = slice(None, None, 3)  # rows and columns from which that is told: neighbours answer alike
 
 
 def narrowed(tolerance_px: float) -> float:
     """The tolerance of a refined placement."""
-    return max(_NARROWED * tolerance_px, 1.5)
+    return max(_NARROWED * tolerance_px, LEAST_TOLERANCE_PX)
 
 
 class Layer:
@@ -61,7 +64,7 @@ class Reach:
     def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float) -> None:
         about = _about(radius_px)
         self.map, self.origin, self.area_px = np.asarray(cv2.dilate(map_, about)), origin, int(about.sum())
-        self.chance = max(float(np.percentile(self.map[::3, ::3], 95)), 0.0)
+        self.chance = max(float(np.percentile(self.map[_SAMPLED, _SAMPLED], _CHANCE_PERCENT)), 0.0)
 
     def share(self, place: Array) -> float:
         """Of all places, those that answer as strongly as the one (2,) of the reduced scan."""

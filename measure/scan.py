@@ -24,7 +24,7 @@ from measure.tiff_scan import RawRows, open_tiff
 Array = NDArray[np.float32]
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
-GREEN = (0.0, 1.0, 0.0)
+SINGLE_CHANNELS = RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
 PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, about
 LARGEST_PART_PX = 2048
