@@ -25,6 +25,7 @@ from measure.picture_fit import PictureFit
 from measure.picture_model import GREY, PictureModel, State, background_px, is_round
 from measure.pixel_sums import combined, factors
 from measure.rendering import extent_px
+from measure.second_order import second_order
 from measure.second_place import SecondPlace, edge_place, sloping_place
 from measure.shapes import Mark, MarkTemplate
 
@@ -226,6 +227,8 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         if not noise.is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
         covariance, by_grey = fit.weigh(noise)
+        priors_dn2 = model.prior_weights() * noise.variance_dn2
+        covariance[:2, :2] *= 1 + second_order(model.design, fit.used, covariance, priors_dn2)
         if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
             change = fit.contrast_dn / float(np.ptp(model.mark.image))
             covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
