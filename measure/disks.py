@@ -1,5 +1,6 @@
 """Round targets measured to the noise of the film: a blurred ellipse fitted by least-squares matching."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,9 @@ Array = NDArray[np.float64]
 
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
 LONGEST_MARGIN_PX = 10.0
+NARROWEST_MARGIN_PX = 1.5  # however near a neighbour is: with less, no pixel is ground
+LEAST_SHIFT_PX = 2.0  # from the start: a small disk may have been found so far off
+FORM_SIGMA = 0.2  # of size and shear: as well as the start is known
 PLAIN_MARGIN_PX = 7.0  # where it is plain, for a tenth less noise than with the shortest margin
 MARGIN_BLURS = 4.0  # in a soft scan so many standard deviations of its blur, as other marks get
 LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
@@ -113,19 +117,44 @@ def fit_disk(
     Never raises for what the picture holds: a fit that fails, or shows that there is no disk, has a reason.
     """
     start = np.column_stack([pixel_from_disk, center_px])
-    radius = float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
+    radius = _mean_radius_px(pixel_from_disk)
     sure = max(MARGIN * radius, LEAST_MARGIN_PX, LEAST_REACH_PX - radius)
-    sure = max(min(sure, longest_margin_px, LONGEST_MARGIN_PX), 1.5)
+    sure = max(min(sure, longest_margin_px, LONGEST_MARGIN_PX), NARROWEST_MARGIN_PX)
     wide = max(sure, min(PLAIN_MARGIN_PX, longest_margin_px))
+    fitted = _fit_by_margin(scan, start, shape, sure, wide)
+    disk = fitted(wide)
+    soft = min(MARGIN_BLURS * disk.blur_px, longest_margin_px)
+    # In less ground than its blur reaches, a disk's blur, size and contrast may run away together.
+    if soft > wide and not (disk.reason and disk.is_fitted):
+        softer = fitted(soft)
+        disk = disk if softer.reason else softer
+    if not disk.reason:
+        return disk
+    # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
+    # it does how soft an edge is: what passes with less of it, at another place, may be the dust itself.
+    if disk.is_soft or not sure < wide:
+        return disk
+    narrow = fitted(sure)
+    if narrow.reason or not disk.is_spoilt:
+        return narrow
+    agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
+    return narrow if agree else replace(narrow, weakness=f"with more ground: {disk.reason}")
+
+
+def _fit_by_margin(
+    scan: Scan, start: Array, shape: MarkShape, sure_px: float, wide_px: float
+) -> Callable[[float], FittedDisk]:
+    """The fit from start (2, 3), pixels from the shape, by how much ground about it is used; its window holds wide_px
+    of ground, of which what is within sure_px is the disk's for sure."""
     options = MatchOptions(
         freedom="ellipse" if shape is UNIT_DISK else "affine",
-        margin_px=wide,
+        margin_px=wide_px,
         margin_blurs=0.0,
-        plain_px=sure,
-        max_shift_px=max(radius, 2.0),
-        linear_sigma=0.2,
+        plain_px=sure_px,
+        max_shift_px=max(_mean_radius_px(start[:, :2]), LEAST_SHIFT_PX),
+        linear_sigma=FORM_SIGMA,
     )
-    col0, row0, width, height = window_about(shape, start, wide + BESIDE_PX)
+    col0, row0, width, height = window_about(shape, start, wide_px + BESIDE_PX)
     window, valid = scan.window(col0, row0, width, height), scan.inside(col0, row0, width, height)
     clipped = clipped_sides(scan, col0, row0, width, height, None)
 
@@ -146,23 +175,12 @@ def fit_disk(
         )
         return judged(disk, fit)
 
-    disk = fitted(wide)
-    soft = min(MARGIN_BLURS * disk.blur_px, longest_margin_px)
-    # In less ground than its blur reaches, a disk's blur, size and contrast may run away together.
-    if soft > wide and not (disk.reason and disk.is_fitted):
-        softer = fitted(soft)
-        disk = disk if softer.reason else softer
-    if not disk.reason:
-        return disk
-    # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
-    # it does how soft an edge is: what passes with less of it, at another place, may be the dust itself.
-    if disk.is_soft or not sure < wide:
-        return disk
-    narrow = fitted(sure)
-    if narrow.reason or not disk.is_spoilt:
-        return narrow
-    agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
-    return narrow if agree else replace(narrow, weakness=f"with more ground: {disk.reason}")
+    return fitted
+
+
+def _mean_radius_px(pixel_from_disk: Array) -> float:
+    """Of the circle of an ellipse's area."""
+    return float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
 
 
 def appearance_covariance(fit: Match) -> Array:
