@@ -13,13 +13,17 @@ class MatchOptions:
     """How a mark is matched.
 
     freedom: what is estimated beside the shift; "ellipse" is an affinity without rotation, for disks.
-    blur_px: standard deviation of the scan's blur; the start of its estimation, if it is estimated.
+    blur_px: standard deviation of the scan's blur; the start of its estimation, if estimate_blur has it estimated.
     blur_sigma: prior standard deviation of the logarithm of the blur, the pixel's share included, as known from the
     other marks.
     linear_sigma: prior standard deviation of rotation (rad), scale and shear, as known from the other marks; the
     default holds only what the picture does not show at all.
-    margin_px: how far about the mark grey values are used; in a blurred scan so many standard deviations of the blur.
+    margin_px: how far about the mark grey values are used; in a blurred scan margin_blurs standard deviations of the
+    blur, where that is more.
     plain_px: where grey values farther from the mark vary much more than the nearer ones, the match fails.
+    damage_rounds: how often damage is sought, cut out and the rest adjusted; 0: it stays in.
+    max_shift_px: how far from its start the mark may move.
+    Raises ValueError, naming the option, for a value that is none.
     """
 
     freedom: Freedom = "similarity"
@@ -30,26 +34,13 @@ class MatchOptions:
     margin_px: float = 6.0
     margin_blurs: float = 4.0
     plain_px: float = inf
-    damage_sigmas: float = 3.2
     damage_rounds: int = 3
-    max_iterations: int = 15
     max_shift_px: float = 8.0
-    max_distortion: float = 0.3
 
     def __post_init__(self) -> None:
         if self.freedom not in FREEDOMS:
             raise ValueError(f"freedom is {self.freedom!r}; one of {', '.join(FREEDOMS)} is right")
-        for name in (
-            "blur_px",
-            "blur_sigma",
-            "linear_sigma",
-            "margin_px",
-            "plain_px",
-            "damage_sigmas",
-            "max_iterations",
-            "max_shift_px",
-            "max_distortion",
-        ):
+        for name in ("blur_px", "blur_sigma", "linear_sigma", "margin_px", "plain_px", "max_shift_px"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
         for name in ("margin_blurs", "damage_rounds"):

@@ -21,7 +21,8 @@ Mask = NDArray[np.bool_]
 
 _SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
 _FLOOR = 0.005  # of the contrast: residuals below it may be the drawing's own
-_HALVINGS = 4
+_ITERATIONS, _HALVINGS = 15, 4  # more steps, or shorter ones, settle no fit that these do not
+_DAMAGE_SIGMAS = 3.2  # of smoothed residuals: one pixel in seven hundred of a window without damage goes beyond
 _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
 _LEAST_VARIANCE_DN2 = 1e-12
 _WEIGHTED_STEPS, _CLOSE_PX, _SETTLED_PX = 4, 0.002, 0.02
@@ -66,7 +67,7 @@ class PictureFit:
                 return
             shown = self.area & self.model.tells
             damaged = damage_where_lossy if self.is_lossy else damage
-            undamaged = self.area & ~damaged(self.model.residuals, shown, self.options.damage_sigmas, self.floor_dn)
+            undamaged = self.area & ~damaged(self.model.residuals, shown, _DAMAGE_SIGMAS, self.floor_dn)
             if round_ > 0 and np.array_equal(undamaged, self.used):
                 return
             self.used = undamaged
@@ -203,7 +204,7 @@ class PictureFit:
         self.variance_dn2 = tukey_dn**2
         scale_dn = tukey_dn if robust else np.inf
         cost = self._cost(scale_dn)
-        for _ in range(self.options.max_iterations):
+        for _ in range(_ITERATIONS):
             step = self._solve(self.used * tukey_weights(model.residuals, scale_dn))
             if step is None:
                 self.reason = "the picture does not determine the mark's place"

@@ -30,6 +30,7 @@ _AS_NOISY = 0.02
 _LEAST = 1e-300  # squared slope of a clipped grey value that tells nothing
 _BLUR_RANGE_PX = (0.3, 6.0)
 BENT, ROUGHLY_BENT = 0.075, 0.4  # of the mark's outline, times the blur: so far a series replaces a new drawing
+_MOST_DISTORTION = 0.3  # of scale, rotation (rad) and shear: more is another mark
 PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
 _MOST_BLURRED = 2.0  # times the blur, likewise
@@ -287,7 +288,7 @@ class PictureModel:
         moved = float(np.hypot(*(self.state.pixel_from_mark[:, 2] - self.start[:, 2])))
         if moved > self.options.max_shift_px:
             return f"the fit ran {moved:.1f} px away from where the mark was expected"
-        if np.abs(self._distortion()).max() > self.options.max_distortion:
+        if np.abs(self._distortion()).max() > _MOST_DISTORTION:
             return "the fit wants a mark of another size or direction than the one drawn"
         return ""
 

@@ -14,6 +14,7 @@ Mask = NDArray[np.bool_]
 Real = TypeVar("Real", np.float32, np.float64)
 
 _TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
+_SMOOTHING_PX = 0.8  # of residuals: hardly more than a pixel, so that the finest specks stand out too
 
 
 def tukey_weights(residuals: NDArray[Real], scale_dn: float) -> NDArray[Real]:
@@ -71,8 +72,8 @@ def damage_where_lossy(residuals: Array, area: Mask, sigmas: float, floor_dn: fl
 
 
 def _smoothed(residuals: Array, area: Mask) -> Array:
-    weight = cv2.GaussianBlur(area.astype(float), (0, 0), 0.8)
-    smooth = cv2.GaussianBlur(np.where(area, residuals, 0.0), (0, 0), 0.8) / np.maximum(weight, 0.1)
+    weight = cv2.GaussianBlur(area.astype(float), (0, 0), _SMOOTHING_PX)
+    smooth = cv2.GaussianBlur(np.where(area, residuals, 0.0), (0, 0), _SMOOTHING_PX) / np.maximum(weight, 0.1)
     return np.where(area, smooth, 0.0)
 
 
