@@ -1,6 +1,7 @@
 """The marks of one frame sighted at full resolution from its placement, and the frame fitted to those that agree."""
 
 from measure.constellation import Placement
+from measure.faint_sighting import faint_reach_px, look_for_faint
 from measure.fiducial_options import FiducialOptions
 from measure.frame import Frame
 from measure.frame_settling import compare_shapes, compare_sizes, settle, share_blur
@@ -23,14 +24,14 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
         sighter.judge()
     if sighter.belongs.sum() >= 2 and not sighter.sure():
         if len(layout.marks) > MANY:
-            sighter.look_for_faint(sighter.faint_px)
+            look_for_faint(sighter, sighter.faint_px)
             sighter.vouched[:] = False  # so far from its place a mark still has to agree with the others
         else:
             sighter.look_astray([index for index in everything if not sighter.clear(index)])
         sighter.judge()
     for _ in range(_ROUNDS):
         if sighter.sure():
-            sighter.look_for_faint(sighter.reach_px())
+            look_for_faint(sighter, faint_reach_px(sighter))
             sighter.judge()
     settle(sighter)
     share_blur(sighter)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from measure.channels import best_weights
 from measure.constellation import NARROW, Placement, sign_of
 from measure.correlation import CLOSE
-from measure.faint_marks import FaintMark, find_faint
 from measure.fiducial_options import FiducialOptions
 from measure.first_look import strongest
 from measure.frame import CLEAR_LIKENESS, Frame
@@ -18,10 +17,8 @@ from measure.matching import Match
 from measure.poses import up_from_camera
 from measure.prediction import MarkPrediction
 from measure.refinement import Sighting, sight
-from measure.rendering import extent_px
 from measure.scan import LUMINANCE, SINGLE_CHANNELS, Scan
-from measure.shapes import FiducialLayout, FrameCorner
-from measure.unseen import Ground, reason_unseen
+from measure.shapes import FiducialLayout
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,14 +31,7 @@ _CLEAR_RESPONSE = 0.25  # correlation of marks before they are fitted, where lik
 _GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
 _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
 _REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
-_CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
-_FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
-_FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
-_LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
-_SAME_PX = 1.0
-_REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
-_NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
-_EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
+CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
 
 
 def first_search_px(
@@ -111,7 +101,7 @@ class FrameSighter:
                 continue
             expected = replace(self.expected(index, self.gate_px), surroundings=CLOSE)
             seen = sight(self.scan, expected, self.options.match)
-            if seen.fit is not None and seen.chance <= _CHANCE and _is_plain(seen.fit):
+            if seen.fit is not None and seen.chance <= CHANCE and _is_plain(seen.fit):
                 self.sightings[index] = replace(seen, closer=True)
 
     def look_astray(self, indices: Sequence[int]) -> None:
@@ -152,33 +142,6 @@ class FrameSighter:
         clear = sum(self.clear(index) for index in np.flatnonzero(self.belongs).tolist())
         return bool(self.belongs.sum() >= MANY and clear >= MANY / 2)
 
-    def look_for_faint(self, reach_px: float) -> None:
-        """Look again at every mark that is not clear, or does not lie where the others put it: what stands out of its
-        texture there is this mark, the film being deformed where it lies off. A clear one may be a pattern beside it.
-        """
-        near = self.belongs & (self._misfit_mm() <= _NEAR * self.scatter_mm())
-        faint = [
-            (index, sighting)
-            for index, sighting in enumerate(self.sightings)
-            if sighting is not None and sighting.inside and not (self.clear(index) and near[index])
-            if not isinstance(self.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
-        ]
-        agreeing = [s.fit for s, ok in zip(self.sightings, self.belongs, strict=True) if ok and s is not None and s.fit]
-        if not faint or not agreeing:
-            return
-        # The marks that agree tell both better than a faint mark does itself.
-        blur_px = float(np.median([fit.blur_px for fit in agreeing]))
-        usual_dn = float(np.median([abs(fit.contrast_dn) for fit in agreeing]))
-        extremes = np.percentile(self.scan.reduced(self.placement.reduction, self.weights), _EXTREMES)
-        for index, sighting in faint:
-            expected = self.expected(index, reach_px)
-            extreme_dn = float(extremes[int(expected.polarity > 0)])
-            seen = find_faint(self.scan, expected, extreme_dn, blur_px)
-            known = seen is not None and seen.sigma_px <= _FAINT_SIGMA_PX
-            certain = seen is not None and self._certain(seen)
-            unseen = reason_unseen(self._ground(expected, extreme_dn), usual_dn, reach_px, seen, certain)
-            self._take(index, sighting, seen if certain and known else None, unseen)
-
     def doubt(self, index: int, reason: str) -> None:
         """Say of a mark that was seen why it may be wrong."""
         sighting = self.sightings[index]
@@ -193,44 +156,13 @@ class FrameSighter:
             covariance = sighting.fit.covariance_px2 + variance_px2 * np.eye(2)
             self.sightings[index] = replace(sighting, fit=replace(sighting.fit, covariance_px2=covariance))
 
-    def _ground(self, expected: MarkPrediction, extreme_dn: float) -> Ground:
-        """About a mark's place; extreme_dn: the grey value that the mark cannot pass."""
-        least, greatest = extent_px(expected.mark, expected.pixel_from_mark)
-        low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
-        grey = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights).astype(float)
-        room_dn = max(expected.polarity * (extreme_dn - float(np.median(grey))), 0.0)
-        return Ground(expected.polarity > 0, room_dn, float(grey.std()))
-
-    def _take(self, index: int, sighting: Sighting, seen: FaintMark | None, unseen: str) -> None:
-        """Keep a clear fit where what was seen is the same mark; else what was seen counts, or that nothing was."""
-        clear, away = self.clear(index), np.inf
-        if seen is not None and sighting.fit is not None:
-            away = float(np.hypot(*(sighting.fit.center_px - seen.fit.center_px)))
-        # That the same pixels answer twice proves nothing of a clear mark that agreed with the others anyway.
-        again = clear and bool(self.belongs[index]) and away <= _SAME_PX
-        self.vouched[index] = seen is not None and (bool(self.vouched[index]) or not again)
-        if seen is None and not clear:
-            self.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
-        elif seen is not None and (not clear or away > _SAME_PX):
-            reason = f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
-            self.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
-
-    def _certain(self, seen: FaintMark) -> bool:
-        """Whether neither texture nor rounding feigns it."""
-        strong = abs(seen.fit.contrast_dn) >= _FAINT_CONTRAST * self.scan.full_scale_dn
-        return seen.chance <= _CHANCE and strong
-
     def clear(self, index: int) -> bool:
         """Whether a mark needs no second look: it is plainly there, be it where the others put it or not."""
         sighting = self.sightings[index]
         return sighting is not None and sighting.fit is not None and sighting.fit.likeness >= CLEAR_LIKENESS
 
-    def reach_px(self) -> float:
-        """How far a faint mark can be from where many others put it."""
-        return min(self.gate_px, max(_REACH * self.scatter_mm() / float(self.pitch.mean()), _LEAST_REACH_PX))
-
     def scatter_mm(self) -> float:
-        return float(np.median(self._misfit_mm()[self.belongs])) if self.belongs.any() else 0.0
+        return float(np.median(self.misfit_mm()[self.belongs])) if self.belongs.any() else 0.0
 
     def frame(self) -> Frame:
         sightings = tuple(sighting for sighting in self.sightings if sighting is not None)
@@ -239,13 +171,13 @@ class FrameSighter:
             self.camera,
             sightings,
             self.belongs,
-            self._misfit_mm(),
+            self.misfit_mm(),
             self.scatter_mm(),
             self.pixel_from_camera,
             self.weights,
         )
 
-    def _misfit_mm(self) -> Array:
+    def misfit_mm(self) -> Array:
         misfit = np.full(len(self.sightings), np.nan)
         predicted = self._predicted_px()
         for index, sighting in enumerate(self.sightings):
@@ -265,7 +197,7 @@ class FrameSighter:
         """At a closer look a mark may be as faint as what texture feigns, where it hardly ever does so near by."""
         sighting = sight(self.scan, self.expected(index, search_px), self.options.match)
         fit, closer = sighting.fit, self.placement.surroundings == CLOSE
-        sure = closer and sighting.chance <= _CHANCE
+        sure = closer and sighting.chance <= CHANCE
         least = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
         if fit is not None and (fit.likeness < least[0] or fit.significance < least[1]):
             reason = f"nothing within {search_px:.0f} px of its place looks like it"
