@@ -19,14 +19,13 @@ from measure.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scan import Scan, open_scan
 from pipeline.camera_file import CameraFile
-from pipeline.coded_sheet import CodedSheet
 from pipeline.errors import InputError
 from pipeline.learn_stage import learn_marks, pose_of
 from pipeline.learned_table import LearnedFrom
 from pipeline.measurement_file import MeasuredScan
 from pipeline.progress import Reporter
 from pipeline.project_file import Project
-from pipeline.target_stage import measure_targets
+from pipeline.target_stage import check_targets, measure_targets
 from pipeline.tie_stage import check_tie_names, with_ties
 from pipeline.workers import processes, worker_pool
 
@@ -39,8 +38,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     """
     if not project.scans:
         raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
-    if project.targets is not None and project.targets.code is not None:
-        CodedSheet.of(project, project.targets)
+    check_targets(project)
     check_tie_names(project)
     _check_marks(project)
     _check_readable(list(project.scans.values()))

@@ -220,11 +220,12 @@ def _scans(table: Table, patterns: Sequence[str]) -> Mapping[str, Path]:
 
 
 def _found(pattern: str, folder: Path) -> list[Path]:
-    """The file of that very name, brackets and all, or those that the pattern finds in the folder."""
+    """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
+    that lead nowhere: a scan that is named is opened or refused."""
     if (folder / pattern).is_file():
         return [folder / pattern]
     names = glob.glob(pattern, root_dir=folder)
-    return [path for path in (folder / name for name in sorted(names)) if path.is_file()]
+    return [path for path in (folder / name for name in sorted(names)) if not path.is_dir()]
 
 
 def _nothing_found(pattern: str, whole: Path) -> str:

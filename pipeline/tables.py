@@ -227,4 +227,4 @@ class Table:
 
 
 def _listed(words: Sequence[str]) -> str:
-    return ", ".join(repr(word) for word in words)
+    return ", ".join(repr(word) for word in words) or "none"

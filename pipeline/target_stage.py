@@ -18,6 +18,7 @@ from pipeline.camera_model import camera_model
 from pipeline.coded_field import measure_coded_field
 from pipeline.coded_sheet import CodedSheet, measure_sheet
 from pipeline.comparator_file import comparator_from_pixel
+from pipeline.errors import InputError
 from pipeline.identification import PatternOptions, assign, log10_of_chance, recognise
 from pipeline.measurement_file import MeasuredScan
 from pipeline.project_file import Project
@@ -37,6 +38,27 @@ _STRONGEST = 3  # patches a target, by contrast: dust and texture are weaker tha
 _NEAR = 0.65  # of the scan's size from its middle: targets there may be in it
 _LEAST_DIAMETER_PX = 2.5
 _SIZE_SLACK = 1.5  # how wrong the approximate distance may make a target's size
+
+
+def check_targets(project: Project) -> None:
+    """Raises InputError for single targets and rings that nothing in the project could name."""
+    settings = project.targets
+    if settings is None or settings.board is not None:
+        return
+    if settings.code is not None:
+        CodedSheet.of(project, settings)
+        return
+    if project.given_points is None:
+        raise InputError(
+            f"{project.path}: [targets] kind {settings.kind!r} is named by the targets' coordinates, and there is no "
+            '[object] points = "...". Give the file of the points, or leave [targets] out to measure fiducials only.'
+        )
+    known = len(target_field(project).ids)
+    if known < _LEAST_PAIRS:
+        raise InputError(
+            f"{project.path}: [object] points: {known} points with X, Y and Z name no targets; give {_LEAST_PAIRS}, if "
+            "only roughly."
+        )
 
 
 def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> MeasuredScan:

@@ -134,6 +134,19 @@ def one_fiducial(folder: Path) -> None:
     (folder / "camera.toml").write_text(f"{head}[[fiducial]]{first}{marks}", encoding="utf-8")
 
 
+def no_points(folder: Path) -> None:
+    replaced(folder / "project.toml", 'points = "points.csv"', "")
+
+
+def points_without_coordinates(folder: Path) -> None:
+    (folder / "points.csv").write_text("point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n", encoding="utf-8")
+
+
+def link_to_no_scan(folder: Path) -> None:
+    (folder / "scans" / "frame9.tif").symlink_to("moved away.tif")
+    rewritten_scans(folder, "scans/*.tif")
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -156,6 +169,9 @@ def one_fiducial(folder: Path) -> None:
         (marks_over_a_folder, ["line 4: comparator:", "is a folder"]),
         (calibration_that_is_written_anew, ["line 5: output:", "over the earlier calibration", "another folder"]),
         (no_fiducials, ["transformation is 'affine'", "has no fiducials for it"]),
+        (no_points, ["kind 'disk' is named by the targets' coordinates", "there is no [object] points"]),
+        (points_without_coordinates, ["[object] points: 1 points with X, Y and Z name no targets; give 4"]),
+        (link_to_no_scan, ["there is no scan", "frame9.tif"]),
         (one_fiducial, ["camera.toml has one fiducial mark", "two or more"]),
     ],
 )
