@@ -12,8 +12,8 @@ Array = NDArray[np.float64]
 
 AFFINE_FROM = 8  # targets that agree: from so many on the shared shift may vary over the frame
 VOTE_SHARE = 0.2  # of the farthest link: how far shifts may differ and still count as one
-ROUNDS = 5
-FORBIDDEN = 1e9
+ROUNDS = 5  # of the shared shift and the gate, each by the other
+FORBIDDEN = 1e9  # px: the cost of a link that there is not
 
 
 @dataclass(frozen=True, eq=False)

@@ -166,7 +166,8 @@ def _affine(places: Array) -> Array:
 
 
 class _Fit:
-    """A frame fitted by an affinity to a reference, in mm of the camera: residuals (n, 2), leverage (n,)."""
+    """A frame fitted by an affinity to a reference, in mm of the camera, on the marks kept (n,), all unless said: off
+    (all, 2), of every mark, residuals (n, 2) and leverage (n,) of those kept, degrees of freedom."""
 
     def __init__(self, seen: _Seen, reference: Array | None, kept: NDArray[np.bool_] | None = None) -> None:
         assert reference is not None

@@ -18,7 +18,8 @@ class FiducialOptions:
     for sure; else the frame may also fill the scan. misfit_mm, affinity: how far a mark may lie from its given place
     when it is searched, plus what share of the constellation's span. gate_mm: how far a measured mark may lie from
     where the others put it. film_sigma_mm: scatter of marks by film and scanner. match: of the fit at full resolution;
-    a polygon is matched with the rotation and scale of the frame.
+    a polygon is matched with the rotation and scale of the frame. Raises ValueError, naming the option, for a value
+    that is none.
     """
 
     pose: str = "auto"

@@ -29,11 +29,15 @@ Mask = NDArray[np.bool_]
 _PROFILES = 60  # along an edge, each the mean over its share of it
 _LEAST_SHARE = 0.5  # of the profiles that lie on the line: with fewer it may be another line
 _LEAST_SNR = 3.0  # of the step in one profile: less is texture
-_THEN_PX = 5.0  # about the line: what an edge under any usual blur takes
+_ABOUT_PX = 5.0  # about the line: what an edge under any usual blur takes
 _STEP_PX = 0.5  # of the samples across the edge
 _SMOOTH_PX = 1.5  # across the edge, before its slope is taken
 _TILT = 0.02  # rad: the placement knows the edge's direction better
-_ITERATIONS = 12
+_ITERATIONS = 12  # of the steps across an edge
+_ROUNDS = 20  # of Tukey's line, which rests after a few
+_START_BLUR_PX = 1.5
+_RIM_PX = 2.0  # of a profile: a step so near its end may be another's
+_MOST_ALIKE = 0.9  # correlation of neighbouring profiles: nineteen count as one
 _BLUR_RANGE_PX = (0.3, 4.0)
 _SCATTER_FLOOR_PX = 0.01  # under the scatter about a line: clean pictures have none
 _ROUNDED = 0.1  # of the reach: left out at every corner, for few are sharp
@@ -110,13 +114,13 @@ def _edge(course: _Course, extent: tuple[float, float], search_px: float, polari
     """The edge that runs along from the start, the frame's inside lying across."""
     share = (extent[1] - extent[0]) / _PROFILES
     middle: Array = np.asarray(extent[0] + share * (np.arange(_PROFILES) + 0.5), dtype=float)
-    half = round(search_px + _THEN_PX)
+    half = round(search_px + _ABOUT_PX)
     near, inside = course.profiles(middle, np.zeros(_PROFILES), share, half)
     near, middle = near[inside], middle[inside]
     if len(middle) < _LEAST_SHARE * _PROFILES:
         return None
     line = _straightest(near * polarity, middle, half)
-    found, _ = course.profiles(middle, line[0] + line[1] * middle, share, _THEN_PX)
+    found, _ = course.profiles(middle, line[0] + line[1] * middle, share, _ABOUT_PX)
     steps = _fit_steps(found)
     good = steps.good & (steps.contrast * polarity > FAINT * course.scan.full_scale_dn)
     good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
@@ -160,7 +164,7 @@ def _fit_steps(grey: Array) -> _Steps:
     """The step level + contrast * Phi((s - place) / blur) in every profile, by Gauss-Newton."""
     s = (np.arange(grey.shape[1]) - (grey.shape[1] - 1) / 2) * _STEP_PX
     count = len(grey)
-    place, blur = np.zeros(count), np.full(count, 1.5)
+    place, blur = np.zeros(count), np.full(count, _START_BLUR_PX)
     contrast, level = np.zeros(count), np.zeros(count)
     for _ in range(_ITERATIONS):
         z = (s - place[:, None]) / blur[:, None]
@@ -181,7 +185,7 @@ def _fit_steps(grey: Array) -> _Steps:
     noise = np.sqrt((residuals**2).mean(axis=1))
     spread = np.maximum(grey.std(axis=1), 1e-12)
     likeness = np.sqrt(np.clip(1 - (noise / spread) ** 2, 0.0, 1.0))
-    return _Steps(place, contrast, blur, noise, likeness, np.abs(place) < s[-1] - 2.0)
+    return _Steps(place, contrast, blur, noise, likeness, np.abs(place) < s[-1] - _RIM_PX)
 
 
 def _linear(step: Array, grey: Array) -> tuple[Array, Array]:
@@ -194,7 +198,7 @@ def _linear(step: Array, grey: Array) -> tuple[Array, Array]:
 def _line(along: Array, across: Array, steps: _Steps, good: Mask, asked: int) -> _Edge | None:
     """Tukey's line, its covariance from the scatter about it and from how far along the edge that is alike."""
     offset, slope, weights = float(np.median(across)), 0.0, np.ones(len(along))
-    for _ in range(20):
+    for _ in range(_ROUNDS):
         slope, offset = (float(value) for value in np.polyfit(along, across, 1, w=np.sqrt(weights)))
         residuals = across - offset - slope * along
         weights = tukey_weights(residuals, max(robust_scale(residuals), _SCATTER_FLOOR_PX))
@@ -225,7 +229,7 @@ def _alike(residuals: Array, on: Mask) -> float:
     if not pairs.any():
         return 1.0
     next_to = float((residuals[1:] * residuals[:-1])[pairs].mean() / max((residuals[on] ** 2).mean(), 1e-12))
-    alike = float(np.clip(next_to, 0.0, 0.9))
+    alike = float(np.clip(next_to, 0.0, _MOST_ALIKE))
     return (1 + alike) / (1 - alike)
 
 

@@ -17,9 +17,11 @@ Array = NDArray[np.float64]
 
 SEARCHED_RADIUS_PX = 4.0  # windows are reduced until the shorter half axis has about this length...
 THINNEST_PX = 1.5  # ...or the thinnest line this width
-LEAST_CORRELATION = 0.55
+LEAST_CORRELATION = 0.55  # below it a spot is worth no fit, which decides what is a target
 MOST_SPOTS = 6  # fitted near one prediction
-EXPECTED_BLUR_PX = 1.0
+EXPECTED_BLUR_PX = 1.0  # of the reduced window
+GROUND, GROUND_PX = 0.3, 1.5  # about the target in its predicted picture: a share of its reach, and for the blur
+SAME_DISK = 0.5  # of the shorter half axis: spots nearer to a disk's centre are that disk
 
 
 class Prediction(Protocol):
@@ -92,7 +94,7 @@ def spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -
 def predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> NDArray[np.float32]:
     """The target as it should look, with some of its surroundings; its centre is that of the middle pixel."""
     _, greatest = extent_px(shape, np.column_stack([pixel_from_disk, (0.0, 0.0)]))
-    half = np.ceil(greatest * 1.3 + 1.5).astype(int)
+    half = np.ceil(greatest * (1 + GROUND) + GROUND_PX).astype(int)
     width, height = 2 * half + 1
     placed = np.column_stack([pixel_from_disk, half])
     return picture(shape, placed, int(width), int(height), EXPECTED_BLUR_PX).astype(np.float32)
@@ -130,7 +132,7 @@ def _in_perspective(shape: MarkShape, prediction: Prediction) -> MarkShape:
 def known_disk(disks: list[FittedDisk], spot: Array) -> int | None:
     """The disk that was already fitted at a spot."""
     for index, disk in enumerate(disks):
-        if np.hypot(*(disk.center_px - spot)) < 0.5 * disk.half_axes_px[1]:
+        if np.hypot(*(disk.center_px - spot)) < SAME_DISK * disk.half_axes_px[1]:
             return index
     return None
 
