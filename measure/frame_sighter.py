@@ -43,7 +43,15 @@ def first_search_px(
 
 
 class FrameSighter:
-    """The state of a frame's measurement."""
+    """A frame of n marks in the making.
+
+    camera (n, 2): given places, mm; turn (2, 2): of the pose; pitch (2,): mm of a pixel. pixel_from_camera (2, 3): as
+    the placement has it, or the marks that belong. sightings: None for a mark that was not looked at yet. belongs (n,):
+    marks that were seen and agree; vouched (n,): those that stand out so much of their texture that they need not.
+    weights: of the channels. gate_px, first_search_px, near_px, faint_px: how far from its predicted place a mark is
+    looked for: where the others give it, where only the placement does, there on film that is hardly deformed, and
+    where it is faint.
+    """
 
     def __init__(
         self,
@@ -86,6 +94,7 @@ class FrameSighter:
         self.weights = best_weights(self.scan, places)
 
     def look(self, indices: Sequence[int], search_px: float) -> None:
+        """Sight marks anew, within search_px of where they are predicted now."""
         # From below upwards: the search of windows ended there, and what it read last is still decoded.
         rows = self._predicted_px()[:, 1]
         upwards = sorted(indices, key=lambda index: -rows[index])
@@ -162,9 +171,11 @@ class FrameSighter:
         return sighting is not None and sighting.fit is not None and sighting.fit.likeness >= CLEAR_LIKENESS
 
     def scatter_mm(self) -> float:
+        """The median misfit of the marks that belong; 0 where none does."""
         return float(np.median(self.misfit_mm()[self.belongs])) if self.belongs.any() else 0.0
 
     def frame(self) -> Frame:
+        """As far as it has come."""
         sightings = tuple(sighting for sighting in self.sightings if sighting is not None)
         return Frame(
             self.placement,
@@ -178,6 +189,7 @@ class FrameSighter:
         )
 
     def misfit_mm(self) -> Array:
+        """(n,) how far each mark that was seen is from where the frame puts it, nan without a fit."""
         misfit = np.full(len(self.sightings), np.nan)
         predicted = self._predicted_px()
         for index, sighting in enumerate(self.sightings):
@@ -205,6 +217,7 @@ class FrameSighter:
         return sighting
 
     def expected(self, index: int, search_px: float) -> MarkPrediction:
+        """A mark where the frame puts it now."""
         mark = self.layout.marks[index].mark
         start = np.column_stack([self.pixel_from_camera[:, :2], self._predicted_px()[index]])
         sign = sign_of(mark, self.placement.polarity)
