@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
+from rich.padding import Padding
 
 from adjust.fiducial_fit import fit_transformation
 from adjust.transformation import film_kind
@@ -165,24 +165,23 @@ def _not_measured(names: tuple[str, ...], drawn: int, expected: float) -> Trial:
 
 
 def print_identification(identification: Identification, console: Console) -> None:
-    table = Table(box=None, pad_edge=False)
-    for heading in ("score", "wrong places", "by chance", "marks", "likeness", "SNR", "residual", "cameras", "seconds"):
-        table.add_column(heading, overflow="fold")
     for trial in identification.trials:
-        residual = "" if trial.residual_mm is None else f"{trial.residual_mm:.3f} mm, {trial.residual_sigmas:.0f} sigma"
-        table.add_row(
-            f"{trial.score:.2f}",
-            "" if trial.chance is None else f"{trial.chance:.2f}",
-            f"{trial.expected:.1g}",
-            f"{trial.found} of {trial.drawn}",
-            f"{trial.likeness:.2f}" if trial.found else "",
-            f"{trial.snr:.1f}" if trial.found else "",
-            residual,
-            ", ".join(trial.cameras) + (f": {trial.reason}" if trial.reason else ""),
-            f"{trial.seconds:.0f}",
-        )
-    console.print(table)
+        console.print(", ".join(trial.cameras), style="bold", highlight=False)
+        console.print(Padding(_figures(trial), (0, 0, 0, 4)), highlight=False)
     console.print(identification.sentence(), highlight=False, soft_wrap=True)
+
+
+def _figures(trial: Trial) -> str:
+    if not trial.found:
+        return f"{trial.score:.2f}: {trial.reason}"
+    words = [f"{trial.score:.2f}: {trial.found} of {trial.drawn} marks, likeness {trial.likeness:.2f}"]
+    words.append(f"signal-to-noise {trial.snr:.1f}")
+    if trial.residual_mm is not None:
+        words.append(f"affine residual {trial.residual_mm:.3f} mm ({trial.residual_sigmas:.0f} sigma)")
+    words.append(f"by chance {trial.expected:.1g}")
+    if trial.chance is not None:
+        words.append(f"in wrong places {trial.chance:.2f}")
+    return f"{', '.join(words)}; {trial.seconds:.0f} s"
 
 
 def _alike(cameras: Mapping[str, CameraFile]) -> list[tuple[str, ...]]:
