@@ -17,6 +17,7 @@ from measure.shapes import FiducialLayout, LayoutMark, MarkTemplate
 from measure.status import Status
 
 _FAINT = "the frame was found at a closer look only, its marks being faint beside what surrounds them"
+_ASSUMED = "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere"
 
 
 def absent_frame(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasurement:
@@ -34,6 +35,8 @@ def present_frame(
     """Of a frame that was found. problems: why it may lie elsewhere, sentences, beside those that its marks show;
     chance: why it may be none at all: then none of its marks is certain, nor if it was found at a closer look."""
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
+    if not pose.decided:
+        marks = tuple(_of_assumed_name(row, mark) for row, mark in zip(marks, layout.marks, strict=True))
     weak = chance or (_FAINT if frame.placement.surroundings == CLOSE else "")
     if weak:
         marks = tuple(
@@ -83,6 +86,13 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
         if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:
             status, reason = Status.WEAK, "its template is its own picture: nothing checks its place"
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
+
+
+def _of_assumed_name(row: MarkMeasurement, mark: LayoutMark) -> MarkMeasurement:
+    """A drawn mark is the same place under every name. A learned one's origin is where somebody clicked: at another
+    mark that looks like it, it lies elsewhere."""
+    learned = isinstance(mark.mark, MarkTemplate) and mark.mark.learned_mm > 0
+    return replace(row, status=Status.WEAK, reason=_ASSUMED) if learned and row.status is Status.MEASURED else row
 
 
 def _by_edges(edges: SecondPlace | None) -> dict[str, float]:

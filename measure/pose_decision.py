@@ -23,7 +23,16 @@ from measure.pose_pictures import SPOILT, Drawings, Shown, Site
 from measure.poses import up_from_camera
 from measure.results import Pose
 from measure.scan import Scan
-from measure.shapes import Disk, FiducialLayout, Mark, MarkShape, Side
+from measure.shapes import (
+    LEARNED_ORIGIN,
+    Disk,
+    FiducialLayout,
+    LayoutMark,
+    Mark,
+    MarkShape,
+    MarkTemplate,
+    Side,
+)
 
 Array = NDArray[np.float64]
 
@@ -136,7 +145,7 @@ class _Named:
             alone = cls(placement.pose, tuple(names.tolist()), None)
             return alone if len(seen) < 2 else None
         own = names[: len(seen)][near]
-        given = np.array([min(max(layout.marks[name].sigma_mm), _FREE_MM) for name in own])
+        given = np.array([_given_sigma_mm(layout.marks[name]) for name in own])
         measured = np.array([np.sqrt(np.trace(fit.covariance_px2) / 2) for fit in seen])[near] * pitch.mean()
         sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
         up = centers[near] * pitch * (1.0, -1.0)
@@ -154,6 +163,12 @@ class _Named:
         degrees = _FILM_DEGREES + max(self.fit.redundancy, 0)
         coordinates = -degrees / 2 * float(np.log1p(self.fit.chi_square / _FILM_DEGREES))
         return _Verdict(self.pose, self.names, pictures, coordinates, self.fit.chi_square)
+
+
+def _given_sigma_mm(mark: LayoutMark) -> float:
+    """What was found under one name has that learned mark's origin; under another one it would lie elsewhere."""
+    origin_mm = LEARNED_ORIGIN * mark.mark.learned_mm if isinstance(mark.mark, MarkTemplate) else 0.0
+    return float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm))
 
 
 def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout) -> Pose:

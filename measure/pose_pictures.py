@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from measure.candidates import detail_px, quarter_turned
 from measure.matching import Match
@@ -26,6 +27,9 @@ _PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbo
 _OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
 _ROUNDS = 4  # of robust weights
 _FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
+_ALIGNMENTS = 3
+_FEWEST = 40  # pixels that two chips are compared by
+_CHANCE_SIGMAS = 3.0  # what chance may make of a difference
 SPOILT = 0.01  # probability that writing, dust or a neighbour beside a mark feigns or hides what tells marks apart
 
 
@@ -41,30 +45,72 @@ class Shown:
 class View:
     """A mark's picture on the drawings' grid, (size, size) with its origin in the middle. told: where it tells the grey
     values: a learned chip has the landscape of other scans beside its mark. reached: the chip, which tells nothing
-    beyond its edge; of a drawn mark everything."""
+    beyond its edge; of a drawn mark everything. noise: of the chip's own pixels, in shares of the contrast, inf where
+    it is not known."""
 
     grey: Array
     told: Mask
     reached: Mask
+    noise: float = 0.0
 
     def turned(self, turn: Array) -> "View":
-        return View(
-            quarter_turned(self.grey, turn), quarter_turned(self.told, turn), quarter_turned(self.reached, turn)
+        return replace(
+            self,
+            grey=quarter_turned(self.grey, turn),
+            told=quarter_turned(self.told, turn),
+            reached=quarter_turned(self.reached, turn),
         )
 
     def wider(self, spare: int) -> "View":
         """On a larger grid. A drawing's edge goes on; beyond a chip's there is nothing."""
-        return View(
-            np.pad(self.grey, spare, mode="edge"),
-            np.pad(self.told, spare, mode="edge"),
-            np.pad(self.reached, spare, mode="edge"),
+        return replace(
+            self,
+            grey=np.pad(self.grey, spare, mode="edge"),
+            told=np.pad(self.told, spare, mode="edge"),
+            reached=np.pad(self.reached, spare, mode="edge"),
         )
 
     def moved(self, cells: tuple[int, int]) -> "View":
         """Down and right by so many cells, which must be spare about a chip."""
-        return View(
-            np.roll(self.grey, cells, (0, 1)), np.roll(self.told, cells, (0, 1)), np.roll(self.reached, cells, (0, 1))
+        return replace(
+            self,
+            grey=np.roll(self.grey, cells, (0, 1)),
+            told=np.roll(self.told, cells, (0, 1)),
+            reached=np.roll(self.reached, cells, (0, 1)),
         )
+
+    def aligned(self, window: Array) -> "View":
+        """Moved by the part of a cell that makes it most like a window (size, size), which it lies on to a cell."""
+        used, moved, shift = self.told & self.reached, self, np.zeros(2)
+        for _ in range(_ALIGNMENTS):
+            _, solution = moved.fitted(window, used)
+            if solution[1] == 0.0:
+                return self
+            shift = np.clip(shift - solution[2:] / solution[1], -1.0, 1.0)
+            moved = replace(self, grey=np.asarray(ndimage.shift(self.grey, shift, order=3, mode="nearest")))
+        return moved
+
+    def unlike(self, other: "View", contrast: float) -> float:
+        """The sum of the squares by which two chips differ wherever both tell something, one moved as it is most like
+        the other, beyond what their noise makes of a pixel. contrast: of the picture, in standard deviations of its
+        noise: what is an outlier there counts as one."""
+        used = self.told & other.told & self.reached & other.reached
+        if used.sum() < _FEWEST:
+            return 0.0
+        moved = replace(self, told=used, reached=used).aligned(other.grey)
+        residuals, _ = moved.fitted(other.grey, used)
+        noise = min(robust_scale(residuals), float(np.hypot(self.noise, other.noise)))
+        alike = max(_OUTLIER * noise, _ALIKE)
+        return float(((residuals**2 - alike**2) * contrast**2).clip(0.0, _OUTLIER**2).sum())
+
+    def fitted(self, window: Array, used: Mask) -> tuple[Array, Array]:
+        """What it leaves of a window in the pixels used, and the factors: offset, gain, by row and by column."""
+        slopes = [np.asarray(np.gradient(self.grey, axis=axis))[used] for axis in (0, 1)]
+        return _robust([np.ones(int(used.sum())), self.grey[used], *slopes], window[used])
+
+    @property
+    def is_chip(self) -> bool:
+        return not bool(self.reached.all())
 
 
 _EVERYWHERE = np.ones((1, 1), dtype=bool)
@@ -111,6 +157,7 @@ class Site:
     ) -> None:
         self.scan, self.center_px, self.weights, self.drawings = scan, center_px, weights, drawings
         self.reach_px = reach_px
+        self.contrast_dn = like.contrast_dn
         self.sign = np.sign(like.contrast_dn)
         self.noise_dn = like.noise_dn / drawings.reduction
 
@@ -132,8 +179,19 @@ class Site:
         for misfit, view, residual in zip(misfits, views, residuals, strict=True):
             misfit[area & view.told] = np.minimum(np.abs(residual) / scale, _OUTLIER) ** 2
         excess = _excess(misfits, np.stack([area & view.reached for view in views]))
+        best = views[int(excess.argmin())]
+        if best.is_chip:
+            excess = np.minimum(excess, [self._most_excess(best, view, scale) for view in views])
         relative = np.exp(-excess / 2 / _PIXELS_PER_DEGREE)
         return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[view_of]
+
+    def _most_excess(self, best: View, view: View, scale_dn: float) -> float:
+        """By how much more than the best chip another one can miss the picture for being another mark, chance included:
+        the more the two differ. The rest comes of the chips' own noise, or of a place that is not quite right."""
+        if view is best or not view.is_chip:
+            return 0.0 if view is best else np.inf
+        squares = view.unlike(best, abs(self.contrast_dn) / scale_dn)
+        return squares + 2 * _CHANCE_SIGMAS * float(np.sqrt(squares))
 
     def _placed(self, window: Array, view: View, spare: int) -> View:
         """A chip moved to where the window is most like it."""
@@ -144,7 +202,7 @@ class Site:
         likeness = cv2.matchTemplate(np.asarray(window, np.float32), grey, cv2.TM_CCOEFF_NORMED, mask=told)
         likeness = np.where(np.isfinite(likeness), self.sign * likeness, -1.0)
         row, col = np.unravel_index(int(likeness.argmax()), likeness.shape)
-        return view.moved((int(row) - spare, int(col) - spare))
+        return view.moved((int(row) - spare, int(col) - spare)).aligned(window)
 
     def _window(self, size: int) -> Array:
         """(size, size) grey values of the scan on the drawings' grid, the site in the middle."""
@@ -186,7 +244,17 @@ def _drawn(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
     if isinstance(mark, MarkTemplate):
         told = chip_mask(mark, place, size, size)
         reached = chip_mask(replace(mark, steady=None), place, size, size)
-    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), told, reached)
+    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), told, reached, _noise(mark))
+
+
+def _noise(mark: Mark) -> float:
+    """Of a chip's pixels, in shares of its contrast; inf where nobody knows it."""
+    if not isinstance(mark, MarkTemplate):
+        return 0.0
+    if mark.noise_dn == 0.0:
+        return np.inf
+    of_mean = float(np.sqrt(sum(share**2 for share in mark.shares.values())))
+    return mark.noise_dn * of_mean / max(float(np.ptp(mark.image)), 1e-9)
 
 
 def _distinct(views: Sequence[View]) -> tuple[list[View], list[int]]:

@@ -15,6 +15,7 @@ Polarity = Literal["light", "dark", "auto"]
 Side = Literal["left", "right", "top", "bottom"]
 Array = NDArray[np.float64]
 
+LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
 _SEARCHED = 0.3  # of a frame corner's reach: the square that it is searched by
 
 

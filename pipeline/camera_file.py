@@ -18,7 +18,6 @@ from pipeline.spelling import did_you_mean
 from pipeline.tables import Table, read_toml
 
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
-LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
 CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation where only a datum is wanted
 
@@ -39,7 +38,7 @@ class GivenFiducial:
     def prior_sigma_mm(self) -> tuple[float, float]:
         """For the adjustment: a learned mark is measured where its template has its origin, somewhere on the mark. What
         the file fixes stays fixed."""
-        sx, sy = (sigma and math.hypot(sigma, LEARNED_ORIGIN * self._learned_mm) for sigma in self.sigma_mm)
+        sx, sy = (sigma and math.hypot(sigma, shapes.LEARNED_ORIGIN * self._learned_mm) for sigma in self.sigma_mm)
         return sx, sy
 
     @property

@@ -27,7 +27,7 @@ from synthetic_images.render import render_scene
 Array = NDArray[np.float64]
 
 CORNERS = {"1": (9.0, -9.0), "2": (-9.0, -9.0), "3": (-9.0, 9.0), "4": (9.0, 9.0)}
-ARROW = areas.polygon(((0.0, 0.0), (0.9, 0.3), (0.5, 0.5), (0.3, 0.9)))
+ARROW = areas.polygon(((0.0, 0.0), (1.1, 0.2), (0.5, 0.5), (0.3, 0.7)))  # lopsided: a mirror shows
 LEARNED = """
 name = "small"
 frame_mm = [22.0, 22.0]
