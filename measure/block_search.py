@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.block import Block
-from measure.disk_patches import Candidate, strength
+from measure.disk_patches import Candidate, Patches
+from measure.joined import joined
 from measure.radiometry import Samples
 from measure.scan import Scan
 
@@ -20,7 +21,7 @@ Image = NDArray[np.float32]
 
 ROW_BYTES, BLOCK_BYTES = 1 << 14, 1 << 24  # of a block at most, but that strips are taken whole: a margin comes on top
 
-Confirmed = Callable[[Block, list[Candidate]], list[Candidate]]
+Confirmed = Callable[[Block, Patches], Patches]
 
 
 class Octave(Protocol):
@@ -33,7 +34,7 @@ class Octave(Protocol):
     def margin_px(self) -> int: ...
     @property
     def widest_px(self) -> int: ...
-    def patches(self, small: Image) -> list[Candidate]:
+    def patches(self, small: Image) -> Patches:
         """In a reduced picture, in its pixels, those within its margin."""
 
 
@@ -49,17 +50,17 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
     rows, cols = height + 2 * margin, width + 2 * margin
     spare: list[Samples] = []  # new memory for every block would take longer than what is done in it
 
-    def in_block(corner: tuple[int, int]) -> list[Candidate]:
+    def in_block(corner: tuple[int, int]) -> Patches:
         row0, col0 = (place - margin for place in corner)
         memory = spare.pop() if spare else np.empty((rows, cols, scan.channels), scan.samples_dtype)
         block = Block(scan, col0, row0, margin, scan.samples(col0, row0, cols, rows, memory))
-        found = separate(list(patches_in(block, octaves)))
+        found = separate(joined(Patches.of(()), *patches_in(block, octaves)))
         found = confirmed(block, found) if confirmed else found
         spare.append(memory)
         return found
 
     corners = product(range(0, scan.height_px, height), range(0, scan.width_px, width))
-    return separate([patch for own in scan.each(in_block, corners) for patch in own])
+    return separate(joined(*scan.each(in_block, corners))).candidates()
 
 
 def block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:
@@ -84,7 +85,7 @@ def whole(size: int, unit: int) -> int:
     return -(-size // unit) * unit
 
 
-def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Candidate]:
+def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
     """Those that lie in the block, in pixels of the scan."""
     reductions = block.reductions({octave.factor for octave in octaves})
     width, height = (size - 2 * block.margin_px for size in block.size_px)
@@ -97,20 +98,16 @@ def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Candidate]:
             first, last = spare + col0, spare + min(col0 + part, width // factor) + 2 * margin
             place = np.array([block.col0, block.row0]) + factor * np.array([first, spare]) + (factor - 1) / 2
             found = octave.patches(small[rows, first:last])
-            centers = np.array([patch.center_px for patch in found]).reshape(-1, 2) * factor + place
-            are_inside = (centers < np.array([block.scan.width_px, block.scan.height_px]) - 0.5).all(axis=1)
-            for patch, center, is_inside in zip(found, centers, are_inside.tolist(), strict=True):
-                if is_inside:
-                    yield Candidate(center, patch.pixel_from_disk * factor, patch.contrast_dn)
+            found = Patches(found.centers * factor + place, found.shapes * factor, found.contrasts)
+            edge = np.array([block.scan.width_px, block.scan.height_px]) - 0.5
+            yield found.part(np.all(found.centers < edge, axis=1))
 
 
-def separate(found: list[Candidate]) -> list[Candidate]:
+def separate(found: Patches) -> Patches:
     """The strongest of candidates that lie within one another, the strongest first."""
-    found = sorted(found, key=strength)
-    centers = np.array([patch.center_px for patch in found]).reshape(-1, 2)
-    radii = np.array([patch.radius_px for patch in found])
+    found = found.by_strength()
     kept: set[int] = set()
-    for index, near in enumerate(cKDTree(centers).query_ball_point(centers, 0.7 * radii) if found else ()):
+    for index, near in enumerate(cKDTree(found.centers).query_ball_point(found.centers, 0.7 * found.radii)):
         if kept.isdisjoint(near):
             kept.add(index)
-    return [found[index] for index in sorted(kept)]
+    return found.part(np.array(sorted(kept), np.intp))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.block_search import search_blocks
-from measure.disk_patches import Candidate, DiskSearch
+from measure.disk_patches import Candidate, DiskSearch, Patches
 from measure.noise import robust_scale
 from measure.scan import Scan
 
@@ -86,11 +86,11 @@ class CrossOctave:
     def _margin(self) -> int:
         return int(np.ceil(2.0 * self.half[1] + 4))
 
-    def patches(self, small: Image) -> list[Candidate]:
-        found = _patches(small, self.half, self.search, self.full_scale_dn)
+    def patches(self, small: Image) -> Patches:
+        found = Patches.of(_patches(small, self.half, self.search, self.full_scale_dn))
         first = self._margin - 0.5
         last = np.array(small.shape[::-1]) - self._margin - 0.5
-        return [patch for patch in found if np.all((patch.center_px >= first) & (patch.center_px < last))]
+        return found.part(np.all((found.centers >= first) & (found.centers < last), axis=1))
 
 
 def _patches(small: Image, half: tuple[float, float], search: CrossSearch, full_scale_dn: float) -> list[Candidate]:

@@ -2,7 +2,7 @@
 as many pixels are adjusted together, in the same few steps: first with some of their pixels, which most patches do not
 outlast, then with all."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.block import Block
-from measure.disk_model import GREYS, UNKNOWNS, DiskModel, DiskStates, each, radius_px, solved
-from measure.disk_patches import Candidate, strength
+from measure.disk_model import GREYS, UNKNOWNS, DiskModel, DiskStates, each, solved
+from measure.disk_patches import Patches
 from measure.disk_pixels import Areas, DiskPixels
+from measure.joined import joined
 from measure.robust import tukey_weights
 
 Array = NDArray[np.float64]
@@ -30,56 +31,47 @@ FIRST_BLUR_PX = 1.0
 HOPELESS = 1.5  # times the misfit that is allowed, before all steps: an outline is right to a few percent
 
 
-@dataclass(frozen=True, eq=False)
-class _Disk:
-    patch: Candidate
-    blur_px: float
-
-
-def disks_among(block: Block, patches: Sequence[Candidate]) -> list[Candidate]:
+def disks_among(block: Block, patches: Patches) -> Patches:
     """Those patches that a disk explains, the strongest first, as fitted: a place within a tenth of a pixel or so."""
-    starts = [_Disk(patch, FIRST_BLUR_PX) for patch in patches]
-    hopeful = [disk for group in _groups(block, starts, _every(starts)) for disk in _hopeful(group)]
-    fitted = [disk.patch for group in _groups(block, hopeful) for disk in _fitted(group)]
-    return sorted(fitted, key=strength)
+    starts = _states(patches)
+    none = starts.part(np.zeros(0, np.intp))
+    hopeful = joined(none, *map(_hopeful, _groups(block, starts, _every(starts.radius))))
+    fitted = joined(none, *map(_fitted, _groups(block, hopeful, np.ones(len(hopeful.blur), np.intp))))
+    return Patches(fitted.centers, fitted.shapes, fitted.greys[:, 0]).by_strength()
 
 
-def _every(disks: Sequence[_Disk]) -> NDArray[np.intp]:
-    """(n,) how many pixels apart those are that tell enough of a disk: of its area, and of its edge."""
-    radius = radius_px(_shapes(disks))
+def _states(patches: Patches) -> DiskStates:
+    greys = np.zeros((len(patches.contrasts), GREYS))
+    greys[:, 0] = patches.contrasts
+    return DiskStates(patches.centers, patches.shapes, np.full(len(greys), FIRST_BLUR_PX), greys)
+
+
+def _every(radius: Array) -> NDArray[np.intp]:
+    """(n,) how many pixels apart those are that tell enough of disks (n,): of their area, and of their edge."""
     of_edge = np.sqrt(4 * np.pi * FIRST_BLUR_PX * radius / EDGE_SAMPLES)
     return np.maximum(np.minimum(radius / COARSE_PX, of_edge), 1.0).astype(np.intp)
 
 
-def _shapes(disks: Sequence[_Disk]) -> Array:
-    return np.array([disk.patch.pixel_from_disk for disk in disks]).reshape(-1, 2, 2)
-
-
-def _places(disks: Sequence[_Disk]) -> Array:
-    return np.array([disk.patch.center_px for disk in disks]).reshape(-1, 2)
-
-
-def _groups(block: Block, disks: Sequence[_Disk], every: NDArray[np.intp] | None = None) -> Iterator["_Group"]:
-    """The disks with every (n,) so many columns and rows, or all: each is sampled by its own size, whatever it is
-    together with."""
-    shapes = _shapes(disks)
-    margin = np.maximum(MARGIN * radius_px(shapes), LEAST_MARGIN_PX)
-    areas = Areas.about(_places(disks), shapes, margin, np.ones(len(disks), np.intp) if every is None else every)
+def _groups(block: Block, disks: DiskStates, every: NDArray[np.intp]) -> Iterator["_Group"]:
+    """The disks with every (n,) so many columns and rows: each is sampled by its own size, whatever it is together
+    with."""
+    margin = np.maximum(MARGIN * disks.radius, LEAST_MARGIN_PX)
+    areas = Areas.about(disks.centers, disks.shapes, margin, every)
     for chosen in areas.alike():
-        yield _Group.of(block, [disks[index] for index in chosen.tolist()], areas.part(chosen).pixels(block))
+        yield _Group.of(block, disks.part(chosen), areas.part(chosen).pixels(block))
 
 
-def _hopeful(group: "_Group") -> list[_Disk]:
+def _hopeful(group: "_Group") -> DiskStates:
     """Those that look like disks, as their outlines have them and still after some steps."""
     group = group.part(group.misfit() < HOPELESS)
-    if not len(group.disks):
-        return []
+    if not len(group.grey):
+        return group.disks
     for step in range(COARSE_STEPS + 1):
         group = group.stepped(is_robust=step == COARSE_STEPS)
     return group.part((group.misfit() < HOPELESS) & group.is_sane()).disks_now()
 
 
-def _fitted(group: "_Group") -> list[_Disk]:
+def _fitted(group: "_Group") -> DiskStates:
     """Those that are disks, after one step more."""
     group = group.stepped(is_robust=True)
     return group.part((group.misfit() < 1.0) & group.is_sane()).disks_now()
@@ -87,18 +79,17 @@ def _fitted(group: "_Group") -> list[_Disk]:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """n disks, their pixels and the grey values of these (n, pixels), and what the disks are by now."""
+    """n disks, by their places in the scan, as they were at first, their pixels and the grey values of these
+    (n, pixels), and what the disks are by now."""
 
-    disks: list[_Disk]
+    disks: DiskStates
     pixels: DiskPixels
     grey: Image
     model: DiskModel
 
     @classmethod
-    def of(cls, block: Block, disks: list[_Disk], pixels: DiskPixels) -> "_Group":
-        blur, grey = np.array([disk.blur_px for disk in disks]), pixels.grey(block)
-        state = DiskStates(_places(disks) - pixels.corners, _shapes(disks), blur, np.zeros((len(disks), GREYS)))
-        model = DiskModel(state, *pixels.places)
+    def of(cls, block: Block, disks: DiskStates, pixels: DiskPixels) -> "_Group":
+        grey, model = pixels.grey(block), DiskModel(disks.moved(-pixels.corners), *pixels.places)
         greys = solved(model.grey_design(), grey, pixels.used.astype(np.float32))
         return cls(disks, pixels, grey, model.with_greys(greys))
 
@@ -122,8 +113,7 @@ class _Group:
         return np.asarray(1.4826 * off[:, middle] * unbiased, float)
 
     def part(self, chosen: Mask) -> "_Group":
-        disks = [disk for disk, is_chosen in zip(self.disks, chosen.tolist(), strict=True) if is_chosen]
-        pixels = self.pixels.part(chosen)
+        disks, pixels = self.disks.part(chosen), self.pixels.part(chosen)
         return _Group(disks, pixels, self.grey[chosen], DiskModel(self.state.part(chosen), *pixels.places))
 
     def stepped(self, is_robust: bool) -> "_Group":
@@ -144,14 +134,12 @@ class _Group:
 
     def is_sane(self) -> Mask:
         """(n,) whether the disks are still about what they started from."""
-        starts = _shapes(self.disks)
-        moved = np.hypot(*(self.state.centers + self.pixels.corners - _places(self.disks)).T) / radius_px(starts)
-        grown = self.state.radius / radius_px(starts)
-        same = np.sign(self.state.greys[:, 0]) == np.sign([disk.patch.contrast_dn for disk in self.disks])
+        starts, radius = self.disks, self.disks.radius
+        moved = np.hypot(*(self.disks_now().centers - starts.centers).T) / radius
+        grown = self.state.radius / radius
+        same = np.sign(self.state.greys[:, 0]) == np.sign(starts.greys[:, 0])
         return np.asarray(np.isfinite(moved) & (moved < 0.5) & (np.abs(np.log(grown)) < np.log(1.5)) & same)
 
-    def disks_now(self) -> list[_Disk]:
-        """As adjusted."""
-        state = self.state
-        patches = map(Candidate, state.centers + self.pixels.corners, state.shapes, state.greys[:, 0].tolist())
-        return [_Disk(patch, blur) for patch, blur in zip(patches, state.blur.tolist(), strict=True)]
+    def disks_now(self) -> DiskStates:
+        """As adjusted, in the scan."""
+        return self.state.moved(self.pixels.corners)

@@ -36,7 +36,11 @@ class DiskStates:
     def radius(self) -> Array:
         return radius_px(self.shapes)
 
-    def part(self, chosen: Mask) -> "DiskStates":
+    def moved(self, by: NDArray[np.intp]) -> "DiskStates":
+        """By (n, 2) columns and rows."""
+        return replace(self, centers=self.centers + by)
+
+    def part(self, chosen: Mask | NDArray[np.intp]) -> "DiskStates":
         return DiskStates(self.centers[chosen], self.shapes[chosen], self.blur[chosen], self.greys[chosen])
 
     def stepped(self, step: Array) -> "DiskStates":

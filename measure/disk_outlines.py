@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.joined import joined
+
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -57,6 +59,9 @@ class Outlines:
         return np.asarray(2.0 * np.maximum(np.linalg.det(self.moments), 0.0) ** 0.25)
 
 
+_NONE = Outlines(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0))
+
+
 def outlines_about(image: Image, blobs: Blobs) -> Outlines:
     """Of those blobs, light ones, that end on every ray; most of what stands out of a landscape runs on along some."""
     near, between = partial(_nearest, image), partial(_interpolated, image)
@@ -69,7 +74,7 @@ def outlines_about(image: Image, blobs: Blobs) -> Outlines:
         for some in _chunks(alike, RAYS * REACH * radius / 0.5):
             profiles = _Profiles(between, some, radius, RAYS, 0.5)
             found.append(_outlines(some.places[profiles.ends], profiles))
-    return _joined(found)
+    return joined(_NONE, *found)
 
 
 def _chunks(blobs: Blobs, samples: float) -> Iterator[Blobs]:
@@ -136,10 +141,3 @@ def _outlines(places: NDArray[np.intp], profiles: _Profiles) -> Outlines:
     center, moments = np.stack([col, row], axis=1), np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     height = profiles.height[profiles.ends]
     return Outlines(places + center.astype(float), moments.astype(float), misfit.astype(float), height.astype(float))
-
-
-def _joined(parts: list[Outlines]) -> Outlines:
-    if not parts:
-        return Outlines(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0))
-    names = ("centers", "moments", "misfit", "height")
-    return Outlines(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -1,7 +1,7 @@
 """Patches of a disk's shape in a picture: blobs by their Laplacian at several scales, then by the outline at half of
 their height."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from math import sqrt
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.disk_outlines import REACH, Blobs, Outlines, outlines_about
+from measure.joined import joined
 from measure.noise import robust_scales
 
 Array = NDArray[np.float64]
@@ -66,9 +67,36 @@ class Candidate:
         return sqrt(abs(a * d - b * c))
 
 
-def strength(patch: Candidate) -> tuple[float, ...]:
-    """Sorts the strongest first, whatever the order in which they were found."""
-    return -abs(patch.contrast_dn), *patch.center_px.tolist()
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Of n candidates: centers (n, 2) px, shapes (n, 2, 2) as their pixel_from_disk, contrasts (n,)."""
+
+    centers: Array
+    shapes: Array
+    contrasts: Array
+
+    @classmethod
+    def of(cls, candidates: Sequence[Candidate]) -> "Patches":
+        return cls(
+            np.array([each.center_px for each in candidates]).reshape(-1, 2),
+            np.array([each.pixel_from_disk for each in candidates]).reshape(-1, 2, 2),
+            np.array([each.contrast_dn for each in candidates], float),
+        )
+
+    def candidates(self) -> list[Candidate]:
+        return [*map(Candidate, self.centers, self.shapes, self.contrasts.tolist())]
+
+    def part(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Patches":
+        return Patches(self.centers[chosen], self.shapes[chosen], self.contrasts[chosen])
+
+    @property
+    def radii(self) -> Array:
+        """(n,) of the circles of the same area."""
+        return np.asarray(np.sqrt(np.abs(np.linalg.det(self.shapes))))
+
+    def by_strength(self) -> "Patches":
+        """The strongest first, whatever the order in which they were found."""
+        return self.part(np.lexsort((*self.centers.T[::-1], -np.abs(self.contrasts))))
 
 
 def margin_px(radii: list[float]) -> int:
@@ -76,7 +104,7 @@ def margin_px(radii: list[float]) -> int:
     return int(np.ceil(REACH * radii[-1])) + 3
 
 
-def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int) -> list[Candidate]:
+def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int) -> Patches:
     """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
     small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
     cells = Cells.of(small.shape[1], round(scan_px2 / CELL_PX**2))
@@ -85,9 +113,8 @@ def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn:
     found = []
     for sign, own in blobs(small, radii, search, full_scale_dn, cells, is_textured):
         outlines = outlines_about(small if sign > 0 else -small, own)
-        for center, shape, height in round_ones(outlines, noise[cells.at(outlines.centers[:, 0])], factor):
-            found.append(Candidate(center, shape, sign * height))
-    return found
+        found.append(round_ones(outlines, noise[cells.at(outlines.centers[:, 0])], factor, sign))
+    return joined(Patches.of(()), *found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +192,8 @@ def fine_structure(small: Image) -> Image:
     return np.asarray((left - 2 * column + right) / 6)
 
 
-def round_ones(found: Outlines, noise: Array, factor: int) -> Iterator[tuple[Array, Array, float]]:
-    """Centre (2,), shape (2, 2) and height of those that are ellipses but for noise (n,).
+def round_ones(found: Outlines, noise: Array, factor: int, sign: int) -> Patches:
+    """Those that are ellipses but for noise (n,), light ones if the sign is 1, dark ones if it is -1.
 
     A disk that stands out of the noise of the scan's own pixels stands out of their means so much the more.
     """
@@ -175,4 +202,4 @@ def round_ones(found: Outlines, noise: Array, factor: int) -> Iterator[tuple[Arr
     axes, directions = np.linalg.eigh(kept.moments)
     shapes = directions * (2 * np.sqrt(np.maximum(axes, 0.0)))[:, None]
     is_wide = axes[:, 0] >= LEAST_FLAT * axes[:, 1]
-    return zip(kept.centers[is_wide], shapes[is_wide], kept.height[is_wide].tolist(), strict=True)
+    return Patches(kept.centers, shapes, sign * kept.height).part(is_wide)

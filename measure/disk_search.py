@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from measure.block import Block
 from measure.block_search import search_blocks
 from measure.disk_batch import disks_among
-from measure.disk_patches import Candidate, DiskSearch, margin_px, patches
+from measure.disk_patches import Candidate, DiskSearch, Patches, margin_px, patches
 from measure.scan import Scan
 
 Array = NDArray[np.float64]
@@ -24,16 +24,17 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
     """What a disk explains, to a tenth of a pixel or so, the strongest first, none within another."""
     smallest, largest = search.diameter_px[0] / SIZE_TOLERANCE, search.diameter_px[1] * SIZE_TOLERANCE
 
-    def disks(block: Block, patches: list[Candidate]) -> list[Candidate]:
-        return [disk for disk in disks_among(block, patches) if is_between(smallest, largest, disk)]
+    def disks(block: Block, patches: Patches) -> Patches:
+        found = disks_among(block, patches)
+        return found.part(are_between(smallest, largest, found))
 
     return search_blocks(scan, octaves_of(search, scan.full_scale_dn), disks)
 
 
-def is_between(smallest_px: float, largest_px: float, disk: Candidate) -> bool:
-    """Whether the diameters of an ellipse can be those of a disk seen obliquely."""
-    longer, shorter = 2 * np.linalg.svd(disk.pixel_from_disk, compute_uv=False)
-    return bool(longer >= smallest_px and shorter <= largest_px)
+def are_between(smallest_px: float, largest_px: float, disks: Patches) -> NDArray[np.bool_]:
+    """(n,) whether the diameters of ellipses can be those of disks seen obliquely."""
+    longer, shorter = 2 * np.linalg.svd(disks.shapes, compute_uv=False).T
+    return np.asarray((longer >= smallest_px) & (shorter <= largest_px))
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class DiskOctave:
     def margin_px(self) -> int:
         return margin_px(self.radii) * self.factor
 
-    def patches(self, small: Image) -> list[Candidate]:
+    def patches(self, small: Image) -> Patches:
         return patches(small, self.radii, self.search, self.full_scale_dn, self.factor)
 
 

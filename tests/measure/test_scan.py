@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from measure.block import Block
 from measure.block_search import search_blocks
-from measure.disk_patches import Candidate
+from measure.disk_patches import Patches
 from measure.errors import MeasurementError
 from measure.scan import open_scan
 from measure.segment_cache import SegmentCache
@@ -321,8 +321,8 @@ class Watched:
 
     factor, margin_px, widest_px = 4, 8, 100
 
-    def patches(self, small: NDArray[np.float32]) -> list[Candidate]:
-        return []
+    def patches(self, small: NDArray[np.float32]) -> Patches:
+        return Patches.of(())
 
 
 @pytest.mark.parametrize("layout", [{"tile": (32, 48)}, {"rowsperstrip": 7}, {"rowsperstrip": HEIGHT}])
