@@ -228,7 +228,7 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
             noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
         covariance, by_grey = fit.weigh(noise)
         priors_dn2 = model.prior_weights() * noise.variance_dn2
-        covariance[:2, :2] *= 1 + second_order(model.design, fit.used, covariance, priors_dn2)
+        covariance[:2, :2] *= 1 + second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
         if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
             change = fit.contrast_dn / float(np.ptp(model.mark.image))
             covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)

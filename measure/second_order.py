@@ -20,19 +20,23 @@ from measure.pixel_sums import combined, products
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_LEAST_SLOPE = 1e-3  # of a clipped grey value: what tells less tells nothing
 
-def second_order(design: Array, used: Mask, covariance: Array, priors_dn2: Array) -> float:
+
+def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, priors_dn2: Array) -> float:
     """By what share of itself the variance of a place is larger than a linearised adjustment has it.
 
     design (unknowns, height, width): derivatives of the model, the first two by column and row, the last four by the
-    greys; used (height, width): the pixels that count; covariance (unknowns, unknowns); priors_dn2 (unknowns,): weights
-    of the priors, that of a pixel being 1. The bends are compared pixel by pixel, with grain in the covariance only:
-    its weights amplify them as no noise does."""
+    greys; slopes (height, width): their part in what clipped grey values tell, 1 elsewhere; used (height, width): the
+    pixels that count; covariance (unknowns, unknowns); priors_dn2 (unknowns,): weights of the priors, that of a pixel
+    being 1. The bends are compared pixel by pixel, with grain in the covariance only: its weights amplify them as no
+    noise does."""
     moving = len(design) - GREY + 1  # all but the ground's
     among, seen = covariance[:moving, :moving], design * used
     by_grey = combined(np.asarray(np.linalg.inv(products(seen, seen) + np.diag(priors_dn2)), float), seen)
     # All that moves with the mark changes by its slope, against the move.
-    changes = -np.concatenate(np.gradient(design[:moving], axis=(2, 1))) * used
+    whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
+    changes = -np.concatenate(np.gradient(whole, axis=(2, 1))) * slopes * used
     taken_up = products(by_grey, changes)
     by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # of the variance's logarithm, negative
     left = changes - combined(taken_up.T, seen)

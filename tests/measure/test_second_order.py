@@ -18,5 +18,5 @@ def test_second_order_of_a_gaussian_spot(noise_dn: float) -> None:
     covariance = noise_dn**2 * np.linalg.inv(flat @ flat.T)
     variance = 2 * noise_dn**2 / (np.pi * gain**2)
     assert covariance[0, 0] == pytest.approx(variance, rel=0.01)
-    share = second_order(design, np.ones(spot.shape, bool), covariance, np.zeros(len(design)))
+    share = second_order(design, np.ones_like(spot), np.ones(spot.shape, bool), covariance, np.zeros(len(design)))
     assert share == pytest.approx((3 / 2 + 2 / 2) * variance / width**2, rel=0.03)
