@@ -13,7 +13,7 @@ from measure.quantisation import jpeg_headers, rounding_step_dn
 from measure.radiometry import Radiometry, Samples
 from measure.resolution import JFIF_UNIT, NO_TAGS, PNG_UNIT, Pitch, pitch_from_density
 from measure.segments import Segments
-from measure.tiff_scan import DECODING_ERRORS, broken, tag_pitch
+from measure.tiff_scan import DECODING_ERRORS, broken, orientation_notes, tag_pitch
 
 JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
@@ -26,15 +26,17 @@ def open_picture(path: Path, start: bytes) -> tuple[Segments, Pitch, tuple[str, 
     if start.startswith(JPEG_START):
         data = path.read_bytes()
         samples, pitch, step_dn = jpeg_samples(path, data), jpeg_pitch(data), rounding_step_dn(data)
+        notes = jpeg_notes(data)
     elif start.startswith(PNG_START):
         data = path.read_bytes()
         samples, pitch, step_dn = png_samples(path, data), png_pitch(data), 0.0
+        notes = ()
     else:
         raise MeasurementError(
             f"{path} is no TIFF, JPEG or PNG picture (it begins with {start[:8]!r}): "
             "give the scan itself, or convert it"
         )
-    return WholePicture(samples, step_dn), pitch, ()
+    return WholePicture(samples, step_dn), pitch, notes
 
 
 class WholePicture:
@@ -91,6 +93,18 @@ def jpeg_pitch(data: bytes) -> Pitch:
         elif marker == 0xE1 and body.startswith(b"Exif\0\0") and pitch.um is None:
             pitch = exif_pitch(body[6:], pitch)
     return pitch
+
+
+def jpeg_notes(data: bytes) -> tuple[str, ...]:
+    """On the orientation that an Exif block gives."""
+    for marker, body in jpeg_headers(data):
+        if marker == 0xE1 and body.startswith(b"Exif\0\0"):
+            try:
+                with TiffFile(BytesIO(body[6:])) as file:
+                    return orientation_notes(file.pages.first.aspage())
+            except DECODING_ERRORS:
+                return ()
+    return ()
 
 
 def exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:

@@ -65,10 +65,15 @@ def main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     notes = []
     if len(full) > 1:
         notes.append(f"the file holds {len(full)} pictures: the first was taken")
-    orientation = int(full[0].tags.valueof(274, default=1))
-    if orientation != 1:
-        notes.append(f"the file's orientation tag ({orientation}) is not applied: columns and rows are as stored")
-    return full[0], tuple(notes)
+    return full[0], (*notes, *orientation_notes(full[0]))
+
+
+def orientation_notes(page: TiffPage) -> tuple[str, ...]:
+    """A viewer may show the picture turned: whoever reads places off one must know."""
+    orientation = int(page.tags.valueof(274, default=1))
+    if orientation == 1:
+        return ()
+    return (f"the file's orientation tag ({orientation}) is not applied: columns and rows are as stored",)
 
 
 def check_extent(page: TiffPage, path: Path) -> None:

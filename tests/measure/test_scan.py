@@ -445,6 +445,16 @@ def test_the_orientation_tag_is_said_and_not_applied(tmp_path: Path) -> None:
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
 
 
+def test_a_jpeg_says_its_orientation_too(tmp_path: Path) -> None:
+    grey = (picture() >> 8).astype(np.uint8)
+    exif = PIL.Image.Exif()
+    exif[274] = 8
+    PIL.Image.fromarray(grey).save(tmp_path / "s.jpg", exif=exif)
+    with open_scan(tmp_path / "s.jpg") as scan:
+        assert (scan.height_px, scan.width_px) == grey.shape
+        assert "orientation tag (8) is not applied" in scan.notes[0]
+
+
 def test_twelve_bits_have_their_own_full_scale(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture() >> 4, bitspersample=12, photometric="miniswhite")
     with open_scan(tmp_path / "s.tif") as scan:
