@@ -70,13 +70,13 @@ def _learned(project: Project, camera: CameraFile, reporter: Reporter, workers: 
     if not names:
         return camera
     with reporter.stage("learning marks of") as count:
-        count(camera.name, 0, 3)
+        count(f"{camera.name}: their first pictures", 0, 3)
         start = (
             _clicked(project, camera, camera.clicks) if camera.clicks else _in_common(project, camera, names, workers)
         )
-        count(camera.name, 1, 3)
+        count(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
         chips = _chips(project, camera.learned, names, start, workers)
-        count(camera.name, 2, 3)
+        count(f"{camera.name}: averaged", 2, 3)
         mean = _averaged(start, camera.learned, chips, workers)
     return _stored(project, mean)
 
