@@ -27,11 +27,12 @@ def pitch_problem(
     if frame.pixel_from_camera is None or len(marks) < LEAST_MARKS:
         return None
     seen_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film mm for each pixel, across and down
-    span_mm = float(np.ptp([mark.xy_mm for mark in marks], axis=0).min())
+    places = np.array([mark.xy_mm for mark in marks])
+    lever_mm = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=0)).min())  # of all marks, along one axis
     given = float(np.median([max(mark.sigma_mm) for mark in marks]))
-    if not span_mm > given:
+    if not lever_mm > given:
         return None
-    sigma = float(np.hypot(AFFINITY_SIGMA, np.sqrt(2) * given / span_mm))
+    sigma = float(np.hypot(AFFINITY_SIGMA, given / lever_mm))
     limit = float(stats.norm.isf(CHANCE / 2 / 2)) * sigma
     excess = seen_um / np.asarray(pitch_um) - 1
     if np.abs(excess).max() <= limit:
