@@ -51,7 +51,7 @@ def test_right_pitches_are_called_wrong_as_rarely_as_is_said() -> None:
             LayoutMark(str(k), (place[0], place[1]), (1.0, 1.0), MarkShape(dot(0.1))) for k, place in enumerate(given)
         ]
         design = np.column_stack([given, np.ones(len(given))])
-        matrix = np.linalg.lstsq(design, true * (50.0, -50.0), rcond=None)[0].T
+        matrix = np.asarray(np.linalg.lstsq(design, true * (50.0, -50.0), rcond=None)[0].T, float)
         seen = [MarkMeasurement(mark.id, "fiducial", np.zeros(2), np.eye(2), Status.MEASURED) for mark in marks]
         small = FiducialLayout(tuple(marks), (33.0, 24.0))
         wrong += pitch_problem(FrameMeasurement("a", tuple(seen), None, matrix), small, (20.0, 20.0), "x") is not None
