@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -44,11 +45,26 @@ _LEAST_EXCESS = 0.15  # of correlations, the best less the second best: what cha
 def learn_marks(project: Project, reporter: Reporter, workers: Executor) -> Project:
     """The project with templates in the place of marks that are to be learned; out/learned then holds the templates
     and a camera file that names them. Raises InputError or MeasurementError where they cannot be learned."""
+    files = _file_names([camera.path for camera in project.cameras.values()])
     cameras = {
-        name: _learned(project, camera, reporter, workers) if camera.learned else _known(project, camera)
+        name: _learned(project, camera, files[camera.path], reporter, workers)
+        if camera.learned
+        else _known(project, camera)
         for name, camera in project.cameras.items()
     }
     return replace(project, cameras=cameras)
+
+
+def _file_names(cameras: Sequence[Path]) -> Mapping[Path, str]:
+    """Under which name in out/learned each camera's files stand: that of its own file, with a number where several
+    folders hold one of that name."""
+    names: dict[Path, str] = {}
+    stems = {path.stem for path in cameras}
+    for path in dict.fromkeys(cameras):
+        taken = set(names.values())
+        numbered = (f"{path.stem}-{number}" for number in count(2))
+        names[path] = next(name for name in numbered if name not in taken | stems) if path.stem in taken else path.stem
+    return names
 
 
 def _known(project: Project, camera: CameraFile) -> CameraFile:
@@ -65,20 +81,20 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _learned(project: Project, camera: CameraFile, reporter: Reporter, workers: Executor) -> CameraFile:
+def _learned(project: Project, camera: CameraFile, file: str, reporter: Reporter, workers: Executor) -> CameraFile:
     names = [name for name in project.scans if project.camera_of(name).path == camera.path]
     if not names:
         return camera
-    with reporter.stage("learning marks of") as count:
-        count(f"{camera.name}: their first pictures", 0, 3)
+    with reporter.stage("learning marks of") as tell:
+        tell(f"{camera.name}: their first pictures", 0, 3)
         start = (
             _clicked(project, camera, camera.clicks) if camera.clicks else _in_common(project, camera, names, workers)
         )
-        count(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
+        tell(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
         chips = _chips(project, camera.learned, names, start, workers)
-        count(f"{camera.name}: averaged", 2, 3)
+        tell(f"{camera.name}: averaged", 2, 3)
         mean = _averaged(start, camera.learned, chips, workers)
-    return _stored(project, mean)
+    return _stored(project, mean, file)
 
 
 def _clicked(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile:
@@ -277,11 +293,11 @@ def _averaged(
     return replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
 
 
-def _stored(project: Project, camera: CameraFile) -> CameraFile:
+def _stored(project: Project, camera: CameraFile, file: str) -> CameraFile:
     """The camera with its templates written as a file that can be used instead, and as that file has them: so what is
     measured with it is what is measured now."""
-    path = project.output / "learned" / f"{camera.path.stem}.toml"
-    write_atomically(path, camera_text(replace(camera, path=path), saved_in(path.parent, f"{camera.path.stem}-")))
+    path = project.output / "learned" / f"{file}.toml"
+    write_atomically(path, camera_text(replace(camera, path=path), saved_in(path.parent, f"{file}-")))
     return replace(camera, fiducials=read_camera(path).fiducials)
 
 

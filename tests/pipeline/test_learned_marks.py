@@ -157,6 +157,30 @@ def test_one_scan_must_be_clicked_and_says_what_it_can_tell(rendered: Path) -> N
     assert all(0 < np.trace(np.asarray(mark.covariance_px2)) < 0.01 for mark in frame.marks)
 
 
+def test_cameras_whose_files_are_named_alike_are_stored_apart(rendered: Path, tmp_path: Path) -> None:
+    """The second in another folder, beside a third that has the name which the second would get."""
+    files = {"f0": "a/camera.toml", "f1": "b/camera.toml", "f2": "b/camera-2.toml"}
+    project_of(tmp_path, LEARNED, f'"{rendered}/scans/*.tif"')
+    given = (tmp_path / "camera.toml").read_text()
+    for name, places in truth(rendered).items():
+        px = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, places, strict=True))
+        (tmp_path / files[name]).parent.mkdir(exist_ok=True)
+        own = given.replace("small", name)
+        (tmp_path / files[name]).write_text(f'{own}[clicks]\nscan = "{name}.tif"\n[clicks.px]\n{px}')
+    rows = "".join(f"{image},{file}\n" for image, file in files.items())
+    (tmp_path / "images.csv").write_text(f"image,camera\n{rows}")
+    text = (tmp_path / "project.toml").read_text()
+    (tmp_path / "project.toml").write_text(
+        text.replace("camera.toml", "a/camera.toml") + '[object]\nimages = "images.csv"\n'
+    )
+    frames = measured(read_project(tmp_path / "project.toml"))
+    assert all(mark.status.is_observation for frame in frames for mark in frame.marks)
+    for image, file in {"f0": "camera.toml", "f1": "camera-3.toml", "f2": "camera-2.toml"}.items():
+        learned = read_camera(tmp_path / "out" / "learned" / file).learned_from
+        assert learned is not None
+        assert learned.scan == image
+
+
 def test_what_was_learned_is_stored_whole_and_read_without_it_too(rendered: Path) -> None:
     """A file of before has none of what a template's pixels tell, and is read as then. Another scan of the name of the
     one clicked in says nothing of the pose."""
