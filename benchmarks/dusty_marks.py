@@ -22,6 +22,7 @@ from measure.poses import POSES
 from measure.refinement import options_for
 from measure.resolution import NO_TAGS
 from measure.scan import Scan
+from measure.scan_window import ScanWindow
 from measure.shapes import FiducialLayout, LayoutMark
 from measure.status import Status
 from measure.targets import TargetPrediction, measure_disks
@@ -65,7 +66,7 @@ class DustyMark:
             options = replace(options, freedom="ellipse", margin_px=PLAIN_MARGIN_PX, margin_blurs=0.0)
         else:
             options = options_for(kind.shape, options, kind.known if np.isfinite(kind.known) else None)
-        fit = match(np.rint(self.grey), (0.0, 0.0), kind.shape, self.mark.place, options, self.seen)
+        fit = match(ScanWindow(np.rint(self.grey), valid=self.seen), kind.shape, self.mark.place, options)
         return Found(fit.center_px, fit.covariance_px2) if fit.converged else None
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from measure.fiducials import measure_fiducials
 from measure.matching import Match, MatchOptions, match, window_about
 from measure.scan import Scan, open_scan
+from measure.scan_window import ScanWindow
 from measure.shapes import FiducialLayout, LayoutMark, MarkShape, MarkTemplate, ring_cross
 
 Array = NDArray[np.float64]
@@ -95,7 +96,7 @@ def self_consistency(pictures: list[tuple[Array, tuple[float, float]]]) -> tuple
     errors, sigmas = [], []
     for picture, shift in pictures[1:]:
         true = middle + SPARE_PX + shift
-        fit = match(picture, (0, 0), template, np.column_stack([PX_FROM_MM, np.rint(true)]), OPTIONS)
+        fit = match(ScanWindow(picture), template, np.column_stack([PX_FROM_MM, np.rint(true)]), OPTIONS)
         if fit.converged:
             errors.append(fit.center_px - true)
             sigmas.append(np.sqrt(np.diag(fit.covariance_px2)))
@@ -129,8 +130,9 @@ def print_channels(path: Path) -> None:
 
 def in_channel(scan: Scan, start: Array, weights: tuple[float, ...]) -> Match:
     col0, row0, width, height = window_about(WILD, start, 10.0)
-    window = scan.window(col0, row0, width, height, weights)
-    return match(window, (col0, row0), WILD, start, MatchOptions(linear_sigma=0.05), is_lossy=scan.is_lossy)
+    grey = scan.window(col0, row0, width, height, weights)
+    window = ScanWindow(grey, (col0, row0), is_lossy=scan.is_lossy)
+    return match(window, WILD, start, MatchOptions(linear_sigma=0.05))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ _EDGE_PX = 4.0  # an edge's blur: of 1.4 px it leaves a five hundredth of the ed
 _DRAWN = 0.05  # of the mark's contrast
 
 
-def beyond_edge(window: Array, mark: Mark, pixel_from_mark: Array, polarity: int) -> Mask:
+def beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array, polarity: int) -> Mask:
     """Which pixels of a window (height, width), in which the mark stands about as pixel_from_mark (2, 3) says, lie
     beyond an edge that is far stronger than the mark is, or in its blur. Only what changes the ground the other way
     than the mark does can be told from it: none elsewhere."""
@@ -34,7 +34,7 @@ def beyond_edge(window: Array, mark: Mark, pixel_from_mark: Array, polarity: int
     return np.asarray(cv2.distanceTransform(here.astype(np.uint8), cv2.DIST_L2, 5) <= _EDGE_PX)
 
 
-def _between(grey: Array) -> float:
+def _between(grey: NDArray[np.floating]) -> float:
     """The grey value that parts the pixels into two kinds most unlike one another (Otsu, 1979)."""
     low, high = float(grey.min()), float(grey.max())
     level = np.asarray((grey - low) / max(high - low, 1e-12) * (_LEVELS - 1), np.uint8)

@@ -12,6 +12,7 @@ from measure.circle_grids import measure_circle_grid
 from measure.corners import Corner, Surface, crossing, fit_corner, quarter
 from measure.results import MarkMeasurement
 from measure.scan import Scan
+from measure.scan_window import ScanWindow
 from measure.status import Status
 
 Array = NDArray[np.float64]
@@ -71,10 +72,9 @@ def fit_found(
     half = np.ceil(np.abs(found.steps_px / np.hypot(*found.steps_px)) @ reach).astype(int) + 2
     col0, row0 = np.round(found.center_px).astype(int) - half
     width, height = 2 * half + 1
-    window = scan.window(int(col0), int(row0), int(width), int(height))
-    cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
-    valid = ((rows >= 0) & (rows < scan.height_px))[:, None] & (cols >= 0) & (cols < scan.width_px)
-    corner = fit_corner(window, (int(col0), int(row0)), found.center_px, found.steps_px, reach, surface, valid)
+    place_px = int(col0), int(row0), int(width), int(height)
+    window = ScanWindow(scan.window(*place_px), (col0, row0), scan.inside(*place_px))
+    corner = fit_corner(window, found.center_px, found.steps_px, reach, surface)
     return FittedCorner(corner, float(np.hypot(*(corner.center_px - found.center_px))))
 
 

@@ -20,22 +20,23 @@ from measure.noise import NoiseModel, correlated, noise_model, robust_scale
 from measure.picture_model import PIXEL_VARIANCE_PX2
 from measure.pixel_sums import products
 from measure.robust import tukey_weights
+from measure.scan_window import ScanWindow
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Surface = Callable[[Array, Array, float], tuple[Array, Array, Array, Array]]
 
-SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
-MAX_ITERATIONS = 30
-LARGEST_WINDOW_PX = 3.5  # the standard deviation of the gradients' window about a crossing
-UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
+_SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
+_MAX_ITERATIONS = 30
+_LARGEST_WINDOW_PX = 3.5  # the standard deviation of the gradients' window about a crossing
+_UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
 # Plain, then thrice robust: the scale of the residuals is taken once before each, so that it settles.
-STAGES_TOLERANCE_PX = (0.05, 0.05, 0.01, 0.001)
-SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
-MOST_SHIFT = 0.6  # of the reach: farther off, another corner's edges are nearer
-MOST_TURN_RAD = 0.35  # of an edge: twenty degrees, which no approximate place is wrong by
-START_BLUR_PX, LEAST_BLUR_PX = 0.8, 0.3  # the pixel's share included
-LONGEST_TURN_RAD = 0.15  # of an edge in a step: its picture is no longer linear in more
+_STAGES_TOLERANCE_PX = (0.05, 0.05, 0.01, 0.001)
+_SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
+_MOST_SHIFT = 0.6  # of the reach: farther off, another corner's edges are nearer
+_MOST_TURN_RAD = 0.35  # of an edge: twenty degrees, which no approximate place is wrong by
+_START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # the pixel's share included
+_LONGEST_TURN_RAD = 0.15  # of an edge in a step: its picture is no longer linear in more
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,25 +59,15 @@ class Corner:
     junction_covariance_px2: Array | None = None
 
 
-def fit_corner(
-    window: NDArray[np.floating],
-    origin_px: tuple[int, int],
-    start_px: Array,
-    steps_px: Array,
-    reach_px: Array,
-    surface: Surface,
-    valid: Mask | None = None,
-) -> Corner:
-    """Fit the corner near start_px (2,).
+def fit_corner(window: ScanWindow, start_px: Array, steps_px: Array, reach_px: Array, surface: Surface) -> Corner:
+    """Fit the corner near start_px (2,), in a window of the scan.
 
-    window: (height, width) grey values, the top-left pixel's centre at origin_px (col, row) of the scan; valid: which
-    of them are inside of the scan. steps_px (2, 2): its columns run along the two edges; reach_px (2,): how far along
-    either of them, forth and back, grey values are used. surface: `crossing` or `quarter`.
+    steps_px (2, 2): its columns run along the two edges; reach_px (2,): how far along either of them, forth and back,
+    grey values are used. surface: `crossing` or `quarter`.
     """
-    start = np.asarray(start_px, float) - origin_px
-    fit = _CornerFit(np.asarray(window, float), start, np.asarray(steps_px, float), reach_px, surface, valid)
+    fit = _CornerFit(window, np.asarray(start_px, float), np.asarray(steps_px, float), reach_px, surface)
     fit.run()
-    return fit.result(np.asarray(origin_px, float))
+    return fit.result()
 
 
 def crossing(u: Array, v: Array, correlation: float) -> tuple[Array, Array, Array, Array]:
@@ -113,36 +104,35 @@ def _density(place: Array) -> Array:
 class _CornerFit:
     """One corner's adjustment in progress."""
 
-    def __init__(
-        self, grey: Array, start: Array, steps_px: Array, reach_px: Array, surface: Surface, valid: Mask | None
-    ) -> None:
-        self.grey, self.start, self.surface, self.reach = grey, start, surface, reach_px
-        self.row, self.col = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(float)
+    def __init__(self, window: ScanWindow, start_px: Array, steps_px: Array, reach_px: Array, surface: Surface) -> None:
+        self.grey, self.valid = np.asarray(window.grey, float), window.usable
+        self.origin = np.asarray(window.origin_px, float)
+        self.start, self.surface, self.reach = start_px - self.origin, surface, reach_px
+        self.row, self.col = np.mgrid[: self.grey.shape[0], : self.grey.shape[1]].astype(float)
         self.along_from_pixel = np.linalg.inv(steps_px / np.hypot(*steps_px))
-        self.valid = np.ones(grey.shape, bool) if valid is None else valid
-        self.center = start.copy()
+        self.center = self.start.copy()
         # An edge along a step has its normal a quarter turn on; the signs make the corner between the steps positive.
         mirrored = np.linalg.det(steps_px) < 0
         self.edges = np.arctan2(steps_px[1], steps_px[0]) + np.pi / 2 + np.pi * np.array([mirrored, not mirrored])
         self.start_edges = self.edges.copy()
-        self.max_shift_px = MOST_SHIFT * float(reach_px.min())
-        self.variance = START_BLUR_PX**2
+        self.max_shift_px = _MOST_SHIFT * float(reach_px.min())
+        self.variance = _START_BLUR_PX**2
         self.max_variance = (float(reach_px.min()) / 2) ** 2 + PIXEL_VARIANCE_PX2
         self.bends = surface is crossing
         self.linear = np.zeros(5 if self.bends else 4)  # half the contrast, offset, gradient (2), bend
-        self.unknowns = SHAPE_UNKNOWNS + len(self.linear)
+        self.unknowns = _SHAPE_UNKNOWNS + len(self.linear)
         self.scale_dn = 0.0
         self.weights = self._area()
         self.reason = "" if self.weights.sum() > 2 * self.unknowns else "too little of it is inside of the scan"
 
     def run(self) -> None:
         """Plain, then robust, until the corner stands still; or a reason why it does not."""
-        for stage, tolerance_px in enumerate(STAGES_TOLERANCE_PX):
+        for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
             if not self.reason:
                 self.scale_dn = self._residual_scale() if stage else np.inf
                 self._adjust(tolerance_px)
 
-    def result(self, origin: Array) -> Corner:
+    def result(self) -> Corner:
         """The corner in the scan, with the covariance that the residuals' own autocovariance gives."""
         design, residuals = self._linearised()
         used = self.weights > 0.05
@@ -159,29 +149,29 @@ class _CornerFit:
             elif self.bends:
                 meeting, meeting_covariance = self._junction(residuals, model)
         return Corner(
-            center_px=self.center + origin,
+            center_px=self.center + self.origin,
             covariance_px2=(covariance + covariance.T) / 2,
             contrast_dn=2 * float(self.linear[0]),
             noise_dn=noise,
             blur_px=float(np.sqrt(max(self.variance - PIXEL_VARIANCE_PX2, 0.0))),
             damaged_fraction=float(1 - self.weights.sum() / max(self._area().sum(), 1e-9)),
             reason=self.reason,
-            junction_px=None if meeting is None else meeting + origin,
+            junction_px=None if meeting is None else meeting + self.origin,
             junction_covariance_px2=meeting_covariance,
         )
 
     def _junction(self, residuals: Array, noise: NoiseModel) -> tuple[Array, Array] | tuple[None, None]:
         """Where the gradients' lines meet, and its covariance. Damage is painted over with what was fitted."""
         area = self._area()
-        damaged = self.weights < UNDAMAGED * area
-        window_px = min(LARGEST_WINDOW_PX, float(self.reach.min()) / 2)
+        damaged = self.weights < _UNDAMAGED * area
+        window_px = min(_LARGEST_WINDOW_PX, float(self.reach.min()) / 2)
         meeting, by_grey = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, window_px, area)
         if not np.hypot(*(meeting - self.center)) < window_px:
             return None, None
         return meeting, products(by_grey, correlated(by_grey, noise))
 
     def _adjust(self, tolerance_px: float) -> None:
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(_MAX_ITERATIONS):
             if self.reason:
                 return
             design, residuals = self._linearised()
@@ -200,7 +190,7 @@ class _CornerFit:
 
     def _residual_scale(self) -> float:
         _, residuals = self._linearised()
-        return max(robust_scale(residuals[self.weights > 0]), SCALE_FLOOR * 2 * abs(float(self.linear[0])), 1e-9)
+        return max(robust_scale(residuals[self.weights > 0]), _SCALE_FLOOR * 2 * abs(float(self.linear[0])), 1e-9)
 
     def _linearised(self) -> tuple[Array, Array]:
         """(unknowns, height, width) derivatives and (height, width) residuals, at the best grey-value parameters."""
@@ -240,13 +230,13 @@ class _CornerFit:
             return 0.0
         scaled = normal / np.outer(size, size) + 1e-9 * np.eye(self.unknowns)
         step = np.linalg.solve(scaled, np.tensordot(weighted, residuals, axes=2) / size) / size
-        step /= max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / LONGEST_TURN_RAD, 1.0)
+        step /= max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / _LONGEST_TURN_RAD, 1.0)
         self.center += step[:2]
         self.edges += step[2:4]
         variance = np.clip(self.variance + step[4], self.variance / 2, self.variance * 2)
-        self.variance = float(np.clip(variance, LEAST_BLUR_PX**2, self.max_variance))
+        self.variance = float(np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance))
         if np.hypot(*(self.center - self.start)) > self.max_shift_px:
             self.reason = "the fit ran away to something else"
-        elif np.abs(self.edges - self.start_edges).max() > MOST_TURN_RAD:
+        elif np.abs(self.edges - self.start_edges).max() > _MOST_TURN_RAD:
             self.reason = "the edges here run otherwise than they should"
         return float(np.hypot(*step[:2]))

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.blank_film import BESIDE_PX
-from measure.clipping import clipped_sides
 from measure.compression import with_loss
 from measure.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
 from measure.disk_patches import LEAST_SNR
@@ -15,6 +14,7 @@ from measure.matching import Match, MatchOptions, match, window_about
 from measure.noise import may_be_noise
 from measure.picture_model import GREY
 from measure.scan import Scan
+from measure.scan_window import read_window
 from measure.second_place import SecondPlace
 from measure.shapes import Disk, MarkShape
 
@@ -154,13 +154,10 @@ def _fit_by_margin(
         max_shift_px=max(_mean_radius_px(start[:, :2]), LEAST_SHIFT_PX),
         linear_sigma=FORM_SIGMA,
     )
-    col0, row0, width, height = window_about(shape, start, wide_px + BESIDE_PX)
-    window, valid = scan.window(col0, row0, width, height), scan.inside(col0, row0, width, height)
-    clipped = clipped_sides(scan, col0, row0, width, height, None)
+    window = read_window(scan, window_about(shape, start, wide_px + BESIDE_PX))
 
     def fitted(margin_px: float) -> FittedDisk:
-        own = replace(options, margin_px=margin_px)
-        fit = match(window, (col0, row0), shape, start, own, valid, clipped, scan.is_lossy)
+        fit = match(window, shape, start, replace(options, margin_px=margin_px))
         disk = FittedDisk(
             center_px=fit.center_px,
             covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn),

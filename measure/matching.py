@@ -19,12 +19,13 @@ from measure.clipping import Sides
 from measure.grain import grain_model
 from measure.linear_fit import LinearFit
 from measure.match_options import MatchOptions
-from measure.noise import is_textured, noise_model
+from measure.noise import NoiseModel, is_textured, noise_model
 from measure.own_shape import OwnShape, own_shape
 from measure.picture_fit import PictureFit
 from measure.picture_model import GREY, PictureModel, State, background_px, is_round
 from measure.pixel_sums import combined, factors
 from measure.rendering import extent_px
+from measure.scan_window import ScanWindow
 from measure.second_order import second_order
 from measure.second_place import SecondPlace, edge_place, sloping_place
 from measure.shapes import Mark, MarkTemplate
@@ -86,56 +87,51 @@ class Match:
         return abs(self.contrast_dn) / max(self.noise_dn, 1e-12)
 
 
-def match(
-    window: NDArray[np.floating],
-    origin_px: tuple[float, float],
-    mark: Mark,
-    pixel_from_mark: Array,
-    options: MatchOptions | None = None,
-    valid: Mask | None = None,
-    clipped: Sides | None = None,
-    is_lossy: bool = False,
-) -> Match:
+def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: MatchOptions | None = None) -> Match:
     """Fit the mark to a window of the scan.
 
-    window: (height, width) grey values whose top-left pixel's centre is at origin_px (col, row) of the scan; valid:
-    which of its pixels are true ones; clipped: which are at an end of the scanner's range, as `clipped_sides` gives it.
     pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col, row): its last column is the
-    approximate centre, right to a pixel or two. is_lossy: whether the window was compressed with loss: then its grain
-    tells nothing, and dust is seen otherwise. Never raises for what the picture holds.
+    approximate centre, right to a pixel or two. In a window that was compressed with loss grain tells nothing, and dust
+    is seen otherwise. Never raises for what the picture holds.
     """
     options = options or MatchOptions()
-    grey = np.asarray(window, dtype=float)
-    usable = np.isfinite(grey) if valid is None else np.isfinite(grey) & valid
-    sides = np.zeros(grey.shape, np.int8) if clipped is None else clipped
-    # A chip's picture is smoothed for the fit, and blank film beside it is not.
-    blank = np.zeros_like(usable) if is_lossy or isinstance(mark, MarkTemplate) else usable & (sides == 0)
-    start = np.array(pixel_from_mark, dtype=float)
-    start[:, 2] -= origin_px
-    given = _Window(np.where(usable, grey, 0.0), usable, sides, mark, start, is_lossy)
+    given = _given(window, mark, pixel_from_mark)
     part, fit = _fitted(given, options)
     if not _is_right(fit):
-        detail_part, detail = _fitted(given, options, background_px(mark, start))
+        detail_part, detail = _fitted(given, options, background_px(mark, given.start))
         if not detail.reason:
             whole = _with_ground(given, detail_part, detail) if fit.reason else fit
             part, fit = detail_part, whole if _is_right(whole) else detail
-    free = blank.copy()
+    free = given.blank.copy()
     free[part.rows, part.cols] &= ~fit.area
     result = _result(fit, given.grey, free)
     moved = np.array(result.pixel_from_mark)
-    moved[:, 2] += part.corner_px + origin_px
+    moved[:, 2] += part.corner_px + window.origin_px
     return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
 
 
-class _Window(NamedTuple):
-    """What is given of the scan about a mark, which is expected at start (2, 3)."""
+class _Given(NamedTuple):
+    """What is given of the scan about a mark, which is expected at start (2, 3) of the window. grey, usable, sides and
+    blank (height, width): grey values, which of them are known, which are clipped, and which may be blank film."""
 
     grey: Array
     usable: Mask
     sides: Sides
+    blank: Mask
     mark: Mark
     start: Array
     is_lossy: bool
+
+
+def _given(window: ScanWindow, mark: Mark, pixel_from_mark: Array) -> _Given:
+    usable, sides = window.usable, window.sides
+    # A chip's picture is smoothed for the fit, and blank film beside it is not.
+    has_none = window.is_lossy or isinstance(mark, MarkTemplate)
+    blank = np.zeros_like(usable) if has_none else usable & (sides == 0)
+    start = np.array(pixel_from_mark, dtype=float)
+    start[:, 2] -= window.origin_px
+    grey = np.where(usable, np.asarray(window.grey, dtype=float), 0.0)
+    return _Given(grey, usable, sides, blank, mark, start, window.is_lossy)
 
 
 class _Part(NamedTuple):
@@ -149,17 +145,17 @@ class _Part(NamedTuple):
         return np.array([self.cols.start, self.rows.start], dtype=float)
 
 
-def _fitted(window: _Window, options: MatchOptions, coarse_px: float | None = None) -> tuple[_Part, PictureFit]:
+def _fitted(given: _Given, options: MatchOptions, coarse_px: float | None = None) -> tuple[_Part, PictureFit]:
     """The mark fitted, in the part of the window about it, in that part's pixels. coarse_px: of a background that does
     not count, if one does not."""
-    part = _part(window, options)
-    fit = _begun(window, part, options, coarse_px)
+    part = _part(given, options)
+    fit = _begun(given, part, options, coarse_px)
     fit.approach()
     reach_px = options.margin_blurs * fit.model.blur_px
     if not fit.reason and reach_px > options.margin_px:  # the blur spreads the mark beyond its margin
         wide = replace(options, margin_px=reach_px)
-        narrow, part = part, _part(window, wide)
-        fit = _begun(window, part, wide, coarse_px, fit.model.state.moved(narrow.corner_px - part.corner_px))
+        narrow, part = part, _part(given, wide)
+        fit = _begun(given, part, wide, coarse_px, fit.model.state.moved(narrow.corner_px - part.corner_px))
         fit.choose_area()
     fit.refine()
     return part, fit
@@ -170,38 +166,36 @@ def _is_right(fit: PictureFit) -> bool:
     return not fit.reason and not is_textured(fit.model.residuals, fit.telling, fit.floor_dn)
 
 
-def _with_ground(window: _Window, part: _Part, detail: PictureFit) -> PictureFit:
+def _with_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
     """The mark fitted with its ground from where its detail alone was fitted: a large speck carries the first steps,
     which are plain least squares, away from a mark, and not those of its detail."""
     state = detail.model.state.moved(np.zeros(2))
-    fit = _begun(window, part, detail.options, None, state)
+    fit = _begun(given, part, detail.options, None, state)
     fit.choose_area()
     fit.refine()
     return fit
 
 
 def _begun(
-    window: _Window, part: _Part, options: MatchOptions, coarse_px: float | None, state: State | None = None
+    given: _Given, part: _Part, options: MatchOptions, coarse_px: float | None, state: State | None = None
 ) -> PictureFit:
     rows, cols = part
-    start, ends, usable = window.start.copy(), window.sides[rows, cols], window.usable[rows, cols]
+    start, ends, usable = given.start.copy(), given.sides[rows, cols], given.usable[rows, cols]
     start[:, 2] -= part.corner_px
     if coarse_px is not None:
         # What is left of a clipped grey value without its surroundings is no limit of anything.
         usable, ends = usable & (ends == 0), np.zeros_like(ends)
-    return PictureFit(
-        PictureModel(window.grey[rows, cols], ends, window.mark, start, options, coarse_px, state),
-        usable,
-        window.is_lossy,
-    )
+    model = PictureModel(given.grey[rows, cols], ends, given.mark, start, options, coarse_px)
+    model.state = state or model.state
+    return PictureFit(model, usable, given.is_lossy)
 
 
-def _part(window: _Window, options: MatchOptions) -> _Part:
-    col0, row0, width, height = window_about(window.mark, window.start, options.margin_px + _SPARE_PX)
+def _part(given: _Given, options: MatchOptions) -> _Part:
+    col0, row0, width, height = window_about(given.mark, given.start, options.margin_px + _SPARE_PX)
     return _Part(
         *(
             slice(min(max(first, 0), size - 1), max(first + count, 1))
-            for first, count, size in zip((row0, col0), (height, width), window.grey.shape, strict=True)
+            for first, count, size in zip((row0, col0), (height, width), given.grey.shape, strict=True)
         )
     )
 
@@ -218,28 +212,13 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
     """The match in the pixels of the fit's own window; free: which pixels of the whole window may be blank film."""
     model, used = fit.model, fit.telling
     noise = noise_model(model.scores, fit.used, len(model.design), float(model.information[fit.used].sum()))
-    covariance, gain_sigma = np.full((len(model.design),) * 2, np.inf), np.inf
-    edges: SecondPlace | None = None
-    sloping: SecondPlace | None = None
-    own: OwnShape | None = None
+    precision = _Precision(np.full((len(model.design),) * 2, np.inf), np.inf)
     if not fit.reason:
         patches = blank_patches(window, free, noise.variance_dn2)
         if not noise.is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
-        covariance, by_grey = fit.weigh(noise)
-        priors_dn2 = model.prior_weights() * noise.variance_dn2
-        covariance[:2, :2] *= 1 + second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
-        if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
-            change = fit.contrast_dn / float(np.ptp(model.mark.image))
-            covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
-        gain_sigma = float(np.sqrt(max(covariance[-GREY, -GREY], 1e-12)))
-        linear = LinearFit(model.residuals, used, model.design, by_grey, noise)
-        edges = edge_place(linear, model.blur_px)
-        if model.options.freedom == "ellipse" and model.background_px is None:
-            sloping = sloping_place(linear)
-        if model.options.freedom == "similarity" and not is_round(model.mark):
-            own = own_shape(linear, model.linear, model.departures())
-    state = model.state
+        precision = _weighed(fit, used, noise)
+    state, covariance = model.state, precision.covariance
     return Match(
         converged=not fit.reason,
         reason=fit.reason,
@@ -254,13 +233,45 @@ def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
         neighbour_correlation=noise.neighbour_correlation,
         covariance_is_white=noise.is_white,
         likeness=_likeness(fit),
-        significance=fit.contrast_dn / gain_sigma,
+        significance=fit.contrast_dn / precision.gain_sigma,
         blur_sigma=_blur_sigma(model, covariance),
         size_sigma=float(np.sqrt(covariance[2, 2])) if model.tells_size else np.inf,
-        edges=edges,
-        sloping=sloping,
-        own_shape=own,
+        edges=precision.edges,
+        sloping=precision.sloping,
+        own_shape=precision.own_shape,
         covariance=covariance,
+    )
+
+
+class _Precision(NamedTuple):
+    """What the noise makes of a fit: the covariance of its unknowns (unknowns, unknowns), the standard deviation of the
+    gain, and what the linearised fit says beside the unknowns, as `Match` has it."""
+
+    covariance: Array
+    gain_sigma: float
+    edges: SecondPlace | None = None
+    sloping: SecondPlace | None = None
+    own_shape: OwnShape | None = None
+
+
+def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel) -> _Precision:
+    """The fit ended with the weights of its noise. used: the pixels that said how large this is."""
+    model = fit.model
+    covariance, by_grey = fit.weigh(noise)
+    priors_dn2 = model.prior_weights() * noise.variance_dn2
+    covariance[:2, :2] *= 1 + second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
+    if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
+        change = fit.contrast_dn / float(np.ptp(model.mark.image))
+        covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
+    linear = LinearFit(model.residuals, used, model.design, by_grey, noise)
+    freedom = model.options.freedom
+    tells_shape = freedom == "similarity" and not is_round(model.mark)
+    return _Precision(
+        covariance,
+        gain_sigma=float(np.sqrt(max(covariance[-GREY, -GREY], 1e-12))),
+        edges=edge_place(linear, model.blur_px),
+        sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
+        own_shape=own_shape(linear, model.linear, model.departures()) if tells_shape else None,
     )
 
 

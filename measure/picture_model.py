@@ -58,7 +58,7 @@ class PictureModel:
     column and row, the generators' parameters, the blur's variance if it is estimated, and the greys.
 
     bent: how far, in units of the blur, a series may bend the drawing before it is drawn anew.
-    start: where the mark is expected, and state, if given, what an earlier fit made of it.
+    start: where the mark is expected, where the state begins too.
     ground (3, height, width): offset and slopes of the background.
     clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
     values need; tells (height, width): False where a clipped one says nothing of it. slopes and information (height,
@@ -75,7 +75,6 @@ class PictureModel:
         start: Array,
         options: MatchOptions,
         background_px: float | None = None,
-        state: State | None = None,
     ) -> None:
         self.mark, self.start, self.options = mark, start, options
         self.background_px = background_px
@@ -94,7 +93,7 @@ class PictureModel:
         self.blur = 2 + len(self.generators) if options.estimate_blur else None
         # A chip already has its scan's blur: where none is estimated, none is added.
         added_px2 = 0.0 if is_chip and not options.estimate_blur else options.blur_px**2
-        self.state = state or State(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
+        self.state = State(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
         # The state that the design is of, and its residuals.
         self._linearised: tuple[State, Array] | None = None
         self.bent = BENT

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from measure.beyond_edge import beyond_edge
 from measure.blank_film import BESIDE_PX
 from measure.candidates import FAINT
-from measure.clipping import clipped_sides
 from measure.compression import with_loss
 from measure.correlation import CLOSE
 from measure.first_look import seen
@@ -17,6 +16,7 @@ from measure.matching import Match, MatchOptions, match, window_about
 from measure.prediction import MarkPrediction
 from measure.rendering import extent_px
 from measure.scan import Scan
+from measure.scan_window import read_window
 from measure.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
 
 Array = NDArray[np.float64]
@@ -98,15 +98,11 @@ def _fitted(
         return None, 1.0
     center_px, chance = look
     start = expected.moved(center_px).pixel_from_mark
-    col0, row0, width, tall = window_about(mark, start, options.margin_px + BESIDE_PX)
-    window = scan.window(col0, row0, width, tall, weights).astype(float)
-    valid = scan.inside(col0, row0, width, tall)
+    window = read_window(scan, window_about(mark, start, options.margin_px + BESIDE_PX), weights)
     if expected.surroundings == CLOSE and isinstance(mark, MarkShape):
-        inner = np.column_stack([start[:, :2], start[:, 2] - (col0, row0)])
-        valid &= ~beyond_edge(window, mark, inner, expected.polarity)
-    clipped = clipped_sides(scan, col0, row0, width, tall, weights)
-    own = options_for(mark, options, frame_sigma)
-    return match(window, (col0, row0), mark, start, own, valid, clipped, scan.is_lossy), chance
+        inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
+        window = window.without(beyond_edge(window.grey, mark, inner, expected.polarity))
+    return match(window, mark, start, options_for(mark, options, frame_sigma)), chance
 
 
 def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:

@@ -8,6 +8,7 @@ from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
 from measure.corners import Corner, Surface, crossing, fit_corner, quarter
+from measure.scan_window import ScanWindow
 
 Array = NDArray[np.float64]
 SIZE, NOISE, CONTRAST = 25, 4.0, 100.0
@@ -48,7 +49,7 @@ def square_picture(center: Array, steps: Array, blur_px: float, alone: bool) -> 
 
 
 def fitted(window: Array, start: Array, steps: Array, alone: bool) -> Corner:
-    return fit_corner(window, (0, 0), start, steps, np.array([6.0, 6.0]), quarter if alone else crossing)
+    return fit_corner(ScanWindow(window), start, steps, np.array([6.0, 6.0]), quarter if alone else crossing)
 
 
 @pytest.mark.parametrize(("blur_px", "alone"), [(0.5, False), (0.9, False), (1.5, False), (0.8, True)])

@@ -10,6 +10,7 @@ from scipy.special import ndtr
 from measure.learned import Chip, honest_covariance, template_of
 from measure.matching import MatchOptions, match
 from measure.recurring import recurrence
+from measure.scan_window import ScanWindow
 from measure.shapes import MarkShape, polygon
 
 Array = NDArray[np.float64]
@@ -38,7 +39,7 @@ def pictures(count: int, seed: int, dust: bool = False) -> tuple[list[Chip], Arr
 def measured(chips: list[Chip]) -> tuple[Array, Array]:
     """Places (n, 2) and standard deviations (n, 2) with the template that the chips give."""
     template = template_of(chips, SIZE_MM)
-    fits = [match(chip.grey, (0, 0), template, chip.pixel_from_mark, SHIFT) for chip in chips]
+    fits = [match(ScanWindow(chip.grey), template, chip.pixel_from_mark, SHIFT) for chip in chips]
     covariances = [honest_covariance(template, chip.scan, fit) for chip, fit in zip(chips, fits, strict=True)]
     return np.array([fit.center_px for fit in fits]), np.sqrt(np.array(covariances)[:, [0, 1], [0, 1]])
 
@@ -67,7 +68,7 @@ def test_one_picture_alone_is_its_own_template_and_keeps_an_honest_sigma() -> No
     chips, _ = pictures(1, 4)
     template = template_of(chips, SIZE_MM)
     assert dict(template.shares) == {"frame0": 1.0}
-    fit = match(chips[0].grey, (0, 0), template, chips[0].pixel_from_mark, SHIFT)
+    fit = match(ScanWindow(chips[0].grey), template, chips[0].pixel_from_mark, SHIFT)
     np.testing.assert_allclose(fit.center_px, chips[0].pixel_from_mark[:, 2], atol=0.02)
     sigma = np.sqrt(np.diag(honest_covariance(template, "frame0", fit)))
     assert 0.005 < sigma.min() < sigma.max() < 0.2  # the residuals, which are nothing, would say nothing
@@ -101,7 +102,7 @@ def test_a_corner_of_the_border_beside_a_lighter_landscape_is_known_less_surely(
     for place in 30 + rng.uniform(-0.5, 0.5, (4, 2)):
         seen = corner(rng, 230.0, place)
         start = np.column_stack([seen.pixel_from_mark[:, :2], np.rint(place)])
-        fit = match(seen.grey, (0, 0), template, start, MatchOptions(freedom="shift"))
+        fit = match(ScanWindow(seen.grey), template, start, MatchOptions(freedom="shift"))
         error = fit.center_px - place
         assert fit.converged
         assert np.abs(error).max() < 0.6

@@ -9,6 +9,7 @@ from brute_marks import Array, brute_picture, placed
 from scipy.ndimage import gaussian_filter
 
 from measure.matching import Match, MatchOptions, match
+from measure.scan_window import ScanWindow
 from measure.shapes import Mark, MarkShape, MarkTemplate, cross, dot, polygon, ring_cross, ring_dot
 
 SIZE, SCALE, CONTRAST, GROUND = 41, 10.0, 500.0, 1000.0
@@ -41,7 +42,7 @@ def measured(
 ) -> Match:
     """The match from a start that is off by up to 0.7 px, with the drawn size and no turn."""
     start = placed(SCALE, tuple(place[:, 2] + rng.uniform(-0.7, 0.7, 2)))
-    return match(grey, (0, 0), mark, start, options)
+    return match(ScanWindow(grey), mark, start, options)
 
 
 def errors_and_sigmas(name: str, blur_px: float, snr: float, count: int) -> tuple[Array, Array, list[Match]]:
@@ -113,9 +114,9 @@ def test_clean_marks_are_unbiased_at_every_phase(name: str, blur_px: float) -> N
 
 def test_the_windows_origin_counts() -> None:
     shown, place = drawn("cross", 1.0)[0]
-    here = match(shown * CONTRAST, (0, 0), MARKS["cross"], placed(SCALE, tuple(place[:, 2])))
+    here = match(ScanWindow(shown * CONTRAST), MARKS["cross"], placed(SCALE, tuple(place[:, 2])))
     moved = placed(SCALE, tuple(place[:, 2] + (1000, 2000)))
-    there = match(shown * CONTRAST, (1000, 2000), MARKS["cross"], moved)
+    there = match(ScanWindow(shown * CONTRAST, (1000, 2000)), MARKS["cross"], moved)
     np.testing.assert_allclose(there.center_px - here.center_px, [1000, 2000], atol=1e-6)
 
 
@@ -166,8 +167,8 @@ def test_a_large_speck_costs_what_it_covers() -> None:
         speck = brute_picture(MarkShape(dot(0.4)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 1.0)
         clean = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / 20, shown.shape)
         grey = clean + 2 * CONTRAST * speck
-        found = match(grey, (0, 0), MARKS["cross"], place + np.array([0, 0, 0.5]))
-        told = match(grey, (0, 0), MARKS["cross"], place, valid=speck < 0.01)
+        found = match(ScanWindow(grey), MARKS["cross"], place + np.array([0, 0, 0.5]))
+        told = match(ScanWindow(grey, valid=speck < 0.01), MARKS["cross"], place)
         assert found.sigma_px < 1.1 * told.sigma_px
         assert np.hypot(*(found.center_px - told.center_px)) < told.sigma_px
 
@@ -198,7 +199,7 @@ def test_a_chip_is_matched_by_the_same_core() -> None:
     for _ in range(12):
         grey = GROUND + CONTRAST * shown + rng.normal(0, 10, shown.shape)
         options = MatchOptions(freedom="shift", estimate_blur=False)
-        fit = match(grey, (0, 0), template, placed(SCALE, (27.0, 27.0)), options)
+        fit = match(ScanWindow(grey), template, placed(SCALE, (27.0, 27.0)), options)
         assert fit.converged, fit.reason
         errors.append(fit.center_px - place[:, 2])
     assert np.abs(np.mean(errors, axis=0)).max() < 0.006
@@ -210,7 +211,7 @@ def test_an_ellipse_takes_five_parameters() -> None:
     shown = brute_picture(MarkShape(dot(0.5)), stretched, SIZE, SIZE, 0.8)
     rng = np.random.default_rng(23)
     grey = GROUND + CONTRAST * shown + rng.normal(0, 5, shown.shape)
-    fit = match(grey, (0, 0), MARKS["dot"], placed(SCALE, (20.0, 20.0)), MatchOptions(freedom="ellipse"))
+    fit = match(ScanWindow(grey), MARKS["dot"], placed(SCALE, (20.0, 20.0)), MatchOptions(freedom="ellipse"))
     assert fit.converged, fit.reason
     assert np.abs(fit.center_px - stretched[:, 2]).max() < 0.01
     found, true = (m[:, :2] @ m[:, :2].T for m in (fit.pixel_from_mark, stretched))
@@ -222,19 +223,19 @@ def test_a_notch_is_matched_by_shift_alone() -> None:
     place = placed(SCALE, (20.31, 19.62))
     grey = GROUND + CONTRAST * brute_picture(mark, place, SIZE, SIZE, 0.8)
     grey = grey + np.random.default_rng(29).normal(0, 10, grey.shape)
-    fit = match(grey, (0, 0), mark, placed(SCALE, (20.0, 20.0)), MatchOptions(freedom="shift"))
+    fit = match(ScanWindow(grey), mark, placed(SCALE, (20.0, 20.0)), MatchOptions(freedom="shift"))
     assert np.abs(fit.center_px - place[:, 2]).max() < 4 * np.sqrt(fit.covariance_px2.max())
 
 
 def test_nothing_is_not_a_mark() -> None:
     rng = np.random.default_rng(31)
     place = placed(SCALE, (20.0, 20.0))
-    flat = match(np.full((SIZE, SIZE), 7.0), (0, 0), MARKS["cross"], place)
+    flat = match(ScanWindow(np.full((SIZE, SIZE), 7.0)), MARKS["cross"], place)
     assert not flat.converged
     assert flat.reason
-    noise = match(rng.normal(0, 10, (SIZE, SIZE)), (0, 0), MARKS["ring-cross"], place)
+    noise = match(ScanWindow(rng.normal(0, 10, (SIZE, SIZE))), MARKS["ring-cross"], place)
     assert not noise.converged or noise.likeness < 0.35
-    outside = match(np.zeros((SIZE, SIZE)), (500, 500), MARKS["cross"], place)
+    outside = match(ScanWindow(np.zeros((SIZE, SIZE)), (500, 500)), MARKS["cross"], place)
     assert "outside" in outside.reason
 
 
@@ -242,7 +243,7 @@ def test_half_of_a_mark_outside_of_the_scan_is_said() -> None:
     shown, place = drawn("ring-cross", 1.0)[0]
     valid = np.zeros(shown.shape, dtype=bool)
     valid[:, 24:] = True
-    fit = match(shown, (0, 0), MARKS["ring-cross"], place, valid=valid)
+    fit = match(ScanWindow(shown, valid=valid), MARKS["ring-cross"], place)
     assert "outside of the scan" in fit.reason
 
 

@@ -6,6 +6,7 @@ from drawn import Array, drawn
 
 from measure.match_options import MatchOptions
 from measure.matching import Match, match
+from measure.scan_window import ScanWindow
 from measure.shapes import MarkShape, Polygon
 
 SIZE, CONTRAST = 41, 500.0
@@ -25,7 +26,7 @@ def fits(scale: float, turn: float, sigma: float, count: int) -> list[Match]:
         return np.asarray((x < 0.8) & (np.abs(y) < x * 0.35 / 0.8))
 
     grey, rng = 1000 + CONTRAST * drawn(inside, SIZE, SIZE, 1.0), np.random.default_rng(6)
-    return [match(grey + rng.normal(0, sigma, grey.shape), (0, 0), WEDGE, START, FRAME) for _ in range(count)]
+    return [match(ScanWindow(grey + rng.normal(0, sigma, grey.shape)), WEDGE, START, FRAME) for _ in range(count)]
 
 
 def test_noise_alone_moves_them_by_their_standard_deviations() -> None:

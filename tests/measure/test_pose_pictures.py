@@ -11,6 +11,7 @@ from measure.picture_scan import WholePicture
 from measure.pose_pictures import Drawings, Shown, Site
 from measure.resolution import NO_TAGS
 from measure.scan import Scan
+from measure.scan_window import ScanWindow
 from measure.shapes import MarkTemplate
 
 SIDE = 61
@@ -48,5 +49,5 @@ def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: i
     grey = np.clip(np.rint(grey + rng.normal(0.0, 1.5, grey.shape)), 0, 255)
     scan = Scan(Path("scan"), WholePicture(grey.astype(np.uint8)[..., None]), NO_TAGS)
     place = np.column_stack([linear, [SIDE + 30.0, SIDE + 30.0]])
-    fit = match(grey, (0, 0), template, place, MatchOptions(freedom="shift", estimate_blur=False))
+    fit = match(ScanWindow(grey), template, place, MatchOptions(freedom="shift", estimate_blur=False))
     return Site(scan, fit, fit.center_px + slid_px, None, Drawings([template], FLIP, 0.0), 5.0)

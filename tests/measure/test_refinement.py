@@ -6,6 +6,7 @@ from brute_marks import brute_picture
 
 from measure.matching import MatchOptions, match
 from measure.refinement import strained_px
+from measure.scan_window import ScanWindow
 from measure.shapes import MarkShape, cross, polygon
 
 WING = MarkShape(polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35))))
@@ -18,7 +19,7 @@ def test_a_stretch_moves_what_lies_to_one_side_of_its_centre(mark: MarkShape) ->
     true[:, :2] = np.diag([1.003, 0.997]) @ true[:, :2]
     grey = 100.0 + 100.0 * brute_picture(mark, true, 81, 81, 1.0)
     grey += np.random.default_rng(1).normal(0.0, 2.0, grey.shape)
-    off = match(grey, (0.0, 0.0), mark, START, MatchOptions(freedom="shift")).center_px - true[:, 2]
+    off = match(ScanWindow(grey), mark, START, MatchOptions(freedom="shift")).center_px - true[:, 2]
     assert strained_px(mark, START[:, :2], true[:, :2]) == pytest.approx(np.hypot(*off), abs=0.025)
     assert (np.hypot(*off) > 0.05) == (mark is WING)
     assert strained_px(mark, 1.02 * true[:, :2], true[:, :2]) == pytest.approx(0.0, abs=1e-12)

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 from true_marks import KIND, some_mark
 
 from measure.matching import MatchOptions, match
+from measure.scan_window import ScanWindow
 from measure.shapes import MarkTemplate
 
 FOLD, SPARE_PX = 4, 6
@@ -28,7 +29,9 @@ def test_a_chip_sampled_too_coarsely_is_found_in_pictures_shifted_by_known_parts
         for shift in SHIFTS:
             true = middle + SPARE_PX - np.array(shift) / FOLD
             start = np.column_stack([np.diag([1.0, -1.0]), np.rint(true)])
-            fit = match(100 * coarse(fine, *shift), (0, 0), template, start, MatchOptions("shift", estimate_blur=False))
+            fit = match(
+                ScanWindow(100 * coarse(fine, *shift)), template, start, MatchOptions("shift", estimate_blur=False)
+            )
             assert fit.converged
             errors.append(fit.center_px - true)
             sigmas.append(np.sqrt(np.diag(fit.covariance_px2)))

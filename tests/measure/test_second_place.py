@@ -11,6 +11,7 @@ from drawn import drawn, ellipse
 from measure.disks import UNIT_DISK
 from measure.match_options import MatchOptions
 from measure.matching import Match, match
+from measure.scan_window import ScanWindow
 from measure.second_place import SecondPlace
 from measure.shapes import Mark, MarkShape, polygon, ring_cross
 
@@ -26,7 +27,7 @@ def edge_chances(mark: Mark, grey: Array, place: Array, options: MatchOptions, c
     """The probabilities of the differences of the places by edges in so many noisy pictures."""
     rng = np.random.default_rng(7)
     noisy = [1000 + CONTRAST * grey + rng.normal(0, 20.0, grey.shape) for _ in range(count)]
-    return chances([match(each, (0, 0), mark, place, options).edges for each in noisy])
+    return chances([match(ScanWindow(each), mark, place, options).edges for each in noisy])
 
 
 def disks(slope: float, sigma: float, count: int) -> list[Match]:
@@ -39,7 +40,7 @@ def disks(slope: float, sigma: float, count: int) -> list[Match]:
 
     grey, rng = 1000 - CONTRAST * drawn(painted, DISK_SIZE, DISK_SIZE, 1.0), np.random.default_rng(5)
     options = MatchOptions(freedom="ellipse")
-    return [match(grey + rng.normal(0, sigma, grey.shape), (0, 0), UNIT_DISK, start, options) for _ in range(count)]
+    return [match(ScanWindow(grey + rng.normal(0, sigma, grey.shape)), UNIT_DISK, start, options) for _ in range(count)]
 
 
 def chances(places: list[SecondPlace | None]) -> Array:

@@ -16,6 +16,7 @@ from measure.matching import match
 from measure.picture_scan import WholePicture
 from measure.resolution import NO_TAGS
 from measure.scan import Scan
+from measure.scan_window import ScanWindow
 from measure.shapes import MarkShape, ring_cross
 from pipeline.comparator_file import read_comparator
 
@@ -29,7 +30,7 @@ def errors_over_a_pixel() -> np.ndarray:
         true = placed(12.0, (24.0 + phase, 24.3))
         grey = np.rint(8000.0 + 30000.0 * brute_picture(RING_CROSS, true, 49, 49, 0.8))
         start = placed(12.0, (24.5, 24.5))
-        errors.append(match(grey, (0.0, 0.0), RING_CROSS, start).center_px[0] - (24.0 + phase))
+        errors.append(match(ScanWindow(grey), RING_CROSS, start).center_px[0] - (24.0 + phase))
     return np.array(errors)
 
 
