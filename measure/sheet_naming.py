@@ -6,25 +6,23 @@ from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from measure.noise import robust_scale
+from measure.sheet_view import SheetView, fitted_view, homography_through
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-NEIGHBOURS = 8  # of a named point on the sheet, that are looked for next
-NEAR = 0.3  # of the distance to the next point in the picture, between where a dot is expected and where it is
-RADIAL_FROM, SECOND_RADIAL_FROM = 10, 30  # named dots, from which on the lens's radial distortion is estimated too
-IDLE_ROUNDS = 3  # after which names that come and go are not followed any further
-MOST_PAIRS = 150  # of coded dots
-GROWN = 8  # suggestions, the best ones, that are followed to their end
-LEAST_NAMED = 8
-LEAST_SHARE = 0.5  # of the sheet's points in the picture
-GATE_SIGMAS, LEAST_GATE_PX = 6.0, 3.0
-SHAPE = 1.35  # radii of a dot's ellipse over those expected, in any direction, or the reverse
-LARGEST_RADIAL = 0.6  # at the picture's corner, relative
+_NEIGHBOURS = 8  # of a named point on the sheet, that are looked for next
+_NEAR = 0.3  # of the distance to the next point in the picture, between where a dot is expected and where it is
+_IDLE_ROUNDS = 3  # after which names that come and go are not followed any further
+_MOST_PAIRS = 150  # of coded dots
+_GROWN = 8  # suggestions, the best ones, that are followed to their end
+_LEAST_NAMED = 8
+_LEAST_SHARE = 0.5  # of the sheet's points in the picture
+_GATE_SIGMAS, _LEAST_GATE_PX = 6.0, 3.0
+_SHAPE = 1.35  # radii of a dot's ellipse over those expected, in any direction, or the reverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,58 +33,6 @@ class Dots:
     centers_px: Array
     pixel_from_disk: Array
     coded: Mapping[int, int]
-
-
-@dataclass(frozen=True, eq=False)
-class SheetView:
-    """The sheet as a picture shows it: a homography and radial distortion about the picture's middle.
-
-    homography (3, 3): sheet to undistorted px about the middle, in half diagonals; radial (2,): the undistorted place
-    is (1 + k1 r² + k2 r⁴) times the distorted one.
-    """
-
-    homography: Array
-    radial: Array
-    size_px: tuple[int, int]
-
-    def undistorted(self, places_px: Array) -> Array:
-        """(n, 2) places in the picture as the homography gives them."""
-        place = (places_px - self._middle) / self._unit
-        r2 = (place**2).sum(axis=1, keepdims=True)
-        return np.asarray(place * (1.0 + self.radial[0] * r2 + self.radial[1] * r2**2))
-
-    def ideal(self, sheet: Array) -> Array:
-        """(n, 2) what the homography makes of points of the sheet; nan behind the camera."""
-        mapped = np.column_stack([sheet, np.ones(len(sheet))]) @ self.homography.T
-        depth = np.where(mapped[:, 2:] > 1e-9, mapped[:, 2:], np.nan)
-        return np.asarray(mapped[:, :2] / depth)
-
-    def places_px(self, sheet: Array) -> Array:
-        """(n, 2) where points of the sheet are in the picture; nan behind the camera, or where the lens folds."""
-        ideal = self.ideal(sheet)
-        place = ideal.copy()
-        for _ in range(25):
-            r2 = (place**2).sum(axis=1, keepdims=True)
-            with np.errstate(all="ignore"):
-                place = ideal / np.maximum(1.0 + self.radial[0] * r2 + self.radial[1] * r2**2, 0.3)
-        places = place * self._unit + self._middle
-        unsettled = np.hypot(*(self.undistorted(places) - ideal).T) > 1e-3
-        return np.where(unsettled[:, None], np.nan, places)
-
-    def pixel_from_disks(self, sheet: Array, radius: float) -> Array:
-        """(n, 2, 2) the images of two radius vectors of disks about points of the sheet, px."""
-        columns = [
-            (self.places_px(sheet + step) - self.places_px(sheet - step)) / 2.0 for step in radius * np.eye(2)
-        ]  # fmt: skip
-        return np.stack(columns, axis=-1)
-
-    @property
-    def _middle(self) -> Array:
-        return (np.array(self.size_px) - 1.0) / 2.0
-
-    @property
-    def _unit(self) -> float:
-        return float(np.hypot(*self.size_px)) / 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +63,7 @@ def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | st
     near_codes = _neighbourhood(sheet, list(dots.coded.values()))
     support = [len(_pairs(view, sheet, dots.centers_px, near_codes)) for view in views]
     best: Naming | None = None
-    for index in np.argsort(-np.array(support), kind="stable")[:GROWN]:
+    for index in np.argsort(-np.array(support), kind="stable")[:_GROWN]:
         naming = _grown(views[index], sheet, dots)
         if naming is not None and (best is None or len(naming.named) > len(best.named)):
             best = naming
@@ -131,12 +77,12 @@ def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | st
 def _suggestions(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> list[SheetView]:
     """A view for each two coded dots, for the sheet's front and for its back, whose coordinates are left-handed."""
     pairs = [(a, b) for a, b in combinations(dots.coded, 2) if dots.coded[a] != dots.coded[b]]
-    tried = pairs[:: len(pairs) // MOST_PAIRS + 1]
+    tried = pairs[:: len(pairs) // _MOST_PAIRS + 1]
     views = []
     for hand, (first, second) in product((np.diag([1.0, -1.0]), np.eye(2)), tried):
         points, seen = _by_two(sheet, dots, first, second, hand)
         empty = SheetView(np.eye(3), np.zeros(2), size_px)
-        homography = _homography(points, empty.undistorted(seen))
+        homography = homography_through(points, empty.undistorted(seen))
         if homography is not None:
             views.append(replace(empty, homography=homography))
     return views
@@ -173,25 +119,9 @@ def _turn(start: Array, end: Array) -> Array:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def _homography(source: Array, target: Array) -> Array | None:
-    """Least squares of the normalised linear equations (Hartley 1997), its depth positive at the source's mean; None
-    where the source lies on both sides of the camera."""
-    middle, spread = source.mean(axis=0), float(np.std(source)) or 1.0
-    normal = (source - middle) / spread
-    x, y = target.T
-    ones, zeros = np.column_stack([normal, np.ones(len(normal))]), np.zeros((len(normal), 3))
-    rows = np.concatenate([np.hstack([ones, zeros, -x[:, None] * ones]), np.hstack([zeros, ones, -y[:, None] * ones])])
-    homography = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    depth = ones @ homography[2]
-    if not (np.all(depth > 0.0) or np.all(depth < 0.0)):
-        return None
-    to_normal = np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1]])
-    return np.asarray(homography @ to_normal / depth.mean())
-
-
 def _neighbourhood(sheet: Array, points: list[int]) -> Indices:
     """Indices of points of the sheet and of those next to them."""
-    count = min(NEIGHBOURS + 1, len(sheet))
+    count = min(_NEIGHBOURS + 1, len(sheet))
     _, near = cKDTree(sheet).query(sheet[points], k=np.arange(1, count + 1))
     return np.unique(near)
 
@@ -206,7 +136,7 @@ def _pairs(view: SheetView, sheet: Array, centers_px: Array, among: Indices) -> 
     spacing = np.asarray(tree.query(places[seen], k=[2])[0])[:, 0]
     distance, dot = (np.asarray(found) for found in cKDTree(centers_px).query(places[seen]))
     back = np.asarray(cKDTree(places[seen]).query(centers_px)[1])
-    mutual = (back[dot] == np.arange(len(seen))) & (distance < NEAR * spacing)
+    mutual = (back[dot] == np.arange(len(seen))) & (distance < _NEAR * spacing)
     return {int(point): int(one) for point, one in zip(seen[mutual], dot[mutual], strict=True)}
 
 
@@ -215,10 +145,10 @@ def _grown(view: SheetView, sheet: Array, dots: Dots) -> Naming | None:
     among = _neighbourhood(sheet, list(dots.coded.values()))
     pairs = _pairs(view, sheet, dots.centers_px, among)
     idle, most = 0, 0
-    while idle < IDLE_ROUNDS:
-        if len(pairs) < LEAST_NAMED // 2:
+    while idle < _IDLE_ROUNDS:
+        if len(pairs) < _LEAST_NAMED // 2:
             return None
-        fitted = _fitted(view, sheet, dots.centers_px, pairs)
+        fitted = fitted_view(view, sheet[list(pairs)], dots.centers_px[list(pairs.values())])
         if fitted is None:
             return None
         view = fitted
@@ -230,32 +160,6 @@ def _grown(view: SheetView, sheet: Array, dots: Dots) -> Naming | None:
     return _tested(view, sheet, dots, pairs)
 
 
-def _fitted(view: SheetView, sheet: Array, centers_px: Array, pairs: Mapping[int, int]) -> SheetView | None:
-    """The view that explains the pairs best, single wrong ones tolerated."""
-    points, seen = sheet[list(pairs)], centers_px[list(pairs.values())]
-    homography = _homography(points, view.undistorted(seen))
-    if homography is None:
-        return None
-    start = SheetView(homography, view.radial, view.size_px)
-    terms = 0 if len(pairs) < RADIAL_FROM else 1 if len(pairs) < SECOND_RADIAL_FROM else 2
-    scale = np.abs(homography).max(axis=0)
-
-    def with_parameters(values: Array) -> SheetView:
-        matrix = np.append(values[:8], homography[2, 2] / scale[2]).reshape(3, 3) * scale
-        return SheetView(matrix, np.append(values[8:], np.zeros(2 - terms)), view.size_px)
-
-    def residuals(values: Array) -> Array:
-        candidate = with_parameters(values)
-        difference = candidate.undistorted(seen) - candidate.ideal(points)
-        return np.nan_to_num(difference, nan=1.0).ravel()
-
-    values = np.append((start.homography / scale).ravel()[:8], view.radial[:terms])
-    width = max(robust_scale(residuals(values)), 1e-4)
-    solution = least_squares(residuals, values, loss="soft_l1", f_scale=width, max_nfev=30)
-    found = with_parameters(solution.x)
-    return found if np.abs(found.radial).max() < LARGEST_RADIAL else start
-
-
 def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Naming | None:
     """The names that lie where the view and their neighbours put them, each dot alone at its place; None where they are
     too few."""
@@ -264,7 +168,7 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     places = view.places_px(sheet)
     places += _unevenness(sheet, points, seen - places[points])
     off = seen - places[points]
-    gate_px = max(GATE_SIGMAS * robust_scale(off.ravel()), LEAST_GATE_PX)
+    gate_px = max(_GATE_SIGMAS * robust_scale(off.ravel()), _LEAST_GATE_PX)
     tree = cKDTree(dots.centers_px)
 
     def is_alone(point: int) -> bool:
@@ -280,7 +184,7 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     expected = int(np.sum(np.all((places >= 0.0) & (places <= np.array(view.size_px) - 1.0), axis=1)))
     right = sum(named.get(point) == dot for dot, point in dots.coded.items())
     strangers = tuple(dot for dot, point in dots.coded.items() if named.get(point) != dot)
-    if len(named) < max(min(LEAST_NAMED, len(sheet)), LEAST_SHARE * expected) or right < 2 or right <= len(strangers):
+    if len(named) < max(min(_LEAST_NAMED, len(sheet)), _LEAST_SHARE * expected) or right < 2 or right <= len(strangers):
         return None
     return Naming(places, shapes, named, gate_px, strangers)
 
@@ -288,7 +192,7 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
 def _unevenness(sheet: Array, points: Indices, residuals: Array) -> Array:
     """(n, 2) px by which dots next to each point of the sheet lie off, the point itself not asked: a sheet that is not
     quite flat takes its dots along."""
-    count = min(NEIGHBOURS + 1, len(points))
+    count = min(_NEIGHBOURS + 1, len(points))
     _, near = cKDTree(sheet[points]).query(sheet, k=np.arange(1, count + 1))
     others = np.where(points[near] == np.arange(len(sheet))[:, None], -1, near)
     of_neighbours = np.where((others < 0)[..., None], np.nan, residuals[near])
@@ -312,5 +216,5 @@ def _alike(seen: Array, expected: Array) -> NDArray[np.bool_]:
     """(n,) whether ellipses (n, 2, 2) are of the size and the shape expected."""
     known = _areas(expected) > 0.0
     radii = np.linalg.svd(np.linalg.solve(expected[known], seen[known]), compute_uv=False)
-    known[known] = np.all((radii < SHAPE) & (radii > 1.0 / SHAPE), axis=1)
+    known[known] = np.all((radii < _SHAPE) & (radii > 1.0 / _SHAPE), axis=1)
     return known
