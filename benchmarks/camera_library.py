@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from measure.noise import SIGMA_OF_DEVIATION
+
 # Numbered as in the reports of the US Geological Survey, x' to the right and y' up. Their form, as in OSL/1785, has the
 # data strip to the left; what forms of other makers and of before 1960 have is not known.
 PLACES = {"ll": "1", "ur": "2", "ul": "3", "lr": "4", "ml": "5", "mr": "6", "mt": "7", "mb": "8"}
@@ -32,7 +34,6 @@ DIRECTIONS = {"ll": (-1, -1), "ur": (1, 1), "ul": (-1, 1), "lr": (1, -1)} | {
 }
 SEPARATIONS = {"lr_dist": "left to right", "tb_dist": "top to bottom", "llur_dist": "1 to 2", "ullr_dist": "3 to 4"}
 
-MAD_TO_SIGMA = 1.4826  # of normally distributed values
 ENOUGH = 5  # reports for a spread
 LEAST_SIGMA_MM = 0.005  # what the reports give as their own accuracy
 PRINCIPAL_POINT_MM = 0.02  # the rms of nine cameras written out is 0.013 mm an axis
@@ -352,7 +353,7 @@ def _separations(own: Sequence[Report], name: str, gate_mm: float) -> np.ndarray
 
 
 def _spread(values: np.ndarray) -> float:
-    return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values))))
+    return SIGMA_OF_DEVIATION * float(np.median(np.abs(values - np.median(values))))
 
 
 def _source(own: Sequence[Report]) -> str:

@@ -10,10 +10,10 @@ from measure.noise import robust_scale
 
 Array = NDArray[np.float64]
 
-AFFINE_FROM = 8  # targets that agree: from so many on the shared shift may vary over the frame
-VOTE_SHARE = 0.2  # of the farthest link: how far shifts may differ and still count as one
-ROUNDS = 5  # of the shared shift and the gate, each by the other
-FORBIDDEN = 1e9  # px: the cost of a link that there is not
+_AFFINE_FROM = 8  # targets that agree: from so many on the shared shift may vary over the frame
+_VOTE_SHARE = 0.2  # of the farthest link: how far shifts may differ and still count as one
+_ROUNDS = 5  # of the shared shift and the gate, each by the other
+_FORBIDDEN = 1e9  # px: the cost of a link that there is not
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +51,15 @@ def assign(links: Links, gate_sigmas: float, least_gate_px: float) -> Assignment
     if not len(place):
         return Assignment(chosen, nearest, why_not)
     residuals, gate = shared_shift_residuals(links, place, disk, gate_sigmas, least_gate_px)
-    cost = np.full((count, len(links.centers)), FORBIDDEN)
+    cost = np.full((count, len(links.centers)), _FORBIDDEN)
     cost[place, disk] = residuals
-    gated = np.where(cost <= gate, cost, FORBIDDEN)
+    gated = np.where(cost <= gate, cost, _FORBIDDEN)
     for one_place, one_disk in zip(*linear_sum_assignment(gated), strict=True):
-        if gated[one_place, one_disk] < FORBIDDEN:
+        if gated[one_place, one_disk] < _FORBIDDEN:
             chosen[int(one_place)] = int(one_disk)
     taken = {index for index in chosen if index is not None}
     for row, own in enumerate(chosen.copy()):
-        rivals = [index for index in np.flatnonzero(gated[row] < FORBIDDEN) if index not in taken]
+        rivals = [index for index in np.flatnonzero(gated[row] < _FORBIDDEN) if index not in taken]
         if own is not None and rivals:
             chosen[row], nearest[row] = None, own
             why_not[row] = f"{len(rivals) + 1} disks lie within {gate:.1f} px of its place"
@@ -81,11 +81,11 @@ def shared_shift_residuals(
     """Lengths of all links less the shift that most of them share, and the gate: a few robust standard deviations of
     the links that share it."""
     shifts = links.centers[disk] - links.places[place]
-    tolerance = max(least_gate_px, VOTE_SHARE * float(np.hypot(*shifts.T).max()))
+    tolerance = max(least_gate_px, _VOTE_SHARE * float(np.hypot(*shifts.T).max()))
     common = most_voted(shifts, place, tolerance)
     residuals = np.hypot(*(shifts - common).T)
     gate = tolerance
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         agreeing = best_of_each_place(place, residuals) & (residuals <= gate)
         if agreeing.sum() < 3:
             break
@@ -118,7 +118,7 @@ def best_of_each_place(place: NDArray[np.int64], residuals: Array) -> NDArray[np
 
 def shift_model(places: Array, shifts: Array, agreeing: NDArray[np.bool_]) -> Array:
     """(n, 2) the shared shift at all places: their median, or an affine function where there are enough."""
-    if agreeing.sum() < AFFINE_FROM:
+    if agreeing.sum() < _AFFINE_FROM:
         return np.broadcast_to(np.median(shifts[agreeing], axis=0), shifts.shape)
     middle, spread = places[agreeing].mean(axis=0), np.maximum(places[agreeing].std(axis=0), 1.0)
     design = np.column_stack([np.ones(len(places)), (places - middle) / spread])

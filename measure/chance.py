@@ -23,12 +23,12 @@ from measure.shapes import FiducialLayout
 
 Array = NDArray[np.float64]
 
-LIKELY = 0.05  # probability of chance above which a frame is doubted
-PLACES = 64  # that are looked at beside the marks: enough to tell three marks of four from chance
-BESIDE = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
-FREE = 2  # marks that a similarity goes through wherever they lie
-SURE = 12  # marks that agree: no speck feigns so many
-FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
+_LIKELY = 0.05  # probability of chance above which a frame is doubted
+_PLACES = 64  # that are looked at beside the marks: enough to tell three marks of four from chance
+_BESIDE = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
+_FREE = 2  # marks that a similarity goes through wherever they lie
+_SURE = 12  # marks that agree: no speck feigns so many
+_FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
 
 
 def doubt(search: FrameSearch, frame: Frame) -> str:
@@ -41,7 +41,7 @@ def doubt(search: FrameSearch, frame: Frame) -> str:
         and fit.likeness >= CLEAR_LIKENESS
         and not frame.sightings[index].closer  # those were seen for the others
     }
-    if frame.belongs.sum() >= SURE:
+    if frame.belongs.sum() >= _SURE:
         return ""
     if len(clear) == len(inside):
         return _by_the_scan(search, frame, clear)
@@ -51,10 +51,10 @@ def doubt(search: FrameSearch, frame: Frame) -> str:
 def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> str:
     """Where every mark was found: whether the scan has many places that answer as strongly. Few frames lie in the
     middle of it, and windows about the marks tell of no others."""
-    if len(clear) <= FREE or not search.was_everywhere(frame):
+    if len(clear) <= _FREE or not search.was_everywhere(frame):
         return ""
     expected = search.expected_where_seen(frame, clear)
-    if expected <= LIKELY:
+    if expected <= _LIKELY:
         return ""
     return (
         f"so much of the scan looks like the {len(clear)} marks found that chance would make {expected:.2g} such "
@@ -82,11 +82,11 @@ def _by_places_beside(
 
     radius = first_search_px(frame.placement, layout, options)
     places = _beside(scan, frame, inside, radius)
-    weakest = min((response(index, place, FITTED_PX) for index, place in clear.items()), default=0.0)
+    weakest = min((response(index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
     hits = sum(response(index, place, radius) >= weakest for index, place in places)
     share = (hits + 1) / (len(places) + 2)  # Laplace: none of sixty does not mean never
-    chance = float(stats.binom.sf(found - FREE - 1, len(inside) - FREE, share))
-    if chance <= LIKELY:
+    chance = float(stats.binom.sf(found - _FREE - 1, len(inside) - _FREE, share))
+    if chance <= _LIKELY:
         return ""
     return (
         f"only {found} of {len(inside)} marks were clearly found, and {hits} of {len(places)} places beside them look "
@@ -101,10 +101,10 @@ def _beside(scan: Scan, frame: Frame, inside: Sequence[int], radius_px: float) -
     size = np.array([scan.width_px, scan.height_px])
     every = [
         (index, np.asarray(frame.pixel_from_camera @ (*frame.camera_mm[index], 1.0) + off * radius_px * direction))
-        for off in BESIDE
+        for off in _BESIDE
         for direction in directions
         for index in inside
     ]
     within = [(index, place) for index, place in every if np.all(place >= 0) and np.all(place < size)]
-    step = max(1, len(within) // PLACES)
-    return within[::step][:PLACES]
+    step = max(1, len(within) // _PLACES)
+    return within[::step][:_PLACES]

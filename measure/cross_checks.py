@@ -20,13 +20,13 @@ from measure.status import Status
 
 Array = NDArray[np.float64]
 
-CHANCE = 0.01  # of doubting any good mark, of each check
-FILM_MM = 0.005  # scatter of marks by film and scanner, where one frame has to be judged alone
-GIVEN_MM = 0.1  # a datum's standard deviation may be a millimetre: the given places are better than that
-OPPOSITE_MM = 0.3  # how far from being opposite about the centre two given marks may be: an affinity keeps midpoints
-TOLD = np.log(100.0)  # log-odds at which one mark rather than another is taken for the one that is off
-ROUNDS = 10  # of fitting the frames to the median of all, which comes to rest after a few
-MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
+_CHANCE = 0.01  # of doubting any good mark, of each check
+_FILM_MM = 0.005  # scatter of marks by film and scanner, where one frame has to be judged alone
+_GIVEN_MM = 0.1  # a datum's standard deviation may be a millimetre: the given places are better than that
+_OPPOSITE_MM = 0.3  # how far from being opposite about the centre two given marks may be: an affinity keeps midpoints
+_TOLD = np.log(100.0)  # log-odds at which one mark rather than another is taken for the one that is off
+_ROUNDS = 10  # of fitting the frames to the median of all, which comes to rest after a few
+_MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _by_other_method(frames: Sequence[FrameMeasurement], _: FiducialLayout) -> I
         doubts = {}
         for mark in _observed(frame):
             sigmas = mark.quality.get(name)
-            if sigmas is not None and stats.chi2.sf(sigmas**2, 2) * tests < CHANCE:
+            if sigmas is not None and stats.chi2.sf(sigmas**2, 2) * tests < _CHANCE:
                 off = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
                 doubts[mark.point] = Doubt(
                     f"its edges put it {off:.2f} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
@@ -114,7 +114,7 @@ def _by_other_frames(frames: Sequence[FrameMeasurement], layout: FiducialLayout)
         scatter = _Scatter.of(list(fits.values()))
         chances = {place: scatter.chance(fit) for place, fit in fits.items()}
         worst = min(chances, key=lambda place: chances[place])
-        if chances[worst] * len(fits) >= CHANCE:
+        if chances[worst] * len(fits) >= _CHANCE:
             break
         # Of two frames nobody knows which one is off.
         for place in fits if len(fits) == 2 else (worst,):
@@ -145,7 +145,7 @@ def _others_mm(seen: Sequence[_Seen], layout: FiducialLayout) -> list[Array | No
     """
     common = np.array([mark.xy_mm for mark in layout.marks])
     fitted = np.full((len(seen), *common.shape), np.nan)
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         for each, places in zip(seen, fitted, strict=True):
             places[:] = np.nan
             if len(each.index) > 3:
@@ -195,7 +195,7 @@ class _Scatter:
         Half of Rayleigh's squares are below 2 ln 2."""
         squares = np.concatenate([(fit.residuals**2).sum(axis=1) / np.maximum(1 - fit.leverage, 1e-6) for fit in fits])
         variance = float(np.median(squares)) / (2 * np.log(2))
-        return cls(max(variance, 1e-12), MEDIAN_EFFICIENCY * sum(fit.degrees for fit in fits))
+        return cls(max(variance, 1e-12), _MEDIAN_EFFICIENCY * sum(fit.degrees for fit in fits))
 
     def chi_square(self, fit: _Fit) -> float:
         return float(((fit.residuals**2).sum(axis=1) / (self.variance_mm2 + fit.sigma**2)).sum())
@@ -216,7 +216,7 @@ def _strangers(seen: _Seen, reference: Array | None, scatter: _Scatter) -> tuple
         rest[place] = False
         without.append(_Fit(seen, reference, rest))
     misfits = np.array([scatter.chi_square(fit) for fit in without])
-    alike = np.flatnonzero(misfits - misfits.min() < 2 * TOLD).tolist()
+    alike = np.flatnonzero(misfits - misfits.min() < 2 * _TOLD).tolist()
     fit = without[alike[0]] if len(alike) == 1 else _Fit(seen, reference)
     return alike, [float(np.hypot(*fit.off[place])) for place in alike]
 
@@ -237,7 +237,7 @@ def _by_midpoints(frames: Sequence[FrameMeasurement], layout: FiducialLayout) ->
     whole = [[pair for pair in pairs if np.isin(pair, each.index).all()] for each in seen]
     tests = sum(len(own) for own in whole if len(own) > 1)
     for each, own in zip(seen, whole, strict=True):
-        yield _off_midpoint(each, own, CHANCE / max(tests, 1), layout) if len(own) > 1 else {}
+        yield _off_midpoint(each, own, _CHANCE / max(tests, 1), layout) if len(own) > 1 else {}
 
 
 def _opposite(layout: FiducialLayout) -> list[tuple[int, int]]:
@@ -246,7 +246,7 @@ def _opposite(layout: FiducialLayout) -> list[tuple[int, int]]:
     return [
         (first, second)
         for first, second in combinations(range(len(xy)), 2)
-        if np.hypot(*(xy[first] + xy[second] - 2 * middle)) < OPPOSITE_MM
+        if np.hypot(*(xy[first] + xy[second] - 2 * middle)) < _OPPOSITE_MM
     ]
 
 
@@ -255,11 +255,11 @@ def _off_midpoint(
 ) -> dict[str, Doubt]:
     """The marks of the pair whose midpoint is farthest, in standard deviations, from that of the others."""
     given = np.array([mark.xy_mm for mark in layout.marks])
-    sigma = np.array([min(max(mark.sigma_mm), GIVEN_MM) for mark in layout.marks])
+    sigma = np.array([min(max(mark.sigma_mm), _GIVEN_MM) for mark in layout.marks])
     off = np.zeros((len(layout.marks), 2))
     variance = np.full(len(layout.marks), np.inf)
     off[seen.index] = seen.camera_mm - given[seen.index]
-    variance[seen.index] = seen.sigma_mm**2 + sigma[seen.index] ** 2 + FILM_MM**2
+    variance[seen.index] = seen.sigma_mm**2 + sigma[seen.index] ** 2 + _FILM_MM**2
     midpoints = np.array([off[list(pair)].mean(axis=0) for pair in pairs])
     spread = np.array([variance[list(pair)].sum() / 4 for pair in pairs])
     count = len(pairs)

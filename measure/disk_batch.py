@@ -14,6 +14,7 @@ from measure.disk_model import GREYS, UNKNOWNS, DiskModel, DiskStates, each, sol
 from measure.disk_patches import Patches
 from measure.disk_pixels import Areas, DiskPixels
 from measure.joined import joined
+from measure.noise import SIGMA_OF_DEVIATION
 from measure.robust import tukey_weights
 
 Array = NDArray[np.float64]
@@ -110,7 +111,7 @@ class _Group:
         off = np.where(used, np.abs(self.residuals), beyond)
         off.partition(middle, axis=1)
         unbiased = np.sqrt(count / np.maximum(count - UNKNOWNS, 1))
-        return np.asarray(1.4826 * off[:, middle] * unbiased, float)
+        return np.asarray(SIGMA_OF_DEVIATION * off[:, middle] * unbiased, float)
 
     def part(self, chosen: Mask) -> "_Group":
         disks, pixels = self.disks.part(chosen), self.pixels.part(chosen)

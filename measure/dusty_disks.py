@@ -19,21 +19,21 @@ from measure.noise import SIGMA_OF_DEVIATION
 
 Array = NDArray[np.float64]
 
-LARGE_PX = 0.3  # the error that a small target must not have
-LARGE_CHANCE = 0.0015  # of it, that is borne: of 384 such errors in 840 rendered frames it leaves two unflagged
+_LARGE_PX = 0.3  # the error that a small target must not have
+_LARGE_CHANCE = 0.0015  # of it, that is borne: of 384 such errors in 840 rendered frames it leaves two unflagged
 # What dust that moves a disk by more does to it, rms of 148 rendered disks: to size, stretch, shear, px of the radius
 # (one edge is moved by twice as much as the disk), the contrast's logarithm, and the blur's variance, px².
 # Then to the place with sloping paint against the matched one, px, which less dust does not move.
-DUST_APPEARANCE, DUST_SLOPING_PX = (0.2, 0.2, 0.2, 0.3, 0.4), 0.5
-DUST = (0.0, 1 / 3, 1.5, 6.0)  # times that: none, some, and what moves a disk by 0.3 px, or is something else
+_DUST_APPEARANCE, _DUST_SLOPING_PX = (0.2, 0.2, 0.2, 0.3, 0.4), 0.5
+_DUST = (0.0, 1 / 3, 1.5, 6.0)  # times that: none, some, and what moves a disk by 0.3 px, or is something else
 # Each of these a coordinate. A few disks of each kind are moved by far more and make the rms 0.16, 0.5 and 0.6: with
 # those the errors of all, and which are large, are far less likely (docs/precision.md).
-DUST_MOVES_PX = np.array([0.0, 0.08, 0.3, 0.6])
+_DUST_MOVES_PX = np.array([0.0, 0.08, 0.3, 0.6])
 # The shares of these, as if of so many disks they had been seen before; most dust beside a disk is cut out.
-BEFORE, WHOLE, DAMAGED = 20.0, (0.9, 0.085, 0.0125, 0.0025), (0.56, 0.36, 0.07, 0.01)
+_BEFORE, _WHOLE, _DAMAGED = 20.0, (0.9, 0.085, 0.0125, 0.0025), (0.56, 0.36, 0.07, 0.01)
 _MUCH = slice(2, None)
-FEWEST = 8  # that tell how much targets differ
-DUST_PX = 4.0  # the shorter half axis up to which dust may pass for a disk or hide its edge: it is seldom larger
+_FEWEST = 8  # that tell how much targets differ
+_DUST_PX = 4.0  # the shorter half axis up to which dust may pass for a disk or hide its edge: it is seldom larger
 _SHOWN = 0.05  # the probability of much dust that has the disk called unlike the others
 _FORM = slice(0, 3)  # size, stretch and shear among the figures of an appearance
 _ROUNDS, _SETTLED = 60, 1e-4
@@ -43,13 +43,13 @@ _LEAST_SPREAD = 1e-4  # no frame's targets are alike to better than 1 %, nor is 
 def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[str]:
     """Why each disk may be as far off as only dust is, or more or less than its target, empty where it is too large for
     dust and not soft, or well determined and like the others; predicted: pixel_from_disk (2, 2) of each, right but for
-    a factor common to all. Fewer than FEWEST tell nothing: then every one that dust may look like is doubted."""
-    if len(disks) < FEWEST:
+    a factor common to all. Fewer than _FEWEST tell nothing: then every one that dust may look like is doubted."""
+    if len(disks) < _FEWEST:
         return [disk.lone_doubt for disk in disks]
     appearances = np.array([_appearance(disk, shape) for disk, shape in zip(disks, predicted, strict=True)])
     common = _common(appearances, disks)
     return [
-        _doubt(disk, appearance - common.appearance, kinds) if disk.is_soft or disk.half_axes_px[1] < DUST_PX else ""
+        _doubt(disk, appearance - common.appearance, kinds) if disk.is_soft or disk.half_axes_px[1] < _DUST_PX else ""
         for disk, appearance, kinds in zip(disks, appearances, common.kinds, strict=True)
     ]
 
@@ -59,10 +59,10 @@ def _doubt(disk: FittedDisk, off: Array, kinds: Array) -> str:
     probability of each kind of dust."""
     if kinds[_MUCH].sum() < _SHOWN:
         sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
-        chances = stats.chi2.sf(LARGE_PX**2 / (sigma**2 + DUST_MOVES_PX**2), 2)
-        if chances[0] > LARGE_CHANCE:
+        chances = stats.chi2.sf(_LARGE_PX**2 / (sigma**2 + _DUST_MOVES_PX**2), 2)
+        if chances[0] > _LARGE_CHANCE:
             return f"faint: good to {sigma:.2f} px only"
-        return f"dust that puts it {LARGE_PX} px off may hide in it" if chances @ kinds > LARGE_CHANCE else ""
+        return f"dust that puts it {_LARGE_PX} px off may hide in it" if chances @ kinds > _LARGE_CHANCE else ""
     size, *form, contrast, variance = off
     return (
         f"unlike the other targets: {np.exp(size):.2f} times their size, {np.exp(contrast):.2f} times their "
@@ -105,11 +105,11 @@ def _common(appearances: Array, disks: Sequence[FittedDisk]) -> _Common:
     noise = np.array([disk.appearance_covariance for disk in disks])
     dust, by_slope = _dust_variances(disks), _by_slope(disks)
     damaged = np.array([disk.damaged_fraction > 0 for disk in disks])
-    before = np.array([WHOLE, DAMAGED])
+    before = np.array([_WHOLE, _DAMAGED])
     shares = before
     appearance = np.median(appearances, axis=0)
     spread = np.maximum((SIGMA_OF_DEVIATION * np.median(np.abs(appearances - appearance), axis=0)) ** 2, _LEAST_SPREAD)
-    kinds = np.zeros((len(DUST), len(disks)))
+    kinds = np.zeros((len(_DUST), len(disks)))
     for _ in range(_ROUNDS):
         weights = np.linalg.inv(noise + np.diag(spread) + dust)
         last, off = kinds, appearances - appearance
@@ -117,7 +117,7 @@ def _common(appearances: Array, disks: Sequence[FittedDisk]) -> _Common:
         kinds = np.exp(logs - logs.max(axis=0))
         kinds /= kinds.sum(axis=0)
         seen = np.array([kinds[:, ~damaged].sum(axis=1), kinds[:, damaged].sum(axis=1)])
-        shares = (seen + BEFORE * before) / (seen.sum(axis=1, keepdims=True) + BEFORE)
+        shares = (seen + _BEFORE * before) / (seen.sum(axis=1, keepdims=True) + _BEFORE)
         clean, weights = kinds[0], weights[0]
         weighed = clean[:, None, None] * weights
         appearance = np.linalg.solve(weighed.sum(axis=0), np.einsum("nij,nj->i", weighed, appearances))
@@ -135,19 +135,19 @@ def _common(appearances: Array, disks: Sequence[FittedDisk]) -> _Common:
 def _dust_variances(disks: Sequence[FittedDisk]) -> Array:
     """(kinds, n, figures, figures): what each kind of dust adds to the variances of the appearances."""
     radius = np.array([np.sqrt(np.prod(disk.half_axes_px)) for disk in disks])
-    appearance = np.tile(DUST_APPEARANCE, (len(disks), 1))
+    appearance = np.tile(_DUST_APPEARANCE, (len(disks), 1))
     appearance[:, _FORM] /= radius[:, None]
-    return np.asarray(np.multiply.outer(np.square(DUST), appearance[..., None] ** 2 * np.eye(len(DUST_APPEARANCE))))
+    return np.asarray(np.multiply.outer(np.square(_DUST), appearance[..., None] ** 2 * np.eye(len(_DUST_APPEARANCE))))
 
 
 def _by_slope(disks: Sequence[FittedDisk]) -> Array:
     """(kinds, n) the logarithms of the probability densities of the places with sloping paint: these are independent of
     the appearances, for they are told by residuals. 0 where a disk has none."""
-    logs = np.zeros((len(DUST), len(disks)))
+    logs = np.zeros((len(_DUST), len(disks)))
     for index, disk in enumerate(disks):
         if disk.sloping is not None:
-            moved = np.tile(disk.sloping.covariance_px2, (len(DUST), 1, 1, 1))
-            moved[_MUCH] += DUST_SLOPING_PX**2 * np.eye(2)
+            moved = np.tile(disk.sloping.covariance_px2, (len(_DUST), 1, 1, 1))
+            moved[_MUCH] += _DUST_SLOPING_PX**2 * np.eye(2)
             logs[:, index] = _log_density(disk.sloping.offset_px[None], np.asarray(np.linalg.inv(moved), float))[:, 0]
     return logs
 

@@ -15,13 +15,13 @@ from measure.shapes import MarkShape, thinnest_mm
 
 Array = NDArray[np.float64]
 
-SEARCHED_RADIUS_PX = 4.0  # windows are reduced until the shorter half axis has about this length...
-THINNEST_PX = 1.5  # ...or the thinnest line this width
-LEAST_CORRELATION = 0.55  # below it a spot is worth no fit, which decides what is a target
-MOST_SPOTS = 6  # fitted near one prediction
-EXPECTED_BLUR_PX = 1.0  # of the reduced window
-GROUND, GROUND_PX = 0.3, 1.5  # about the target in its predicted picture: a share of its reach, and for the blur
-SAME_DISK = 0.5  # of the shorter half axis: spots nearer to a disk's centre are that disk
+_SEARCHED_RADIUS_PX = 4.0  # windows are reduced until the shorter half axis has about this length...
+_THINNEST_PX = 1.5  # ...or the thinnest line this width
+_LEAST_CORRELATION = 0.55  # below it a spot is worth no fit, which decides what is a target
+_MOST_SPOTS = 6  # fitted near one prediction
+_EXPECTED_BLUR_PX = 1.0  # of the reduced window
+_GROUND, _GROUND_PX = 0.3, 1.5  # about the target in its predicted picture: a share of its reach, and for the blur
+_SAME_DISK = 0.5  # of the shorter half axis: spots nearer to a disk's centre are that disk
 
 
 class Prediction(Protocol):
@@ -72,7 +72,7 @@ def search_targets(
 def spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -> list[Array]:
     """(2,) places within the search distance where the predicted picture correlates best, the best first."""
     shorter = float(np.linalg.svd(prediction.pixel_from_disk, compute_uv=False)[1])
-    factor = max(1, int(shorter * min(1.0 / SEARCHED_RADIUS_PX, thinnest_mm(shape) / THINNEST_PX)))
+    factor = max(1, int(shorter * min(1.0 / _SEARCHED_RADIUS_PX, thinnest_mm(shape) / _THINNEST_PX)))
     template = predicted_picture(prediction.pixel_from_disk / factor, shape)
     half = np.array(template.shape[::-1]) // 2
     reach = int(np.ceil(prediction.search_px / factor)) + 1
@@ -84,20 +84,20 @@ def spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -
         return []
     score = np.nan_to_num(cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0)
     signed = {"light": score, "dark": -score}.get(polarity, np.abs(score))
-    peaks = np.argwhere((signed >= cv2.dilate(signed, np.ones((3, 3), np.uint8))) & (signed > LEAST_CORRELATION))
+    peaks = np.argwhere((signed >= cv2.dilate(signed, np.ones((3, 3), np.uint8))) & (signed > _LEAST_CORRELATION))
     peaks = peaks[np.argsort(-signed[peaks[:, 0], peaks[:, 1]], kind="stable")]
     places = (peaks[:, ::-1] + half) * factor + (factor - 1) / 2 + corner
     within = np.hypot(*(places - prediction.center_px).T) <= prediction.search_px + factor
-    return list(places[within][:MOST_SPOTS])
+    return list(places[within][:_MOST_SPOTS])
 
 
 def predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> NDArray[np.float32]:
     """The target as it should look, with some of its surroundings; its centre is that of the middle pixel."""
     _, greatest = extent_px(shape, np.column_stack([pixel_from_disk, (0.0, 0.0)]))
-    half = np.ceil(greatest * (1 + GROUND) + GROUND_PX).astype(int)
+    half = np.ceil(greatest * (1 + _GROUND) + _GROUND_PX).astype(int)
     width, height = 2 * half + 1
     placed = np.column_stack([pixel_from_disk, half])
-    return picture(shape, placed, int(width), int(height), EXPECTED_BLUR_PX).astype(np.float32)
+    return picture(shape, placed, int(width), int(height), _EXPECTED_BLUR_PX).astype(np.float32)
 
 
 def fitted_at(
@@ -132,7 +132,7 @@ def _in_perspective(shape: MarkShape, prediction: Prediction) -> MarkShape:
 def known_disk(disks: list[FittedDisk], spot: Array) -> int | None:
     """The disk that was already fitted at a spot."""
     for index, disk in enumerate(disks):
-        if np.hypot(*(disk.center_px - spot)) < SAME_DISK * disk.half_axes_px[1]:
+        if np.hypot(*(disk.center_px - spot)) < _SAME_DISK * disk.half_axes_px[1]:
             return index
     return None
 
