@@ -38,12 +38,12 @@ class GivenFiducial:
     def prior_sigma_mm(self) -> tuple[float, float]:
         """For the adjustment: a learned mark is measured where its template has its origin, somewhere on the mark. What
         the file fixes stays fixed."""
-        sx, sy = (sigma and math.hypot(sigma, shapes.LEARNED_ORIGIN * self._learned_mm) for sigma in self.sigma_mm)
+        sx, sy = (sigma and math.hypot(sigma, shapes.LEARNED_ORIGIN * self.learned_mm) for sigma in self.sigma_mm)
         return sx, sy
 
     @property
-    def _learned_mm(self) -> float:
-        """A learned mark's size; 0 of others."""
+    def learned_mm(self) -> float:
+        """The size of a learned mark, or of one that is to be; 0 of others."""
         if isinstance(self.mark, shapes.MarkTemplate):
             return self.mark.learned_mm
         return self.mark.size_mm if isinstance(self.mark, shapes.LearnedMark) else 0.0
