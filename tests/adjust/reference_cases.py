@@ -24,6 +24,27 @@ from adjust.transformation import film_parameter_names
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
 CAMERA = "K"
+DROPPED: dict[str, set[int]] = {  # pseudo-observations, by their words in the file
+    "F5-F9": {5, 6, 7, 8, 9},
+    "F5-F8": {5, 6, 7, 8},
+    "F5,F6": {5, 6},
+    "F5,F6,F9": {5, 6, 9},
+    "F7,F8": {7, 8},
+    "F7-F9": {7, 8, 9},
+    "F9": {9},
+    "none": set(),
+}
+CAUSES = {  # what a direction's leading parameter has the message say
+    "F:tx": "shift together in x'",
+    "F:ty": "shift together in y'",
+    "F:rot": "turn together",
+    "F:scale": "grow together",
+    "F:aff": "stretch in x'",
+    "F:shear": "shear",
+    "IO.x0": "x0' of camera",
+    "IO.y0": "y0' of camera",
+    "IO.c": "principal distance of camera",
+}
 
 Case = dict[str, Any]
 

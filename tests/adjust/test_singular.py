@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_cases import CAMERA, Case, approximations_of, load, network_of
+from reference_cases import CAMERA, CAUSES, DROPPED, Case, approximations_of, load, network_of
 from simulated import Truth, field_points, simulated
 
 from adjust.adjustment import Datum, Options, adjust
@@ -13,27 +13,6 @@ from adjust.network import Network, Observations
 from adjust.result import Adjustment
 
 SINGULAR = ("K2D_vert0", "K3D_conv", "U3D_vert0", "H2D_vertcross")
-DROPPED: dict[str, set[int]] = {
-    "F5-F9": {5, 6, 7, 8, 9},
-    "F5-F8": {5, 6, 7, 8},
-    "F5,F6": {5, 6},
-    "F5,F6,F9": {5, 6, 9},
-    "F7,F8": {7, 8},
-    "F7-F9": {7, 8, 9},
-    "F9": {9},
-    "none": set(),
-}
-WORDS = {
-    "F:tx": "shift together in x'",
-    "F:ty": "shift together in y'",
-    "F:rot": "turn together",
-    "F:scale": "grow together",
-    "F:aff": "stretch in x'",
-    "F:shear": "shear",
-    "IO.x0": "x0' of camera",
-    "IO.y0": "y0' of camera",
-    "IO.c": "principal distance of camera",
-}
 
 
 def dropped(case: Case, functions: set[int]) -> Case:
@@ -61,7 +40,7 @@ def test_null_directions_are_counted_and_named(name: str, priors: str) -> None:
     datum, camera = np.split(np.array(result.singular, dtype=object), [expected["object_datum_defect"]])
     assert all("object space" in direction.cause for direction in datum)
     for direction, row in zip(camera, expected["directions"], strict=True):
-        assert WORDS[row["lead"]] in direction.cause
+        assert CAUSES[row["lead"]] in direction.cause
         assert direction.remedy
         named = {"T" if name.startswith("T.") else kind(name) for name in direction.parameters}
         assert named - {"FID"} <= set(row["involved"]) | {"IO.x0", "IO.y0", "IO.c"}
@@ -85,7 +64,7 @@ def test_a_singular_result_keeps_the_approximations() -> None:
 def test_a_datum_for_the_object_leaves_the_camera_directions(datum: Datum) -> None:
     case = load("v_singular_U3D_vert0_affine")
     result = adjusted(dropped(case, {9}), Options(datum=datum))
-    assert [WORDS["IO.c"] in direction.cause for direction in result.singular] == [True]
+    assert [CAUSES["IO.c"] in direction.cause for direction in result.singular] == [True]
 
 
 def test_a_flat_field_of_heights_needs_four_datum_values() -> None:

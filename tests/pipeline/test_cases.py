@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reference_cases import CASES, CAUSES, DROPPED
 
 from pipeline.adjust_stage import adjust_marks
 from pipeline.adjustment_file import adjustment_json
@@ -13,29 +14,7 @@ from pipeline.cli import run
 from pipeline.comparator_file import read_comparator
 from pipeline.project_file import read_project
 
-CASES = Path(__file__).parents[3] / "shared" / "cases"
-SINGULAR = {  # pseudo-observations that are dropped, by their words in the file
-    "F5-F9": {5, 6, 7, 8, 9},
-    "F5-F8": {5, 6, 7, 8},
-    "F5,F6": {5, 6},
-    "F5,F6,F9": {5, 6, 9},
-    "F7,F8": {7, 8},
-    "F7-F9": {7, 8, 9},
-    "F9": {9},
-    "none": set(),
-}
 USUAL = ("F5-F9", "F7-F9")  # what is not left to the slow tests
-CAUSES = {
-    "F:tx": "shift together in x'",
-    "F:ty": "shift together in y'",
-    "F:rot": "turn together",
-    "F:scale": "grow together",
-    "F:aff": "stretch in x'",
-    "F:shear": "shear",
-    "IO.x0": "x0' of camera",
-    "IO.y0": "y0' of camera",
-    "IO.c": "principal distance of camera",
-}
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
 
 
@@ -67,14 +46,14 @@ def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "priors", [each if each in USUAL else pytest.param(each, marks=pytest.mark.slow) for each in SINGULAR]
+    "priors", [each if each in USUAL else pytest.param(each, marks=pytest.mark.slow) for each in DROPPED]
 )
 @pytest.mark.parametrize("name", sorted(path.stem for path in CASES.glob("v_*.json")))
 def test_singular_case_through_files(name: str, priors: str, tmp_path: Path) -> None:
     """The number and the kinds of the null directions, from the case's own orientations as approximations."""
     case = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))
     expected = case["expected_defects_by_dropped_pseudo_observations"][priors]
-    sigmas = {number: None if number in SINGULAR[priors] else 1.0 for number in range(5, 10)}
+    sigmas = {number: None if number in DROPPED[priors] else 1.0 for number in range(5, 10)}
     case["input"]["fid_sigma"] = [[sigmas[5], sigmas[6]]] * len(case["input"]["fid_obs"])
     case["input"]["io_sigma"][:3] = [sigmas[7], sigmas[8], sigmas[9]]
     write_project(case, tmp_path)

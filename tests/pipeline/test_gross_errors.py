@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_cases import CASES, write_project
+from reference_cases import CASES
+from test_cases import write_project
 
 from pipeline.cli import run
 from pipeline.errors import InputError

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_cases import CASES, write_project
+from reference_cases import CASES
+from test_cases import write_project
 
 from adjust.errors import AdjustmentError
 from adjust.network import EXTERIOR_NAMES
