@@ -3,10 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
-import numpy as np
-
 from pipeline.report.data import Problem
-from pipeline.report.fractions import fraction_test
+from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
 from pipeline.wording import LISTED, counted, listed
@@ -63,8 +61,7 @@ def _reasons(lost: list[Mark]) -> str:
 
 
 def pixel_locking(shots: list[Frame]) -> Iterator[Problem]:
-    centers = [m.center_px for f in shots for m in f.marks if m.status.is_observation and m.center_px is not None]
-    for axis, positions in zip(("column", "row"), np.reshape(centers, (-1, 2)).T, strict=True):
+    for axis, positions in zip(("column", "row"), places_px(shots).T, strict=True):
         test = fraction_test(positions)
         if test.is_locked:
             yield Problem(

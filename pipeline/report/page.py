@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -13,7 +12,7 @@ from pipeline.atomic import write_atomically
 from pipeline.report.camera_views import camera_views
 from pipeline.report.charts import fraction_plot
 from pipeline.report.data import Json, ReportData
-from pipeline.report.fractions import LEAST_MARKS, FractionTest, fraction_test
+from pipeline.report.fractions import LEAST_MARKS, FractionTest, fraction_test, places_px
 from pipeline.report.frame_views import frame_views, thumbnail_scale
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, significant, value_and_sigma
@@ -66,14 +65,9 @@ def _context(data: ReportData) -> dict[str, Any]:
 
 def _fractions(shots: list[Frame]) -> Iterator[tuple[str, FractionTest, Markup]]:
     """By axis: the test of the fractional parts and its drawing; nothing where no pixel positions are known."""
-    centers = [
-        mark.center_px
-        for frame in shots
-        for mark in frame.marks
-        if mark.status.is_observation and mark.center_px is not None
-    ]
-    if centers:
-        for axis, positions in zip(("column", "row"), np.array(centers).T, strict=True):
+    places = places_px(shots)
+    if len(places):
+        for axis, positions in zip(("column", "row"), places.T, strict=True):
             test = fraction_test(positions)
             yield axis, test, fraction_plot(axis, test)
 
