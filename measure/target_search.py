@@ -82,7 +82,10 @@ def spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -
     small = cv2.resize(window, (int(width), int(height)), interpolation=cv2.INTER_AREA)
     if float(small.max() - small.min()) <= 0.0:
         return []
-    score = np.nan_to_num(cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0)
+    small = small - small.mean()  # the correlation's sums are of single precision
+    compared = compared_part(prediction.pixel_from_disk / factor, half, shape)
+    score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
+    score = np.nan_to_num(score, posinf=0.0, neginf=0.0)
     signed = {"light": score, "dark": -score}.get(polarity, np.abs(score))
     peaks = np.argwhere((signed >= cv2.dilate(signed, np.ones((3, 3), np.uint8))) & (signed > _LEAST_CORRELATION))
     peaks = peaks[np.argsort(-signed[peaks[:, 0], peaks[:, 1]], kind="stable")]
@@ -98,6 +101,18 @@ def predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> NDArray[np.fl
     width, height = 2 * half + 1
     placed = np.column_stack([pixel_from_disk, half])
     return picture(shape, placed, int(width), int(height), _EXPECTED_BLUR_PX).astype(np.float32)
+
+
+def compared_part(pixel_from_disk: Array, half: NDArray[np.intp], shape: MarkShape) -> NDArray[np.float32]:
+    """1 where the predicted picture, of half (2,) px about its middle, is to be found, 0 elsewhere: a disk with what is
+    next to it, for a ring may begin where the picture's corners are."""
+    width, height = 2 * half + 1
+    if shape is not UNIT_DISK:
+        return np.ones((height, width), np.float32)
+    left, size, right = np.linalg.svd(pixel_from_disk)
+    grown = left @ np.diag(size * (1 + GROUND) + GROUND_PX) @ right
+    places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - half
+    return np.asarray(np.linalg.norm(places @ np.linalg.inv(grown).T, axis=-1) <= 1, np.float32)
 
 
 def fitted_at(
