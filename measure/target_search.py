@@ -110,7 +110,7 @@ def compared_part(pixel_from_disk: Array, half: NDArray[np.intp], shape: MarkSha
     if shape is not UNIT_DISK:
         return np.ones((height, width), np.float32)
     left, size, right = np.linalg.svd(pixel_from_disk)
-    grown = left @ np.diag(size * (1 + GROUND) + GROUND_PX) @ right
+    grown = left @ np.diag(size * (1 + _GROUND) + _GROUND_PX) @ right
     places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - half
     return np.asarray(np.linalg.norm(places @ np.linalg.inv(grown).T, axis=-1) <= 1, np.float32)
 
