@@ -4,7 +4,7 @@ python benchmarks/false_frames.py [--frames 60] [--first 0] [--seed 11]
 
 The frames of `search.py`, every other one painted without its marks and searched for its own camera, and the rest with
 their marks, but searched for a camera with marks of another kind. Whatever is found is false. The pitch is given, right
-by 1 %: the frame not being there, they go on to the retries with other pitches and to the closer look.
+by 1 %: as the frame is not there, a search goes on to other pitches and to the closer look.
 """
 
 import argparse
@@ -12,12 +12,11 @@ import time
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 from search_frames import PITCH_UM, Case, draw_case
 
-from measure import fiducials
+from measure.fiducials import measure_fiducials
 from measure.picture_scan import WholePicture
 from measure.resolution import NO_TAGS
 from measure.scan import Scan
@@ -26,11 +25,10 @@ from measure.status import Status
 
 @dataclass(frozen=True)
 class Alarm:
-    """measured, weak: how many marks of a frame have the status; retried: whether other pitches were tried."""
+    """measured, weak: how many marks of a frame have the status."""
 
     measured: int
     weak: int
-    retried: bool
 
 
 def main() -> None:
@@ -67,20 +65,15 @@ def strange(seed: int, index: int) -> Case:
 
 
 def searched(case: Case) -> Alarm:
-    with patch.object(fiducials, "_in_spite_of_pitch", wraps=fiducials._in_spite_of_pitch) as retry:
-        found = fiducials.measure_fiducials(case.scan, case.layout, (PITCH_UM, PITCH_UM))
-    retried = retry.called
-    retry.reset_mock()  # it holds the scan that it was called with, and itself in a circle
+    found = measure_fiducials(case.scan, case.layout, (PITCH_UM, PITCH_UM))
     statuses = [mark.status for mark in found.marks]
-    return Alarm(statuses.count(Status.MEASURED), statuses.count(Status.WEAK), retried)
+    return Alarm(statuses.count(Status.MEASURED), statuses.count(Status.WEAK))
 
 
 def summary(alarms: list[Alarm]) -> str:
-    retried = [alarm for alarm in alarms if alarm.retried]
     return (
-        f"{len(alarms)} frames, {len(retried)} retried; with measured marks {sum(a.measured > 0 for a in alarms)} "
-        f"({sum(a.measured > 0 for a in retried)} of the retried), with weak marks alone "
-        f"{sum(a.weak > 0 and not a.measured for a in alarms)} ({sum(a.weak > 0 and not a.measured for a in retried)})"
+        f"{len(alarms)} frames; with measured marks {sum(a.measured > 0 for a in alarms)}, "
+        f"with weak marks alone {sum(a.weak > 0 and not a.measured for a in alarms)}"
     )
 
 
