@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.frame_sighter import FrameSighter
+from measure.generators import is_round
 from measure.mark_comparison import round_moves_px, shared_blurs, shared_shapes, shared_sizes
 from measure.match_options import MatchOptions
 from measure.matching import Match
-from measure.picture_model import is_round
 from measure.refinement import leans_on_frame, sight, strained_px
 from measure.rendering import reach_px
 from measure.shapes import Disk, Mark, MarkShape, Ring

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from measure.blank_film import blank_patches, is_coloured
 from measure.changed_tone import covariance_of_changed_tone
 from measure.clipping import Sides
+from measure.generators import is_round
 from measure.grain import grain_model
 from measure.linear_fit import LinearFit
 from measure.match_options import MatchOptions
 from measure.noise import NoiseModel, is_textured, noise_model
 from measure.own_shape import OwnShape, own_shape
 from measure.picture_fit import PictureFit
-from measure.picture_model import GREY, PictureModel, State, background_px, is_round
+from measure.picture_model import GREY, PictureModel, State, background_px
 from measure.pixel_sums import combined, factors
 from measure.rendering import extent_px
 from measure.scan_window import ScanWindow

@@ -7,24 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.clipping import Sides, censored, tells
-from measure.match_options import Freedom, MatchOptions
+from measure.generators import generators
+from measure.match_options import MatchOptions
 from measure.pixel_sums import combined, factors
 from measure.rendering import Rendering, chip_steadiness, reach_px, render
-from measure.shapes import Disk, Mark, MarkTemplate, Ring, thinnest_mm
+from measure.shapes import Mark, MarkTemplate, thinnest_mm
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 GREY = 4  # unknowns: gain, offset and two slopes, the last ones
-# Changes of the mark's linear part: (I + e G) times it, G a generator.
-_TURN, _SCALE = ((0.0, -1.0), (1.0, 0.0)), ((1.0, 0.0), (0.0, 1.0))
-_STRETCH, _SHEAR = ((1.0, 0.0), (0.0, -1.0)), ((0.0, 1.0), (1.0, 0.0))
-_GENERATORS: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]], ...]] = {
-    "shift": (),
-    "similarity": (_SCALE, _TURN),
-    "affine": (_SCALE, _STRETCH, _SHEAR, _TURN),
-    "ellipse": (_SCALE, _STRETCH, _SHEAR),
-}
 ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values adds
 _AS_NOISY = 0.02
 _LEAST = 1e-300  # squared slope of a clipped grey value that tells nothing
@@ -87,8 +79,7 @@ class PictureModel:
         self.smoothed_px2 = _CHIP_SMOOTHED_PX**2 if is_chip else 0.0
         seen = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), dtype=float) if is_chip else grey
         self.grey = self._detail(seen)
-        generators = [g for g in _GENERATORS[options.freedom] if not (g is _TURN and is_round(mark))]
-        self.generators = np.array(generators).reshape(-1, 2, 2)
+        self.generators = generators(options.freedom, mark)
         self.linear = slice(2, 2 + len(self.generators))
         self.blur = 2 + len(self.generators) if options.estimate_blur else None
         # A chip already has its scan's blur: where none is estimated, none is added.
@@ -318,11 +309,3 @@ def background_px(mark: Mark, pixel_from_mark: Array) -> float:
     """The standard deviation of a blur that leaves nothing of the mark's lines."""
     scale = float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
     return max(1.5 * scale * thinnest_mm(mark), 1.0) + 1.0
-
-
-def is_round(mark: Mark) -> bool:
-    """Whether every rotation leaves the mark as it is."""
-    if isinstance(mark, MarkTemplate):
-        return False
-    centred = all(isinstance(part, Disk | Ring) and part.center_mm == (0.0, 0.0) for part in mark.parts)
-    return centred and not any(mark.perspective)
