@@ -270,11 +270,7 @@ def _camera(
         "",
         f'name = "{kind.title}, {cone_mm} mm"',
         f"frame_mm = [{kind.frame_mm}, {kind.frame_mm}]",
-        *(
-            ['data_strip = "left"                     # as the form of the reports has it (OSL/1785)']
-            if kind.strip
-            else []
-        ),
+        *([DATA_STRIP] if kind.strip else []),
         f"principal_distance_mm = {c_mm:.3f}",
         "principal_point_mm = [0.0, 0.0]         # the reports count from it",
         "",

@@ -35,6 +35,7 @@ from adjust.rotation import angles_from_rotation, rotation_from_angles, rotation
 from adjust.transformation import Film
 
 Array = NDArray[np.float64]
+Row = tuple[str, str, ObservationKind, Array]  # image, point, kind, place in mm
 
 ANGLE_DEG = 30.0
 SHARE = 0.2  # of distances
@@ -170,6 +171,22 @@ def scenes() -> dict[str, Scene]:
     }
 
 
+@dataclass(frozen=True)
+class Optics:
+    """A camera with its true lens (7,) and the half side of its frame; sigma_mm: of a measured coordinate."""
+
+    camera: Camera
+    lens: Array
+    half_mm: float
+    sigma_mm: float
+
+    @property
+    def interior(self) -> Array:
+        """(3,) the true principal distance and point."""
+        distance = self.camera.principal_distance_mm
+        return np.array([0.0 if distance is None else distance.value, 0.1, -0.1])
+
+
 def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> Scene:
     """A film camera of 153 mm. known, of the object points: "fixed", "heights", or four "control" points."""
     free = () if known == "heights" else ("k3", "k5", "p1", "p2")
@@ -186,7 +203,7 @@ def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, kno
         Film("affine", np.array([3.0, np.cos(turn), -np.sin(turn), -2.0, np.sin(turn), np.cos(turn)]), np.zeros(2))
         for turn in 0.3 + np.arange(len(exteriors))
     ]
-    return simulated(rng, camera, lens, 115.0, 0.005, exteriors, films, points_of(xyz, known), xyz)
+    return simulated(rng, Optics(camera, lens, 115.0, 0.005), exteriors, films, points_of(xyz, known))
 
 
 def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> Scene:
@@ -194,74 +211,67 @@ def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, 
     nothing = Prior(0.0, np.inf)
     camera = Camera("K", Prior(8.0, np.inf), nothing, nothing, Distortion("brown", {"k1": nothing, "k2": nothing}))
     lens = np.array([1e-3, -2e-5, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return simulated(
-        rng,
-        camera,
-        lens,
-        5.0,
-        0.0003,
-        exteriors,
-        [Film("none", np.empty(0), np.zeros(2))] * len(exteriors),
-        points_of(xyz, known),
-        xyz,
-    )
+    films = [Film("none", np.empty(0), np.zeros(2))] * len(exteriors)
+    return simulated(rng, Optics(camera, lens, 5.0, 0.0003), exteriors, films, points_of(xyz, known))
 
 
-def points_of(xyz: Array, known: str) -> list[ObjectPoint]:
+def points_of(xyz: Array, known: str) -> list[tuple[ObjectPoint, Array]]:
+    """The points as they are given, and where they are (3,)."""
     corners = {int(np.argmax(xyz[:, :2] @ np.array(corner))) for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1))}
     sigmas = {"fixed": (0.0, 0.0, 0.0), "unknown": (np.inf,) * 3, "heights": (np.inf, np.inf, 0.05)}
     by_point = [sigmas.get(known, sigmas["fixed" if j in corners else "unknown"]) for j in range(len(xyz))]
     return [
-        ObjectPoint(f"p{j}", *(Prior(float(value), sigma) for value, sigma in zip(place, by_point[j], strict=True)))
+        (ObjectPoint(f"p{j}", *(Prior(float(value), s) for value, s in zip(place, by_point[j], strict=True))), place)
         for j, place in enumerate(xyz)
     ]
 
 
 def simulated(
     rng: np.random.Generator,
-    camera: Camera,
-    lens: Array,
-    half_mm: float,
-    sigma_mm: float,
+    optics: Optics,
     exteriors: list[Array],
     films: list[Film],
-    points: list[ObjectPoint],
-    xyz: Array,
+    points: list[tuple[ObjectPoint, Array]],
 ) -> Scene:
-    """The points in a frame of 2 half_mm that two images show at least, with errors of sigma_mm."""
-    interior = np.array(
-        [0.0 if camera.principal_distance_mm is None else camera.principal_distance_mm.value, 0.1, -0.1]
-    )
-    rows: list[tuple[str, str, ObservationKind, Array]] = []
-    for i, exterior in enumerate(exteriors):
-        rotation = rotation_from_angles(exterior[3:])
-        model = ImageModel(camera.distortion, interior, lens, rotation, exterior[:3], films[i])
-        xy, seen = model.camera_from_object(xyz)
-        comparator = model.comparator_from_camera(xy)[0]
-        inside = np.flatnonzero(seen & (np.abs(xy) < half_mm).all(axis=1))
-        rows += [(f"i{i}", f"p{j}", "target", xy_mm) for j, xy_mm in zip(inside, comparator[inside], strict=True)]
-        for id_, mark in camera.fiducials.items():
-            place = np.array([mark.x_mm.value, mark.y_mm.value])
-            rows.append((f"i{i}", id_, "fiducial", model.comparator_from_camera(place[None])[0][0]))
+    """The points in the frame that two images show at least, with errors."""
+    xyz = np.array([place for _, place in points])
+    pairs = list(zip(exteriors, films, strict=True))
+    rows = [row for i, (exterior, film) in enumerate(pairs) for row in exposed(optics, f"i{i}", exterior, film, xyz)]
     shown = Counter(point for _, point, kind, _ in rows if kind == "target")
     rows = [row for row in rows if row[2] == "fiducial" or shown[row[1]] > 1]
     observations = Observations(
         tuple(row[0] for row in rows),
         tuple(row[1] for row in rows),
         tuple(row[2] for row in rows),
-        np.array([row[3] + rng.normal(0.0, sigma_mm, 2) for row in rows]),
-        np.tile(sigma_mm**2 * np.eye(2), (len(rows), 1, 1)),
+        np.array([row[3] + rng.normal(0.0, optics.sigma_mm, 2) for row in rows]),
+        np.tile(optics.sigma_mm**2 * np.eye(2), (len(rows), 1, 1)),
     )
-    images = tuple(Image(f"i{i}", "K", films[i].transformation) for i in range(len(exteriors)))
+    images = tuple(Image(f"i{i}", "K", film.transformation) for i, film in enumerate(films))
+    kept = [(point, place) for point, place in points if shown[point.id] > 1]
     truth = Approximations(
-        interior={"K": interior},
+        interior={"K": optics.interior},
         exterior={f"i{i}": exterior for i, exterior in enumerate(exteriors)},
-        transformation={f"i{i}": films[i].parameters for i in range(len(exteriors))},
-        points={point.id: place for point, place in zip(points, xyz, strict=True) if shown[point.id] > 1},
+        transformation={f"i{i}": film.parameters for i, film in enumerate(films)},
+        points={point.id: place for point, place in kept},
     )
-    kept = tuple(point for point in points if shown[point.id] > 1)
-    held = all(prior is not None and prior.sigma == 0 for point in kept[:1] for prior in (point.X, point.Y, point.Z))
-    return Scene(Network((camera,), images, kept, observations), truth, Options(datum="control" if held else "minimal"))
+    first = kept[0][0]
+    held = all(prior is not None and prior.sigma == 0 for prior in (first.X, first.Y, first.Z))
+    network = Network((optics.camera,), images, tuple(point for point, _ in kept), observations)
+    return Scene(network, truth, Options(datum="control" if held else "minimal"))
+
+
+def exposed(optics: Optics, image: str, exterior: Array, film: Film, xyz: Array) -> list[Row]:
+    """The points (n, 3) in an image's frame, and its fiducials, without errors."""
+    camera, rotation = optics.camera, rotation_from_angles(exterior[3:])
+    model = ImageModel(camera.distortion, optics.interior, optics.lens, rotation, exterior[:3], film)
+    xy, seen = model.camera_from_object(xyz)
+    comparator = model.comparator_from_camera(xy)[0]
+    inside = np.flatnonzero(seen & (np.abs(xy) < optics.half_mm).all(axis=1))
+    rows: list[Row] = [(image, f"p{j}", "target", comparator[j]) for j in inside]
+    for id_, mark in camera.fiducials.items():
+        place = np.array([mark.x_mm.value, mark.y_mm.value])
+        rows.append((image, id_, "fiducial", model.comparator_from_camera(place[None])[0][0]))
+    return rows
 
 
 def looking_at_origin(station: list[float], kappa: float) -> Array:

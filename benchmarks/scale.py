@@ -16,11 +16,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
+from large_networks import CONTROL_EVERY, FLIP, FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known, strip, unknown
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_array, diags_array
@@ -29,17 +30,7 @@ from scipy.sparse.linalg import splu
 from adjust.adjustment import adjust
 from adjust.approximations import approximate
 from adjust.iteration import linearise
-from adjust.network import (
-    Approximations,
-    Camera,
-    Distortion,
-    Exterior,
-    Image,
-    Network,
-    ObjectPoint,
-    Observations,
-    Prior,
-)
+from adjust.network import Exterior
 from adjust.numbering import Numbering
 from adjust.problem import ABSENT, number
 from adjust.rotation import rotation_from_angles
@@ -51,27 +42,8 @@ VIEWS, VIEWS_OF_RESEAU_ALONE = (50, 200, 1000), (4000,)
 NETWORKS = ((50, 2000), (200, 20000))  # images and unknown points
 NETWORK_OF_RESEAU_ALONE = (1000, 50000)
 STRIPS, STRIPS_OF_RESEAU_ALONE, HANGING = (500,), (1000, 2000, 4000), 1000  # images
-POINTS_AN_IMAGE, CONTROL_EVERY = 50, 10  # of a strip: points that an image shows, images between known points
 PATIENCE_S = 300.0  # of CPU time, for SciPy
-SIGMA_MM = 0.005
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
-FOCAL_MM, FRAME_MM = 100.0, 200.0
-ESTIMATED = {"known": ("k1", "k2", "p1", "p2", "k3"), "unknown": ("k1", "k2")}
-TRUE = {"k1": -0.05, "k2": 0.02}
-FLIP = np.diag([1.0, -1.0, -1.0])  # from axes with y up, looking along -z, to OpenCV's
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A network to adjust, with what other programs need of it.
-
-    points (p, 3); seen: per image the points' numbers and their places (m, 2) in mm, y up.
-    """
-
-    network: Network
-    start: Approximations
-    points: Array
-    seen: list[tuple[NDArray[np.intp], Array]]
 
 
 def main() -> None:
@@ -159,99 +131,6 @@ def _peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def known(views: int) -> Scene:
-    """A board of 100 points with some relief, all of them in every view."""
-    rng = np.random.default_rng(views)
-    grid = (np.arange(10) - 4.5) * 0.1
-    plan = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    points = np.column_stack([plan, 0.05 * rng.normal(size=len(plan))])
-    angles = np.column_stack([rng.uniform(-0.5, 0.5, (views, 2)), rng.uniform(-3.0, 3.0, views)])
-    offset = np.column_stack([0.1 * rng.normal(size=(views, 2)), np.full(views, -1.2)])
-    stations = -np.einsum("nij,ni->nj", rotation_from_angles(angles), offset)
-    return _scene(rng, points, stations, angles, "known", np.zeros(len(points)), 0.002)
-
-
-def unknown(images: int, points: int) -> Scene:
-    """An aerial block of 60 % overlap along and across, attitudes within some degrees, one point in a hundred known."""
-    rng = np.random.default_rng(images)
-    across = int(np.sqrt(images / 2))
-    base, height = 0.4 * FRAME_MM, 1.0 * FOCAL_MM
-    place = np.array([(i * base, j * base) for i in range(images // across) for j in range(across)])
-    low, high = place.min(axis=0) - 0.3 * base, place.max(axis=0) + 0.3 * base
-    xyz = np.column_stack([rng.uniform(low, high, (points, 2)), rng.uniform(-10.0, 10.0, points)])
-    stations = np.column_stack([place, np.full(len(place), height)]) + rng.normal(size=(len(place), 3))
-    angles = (
-        0.05 * rng.normal(size=(len(place), 3))
-        + np.array([0.0, 0.0, 1.0]) * rng.integers(0, 4, (len(place), 1)) * np.pi / 2
-    )
-    sigma = np.where(np.arange(points) % 100 == 0, 0.0, np.inf)
-    return _scene(rng, xyz, stations, angles, "unknown", sigma, 0.02)
-
-
-def strip(images: int, control: int = CONTROL_EVERY) -> Scene:
-    """A strip of 60 % overlap, fifty points an image, some known every ten images; 0: at the first two alone."""
-    rng = np.random.default_rng(images)
-    base, height = 0.4 * FRAME_MM, 1.0 * FOCAL_MM
-    stations = np.column_stack([base * np.arange(images), np.zeros(images), np.full(images, height)])
-    per_base = int(0.4 * POINTS_AN_IMAGE)
-    along = base * (np.arange(images * per_base) / per_base - 0.5)
-    across = rng.uniform(-0.4 * FRAME_MM, 0.4 * FRAME_MM, len(along))
-    xyz = np.column_stack([along, across, rng.uniform(-10.0, 10.0, len(along))])
-    turns = rng.integers(0, 4, images) * np.pi / 2
-    angles = 0.02 * rng.normal(size=(images, 3)) + np.outer(turns, (0.0, 0.0, 1.0))
-    every = per_base * control // 2
-    known = np.arange(len(along)) % every == 0 if control else along < 1.5 * base
-    sigma = np.where(known, 0.0, np.inf)
-    return _scene(rng, xyz, stations + rng.normal(size=(images, 3)), angles, "unknown", sigma, 0.02)
-
-
-def _scene(
-    rng: np.random.Generator, points: Array, stations: Array, angles: Array, task: str, sigma: Array, error: float
-) -> Scene:
-    """What OpenCV projects, with noise; approximations wrong by an error in object units, hundredths of it in rad."""
-    matrix = np.diag([FOCAL_MM, FOCAL_MM, 1.0])
-    lens = np.array([TRUE["k1"], TRUE["k2"], 0.0, 0.0, 0.0])
-    seen = []
-    for station, rotation in zip(stations, FLIP @ rotation_from_angles(angles), strict=True):
-        vector = cv2.Rodrigues(rotation)[0]
-        near = np.flatnonzero((np.abs(points - station) < 2.0 * FRAME_MM).all(axis=1))
-        projected = cv2.projectPoints(points[near], vector, -rotation @ station, matrix, lens)[0].reshape(-1, 2)
-        shown = (np.abs(projected) < FRAME_MM / 2).all(axis=1)
-        inside = near[shown]
-        places = projected[shown] * (1.0, -1.0) + SIGMA_MM * rng.normal(size=(len(inside), 2))
-        seen.append((inside, places))
-    rays = np.bincount(np.concatenate([inside for inside, _ in seen]), minlength=len(points))
-    names = [f"i{i}" for i in range(len(seen))]
-    free = {name: Prior(0.0, np.inf) for name in ESTIMATED[task]}
-    free_point = Prior(FOCAL_MM, np.inf), Prior(0.0, np.inf), Prior(0.0, np.inf)
-    seen = [(inside[rays[inside] > 1], places[rays[inside] > 1]) for inside, places in seen]
-    network = Network(
-        (Camera("K", *free_point, Distortion("opencv", free)),),
-        tuple(Image(name, "K", "none") for name in names),
-        tuple(
-            ObjectPoint(str(i), *(Prior(float(x)) if s == 0.0 else None for x in xyz))
-            for i, (xyz, s) in enumerate(zip(points, sigma, strict=True))
-        ),
-        Observations(
-            tuple(name for name, (inside, _) in zip(names, seen, strict=True) for _ in inside),
-            tuple(str(i) for inside, _ in seen for i in inside),
-            tuple("target" for inside, _ in seen for _ in inside),
-            np.concatenate([places for _, places in seen]),
-            np.tile(SIGMA_MM**2 * np.eye(2), (sum(len(inside) for inside, _ in seen), 1, 1)),
-        ),
-    )
-    start = Approximations(
-        {"K": np.array([FOCAL_MM * 1.005, 0.0, 0.0])},
-        {
-            name: np.concatenate([station + error * rng.normal(size=3), angle + 0.01 * error * rng.normal(size=3)])
-            for name, station, angle in zip(names, stations, angles, strict=True)
-        },
-        {},
-        {str(i): xyz + error * rng.normal(size=3) for i, xyz in enumerate(points)},
-    )
-    return Scene(network, start, points, seen)
-
-
 def reseau(scene: Scene) -> Figures:
     """With the covariance of camera, images and points; what the observations tell besides is measured by itself."""
     result, seconds = _timed(lambda: adjust(scene.network, scene.start))
@@ -287,57 +166,64 @@ def opencv(scene: Scene) -> Figures:
     return {"seconds": seconds, "mib": _peak_mib(), "vpv": found[0] ** 2 * count / (10 * SIGMA_MM) ** 2}
 
 
-def scipy(scene: Scene) -> Figures:
-    """Trust region with LSMR on the same residuals and their analytic sparse Jacobian; then the camera's covariance."""
-    exterior = np.full(6, np.inf)
-    exterior[3:] = 1e6  # angles as unknowns, all but free: they add up
-    images = tuple(
-        replace(image, exterior=Exterior(scene.start.exterior[image.name], exterior)) for image in scene.network.images
-    )
-    problem = number(replace(scene.network, images=images), scene.start)
-    numbering, first = Numbering(problem), problem.start()
-    numbers = numbering.numbers[problem.columns]
-    covariance = problem.network.observations.covariance_mm2
+class SparseProblem:
+    """The residuals of a scene and their analytic sparse Jacobian, as SciPy asks for them."""
 
-    def at(x: Array) -> tuple[Array, csr_array]:
-        step = np.zeros(len(problem.unknowns))
-        step[numbering.free] = x
-        linear = linearise(numbering, covariance, problem.moved(first, step))
+    def __init__(self, scene: Scene) -> None:
+        exterior = np.full(6, np.inf)
+        exterior[3:] = 1e6  # angles as unknowns, all but free: they add up
+        images = tuple(
+            replace(image, exterior=Exterior(scene.start.exterior[image.name], exterior))
+            for image in scene.network.images
+        )
+        self.problem = number(replace(scene.network, images=images), scene.start)
+        self.numbering, self.first = Numbering(self.problem), self.problem.start()
+        self.numbers = self.numbering.numbers[self.problem.columns]
+        self.covariance = self.problem.network.observations.covariance_mm2
+
+    def at(self, x: Array) -> tuple[Array, csr_array]:
+        """(2 n,) residuals and (2 n, unknowns) derivatives, in standard deviations, at changes x of the start."""
+        step = np.zeros(len(self.problem.unknowns))
+        step[self.numbering.free] = x
+        linear = linearise(self.numbering, self.covariance, self.problem.moved(self.first, step))
         assert linear is not None
         by = -np.linalg.solve(linear.by_observation, linear.rows.root @ linear.rows.matrix) / SIGMA_MM
-        used = np.broadcast_to((numbers != ABSENT)[:, None, :], by.shape)
+        used = np.broadcast_to((self.numbers != ABSENT)[:, None, :], by.shape)
         rows = np.broadcast_to(np.arange(2 * len(by)).reshape(-1, 2, 1), by.shape)
-        columns = np.broadcast_to(numbers[:, None, :], by.shape)
+        columns = np.broadcast_to(self.numbers[:, None, :], by.shape)
         shape = 2 * len(by), len(x)
         return linear.v_mm.ravel() / SIGMA_MM, csr_array((by[used], (rows[used], columns[used])), shape=shape)
 
+    def of_camera(self, jacobian: csr_array) -> Array:
+        """The columns of the covariance that are the camera's."""
+        scale = diags_array(1.0 / np.sqrt((jacobian**2).sum(axis=0)))
+        normal = (scale @ jacobian.T @ jacobian @ scale).tocsc()
+        factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        camera = self.numbering.numbers[self.problem.unknowns.camera["K"]]
+        unit = np.zeros((len(self.numbering.free), int((camera != ABSENT).sum())))
+        unit[camera[camera != ABSENT], np.arange(unit.shape[1])] = 1.0
+        return np.asarray(factor.solve(unit))
+
+
+def scipy(scene: Scene) -> Figures:
+    """Trust region with LSMR on the same residuals and their analytic sparse Jacobian; then the camera's covariance."""
+    problem = SparseProblem(scene)
     begin = time.process_time()
 
     def patient(**_: Any) -> None:
         if time.process_time() - begin > PATIENCE_S:
             raise StopIteration
 
-    zero = np.zeros(len(numbering.free))
+    zero = np.zeros(len(problem.numbering.free))
     solve: Any = least_squares
     found = solve(
-        lambda x: at(x)[0], zero, lambda x: at(x)[1], x_scale="jac", method="trf",
+        lambda x: problem.at(x)[0], zero, lambda x: problem.at(x)[1], x_scale="jac", method="trf",
         tr_solver="lsmr", tr_options={"atol": 1e-10, "btol": 1e-10},
         ftol=1e-10, xtol=1e-10, gtol=1e-10, max_nfev=5000, callback=lambda intermediate_result: patient(),
     )  # fmt: skip
     seconds = time.process_time() - begin
     says = f"{found.nfev} evaluations" + ("" if found.status > 0 else ", stopped before it converged")
-
-    def of_camera() -> Array:
-        jacobian = found.jac
-        scale = diags_array(1.0 / np.sqrt((jacobian**2).sum(axis=0)))
-        normal = (scale @ jacobian.T @ jacobian @ scale).tocsc()
-        factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        camera = numbering.numbers[problem.unknowns.camera["K"]]
-        unit = np.zeros((len(zero), int((camera != ABSENT).sum())))
-        unit[camera[camera != ABSENT], np.arange(unit.shape[1])] = 1.0
-        return np.asarray(factor.solve(unit))
-
-    _, more = _timed(of_camera)
+    _, more = _timed(lambda: problem.of_camera(found.jac))
     return {
         "seconds": seconds, "covariance_seconds": more, "mib": _peak_mib(), "vpv": 2.0 * float(found.cost),
         "finished": found.status > 0, "says": f"{says}; covariance of the camera alone",
