@@ -65,6 +65,17 @@ def test_byte_order_bigtiff_and_predictor(
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
 
 
+@pytest.mark.parametrize("compression", ["lzw", "deflate", "zstd"])
+@pytest.mark.parametrize(
+    "options", [{"rowsperstrip": 1624, "byteorder": ">"}, {"rowsperstrip": 900}, {"tile": (1024, 2560)}]
+)
+def test_strips_and_tiles_of_megabytes(tmp_path: Path, compression: str, options: dict[str, Any]) -> None:
+    """In one; in two, the last of them a shorter one; in two of which the last reaches beyond the picture."""
+    truth = np.tile(picture(), (8, 8))
+    tifffile.imwrite(tmp_path / "s.tif", truth, photometric="minisblack", compression=compression, **options)
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), truth)
+
+
 @pytest.mark.parametrize("planar", ["contig", "separate"])
 @pytest.mark.parametrize("tile", [None, (64, 64)])
 def test_planes_kept_apart_or_together(tmp_path: Path, planar: str, tile: tuple[int, int] | None) -> None:
