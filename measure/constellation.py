@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from measure.candidates import Responses
 from measure.correlation import WIDE, Surroundings
 from measure.poses import up_from_camera
-from measure.response_layers import LEAST_TOLERANCE_PX, Layer, Reach, narrowed
+from measure.response_layers import LEAST_TOLERANCE_PX, HeldReaches, Layer, Reach, narrowed
 from measure.shapes import LayoutMark, Mark
 
 Array = NDArray[np.float64]
@@ -116,13 +116,18 @@ class PlacementSearch:
     """The search for placements, in one pose after another, of a frame that bounds are known of."""
 
     def __init__(
-        self, marks: Sequence[LayoutMark], responses: Responses, pitch_mm: tuple[float, float], bounds: Bounds
+        self,
+        marks: Sequence[LayoutMark],
+        responses: Responses,
+        pitch_mm: tuple[float, float],
+        bounds: Bounds,
+        held: HeldReaches,
     ) -> None:
         self.marks, self.responses, self.bounds = marks, responses, bounds
         self.pitch = np.asarray(pitch_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
         self.layers = {
-            key: Layer(map_, responses.origin(key[0]), self.tolerance_px) for key, map_ in responses.maps.items()
+            key: Layer(map_, responses.origin(key[0]), self.tolerance_px, held) for key, map_ in responses.maps.items()
         }
 
     def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:

@@ -17,6 +17,7 @@ from measure.frame import Frame
 from measure.pitches import PitchHypothesis, pitch_hypotheses
 from measure.poses import POSES, up_from_camera
 from measure.rendering import extent_px
+from measure.response_layers import HeldReaches
 from measure.scan import Scan
 from measure.shapes import FiducialLayout
 from measure.status import Status
@@ -76,6 +77,7 @@ class FrameSearch:
         self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
         self._drawn: tuple[Pair, Responses, tuple[int, ...]] | None = None
         self._searched: dict[Pair, _Searched] = {}
+        self._held = HeldReaches()
 
     def anywhere(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements in the whole scan, of all poses asked for, best first."""
@@ -242,7 +244,7 @@ class FrameSearch:
         whole: _Searched | None = None,
     ) -> list[Placement]:
         marks, count = self.layout.marks, len(self.layout.marks)
-        search = PlacementSearch(marks, responses, hypothesis.mm, bounds)
+        search = PlacementSearch(marks, responses, hypothesis.mm, bounds, self._held)
         looks: dict[str, tuple[int, ...]] = {}
         found: dict[str, list[Placement]] = {}
         differ = 0

@@ -1,6 +1,7 @@
 """The responses to one look of a mark, and what a constellation asks of them: their highest places, and how strongly
 they answer about any place."""
 
+from collections import OrderedDict
 from functools import cached_property
 
 import cv2
@@ -17,6 +18,7 @@ _CANDIDATES = 100  # of each look
 _NARROWED = 0.7  # of the tolerance, once a placement is refined
 LEAST_TOLERANCE_PX = 1.5  # of the reduced scan: where a response is highest is known no better
 _CHANCE_PERCENT = 95  # of places that stay below what chance is said to answer
+_HELD_BYTES = 512 << 20  # of reaches: two for each of the sixteen looks of four marks that differ, in a large scan
 _SAMPLED = slice(None, None, 3)  # rows and columns from which that is told: neighbours answer alike
 
 
@@ -26,11 +28,10 @@ def narrowed(tolerance_px: float) -> float:
 
 
 class Layer:
-    """The responses to one look, and what is asked of them in every pose."""
+    """The responses to one look, and what is asked of them in every pose. held: what is kept of it, and of others."""
 
-    def __init__(self, map_: Map, origin: NDArray[np.int_], tolerance_px: float) -> None:
-        self.map, self.origin, self.tolerance_px = map_, origin, tolerance_px
-        self._reaches: dict[float, Reach] = {}
+    def __init__(self, map_: Map, origin: NDArray[np.int_], tolerance_px: float, held: "HeldReaches") -> None:
+        self.map, self.origin, self.tolerance_px, self._held = map_, origin, tolerance_px, held
 
     @cached_property
     def candidates(self) -> Array:
@@ -47,9 +48,7 @@ class Layer:
 
     def within(self, radius_px: float) -> "Reach":
         """What is asked of the responses within a radius."""
-        if radius_px not in self._reaches:
-            self._reaches[radius_px] = Reach(self.map, self.origin, radius_px)
-        return self._reaches[radius_px]
+        return self._held.of(self, radius_px)
 
     def highest(self, places: Array, radius_px: float) -> tuple[Array, Array]:
         """The highest responses about places (n, 2) of the reduced scan, and (n,) how high; 0 outside of the map."""
@@ -92,6 +91,26 @@ class Reach:
         inside = (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
         response = np.where(inside, self.map[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0.0).astype(float)
         return np.maximum(np.maximum(response, 0.0) ** 2 - self.chance**2, 0.0), inside
+
+
+class HeldReaches:
+    """The reaches asked for last, of the layers of all hypotheses: marks that look otherwise in every pose have dozens,
+    each as large as the reduced scan."""
+
+    def __init__(self, limit_bytes: int = _HELD_BYTES) -> None:
+        self.limit_bytes = limit_bytes
+        self._reaches: OrderedDict[tuple[Layer, float], Reach] = OrderedDict()
+        self._bytes = 0
+
+    def of(self, layer: Layer, radius_px: float) -> Reach:
+        key = (layer, radius_px)
+        if key not in self._reaches:
+            reach = self._reaches[key] = Reach(layer.map, layer.origin, radius_px)
+            self._bytes += reach.map.nbytes
+            while self._bytes > self.limit_bytes and len(self._reaches) > 1:
+                self._bytes -= self._reaches.popitem(last=False)[1].map.nbytes
+        self._reaches.move_to_end(key)
+        return self._reaches[key]
 
 
 def _about(radius_px: float) -> NDArray[np.uint8]:
