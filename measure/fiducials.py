@@ -26,6 +26,7 @@ from measure.shapes import FiducialLayout
 Array = NDArray[np.float64]
 
 _SET = ("set in the project.",)
+_UNSURE = "none of the marks is measured without blemish: the frame may lie elsewhere."
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
 _HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
@@ -66,8 +67,9 @@ def measure_fiducials(
             frame = measure_frame(scan, layout, placement, options)
     chance = doubt(search, frame)
     problems = [f"{sentence}." for sentence in (*_rivals(found, frame.placement), chance) if sentence]
-    if problems and options.pose == "auto":
-        pose = Pose(pose.name, False, (*pose.evidence, *problems))
+    doubts = problems if frame.measured else [_UNSURE, *problems]
+    if doubts and options.pose == "auto":
+        pose = Pose(pose.name, False, (*pose.evidence, *doubts))
     return present_frame(scan, layout, frame, pose, problems, chance)
 
 
@@ -99,17 +101,18 @@ def _in_the_middle(search: FrameSearch, given: PitchHypothesis) -> tuple[list[Pl
 
 
 def _anywhere(search: FrameSearch, hypotheses: Sequence[PitchHypothesis]) -> tuple[list[Placement], Frame | None]:
-    """The placements, best first, in the whole scan, and the frame in the first of the best ones that is accepted, or
-    else that of most marks; None where nothing looks like the marks."""
+    """The placements, best first, in the whole scan, and the frame in the first of the best ones that is sure, or else
+    accepted, or else that of most marks; None where nothing looks like the marks."""
     found = search.anywhere(hypotheses)
     if not found:
         return [], None
-    frames = [_as_its_pictures_say(search, found, found[0])]
-    for placement in _others(found):
-        if frames[-1].accepted:
-            break
+    frames: list[Frame] = []
+    for placement in (found[0], *_others(found)):
         frames.append(_as_its_pictures_say(search, found, placement))
-    return found, max(frames, key=lambda frame: (frame.accepted, frame.belongs.sum()))
+        if frames[-1].is_sure:
+            return found, frames[-1]
+    accepted = [frame for frame in frames if frame.accepted]
+    return found, accepted[0] if accepted else max(frames, key=lambda frame: int(frame.belongs.sum()))
 
 
 def _as_its_pictures_say(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> Frame:

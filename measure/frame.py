@@ -68,6 +68,17 @@ class Frame:
         return self.agrees and clear >= self._least
 
     @property
+    def measured(self) -> int:
+        """How many marks are measured without blemish."""
+        return sum(self.verdict(int(index))[0] is Status.MEASURED for index in np.flatnonzero(self.belongs))
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it is accepted, as many marks being measured as have to agree: a frame that is seen elsewhere than it
+        lies has hardly any."""
+        return self.accepted and self.measured >= self._least
+
+    @property
     def _least(self) -> int:
         return max(min(_AGREEING, len(self.sightings)), 2)
 

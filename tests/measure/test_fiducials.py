@@ -158,6 +158,20 @@ def test_what_covers_a_dot_and_looks_like_a_smaller_one_is_doubted(tmp_path: Pat
     assert "0.85 times as large as the other marks" in result.marks[3].reason
 
 
+def test_a_frame_without_a_mark_free_of_blemish_has_no_decided_pose(tmp_path: Path) -> None:
+    """A part of every ring and cross is gone; the identification dots are all there."""
+    matrix = pixel_from_camera("90")
+    grey = frame_picture(NUMBERED, matrix)
+    for mark in NUMBERED.marks:
+        col, row = np.rint(matrix @ (*mark.xy_mm, 1.0)).astype(int)
+        grey[row + 2 : row + 20, col - 18 : col + 17] = 3000
+    result = measured(grey, NUMBERED, tmp_path)
+    assert {mark.status for mark in result.marks} == {Status.WEAK}
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided) == ("90", False)
+    assert "none of the marks is measured without blemish" in result.pose.evidence[-1]
+
+
 def test_the_users_pose_is_taken(tmp_path: Path) -> None:
     matrix = pixel_from_camera("270m")
     result = measured(frame_picture(ALIKE, matrix), ALIKE, tmp_path, FiducialOptions(pose="270m"))
