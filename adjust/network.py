@@ -12,15 +12,15 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.families import parameter_names
-from adjust.rotation import rotation_from_angles
-from adjust.transformation import film_kind
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.transformation import film_kind
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 Decentering = Literal["reduced", "paper"]
-Transformation = str  # as `adjust.transformation` spells it
+Transformation = str  # as `adjust.functional_model.transformation` spells it
 ObservationKind = Literal["target", "fiducial", "tie"]
 
 
@@ -40,7 +40,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Distortion:
-    """A distortion family, a name in `adjust.families`, and its parameters; one that is not named is fixed at 0.
+    """A distortion family, a name in `functional_model.families`, and its parameters; one not named is fixed at 0.
 
     decentering "paper": Torlegård's decentering terms with x', y' as printed and not reduced to the principal point.
     r0_mm: radius of zero radial distortion of `torlegard`, of a period of `juhl`.
@@ -325,8 +325,8 @@ class Approximations:
     """Where the iteration starts: by camera, image and point name, in the units of the network.
 
     interior (c, x0', y0'); exterior (6,); transformation: the parameters of the image's kind in the order of
-    `adjust.transformation.film_parameter_names`; points (3,). mirrored: the images whose scan is mirrored (the
-    determinant of their transformation is negative), which a congruent, similarity or conformal one has to be told.
+    `functional_model.transformation`; points (3,). mirrored: the images whose scan is mirrored (the determinant of
+    their transformation is negative), which a congruent, similarity or conformal one has to be told.
     """
 
     interior: Mapping[str, Array]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from adjust.fronts import Fronts, band_order, fronts_of
-from adjust.normal_equations import Groups
+from adjust.least_squares.fronts import Fronts, band_order, fronts_of
+from adjust.least_squares.normal_equations import Groups
 from adjust.problem import ABSENT, Problem, side_by_side
 
 Indices = NDArray[np.intp]

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from adjust.probabilities import Probabilities
-from adjust.reweighting import WeightFunction
-from adjust.tested import PRIOR_GROUPS
+from adjust.quality.probabilities import Probabilities
+from adjust.quality.reweighting import WeightFunction
+from adjust.quality.tested import PRIOR_GROUPS
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]
@@ -22,7 +22,7 @@ class Options:
     datum_coordinates: those that "minimal" fixes, at their given values: "12.X" and so on; none: chosen automatically.
     datum_points: the points that carry the inner constraints of "free"; none: all.
     robust: what contradicts the others loses weight, "huber" (or True) some and "igg3" at last all; see
-    `robust_weights`. snooping: what contradicts the others beyond chance is taken out; see `adjust.snooping`.
+    `robust_weights`. snooping: what contradicts the others beyond chance is taken out; see `adjust.quality.snooping`.
     variance_components: the variances of groups are each multiplied by what their residuals say: True for targets, tie
     points and fiducials in the images, or names of groups (see `Group`).
     probabilities: of the tests.

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.network import Network
-from adjust.probabilities import Probabilities
-from adjust.tested import Tested
+from adjust.quality.probabilities import Probabilities
+from adjust.quality.tested import Tested
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
-from adjust.families import parameter_names
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.transformation import film_parameter_names
 from adjust.network import EXTERIOR_NAMES, Approximations, Camera, Image, Network, ObjectPoint, Prior
-from adjust.transformation import film_parameter_names
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

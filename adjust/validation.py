@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from adjust.errors import AdjustmentError
-from adjust.families import family
+from adjust.functional_model.families import family
+from adjust.functional_model.transformation import fewest_marks, marks_needed
 from adjust.network import Camera, Image, Network, Observations, Prior
-from adjust.transformation import fewest_marks, marks_needed
 
 TARGETS_NEEDED = 3
 DEFINITE = 1e-13  # least eigenvalue of an earlier calibration's correlation matrix

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 import synthetic_images
-from pipeline.against_truth import Comparison, compare_with_truth
+from pipeline.files.project_file import read_project
 from pipeline.progress import Reporter
-from pipeline.project_file import read_project
-from pipeline.scene_file import render_project
+from pipeline.rendered.against_truth import Comparison, compare_with_truth
+from pipeline.rendered.scene_file import render_project
 from pipeline.stages import run_all
 from pipeline.summary import Summary
 

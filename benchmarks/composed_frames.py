@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from search import OUTCOMES, POSE_OUTCOMES, judged, lines, print_table
 from search_frames import Case
 
-from measure.learned import cut, template_of
-from measure.picture_scan import WholePicture
-from measure.poses import POSES, up_from_camera
-from measure.resolution import NO_TAGS
-from measure.scan import Scan
-from measure.shapes import FiducialLayout, LayoutMark
+from measure.marks.poses import POSES, up_from_camera
+from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from measure.special_marks.learned import cut, template_of
 
 Array = NDArray[np.float64]
 Crops = dict[str, NDArray[np.uint8]]

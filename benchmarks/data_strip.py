@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from search_frames import FRAME_MM, SIDES, Case, draw_case
 
-from measure.data_strip import DIRECTIONS, side_in_scan
 from measure.fiducials import measure_fiducials
-from measure.picture_scan import WholePicture
-from measure.resolution import NO_TAGS
+from measure.marks.shapes import Side
+from measure.pose.data_strip import DIRECTIONS, side_in_scan
 from measure.results import FrameMeasurement
-from measure.scan import Scan
-from measure.shapes import Side
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
 

@@ -12,20 +12,20 @@ from measured_marks import CONTRAST, GROUND, Found, measured
 from numpy.typing import NDArray
 from true_marks import KIND, Kind, TrueMark, some_mark
 
-from measure.constellation import Placement
-from measure.disks import PLAIN_MARGIN_PX
 from measure.fiducial_options import FiducialOptions
-from measure.frame_measurement import measure_frame
-from measure.matching import match
-from measure.picture_scan import WholePicture
-from measure.poses import POSES
-from measure.refinement import options_for
-from measure.resolution import NO_TAGS
-from measure.scan import Scan
-from measure.scan_window import ScanWindow
-from measure.shapes import FiducialLayout, LayoutMark
+from measure.fitting.matching import match
+from measure.frames.frame_measurement import measure_frame
+from measure.frames.refinement import options_for
+from measure.marks.poses import POSES
+from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from measure.scans.scan_window import ScanWindow
+from measure.search.constellation import Placement
+from measure.single_targets.disks import PLAIN_MARGIN_PX
+from measure.single_targets.targets import TargetPrediction, measure_disks
 from measure.status import Status
-from measure.targets import TargetPrediction, measure_disks
 from synthetic_images.optics import reach_px, seen_coverage
 
 Array = NDArray[np.float64]

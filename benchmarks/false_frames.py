@@ -17,9 +17,9 @@ import numpy as np
 from search_frames import PITCH_UM, Case, draw_case
 
 from measure.fiducials import measure_fiducials
-from measure.picture_scan import WholePicture
-from measure.resolution import NO_TAGS
-from measure.scan import Scan
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
 from measure.status import Status
 
 

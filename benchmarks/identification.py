@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.naming import Names, name_marks
-from adjust.resection import Pose
+from adjust.initial_values.resection import Pose
+from adjust.target_names.naming import Names, name_marks
 
 Array = NDArray[np.float64]
 

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.rotation import rotation_from_angles
 from adjust.network import (
     Approximations,
     Camera,
@@ -17,7 +18,6 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.rotation import rotation_from_angles
 
 Array = NDArray[np.float64]
 Seen = tuple[NDArray[np.intp], Array]  # of an image: numbers of points, and their places (m, 2) in mm, y up

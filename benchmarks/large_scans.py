@@ -23,14 +23,14 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from measure.disk_patches import DiskSearch
-from measure.disk_search import disk_candidates
-from measure.disks import fit_disk
 from measure.fiducials import measure_fiducials
-from measure.scan import open_scan
-from measure.shapes import FiducialLayout
-from pipeline.project_file import read_project
-from pipeline.scene_file import render_project
+from measure.marks.shapes import FiducialLayout
+from measure.scans.scan import open_scan
+from measure.single_targets.disk_patches import DiskSearch
+from measure.single_targets.disk_search import disk_candidates
+from measure.single_targets.disks import fit_disk
+from pipeline.files.project_file import read_project
+from pipeline.rendered.scene_file import render_project
 
 FRAME_MM = 230.0
 WINDOW_MM = 6.4  # about a mark: what the search at full resolution reads

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from true_marks import areas_of
 
 from measure.fiducials import measure_fiducials
-from measure.scan import Scan
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, cross
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
+from measure.scans.scan import Scan
 from measure.status import Status
 from synthetic_images import areas
 from synthetic_images.optics import reach_px, seen_coverage

@@ -7,8 +7,8 @@ none is given. --keep: rows of the tables are written there, and those that stan
 run may be stopped and go on, or be shared out by --kind among processes.
 
 The pictures are drawn by `synthetic_images` (exact areas, blurred before they are averaged over pixels); the bounds are
-from differences of the same pictures. What is measured with is what `reseau measure` calls: `measure.refinement.sight`,
-and `measure.disks.fit_disk` for the ellipse.
+from differences of the same pictures. What is measured with is what `reseau measure` calls:
+`measure.frames.refinement.sight`, and `measure.single_targets.disks.fit_disk` for the ellipse.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from true_marks import (
     whitened_rms,
 )
 
-from measure.quantisation import rounding_step_dn
+from measure.scans.quantisation import rounding_step_dn
 
 Array = NDArray[np.float64]
 

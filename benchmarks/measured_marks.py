@@ -7,11 +7,11 @@ from drawn import scan_of
 from numpy.typing import NDArray
 from true_marks import TrueMark
 
-from measure.disks import fit_disk
 from measure.fiducial_options import FiducialOptions
-from measure.frame import CLEAR_DAMAGE
-from measure.prediction import MarkPrediction
-from measure.refinement import sight
+from measure.frames.frame import CLEAR_DAMAGE
+from measure.frames.refinement import sight
+from measure.marks.prediction import MarkPrediction
+from measure.single_targets.disks import fit_disk
 
 Array = NDArray[np.float64]
 

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 from adjust.adjustment import Options, adjust
 from adjust.errors import AdjustmentError
+from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
+from adjust.functional_model.transformation import Film
 from adjust.network import (
     Approximations,
     Camera,
@@ -29,10 +32,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.projection import ImageModel
 from adjust.result import Adjustment
-from adjust.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
-from adjust.transformation import Film
 
 Array = NDArray[np.float64]
 Row = tuple[str, str, ObservationKind, Array]  # image, point, kind, place in mm

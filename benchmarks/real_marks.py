@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fiducials import measure_fiducials
-from measure.matching import Match, MatchOptions, match, window_about
-from measure.scan import Scan, open_scan
-from measure.scan_window import ScanWindow
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, MarkTemplate, ring_cross
+from measure.fitting.matching import Match, MatchOptions, match, window_about
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, MarkTemplate, ring_cross
+from measure.scans.scan import Scan, open_scan
+from measure.scans.scan_window import ScanWindow
 
 Array = NDArray[np.float64]
 

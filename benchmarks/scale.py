@@ -28,12 +28,12 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from adjust.adjustment import adjust
-from adjust.approximations import approximate
-from adjust.iteration import linearise
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.initial_values.approximations import approximate
+from adjust.least_squares.iteration import linearise
 from adjust.network import Exterior
 from adjust.numbering import Numbering
 from adjust.problem import ABSENT, number
-from adjust.rotation import rotation_from_angles
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]

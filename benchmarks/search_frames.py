@@ -9,10 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.picture_scan import WholePicture
-from measure.resolution import NO_TAGS
-from measure.scan import Scan
-from measure.shapes import (
+from measure.marks.shapes import (
     Disk,
     FiducialLayout,
     LayoutMark,
@@ -25,7 +22,10 @@ from measure.shapes import (
     turned,
     turned_part,
 )
-from pipeline.scene_file import scene_mark
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from pipeline.rendered.scene_file import scene_mark
 from synthetic_images.background import scene_background
 from synthetic_images.film import FrameGeometry
 from synthetic_images.frame import make_frame

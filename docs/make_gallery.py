@@ -18,9 +18,9 @@ from mishaps import MISHAPS, Mishap, sentences  # the tests' own networks
 from null_directions import AXES, CATALOGUE, Failure
 
 from adjust.adjustment import adjust
+from adjust.functional_model.rotation import rotation_from_angles
 from adjust.network import Network
 from adjust.result import NullDirection
-from adjust.rotation import rotation_from_angles
 
 Array = NDArray[np.float64]
 

@@ -6,22 +6,22 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.centred_frame import is_complete, is_worth_a_look, outermost
-from measure.chance import doubt
-from measure.constellation import Placement
-from measure.correlation import CLOSE
 from measure.fiducial_options import FiducialOptions
-from measure.fiducial_rows import absent_frame, present_frame
-from measure.frame import Frame
-from measure.frame_fit import AFFINITY_SIGMA
-from measure.frame_measurement import measure_frame
-from measure.frame_search import FrameSearch
-from measure.pitches import PitchHypothesis, pitch_hypotheses
-from measure.pose_decision import decide_pose
-from measure.poses import POSES
+from measure.frames.fiducial_rows import absent_frame, present_frame
+from measure.frames.frame import Frame
+from measure.frames.frame_fit import AFFINITY_SIGMA
+from measure.frames.frame_measurement import measure_frame
+from measure.marks.poses import POSES
+from measure.marks.shapes import FiducialLayout
+from measure.pose.pose_decision import decide_pose
 from measure.results import FrameMeasurement, Pose
-from measure.scan import Scan
-from measure.shapes import FiducialLayout
+from measure.scans.scan import Scan
+from measure.search.centred_frame import is_complete, is_worth_a_look, outermost
+from measure.search.chance import doubt
+from measure.search.constellation import Placement
+from measure.search.correlation import CLOSE
+from measure.search.frame_search import FrameSearch
+from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 
 Array = NDArray[np.float64]
 

@@ -15,16 +15,16 @@ from rich.console import Console
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from pipeline import stages
-from pipeline.adjustment_file import without_nan
-from pipeline.camera_trials import identify, print_identification
-from pipeline.choose_stage import choice_json, print_choice, run_choose
+from pipeline.adjusting.adjustment_file import without_nan
+from pipeline.adjusting.choose_stage import choice_json, print_choice, run_choose
 from pipeline.demo import run_demo
 from pipeline.design.run import run_design
 from pipeline.errors import InputError
-from pipeline.library import PREFIX, library_json, library_path, print_library, read_library
+from pipeline.files.library import PREFIX, library_json, library_path, print_library, read_library
+from pipeline.files.project_file import FINEST_PITCH_UM, Project, read_project
+from pipeline.measuring.camera_trials import identify, print_identification
 from pipeline.progress import Reporter
-from pipeline.project_file import FINEST_PITCH_UM, Project, read_project
-from pipeline.scene_file import render_project
+from pipeline.rendered.scene_file import render_project
 from pipeline.summary import Summary, print_summary
 
 DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130

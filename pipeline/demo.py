@@ -4,9 +4,9 @@ from importlib import resources
 from pathlib import Path
 
 from pipeline.errors import InputError
+from pipeline.files.project_file import read_project
 from pipeline.progress import Reporter
-from pipeline.project_file import read_project
-from pipeline.scene_file import TRUTH, render_project
+from pipeline.rendered.scene_file import TRUTH, render_project
 from pipeline.stages import run_all
 from pipeline.summary import Summary
 

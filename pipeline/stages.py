@@ -7,21 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from adjust.result import Adjustment
-from pipeline.adjust_stage import adjust_marks
-from pipeline.adjustment_file import write_adjustment
-from pipeline.adjustment_reader import covariance_path, read_adjustment, read_covariance
-from pipeline.atomic import check_writable, write_atomically
-from pipeline.check import check_against_opencv
-from pipeline.comparator_file import ComparatorPoint, read_comparator, write_comparator
+from pipeline.adjusting.adjust_stage import adjust_marks
+from pipeline.adjusting.adjustment_file import write_adjustment
+from pipeline.adjusting.adjustment_reader import covariance_path, read_adjustment, read_covariance
+from pipeline.adjusting.network import anything_to_adjust, check_transformation
+from pipeline.adjusting.second_visit import measure_again
 from pipeline.errors import InputError
-from pipeline.measure_stage import measure_scans
-from pipeline.measurement_file import MeasuredScan, read_measurement, write_measurement
-from pipeline.network import anything_to_adjust, check_transformation
+from pipeline.files.atomic import check_writable, write_atomically
+from pipeline.files.project_file import Project
+from pipeline.measuring.comparator_file import ComparatorPoint, read_comparator, write_comparator
+from pipeline.measuring.measure_stage import measure_scans
+from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
+from pipeline.opencv_check.check import check_against_opencv
 from pipeline.progress import Reporter
-from pipeline.project_file import Project
 from pipeline.report.data import ReportData
 from pipeline.report.page import write_report
-from pipeline.second_visit import measure_again
 from pipeline.summary import Summary, summarise
 from pipeline.thumbnails import Thumbnails
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
 from measure.results import MarkMeasurement
-from measure.scan import Scan, open_scan
-from pipeline.measurement_file import MeasuredScan
+from measure.scans.scan import Scan, open_scan
+from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.report.data import Thumbnail
 
 _FIDUCIAL_PX, _TARGET_PX = 81, 41  # the least width of a window

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import cv2
 
-from adjust.kept_memory import keep_freed_memory
+from adjust.least_squares.kept_memory import keep_freed_memory
 
 
 def processes(scans: int) -> int:

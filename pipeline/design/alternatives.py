@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.rotation import angles_from_rotation, rotation_from_angles
+from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from pipeline.design.expected import Expected, expect
 from pipeline.design.setup import FEWEST_TARGETS, PlannedPoint, Setup
 from synthetic_images.scene import SceneImage

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from adjust.families import parameter_names
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.transformation import film_parameter_names
 from adjust.network import EXTERIOR_NAMES, Image
-from adjust.transformation import film_parameter_names
-from pipeline.adjustment_file import ANGLES, DEG_PER_RAD, without_nan
+from pipeline.adjusting.adjustment_file import ANGLES, DEG_PER_RAD, without_nan
 from pipeline.design.alternatives import Alternative
 from pipeline.design.expected import Expected, rms
 from pipeline.design.reliability import error_unit

@@ -3,8 +3,8 @@
 import math
 from pathlib import Path
 
-from pipeline.atomic import atomic_path
 from pipeline.design.sweeps import Swept
+from pipeline.files.atomic import atomic_path
 
 WIDE_RANGE = 2.0  # ratio of the largest to the smallest value from which on the axis is logarithmic
 STYLES = ("-", "--", ":", "-.")

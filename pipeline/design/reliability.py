@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.planning import Plan
+from adjust.choices.planning import Plan
 
 UM_PER_MM = 1000.0
 IN_MM = ("target", "tie", "fiducial", "datum")

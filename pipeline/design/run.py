@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from pipeline.atomic import check_writable, write_atomically
 from pipeline.design.alone import alone
 from pipeline.design.alternatives import Alternative, alternatives
 from pipeline.design.design_file import Json, design_json
@@ -16,6 +15,7 @@ from pipeline.design.plots import plot_sweep
 from pipeline.design.summary import print_design
 from pipeline.design.sweeps import Layouts, Swept, over_layouts, sweep
 from pipeline.design.variations import Variations
+from pipeline.files.atomic import check_writable, write_atomically
 from pipeline.progress import Reporter
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import cast, get_args
 
 from adjust.network import Transformation
-from pipeline.adjust_table import Datum, read_transformation
-from pipeline.tables import Table
+from pipeline.files.adjust_table import Datum, read_transformation
+from pipeline.files.tables import Table
 
 Values = tuple[float, ...] | tuple[str, ...]
 

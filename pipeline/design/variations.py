@@ -11,9 +11,9 @@ import numpy as np
 from pipeline.design.settings import Sweep
 from pipeline.design.setup import Setup, setup_of
 from pipeline.errors import InputError
-from pipeline.scene_file import parse_scene
+from pipeline.files.tables import Table, read_toml
+from pipeline.rendered.scene_file import parse_scene
 from pipeline.spelling import did_you_mean
-from pipeline.tables import Table, read_toml
 
 Values = dict[str, Any]
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from adjust.families import parameter_names
-from pipeline.adjustment_reader import Covariance
+from adjust.functional_model.families import parameter_names
+from pipeline.adjusting.adjustment_reader import Covariance
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.adjustment_reader import Covariance
-from pipeline.comparator_file import ComparatorPoint
+from pipeline.adjusting.adjustment_reader import Covariance
+from pipeline.measuring.comparator_file import ComparatorPoint
 
 Json = dict[str, Any]
 

@@ -6,11 +6,11 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from adjust.distortion import image_equations
-from adjust.families import family, parameter_names
+from adjust.functional_model.distortion import image_equations
+from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.projection import ideal_from_observed
 from adjust.network import Distortion
-from adjust.projection import ideal_from_observed
-from pipeline.adjustment_reader import Covariance
+from pipeline.adjusting.adjustment_reader import Covariance
 from pipeline.report import svg
 from pipeline.report.data import Json
 

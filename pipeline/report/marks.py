@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.status import Status
-from pipeline.comparator_file import ComparatorPoint
+from pipeline.measuring.comparator_file import ComparatorPoint
 from pipeline.report.data import Json, ReportData
 
 Array = NDArray[np.float64]

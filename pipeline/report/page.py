@@ -8,7 +8,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from measure.status import MEANING
-from pipeline.atomic import write_atomically
+from pipeline.files.atomic import write_atomically
 from pipeline.report.camera_views import camera_views
 from pipeline.report.charts import fraction_plot
 from pipeline.report.data import Json, ReportData

@@ -8,8 +8,8 @@ from setups import CONVERGENT, FREE, HEIGHT, LEVEL_STATIONS, UNKNOWN, Setup, giv
 from simulated import STATIONS, field_points
 
 from adjust.adjustment import Options
-from adjust.correlation import correlations
 from adjust.network import Approximations, Network, Observations
+from adjust.quality.correlation import correlations
 from adjust.result import Adjustment
 
 

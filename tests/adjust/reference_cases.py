@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adjust.families import parameter_names
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.transformation import film_parameter_names
 from adjust.network import (
     EXTERIOR_NAMES,
     Approximations,
@@ -20,7 +21,6 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.transformation import film_parameter_names
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
 CAMERA = "K"

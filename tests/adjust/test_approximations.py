@@ -11,8 +11,8 @@ from reference_cases import load, network_of
 from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import adjust
-from adjust.approximations import approximate
 from adjust.errors import AdjustmentError
+from adjust.initial_values.approximations import approximate
 from adjust.network import (
     EXTERIOR_NAMES,
     Approximations,

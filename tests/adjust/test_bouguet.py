@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from adjust.adjustment import adjust
-from adjust.approximations import approximate
+from adjust.initial_values.approximations import approximate
 from adjust.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
 from adjust.result import Adjustment
 

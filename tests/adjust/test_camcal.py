@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from adjust.adjustment import Options, adjust
-from adjust.approximations import approximate
+from adjust.initial_values.approximations import approximate
 from adjust.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
 
 FOLDER = Path(__file__).parents[3] / "shared" / "data" / "coded" / "camcal" / "camcaldemo"

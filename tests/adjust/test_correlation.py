@@ -9,7 +9,7 @@ from setups import CONVERGENT, FREE, Setup, given, vertical
 from simulated import STATIONS
 
 from adjust.adjustment import adjust
-from adjust.correlation import correlations
+from adjust.quality.correlation import correlations
 
 LOW_RELIEF = Setup(vertical(0.0, 0.0, 0.0, 0.0), relief=20.0, prior=1.0)
 

@@ -10,9 +10,9 @@ from simulated import Truth, simulated
 
 from adjust.adjustment import Datum, Options, adjust
 from adjust.errors import AdjustmentError
+from adjust.functional_model.transformation import film_parameter_names
 from adjust.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, Prior
 from adjust.result import Adjustment
-from adjust.transformation import film_parameter_names
 
 Array = NDArray[np.float64]
 

@@ -7,13 +7,13 @@ import pytest
 from numpy.typing import NDArray
 from simulated import KINDS, Truth, simulated
 
-from adjust.distortion import image_equations
-from adjust.families import parameter_names
-from adjust.functions import compute, computed_observations, derivatives
+from adjust.functional_model.distortion import image_equations
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.functions import compute, computed_observations, derivatives
+from adjust.functional_model.projection import rays
+from adjust.functional_model.rotation import rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.network import Decentering, Distortion, Transformation
 from adjust.problem import Problem, number
-from adjust.projection import rays
-from adjust.rotation import rotation_from_angles, rotation_from_vector, vector_by_angles
 
 Array = NDArray[np.float64]
 

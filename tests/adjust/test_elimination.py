@@ -10,15 +10,15 @@ from row_roots import row_roots
 from scipy.sparse import eye_array
 from simulated import Truth, field_points, simulated
 
-from adjust import elimination, multifrontal, triangle
 from adjust.adjustment import adjust
-from adjust.elimination import eliminate
-from adjust.factor import Blocks, Factor
-from adjust.iteration import Linearised, factorise, linearise
+from adjust.least_squares import elimination, multifrontal, triangle
+from adjust.least_squares.elimination import eliminate
+from adjust.least_squares.factor import Blocks, Factor
+from adjust.least_squares.iteration import Linearised, factorise, linearise
+from adjust.least_squares.rows import prior_root_weights
 from adjust.network import Approximations, Network, Observations
 from adjust.numbering import Numbering
 from adjust.problem import number
-from adjust.rows import prior_root_weights
 
 Array = NDArray[np.float64]
 

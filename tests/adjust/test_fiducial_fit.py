@@ -5,9 +5,9 @@ import pytest
 from numpy.typing import NDArray
 from simulated import Truth, camera_of_film, film_parameters
 
-from adjust.fiducial_fit import fit_transformation
+from adjust.functional_model.transformation import film_kind
+from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.network import Transformation
-from adjust.transformation import film_kind
 
 Array = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ from simulated import (
 )
 
 from adjust.adjustment import adjust
-from adjust.approximations import approximate
 from adjust.errors import AdjustmentError
+from adjust.initial_values.approximations import approximate
 from adjust.network import Network, Observations, Prior, Transformation
 from adjust.result import Adjustment
 

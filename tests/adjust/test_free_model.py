@@ -5,10 +5,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.absolute_orientation import absolute_orientation
-from adjust.intersection import intersect
-from adjust.relative_orientation import relative_poses
-from adjust.resection import Pose
+from adjust.initial_values.absolute_orientation import absolute_orientation
+from adjust.initial_values.intersection import intersect
+from adjust.initial_values.relative_orientation import relative_poses
+from adjust.initial_values.resection import Pose
 
 Array = NDArray[np.float64]
 

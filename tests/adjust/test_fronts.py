@@ -11,16 +11,17 @@ from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 from simulated import Truth, simulated
 
-from adjust import diagnosis, elimination, fronts, triangle
 from adjust.adjustment import adjust
-from adjust.elimination import eliminate
-from adjust.factor import Blocks, Factor
-from adjust.fronts import Fronts, fronts_of
-from adjust.iteration import factorise, linearise
+from adjust.least_squares import elimination, fronts, triangle
+from adjust.least_squares.elimination import eliminate
+from adjust.least_squares.factor import Blocks, Factor
+from adjust.least_squares.fronts import Fronts, fronts_of
+from adjust.least_squares.iteration import factorise, linearise
+from adjust.least_squares.rows import WhitenedRows, prior_root_weights
 from adjust.network import Approximations, Fiducial, Network, ObjectPoint, Observations, Prior
 from adjust.numbering import Numbering
 from adjust.problem import number
-from adjust.rows import WhitenedRows, prior_root_weights
+from adjust.undetermined import diagnosis
 
 Array = NDArray[np.float64]
 

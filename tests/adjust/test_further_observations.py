@@ -10,8 +10,9 @@ from scipy.optimize import least_squares
 from simulated import ATTITUDES, STATIONS, Truth, camera_point, field_points, rotation, simulated
 
 from adjust.adjustment import Options, adjust
-from adjust.approximations import approximate
+from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
+from adjust.initial_values.approximations import approximate
 from adjust.network import (
     Approximations,
     Calibration,
@@ -25,7 +26,6 @@ from adjust.network import (
     Transformation,
 )
 from adjust.numbering import Numbering
-from adjust.planning import plan
 from adjust.problem import number
 from adjust.result import Adjustment
 

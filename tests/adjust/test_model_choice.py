@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from simulated import HALF_MM, Truth, field_points, simulated
 
 from adjust.adjustment import Options, adjust
-from adjust.approximations import approximate
-from adjust.cross_validation import CrossValidation, cross_validate, folds
-from adjust.model_choice import Candidate, Choice, choose, f_test, nested_tests, simplest_sufficient, weighed
-from adjust.models import Model, lenses
+from adjust.choices.cross_validation import CrossValidation, cross_validate, folds
+from adjust.choices.model_choice import Candidate, Choice, choose, f_test, nested_tests, simplest_sufficient, weighed
+from adjust.choices.models import Model, lenses
+from adjust.initial_values.approximations import approximate
 from adjust.network import Distortion, Network, ObjectPoint, Prior, Transformation
-from adjust.reweighting import WeightFunction
+from adjust.quality.reweighting import WeightFunction
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from adjust.naming import Names, name_marks
-from adjust.rotation import rotation_from_vector
+from adjust.functional_model.rotation import rotation_from_vector
+from adjust.target_names.naming import Names, name_marks
 
 Array = NDArray[np.float64]
 

@@ -6,11 +6,11 @@ from null_directions import AXES, DEFORMATIONS, DISTANCE, POINT
 from setups import UNKNOWN, Array, Setup, vertical
 from simulated import field_points
 
-from adjust import null_space
 from adjust.adjustment import Options, adjust
-from adjust.factor import BlockFactors, Factor
-from adjust.fronts import Fronts
-from adjust.triangle import Triangle
+from adjust.least_squares.factor import BlockFactors, Factor
+from adjust.least_squares.fronts import Fronts
+from adjust.least_squares.triangle import Triangle
+from adjust.undetermined import null_space
 
 
 def triangle(rng: np.random.Generator, singular: Array) -> Array:

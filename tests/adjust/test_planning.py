@@ -8,6 +8,7 @@ from reference_cases import CAMERA, approximations_of, load, network_of, own_nam
 from simulated import simulated
 
 from adjust.adjustment import Datum, Options, adjust
+from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
 from adjust.network import (
     Approximations,
@@ -21,7 +22,6 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.planning import plan
 
 TARGETS: tuple[ObservationKind, ...] = ("target",) * 5
 FIDUCIALS: tuple[ObservationKind, ...] = ("fiducial",) * 3

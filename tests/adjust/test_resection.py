@@ -6,7 +6,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.resection import Pose, image_distances, resect, three_point_poses
+from adjust.initial_values.resection import Pose, image_distances, resect, three_point_poses
 
 Array = NDArray[np.float64]
 

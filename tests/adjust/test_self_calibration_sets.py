@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from adjust.distortion import image_equations
-from adjust.families import parameter_names
+from adjust.functional_model.distortion import image_equations
+from adjust.functional_model.families import parameter_names
 from adjust.network import Distortion
 
 Array = NDArray[np.float64]

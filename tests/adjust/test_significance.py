@@ -9,8 +9,8 @@ from simulated import Truth, field_points, simulated
 
 from adjust.adjustment import adjust
 from adjust.network import Network, Prior
+from adjust.quality.significance import group_tests, parameter_tests
 from adjust.result import Adjustment
-from adjust.significance import group_tests, parameter_tests
 
 FREE = dict.fromkeys(("k3", "k5", "p1", "p2"), np.inf)
 

@@ -5,8 +5,15 @@ import pytest
 from numpy.typing import NDArray
 from simulated import KINDS, Truth, camera_of_film, film_parameters
 
+from adjust.functional_model.transformation import (
+    HIGHEST_ORDER,
+    Film,
+    fewest_marks,
+    film_kind,
+    film_parameter_names,
+    marks_needed,
+)
 from adjust.network import Image, Transformation
-from adjust.transformation import HIGHEST_ORDER, Film, fewest_marks, film_kind, film_parameter_names, marks_needed
 
 Array = NDArray[np.float64]
 

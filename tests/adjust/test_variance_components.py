@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from simulated import field_points, simulated
 
 from adjust.adjustment import Options, adjust
-from adjust.functions import compute, derivatives
-from adjust.iteration import linearise
+from adjust.functional_model.functions import compute, derivatives
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.least_squares.iteration import linearise
+from adjust.least_squares.rows import prior_root_weights
 from adjust.network import Approximations, Network
 from adjust.numbering import Numbering
 from adjust.problem import State, number
 from adjust.result import Adjustment
-from adjust.rotation import rotation_from_angles
-from adjust.rows import prior_root_weights
 
 Array = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ from dense_adjustment import solve_densely
 from simulated import Truth, field_points, simulated
 
 from adjust.adjustment import adjust
+from adjust.functional_model.rotation import rotation_from_angles
 from adjust.network import (
     Approximations,
     Camera,
@@ -20,7 +21,6 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.rotation import rotation_from_angles
 
 Case = tuple[Network, Approximations]
 

@@ -7,8 +7,8 @@ import tifffile
 from drawn import pixel_means
 from numpy.typing import NDArray
 
-from measure.scan import Scan, open_scan
-from measure.shapes import Bar, Disk, MarkShape, Part, Ring
+from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring
+from measure.scans.scan import Scan, open_scan
 
 Array = NDArray[np.float64]
 POINTS, KEPT = 32, 8  # along a pixel's side; asked, and left for the blur

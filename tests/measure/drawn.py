@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.picture_scan import WholePicture
-from measure.radiometry import Samples
-from measure.resolution import NO_TAGS
-from measure.scan import Scan
+from measure.scans.picture_scan import WholePicture
+from measure.scans.radiometry import Samples
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
 

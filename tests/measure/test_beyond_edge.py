@@ -5,14 +5,14 @@ from brute_marks import brute_picture
 from drawn import scan_of
 from numpy.typing import NDArray
 
-from measure.beyond_edge import beyond_edge
-from measure.correlation import CLOSE
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
+from measure.fitting.beyond_edge import beyond_edge
+from measure.frames.refinement import sight
+from measure.marks.prediction import MarkPrediction
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon
 from measure.match_options import MatchOptions
-from measure.prediction import MarkPrediction
-from measure.refinement import sight
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon
+from measure.search.correlation import CLOSE
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,18 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.spatial import KDTree
 
-from measure.board_specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
-from measure.boards import BoardMeasurement, measure_board
-from measure.coma import one_definition
+from measure.codes_and_boards.board_specs import (
+    ArucoSpec,
+    BoardSpec,
+    CharucoSpec,
+    ChessboardSpec,
+    CircleGridSpec,
+    aruco_dictionary,
+)
+from measure.codes_and_boards.boards import BoardMeasurement, measure_board
+from measure.codes_and_boards.coma import one_definition
 from measure.results import MarkMeasurement
-from measure.scan import open_scan
+from measure.scans.scan import open_scan
 from measure.status import Status
 
 Array = NDArray[np.float64]

@@ -3,8 +3,8 @@
 import numpy as np
 from brute_marks import brute_picture
 
-from measure.correlation import WIDE
-from measure.shapes import MarkShape, ring_cross
+from measure.marks.shapes import MarkShape, ring_cross
+from measure.search.correlation import WIDE
 
 
 def test_a_faint_mark_beside_the_frames_edge_is_what_answers_most() -> None:

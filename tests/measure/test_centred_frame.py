@@ -9,12 +9,12 @@ from brute_marks import Array, written_scan
 from test_fiducials import CORNERS, NUMBERED, assert_right, frame_picture, layout_of, pixel_from_camera
 
 from measure import fiducials
-from measure.centred_frame import is_lattice
 from measure.fiducials import measure_fiducials
-from measure.frame_search import FrameSearch
+from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
 from measure.results import FrameMeasurement
-from measure.scan import Scan
-from measure.shapes import FiducialLayout, MarkShape, ring_cross
+from measure.scans.scan import Scan
+from measure.search.centred_frame import is_lattice
+from measure.search.frame_search import FrameSearch
 from measure.status import Status
 
 PITCH_UM = (50.0, 50.0)
@@ -22,7 +22,7 @@ PITCH_UM = (50.0, 50.0)
 
 @pytest.fixture(autouse=True)
 def _small_scans_count_as_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("measure.centred_frame._LARGE_PX", 1)
+    monkeypatch.setattr("measure.search.centred_frame._LARGE_PX", 1)
 
 
 def measured(

@@ -7,17 +7,17 @@ from brute_marks import Array, brute_picture
 from drawn import scan_of
 from numpy.typing import NDArray
 
-from measure.chance import doubt
-from measure.constellation import Placement
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.frame import Frame
-from measure.frame_measurement import measure_frame
-from measure.frame_search import FrameSearch
-from measure.pose_decision import decide_pose
-from measure.poses import POSES, up_from_camera
-from measure.scan import Scan
-from measure.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, dot
+from measure.frames.frame import Frame
+from measure.frames.frame_measurement import measure_frame
+from measure.marks.poses import POSES, up_from_camera
+from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, dot
+from measure.pose.pose_decision import decide_pose
+from measure.scans.scan import Scan
+from measure.search.chance import doubt
+from measure.search.constellation import Placement
+from measure.search.frame_search import FrameSearch
 from measure.status import Status
 
 PX_PER_MM = 20.0

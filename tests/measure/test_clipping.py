@@ -5,11 +5,11 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, TrueMark, some_mark, whitened_rms
 
-from measure.clipping import censored, clipped_sides, noise_scale
 from measure.fiducial_options import FiducialOptions
-from measure.matching import Match
-from measure.prediction import MarkPrediction
-from measure.refinement import sight
+from measure.fitting.clipping import censored, clipped_sides, noise_scale
+from measure.fitting.matching import Match
+from measure.frames.refinement import sight
+from measure.marks.prediction import MarkPrediction
 
 FULL, CONTRAST = 65535.0, 20000.0
 

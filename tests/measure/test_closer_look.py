@@ -7,7 +7,7 @@ from drawn import scan_of
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned_part
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned_part
 from measure.status import Status
 
 PX_PER_MM = 30.0

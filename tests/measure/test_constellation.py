@@ -3,11 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.candidates import Responses, peaks
-from measure.constellation import Bounds, Placement, PlacementSearch, same_picture
-from measure.poses import POSES, up_from_camera
-from measure.response_layers import HeldReaches
-from measure.shapes import LayoutMark, MarkShape, dot
+from measure.marks.poses import POSES, up_from_camera
+from measure.marks.shapes import LayoutMark, MarkShape, dot
+from measure.search.candidates import Responses, peaks
+from measure.search.constellation import Bounds, Placement, PlacementSearch, same_picture
+from measure.search.response_layers import HeldReaches
 
 DOT = MarkShape(dot(0.3), "light")
 PLACES = ((100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0), (0.0, -103.0), (0.0, 95.0))

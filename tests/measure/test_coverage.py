@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from brute_marks import Array, brute_picture, placed
 
-from measure.coverage import coverage
-from measure.rendering import picture, render
-from measure.shapes import Disk, MarkShape, MarkTemplate, Part, cross, dot, polygon, ring_cross, ring_dot
+from measure.marks.coverage import coverage
+from measure.marks.rendering import picture, render
+from measure.marks.shapes import Disk, MarkShape, MarkTemplate, Part, cross, dot, polygon, ring_cross, ring_dot
 
 SHEARED = np.array([[8.1, 0.9, 20.3], [-0.4, -8.6, 19.7]])
 MARKS = {

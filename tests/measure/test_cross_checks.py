@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.cross_checks import cross_checked
+from measure.checks.cross_checks import cross_checked
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.status import Status
 
 Array = NDArray[np.float64]

@@ -10,10 +10,10 @@ from brute_marks import Array, written_scan
 from scipy.ndimage import gaussian_filter
 from test_fiducials import ALIKE, PITCH_UM, frame_picture, pixel_from_camera
 
-from measure.data_strip import Beside, beside_frame, strip_likelihoods
 from measure.fiducials import measure_fiducials
+from measure.marks.shapes import Side
+from measure.pose.data_strip import Beside, beside_frame, strip_likelihoods
 from measure.results import Pose
-from measure.shapes import Side
 
 SIZE_PX = 640
 MIDDLE = (SIZE_PX - 1) / 2

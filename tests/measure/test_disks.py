@@ -6,11 +6,11 @@ from drawn import drawn, ellipse, scan_of, whitened
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from measure.block_search import search_blocks
-from measure.disk_patches import DiskSearch
-from measure.disk_search import disk_candidates, octaves_of
-from measure.disks import FittedDisk, fit_disk
-from measure.scan import Scan
+from measure.scans.scan import Scan
+from measure.single_targets.block_search import search_blocks
+from measure.single_targets.disk_patches import DiskSearch
+from measure.single_targets.disk_search import disk_candidates, octaves_of
+from measure.single_targets.disks import FittedDisk, fit_disk
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 600.0, 12000.0

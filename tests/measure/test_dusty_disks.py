@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from drawn import drawn, ellipse, scan_of, whitened
 
-from measure.disks import FittedDisk
-from measure.dusty_disks import doubts
-from measure.second_place import SecondPlace
+from measure.checks.second_place import SecondPlace
+from measure.single_targets.disks import FittedDisk
+from measure.single_targets.dusty_disks import doubts
+from measure.single_targets.targets import TargetPrediction, measure_disks
 from measure.status import Status
-from measure.targets import TargetPrediction, measure_disks
 
 CONTRAST, GROUND = 15000.0, 25000.0
 

@@ -6,10 +6,10 @@ from brute_marks import brute_picture
 from drawn import drawn, scan_of
 from numpy.typing import NDArray
 
-from measure.exposed_frame import exposed_frame
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, dot
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
+from measure.search.exposed_frame import exposed_frame
 from measure.status import Status
 
 Array = NDArray[np.float64]

@@ -11,10 +11,10 @@ from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.learned import cut, template_of
-from measure.poses import POSES
+from measure.marks.poses import POSES
+from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, Mark, MarkShape, Part, cross, ring_cross
 from measure.results import FrameMeasurement
-from measure.shapes import Disk, FiducialLayout, LayoutMark, Mark, MarkShape, Part, cross, ring_cross
+from measure.special_marks.learned import cut, template_of
 from measure.status import Status
 
 PITCH_UM, PX_PER_MM = 50.0, 20.0

@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from measure.fiducials import measure_fiducials
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
 from measure.results import FrameMeasurement
-from measure.scan import open_scan
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
+from measure.scans.scan import open_scan
 from measure.status import Status
 
 SCANS = Path(__file__).parents[3] / "shared" / "data" / "film_scans"

@@ -7,10 +7,10 @@ from scipy.ndimage import gaussian_filter
 from true_marks import KIND, some_mark
 
 from measure.fiducial_options import FiducialOptions
-from measure.first_look import seen
-from measure.prediction import MarkPrediction
-from measure.refinement import sight
-from measure.shapes import MarkShape, cross
+from measure.frames.first_look import seen
+from measure.frames.refinement import sight
+from measure.marks.prediction import MarkPrediction
+from measure.marks.shapes import MarkShape, cross
 
 GROUND, CONTRAST = 25000.0, 15000.0
 

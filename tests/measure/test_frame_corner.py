@@ -10,9 +10,9 @@ from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.frame_corner import corner_of_edges
-from measure.prediction import MarkPrediction
-from measure.shapes import FiducialLayout, LayoutMark, frame_corner
+from measure.marks.prediction import MarkPrediction
+from measure.marks.shapes import FiducialLayout, LayoutMark, frame_corner
+from measure.special_marks.frame_corner import corner_of_edges
 from measure.status import Status
 
 Array = NDArray[np.float64]

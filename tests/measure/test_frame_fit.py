@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from brute_marks import Array
 
-from measure.frame_fit import fit_frame, strangers
-from measure.poses import POSES, up_from_camera
+from measure.frames.frame_fit import fit_frame, strangers
+from measure.marks.poses import POSES, up_from_camera
 
 SQUARE = np.array([(100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0)])
 EIGHT = np.array([*SQUARE, (100.0, 0.0), (-100.0, 0.0), (0.0, 100.0), (0.0, -100.0)])

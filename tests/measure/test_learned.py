@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
-from measure.learned import Chip, honest_covariance, template_of
-from measure.matching import MatchOptions, match
-from measure.recurring import recurrence
-from measure.scan_window import ScanWindow
-from measure.shapes import MarkShape, polygon
+from measure.fitting.matching import MatchOptions, match
+from measure.marks.shapes import MarkShape, polygon
+from measure.scans.scan_window import ScanWindow
+from measure.special_marks.learned import Chip, honest_covariance, template_of
+from measure.special_marks.recurring import recurrence
 
 Array = NDArray[np.float64]
 

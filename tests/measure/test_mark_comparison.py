@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from measure.mark_comparison import SharedShape, round_moves_px, shared_blurs, shared_shapes, shared_sizes
-from measure.own_shape import OwnShape
+from measure.checks.own_shape import OwnShape
+from measure.frames.mark_comparison import SharedShape, round_moves_px, shared_blurs, shared_shapes, shared_sizes
 
 PIXEL = 1 / 12
 

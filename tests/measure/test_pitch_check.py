@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from measure.pitch_check import pitch_problem
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, dot
+from measure.search.pitch_check import pitch_problem
 from measure.status import Status
 
 

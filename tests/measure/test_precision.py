@@ -14,13 +14,13 @@ from true_marks import (
     whitened_rms,
 )
 
-from measure.disks import fit_disk
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.matching import Match
-from measure.prediction import MarkPrediction
-from measure.refinement import sight
-from measure.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
+from measure.fitting.matching import Match
+from measure.frames.refinement import sight
+from measure.marks.prediction import MarkPrediction
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
+from measure.single_targets.disks import fit_disk
 
 GROUND, CONTRAST, SNR = 25000.0, 15000.0, 20.0
 

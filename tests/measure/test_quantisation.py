@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from measure.quantisation import UNKNOWN_DN, rounding_step_dn
-from measure.scan import open_scan
+from measure.scans.quantisation import UNKNOWN_DN, rounding_step_dn
+from measure.scans.scan import open_scan
 
 # Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.
 COARSE = (16, 11, 12, 14, 12, 10, 16, 14, 13, 14, 18, 17, 16, 19, 24)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from measure.response_layers import HeldReaches, Layer
+from measure.search.response_layers import HeldReaches, Layer
 
 ORIGIN = np.array([7, 3])
 MAP = np.random.default_rng(5).normal(size=(40, 50)).astype(np.float32)

@@ -7,11 +7,11 @@ import pytest
 from drawn import drawn, scan_of
 from numpy.typing import NDArray
 
-from measure.disk_patches import Candidate
-from measure.picture_scan import WholePicture
-from measure.resolution import NO_TAGS
-from measure.ring_codes import RingCode, read_code
-from measure.scan import Scan
+from measure.codes_and_boards.ring_codes import RingCode, read_code
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from measure.single_targets.disk_patches import Candidate
 
 Array = NDArray[np.float64]
 SIZE = 121

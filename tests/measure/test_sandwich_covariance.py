@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 from true_marks import KIND, some_mark
 
-from measure.matching import MatchOptions, match
-from measure.scan_window import ScanWindow
-from measure.shapes import MarkTemplate
+from measure.fitting.matching import MatchOptions, match
+from measure.marks.shapes import MarkTemplate
+from measure.scans.scan_window import ScanWindow
 
 FOLD, SPARE_PX = 4, 6
 SHIFTS = ((2, 0), (0, 2), (1, 1), (3, 2), (2, 3))

@@ -12,12 +12,12 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from measure.block import Block
-from measure.block_search import search_blocks
-from measure.disk_patches import Patches
 from measure.errors import MeasurementError
-from measure.scan import open_scan
-from measure.segment_cache import SegmentCache
+from measure.scans.scan import open_scan
+from measure.scans.segment_cache import SegmentCache
+from measure.single_targets.block import Block
+from measure.single_targets.block_search import search_blocks
+from measure.single_targets.disk_patches import Patches
 
 HEIGHT, WIDTH = 203, 317
 
@@ -340,8 +340,8 @@ class Watched:
 def test_a_search_by_blocks_decodes_each_segment_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: dict[str, Any]
 ) -> None:
-    monkeypatch.setattr("measure.block_search.BLOCK_BYTES", 40 * 100)
-    monkeypatch.setattr("measure.block_search.ROW_BYTES", 100)
+    monkeypatch.setattr("measure.single_targets.block_search.BLOCK_BYTES", 40 * 100)
+    monkeypatch.setattr("measure.single_targets.block_search.ROW_BYTES", 100)
     tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", compression="lzw", **layout)
     with open_scan(tmp_path / "s.tif") as scan:
         reads: list[tuple[int, ...]] = []
@@ -360,7 +360,7 @@ def test_a_search_by_blocks_decodes_each_segment_once(
 def test_the_cache_keeps_to_its_limit_and_holds_two_rows_of_tiles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("measure.segment_cache.CACHE_BYTES", 1)
+    monkeypatch.setattr("measure.scans.segment_cache.CACHE_BYTES", 1)
     tifffile.imwrite(tmp_path / "s.tif", picture(), tile=(32, 32), compression="lzw")
     with open_scan(tmp_path / "s.tif") as scan:
         np.testing.assert_array_equal(scan.window(0, 0, WIDTH, HEIGHT), picture())

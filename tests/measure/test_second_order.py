@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from measure.second_order import second_order
+from measure.fitting.second_order import second_order
 
 
 @pytest.mark.parametrize("noise_dn", [1.0, 10.0])

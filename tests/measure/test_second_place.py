@@ -8,12 +8,12 @@ import pytest
 from brute_marks import Array, brute_picture, placed
 from drawn import drawn, ellipse
 
-from measure.disks import UNIT_DISK
+from measure.checks.second_place import SecondPlace
+from measure.fitting.matching import Match, match
+from measure.marks.shapes import Mark, MarkShape, polygon, ring_cross
 from measure.match_options import MatchOptions
-from measure.matching import Match, match
-from measure.scan_window import ScanWindow
-from measure.second_place import SecondPlace
-from measure.shapes import Mark, MarkShape, polygon, ring_cross
+from measure.scans.scan_window import ScanWindow
+from measure.single_targets.disks import UNIT_DISK
 
 SIZE, CONTRAST = 41, 500.0
 RING_CROSS = MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15))

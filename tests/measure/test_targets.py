@@ -6,11 +6,11 @@ import pytest
 from drawn import drawn, ellipse, scan_of, whitened
 from numpy.typing import NDArray
 
-from measure.cross_search import CrossSearch, cross_candidates
 from measure.results import MarkMeasurement
-from measure.scan import Scan
+from measure.scans.scan import Scan
+from measure.single_targets.cross_search import CrossSearch, cross_candidates
+from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from measure.status import Status
-from measure.targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 500.0, 12000.0

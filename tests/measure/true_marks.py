@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from measure.shapes import Bar, Disk, MarkShape, Part, Ring, cross, dot, polygon, ring_cross, ring_dot
+from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring, cross, dot, polygon, ring_cross, ring_dot
 from synthetic_images import areas
 from synthetic_images.optics import reach_px, seen_coverage
 

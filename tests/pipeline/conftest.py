@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import run
-from pipeline.scene_file import render_project
+from pipeline.rendered.scene_file import render_project
 
 
 @pytest.fixture(scope="session")

@@ -33,9 +33,9 @@ from adjust.result import (
     Suspect,
 )
 from measure.status import Status
-from pipeline.adjustment_file import write_adjustment
-from pipeline.adjustment_reader import read_adjustment, read_covariance
-from pipeline.comparator_file import ComparatorPoint
+from pipeline.adjusting.adjustment_file import write_adjustment
+from pipeline.adjusting.adjustment_reader import read_adjustment, read_covariance
+from pipeline.measuring.comparator_file import ComparatorPoint
 from pipeline.report import ReportData, Thumbnail
 
 Array = NDArray[np.float64]

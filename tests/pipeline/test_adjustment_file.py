@@ -13,9 +13,9 @@ from setups import Setup, vertical
 from adjust.adjustment import adjust
 from adjust.network import ObjectPoint, Prior
 from adjust.result import Adjustment, Residuals
-from pipeline import covariance_arrays
-from pipeline.adjustment_file import write_adjustment
-from pipeline.adjustment_reader import covariance_path, read_adjustment, read_covariance
+from pipeline.adjusting import covariance_arrays
+from pipeline.adjusting.adjustment_file import write_adjustment
+from pipeline.adjusting.adjustment_reader import covariance_path, read_adjustment, read_covariance
 from pipeline.errors import InputError
 
 

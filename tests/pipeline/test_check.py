@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from adjust.adjustment import Options, adjust
-from adjust.approximations import approximate
+from adjust.initial_values.approximations import approximate
 from adjust.network import (
     Camera,
     Distortion,
@@ -24,9 +24,9 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from pipeline.check import check_against_opencv
-from pipeline.check_result import CameraCheck, Check
-from pipeline.opencv_calibration import OpenCvCalibration, calibrate
+from pipeline.opencv_check.check import check_against_opencv
+from pipeline.opencv_check.check_result import CameraCheck, Check
+from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate
 
 Array = NDArray[np.float64]
 
@@ -257,7 +257,7 @@ def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, wha
             return replace(found, sigmas=1.4 * found.sigmas)
         return replace(found, parameters=found.parameters + 1.5 * found.sigmas)
 
-    monkeypatch.setattr("pipeline.check.calibrate", shifted)
+    monkeypatch.setattr("pipeline.opencv_check.check.calibrate", shifted)
     check = checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
     assert check.verdict == "differs"
     assert ("factor of 1.4" if what == "sigmas" else "by 1.5") in check.reason

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from adjust.families import parameter_names
+from adjust.functional_model.families import parameter_names
 from adjust.network import Distortion
-from pipeline.opencv_model import NAMES, Freedom, image_grid, project, refit, refit_jacobian
+from pipeline.opencv_check.opencv_model import NAMES, Freedom, image_grid, project, refit, refit_jacobian
 
 Array = NDArray[np.float64]
 

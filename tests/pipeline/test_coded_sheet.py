@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.disk_patches import DiskSearch
-from measure.disk_search import disk_candidates
-from measure.ring_codes import RingCode, read_code
-from measure.scan import open_scan
-from measure.sheet_naming import Dots, Naming, name_dots
+from measure.codes_and_boards.ring_codes import RingCode, read_code
+from measure.codes_and_boards.sheet_naming import Dots, Naming, name_dots
+from measure.scans.scan import open_scan
+from measure.single_targets.disk_patches import DiskSearch
+from measure.single_targets.disk_search import disk_candidates
 from pipeline.cli import run
 
 Array = NDArray[np.float64]

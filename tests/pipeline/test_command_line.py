@@ -18,7 +18,7 @@ import tifffile
 
 from pipeline import stages
 from pipeline.cli import run
-from pipeline.measure_stage import expected_time
+from pipeline.measuring.measure_stage import expected_time
 from pipeline.workers import worker_pool
 
 SAID = pytest.CaptureFixture[str]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.against_truth import compare_with_truth
+from pipeline.rendered.against_truth import compare_with_truth
 
 pytestmark = pytest.mark.xdist_group("demonstration")  # one run of it serves all
 

@@ -17,7 +17,7 @@ from pipeline.design.setup import planned_network, setup_of
 from pipeline.design.sweeps import Swept, over_layouts, sweep
 from pipeline.design.variations import Variations
 from pipeline.errors import InputError
-from pipeline.scene_file import read_scene
+from pipeline.rendered.scene_file import read_scene
 
 SCENES = Path(str(resources.files("synthetic_images").joinpath("scenes")))
 JUHL = SCENES / "juhl_example.toml"

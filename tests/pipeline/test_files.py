@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 import tifffile
 
+from measure.marks.shapes import MarkShape, MarkTemplate, Polygon
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.shapes import MarkShape, MarkTemplate, Polygon
 from measure.status import Status
-from pipeline.atomic import atomic_path, write_atomically
-from pipeline.camera_file import read_camera
-from pipeline.camera_text import camera_text
-from pipeline.comparator_file import (
+from pipeline.errors import InputError
+from pipeline.files.atomic import atomic_path, write_atomically
+from pipeline.files.camera_file import read_camera
+from pipeline.files.camera_text import camera_text
+from pipeline.files.images_file import read_images
+from pipeline.files.points_file import read_points
+from pipeline.files.tables import read_toml
+from pipeline.files.template_table import saved_in
+from pipeline.measuring.comparator_file import (
     comparator_from_pixel,
     pixel_from_comparator,
     read_comparator,
     write_comparator,
 )
-from pipeline.errors import InputError
-from pipeline.images_file import read_images
-from pipeline.points_file import read_points
-from pipeline.tables import read_toml
-from pipeline.template_table import saved_in
 
 CAMERA = """
 name = "C"

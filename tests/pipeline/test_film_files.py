@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from simulated import Truth, field_points, film_parameters, simulated
 
+from adjust.functional_model.transformation import film_parameter_names
 from adjust.network import Network, Transformation
-from adjust.transformation import film_parameter_names
 from pipeline.cli import run
 from pipeline.errors import InputError
-from pipeline.project_file import read_project
+from pipeline.files.project_file import read_project
 
 SCANS = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
 

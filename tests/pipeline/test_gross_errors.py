@@ -10,7 +10,7 @@ from test_cases import write_project
 
 from pipeline.cli import run
 from pipeline.errors import InputError
-from pipeline.project_file import read_project
+from pipeline.files.project_file import read_project
 
 CASE = "i_five_images_affine_reduced"
 POINT = "7"

@@ -13,14 +13,14 @@ import tifffile
 from numpy.typing import NDArray
 from rich.console import Console
 
+from measure.marks.shapes import MarkTemplate
 from measure.results import FrameMeasurement
-from measure.shapes import MarkTemplate
-from pipeline.camera_file import read_camera
 from pipeline.errors import InputError
-from pipeline.learn_stage import learn_marks, pose_of
-from pipeline.measure_stage import measure_scan
+from pipeline.files.camera_file import read_camera
+from pipeline.files.project_file import Project, read_project
+from pipeline.measuring.learn_stage import learn_marks, pose_of
+from pipeline.measuring.measure_stage import measure_scan
 from pipeline.progress import Reporter
-from pipeline.project_file import Project, read_project
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
 

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import camera_trials
-from pipeline.against_truth import compare_with_truth
-from pipeline.camera_file import CameraFile, read_camera
-from pipeline.camera_trials import Identification, Trial, identify
 from pipeline.cli import run
 from pipeline.errors import InputError
-from pipeline.library import library_names, library_path, read_library
+from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.library import library_names, library_path, read_library
+from pipeline.files.project_file import read_project
+from pipeline.measuring import camera_trials
+from pipeline.measuring.camera_trials import Identification, Trial, identify
 from pipeline.progress import Reporter
-from pipeline.project_file import read_project
-from pipeline.scene_file import render_project
+from pipeline.rendered.against_truth import compare_with_truth
+from pipeline.rendered.scene_file import render_project
 
 LIBRARY = read_library()
 SCENE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")

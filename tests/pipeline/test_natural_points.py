@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.distance import pdist
 
 from adjust.network import Prior
+from measure.natural_points.tie_frame import TieFrame
+from measure.natural_points.ties import TieOptions, measure_ties
 from measure.status import Status
-from measure.tie_frame import TieFrame
-from measure.ties import TieOptions, measure_ties
-from pipeline.comparator_file import read_comparator
+from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
-from pipeline.network import build_network
-from pipeline.project_file import read_project
-from pipeline.tie_stage import check_tie_names
+from pipeline.files.project_file import read_project
+from pipeline.measuring.comparator_file import read_comparator
+from pipeline.measuring.tie_stage import check_tie_names
 from synthetic_images.film import FrameGeometry
 from synthetic_images.render import render_scene
 from synthetic_images.scene import DiskField, Distortion, Film, Scanner, Scene, SceneCamera, SceneImage

@@ -12,16 +12,16 @@ from reference_cases import CASES
 from test_cases import write_project
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.rotation import rotation_from_angles
 from adjust.network import EXTERIOR_NAMES
 from adjust.result import Adjustment
-from adjust.rotation import rotation_from_angles
-from pipeline.adjust_stage import adjust_marks
-from pipeline.adjustment_file import write_adjustment
-from pipeline.adjustment_reader import read_adjustment
-from pipeline.check import check_against_opencv
-from pipeline.comparator_file import read_comparator
+from pipeline.adjusting.adjust_stage import adjust_marks
+from pipeline.adjusting.adjustment_file import write_adjustment
+from pipeline.adjusting.adjustment_reader import read_adjustment
 from pipeline.errors import InputError
-from pipeline.project_file import read_project
+from pipeline.files.project_file import read_project
+from pipeline.measuring.comparator_file import read_comparator
+from pipeline.opencv_check.check import check_against_opencv
 from pipeline.report import ReportData
 from pipeline.report.verdict import judge
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from adjust.families import parameter_names
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.transformation import Film
 from adjust.network import Distortion
-from adjust.projection import ImageModel
-from adjust.rotation import rotation_from_angles
-from adjust.transformation import Film
-from pipeline.comparator_file import pixel_from_comparator
-from pipeline.disks import across, disk_images, disk_normals, eccentricity_mm, plane_normal
-from pipeline.scene_file import read_scene
+from pipeline.measuring.comparator_file import pixel_from_comparator
+from pipeline.measuring.disks import across, disk_images, disk_normals, eccentricity_mm, plane_normal
+from pipeline.rendered.scene_file import read_scene
 from synthetic_images.frame import make_frame
 from synthetic_images.truth import Truth, truth_json
 

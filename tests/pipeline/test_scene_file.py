@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import tifffile
 
-from measure import shapes
-from measure.board_specs import ChessboardSpec, CircleGridSpec
-from measure.scan import open_scan
-from pipeline.adjust_stage import adjust_marks
-from pipeline.camera_file import read_camera
-from pipeline.comparator_file import read_comparator
+from measure.codes_and_boards.board_specs import ChessboardSpec, CircleGridSpec
+from measure.marks import shapes
+from measure.scans.scan import open_scan
+from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.errors import InputError
-from pipeline.project_file import read_project
-from pipeline.scene_file import read_scene, render_project
-from pipeline.scene_project import SceneFile, write_project
+from pipeline.files.camera_file import read_camera
+from pipeline.files.project_file import read_project
+from pipeline.measuring.comparator_file import read_comparator
+from pipeline.rendered.scene_file import read_scene, render_project
+from pipeline.rendered.scene_project import SceneFile, write_project
 from synthetic_images.frame import make_frame
 from synthetic_images.scene import BoardField, ChipMark, DrawnMark
 from synthetic_images.targets import field_targets

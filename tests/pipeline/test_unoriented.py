@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from measure.results import MarkMeasurement
 from pipeline.errors import InputError
-from pipeline.measure_stage import measure_scan
-from pipeline.measurement_file import MeasuredScan
-from pipeline.project_file import read_project
-from pipeline.scene_file import render_project
-from pipeline.tables import read_toml
-from pipeline.target_table import read_targets
+from pipeline.files.project_file import read_project
+from pipeline.files.tables import read_toml
+from pipeline.files.target_table import read_targets
+from pipeline.measuring.measure_stage import measure_scan
+from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.rendered.scene_file import render_project
 
 Array = NDArray[np.float64]
 

@@ -374,7 +374,7 @@ def test_a_frame_of_real_size_needs_little_memory(tmp_path: Path) -> None:
 import resource, sys
 from dataclasses import replace
 from pathlib import Path
-from pipeline.scene_file import read_scene
+from pipeline.rendered.scene_file import read_scene
 from synthetic_images.render import render_scene
 made = read_scene(Path(sys.argv[1])).scene
 made = replace(made, images=made.images[:1], scanner=replace(made.scanner, pitch_um=(20.0, 20.0)))

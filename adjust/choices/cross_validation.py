@@ -1,0 +1,230 @@
+"""Cross-validation over object points: how well a model predicts the images of points that had no part in its fit."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.adjustment import Options, with_datum
+from adjust.errors import AdjustmentError
+from adjust.functional_model.projection import ImageModel, approximate_image
+from adjust.initial_values.intersection import intersect
+from adjust.least_squares.runs import run
+from adjust.network import Approximations, Network
+from adjust.problem import number
+from adjust.result import Adjustment
+from adjust.validation import validate
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+FOLDS = 5
+FEWEST_KNOWN = 10  # known points below this number stay in every fold: they carry the datum
+UM_PER_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Prediction errors of the rays (image points) of left-out points.
+
+    rms_um: per axis, in the comparator. sigmas: the same in the standard deviations of the observations; 1 would be a
+    perfect model, but for the errors of what predicts. rays: how many were predicted.
+    """
+
+    rms_um: float
+    sigmas: float
+    rays: int
+
+
+def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:
+    """The points that are left out together, every point in one fold.
+
+    Points that distances or the datum name stay in all fits, and so do known points where they are few.
+    """
+    shown = Counter(
+        point
+        for point, kind in zip(network.observations.point, network.observations.kind, strict=True)
+        if kind != "fiducial"
+    )
+    held = {name for distance in network.distances for name in (distance.start, distance.end)}
+    held |= {name.rsplit(".", 1)[0] for name in options.datum_coordinates} | set(options.datum_points)
+    known = {point.id for point in network.points if point.id in shown and _given(network, point.id).any()}
+    if len(known) < FEWEST_KNOWN:
+        held |= known
+    free = sorted(set(shown) - held)
+    return tuple(frozenset(free[i::FOLDS]) for i in range(FOLDS) if free[i::FOLDS])
+
+
+def cross_validate(
+    adjustment: Adjustment, left_out: Sequence[frozenset[str]], options: Options
+) -> CrossValidation | None:
+    """The prediction errors of an adjusted model over all folds; None where a fold has no solution or predicts nothing.
+
+    Every fold is adjusted without its points, from the whole's values on. A point of which all coordinates are given is
+    projected as it is given. Any other is intersected from every second of its rays and predicted in the others, and
+    the other way round, where they locate it.
+    """
+    network = adjustment.network
+    errors, rows = np.empty((0, 2)), np.empty(0, dtype=np.intp)
+    for points in left_out:
+        fitted = _fitted_without(adjustment, points, options)
+        if fitted is None:
+            return None
+        found = _errors(fitted, network, points)
+        errors, rows = np.concatenate([errors, found[0]]), np.concatenate([rows, found[1]])
+    if not len(rows):
+        return None
+    covariance = network.observations.covariance_mm2[rows]
+    normalised = (np.linalg.solve(covariance, errors[..., None])[..., 0] * errors).sum(axis=1)
+    rms_um = UM_PER_MM * float(np.sqrt((errors**2).mean()))
+    return CrossValidation(rms_um, float(np.sqrt(normalised.mean() / 2)), len(rows))
+
+
+def approximations_of(adjustment: Adjustment) -> Approximations:
+    """The values of an adjustment as a start of another one."""
+    values = _by_owner(adjustment.names, adjustment.values)
+    return _as_approximations(adjustment.network, values, adjustment.mirrored)
+
+
+def _by_owner(names: Sequence[str], values: Array) -> dict[str, Array]:
+    """The values of every camera, image and point: by "IO.<camera>", "EO.<image>" and the like."""
+    collected: dict[str, list[float]] = {}
+    for name, value in zip(names, values.tolist(), strict=True):
+        collected.setdefault(name.rsplit(".", 1)[0], []).append(value)
+    return {owner: np.array(each) for owner, each in collected.items()}
+
+
+def _as_approximations(network: Network, values: dict[str, Array], mirrored: frozenset[str]) -> Approximations:
+    def of(kind: str) -> dict[str, Array]:
+        return {owner[len(kind) :]: each for owner, each in values.items() if owner.startswith(kind)}
+
+    transformation = of("T.")
+    return Approximations(
+        interior={camera: each[:3] for camera, each in of("IO.").items()},
+        exterior=of("EO."),
+        transformation={image.name: transformation.get(image.name, np.empty(0)) for image in network.images},
+        points=of("PT."),
+        mirrored=mirrored,
+    )
+
+
+def _fitted_without(
+    adjustment: Adjustment, points: frozenset[str], options: Options
+) -> Mapping[str, ImageModel] | None:
+    """The images as the other points determine them, without the tests that take longest; None where these do not."""
+    network = adjustment.network
+    observations = network.observations
+    kept = [
+        row
+        for row, (point, kind) in enumerate(zip(observations.point, observations.kind, strict=True))
+        if kind == "fiducial" or point not in points
+    ]
+    reduced = replace(
+        network,
+        points=tuple(point for point in network.points if point.id not in points),
+        observations=observations.only(np.array(kept, dtype=np.intp)),
+    )
+    if reduced.unoriented - network.unoriented:
+        return None
+    try:
+        validate(reduced)
+        problem = number(reduced, approximations_of(adjustment), options.method == "elements")
+        last = run(with_datum(problem, options), options)
+    except AdjustmentError:
+        return None
+    if not last.converged:
+        return None
+    values = _by_owner(problem.unknowns.names, last.end.state.values)
+    fitted = _as_approximations(reduced, values, adjustment.mirrored)
+    oriented = [image for image in reduced.images if image.name not in reduced.unoriented]
+    return {
+        image.name: replace(approximate_image(reduced, fitted, image.name), parameters=values[f"IO.{image.camera}"][3:])
+        for image in oriented
+    }
+
+
+def _errors(models: Mapping[str, ImageModel], network: Network, points: frozenset[str]) -> tuple[Array, Array]:
+    """Predicted less observed comparator coordinates (n, 2) of all rays that can be predicted, and their rows (n,)."""
+    rays = _rays(network, points)
+    centers, directions = np.empty((len(rays.rows), 3)), np.empty((len(rays.rows), 3))
+    for image, at in rays.by_image(network).items():
+        centers[at] = models[image].station
+        directions[at] = _directions(models[image], network.observations.xy_mm[rays.rows[at]])
+    unknown = np.asarray(np.isnan(rays.known).any(axis=1))
+    given = ~unknown[rays.point]
+    errors, rows = [], []
+    for half in (False, True):
+        source = ~given & (rays.odd == half)
+        located = rays.known
+        if source.any():
+            found, _ = intersect(centers[source], directions[source], rays.point[source], rays.known)
+            located = np.where(unknown[:, None], found, rays.known)
+        there = np.asarray(np.isfinite(located).all(axis=1))
+        predicted = ~source & ~(given & half) & there[rays.point]
+        for image, at in rays.by_image(network).items():
+            chosen = at[predicted[at]]
+            xy_mm, visible = models[image].comparator_from_object(located[rays.point[chosen]])
+            errors.append((xy_mm - network.observations.xy_mm[rays.rows[chosen]])[visible])
+            rows.append(rays.rows[chosen][visible])
+    return np.concatenate(errors), np.concatenate(rows)
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """The rays (n,) of some points: their observations, the number of their point, whether second, fourth ... of it.
+
+    known (p, 3): what is given of the points, nan where nothing is.
+    """
+
+    rows: Indices
+    point: Indices
+    odd: Mask
+    known: Array
+
+    def by_image(self, network: Network) -> dict[str, Indices]:
+        """The rays of every image."""
+        images = np.array([network.observations.image[row] for row in self.rows])
+        return {str(image): np.flatnonzero(images == image) for image in np.unique(images)}
+
+
+def _rays(network: Network, points: frozenset[str]) -> _Rays:
+    observations = network.observations
+    ordered = sorted(
+        (point, image, row)
+        for row, (point, image, kind) in enumerate(
+            zip(observations.point, observations.image, observations.kind, strict=True)
+        )
+        if kind != "fiducial" and point in points
+    )
+    names = sorted({point for point, _, _ in ordered})
+    number = np.array([names.index(point) for point, _, _ in ordered], dtype=np.intp)
+    first = np.searchsorted(number, number)
+    return _Rays(
+        rows=np.array([row for _, _, row in ordered], dtype=np.intp),
+        point=number,
+        odd=(np.arange(len(number)) - first) % 2 == 1,
+        known=np.array([_known(network, name) for name in names]),
+    )
+
+
+def _known(network: Network, point: str) -> Array:
+    """(3,) the coordinates that are given, nan where none is."""
+    each = network.point_by_id[point]
+    priors = zip((each.X, each.Y, each.Z), _given(network, point), strict=True)
+    return np.array([prior.value if prior is not None and given else np.nan for prior, given in priors])
+
+
+def _directions(model: ImageModel, xy_mm: Array) -> Array:
+    """The directions (n, 3) of rays in the object space, from observed comparator points (n, 2)."""
+    ideal, _ = model.ideal_from_observed(model.camera_from_comparator(xy_mm))
+    in_camera = np.column_stack([ideal - model.interior[1:], np.full(len(ideal), -model.interior[0])])
+    return np.asarray(in_camera @ model.rotation)
+
+
+def _given(network: Network, point: str) -> Mask:
+    """(3,) which coordinates of a point are given, exactly or with a standard deviation."""
+    each = network.point_by_id[point]
+    return np.array([prior is not None and bool(np.isfinite(prior.sigma)) for prior in (each.X, each.Y, each.Z)])

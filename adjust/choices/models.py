@@ -1,0 +1,121 @@
+"""The models that a choice is between: a film transformation and the distortion parameters that are estimated."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.transformation import marks_needed
+from adjust.network import Calibration, Network, Prior, Transformation
+
+# A transformation and the simpler ones that it contains, simplest first.
+TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
+    "congruent": (),
+    "similarity": ("congruent",),
+    "affine": ("congruent", "similarity"),
+    "conformal(2)": ("congruent", "similarity"),
+    "projective": ("congruent", "similarity", "affine"),
+    "bilinear": ("congruent", "similarity", "affine"),
+    "polynomial(2)": ("congruent", "similarity", "affine", "conformal(2)", "bilinear"),
+}
+
+PHYSICAL = {
+    "torlegard": ("k3", "k3 k5", "k3 p1 p2", "k3 k5 p1 p2", "k3 k5 k7 p1 p2"),
+    "brown": ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2"),
+    "opencv": ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3"),
+}
+SETS = {"ebner": ("b1", "b2"), "legendre(3)": ("a10", "a01")}  # with their parameters of affinity and shear
+
+
+@dataclass(frozen=True)
+class Model:
+    """transformation: of all images that have one; family and parameters: what is estimated of every camera's lens."""
+
+    transformation: Transformation
+    family: str = "none"
+    parameters: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """In words: "affine, torlegard k3 k5"; a set is not spelled out."""
+        lens = "no distortion" if self.family == "none" else self.family
+        shown = () if self.family in SETS else self.parameters
+        film = () if self.transformation == "none" else (f"{self.transformation},",)
+        return " ".join((*film, lens, *shown))
+
+    def contains(self, other: "Model") -> bool:
+        """Whether the other model is a special case of this one, some of its parameters being 0."""
+        films = (self.transformation, *TRANSFORMATIONS.get(self.transformation, ()))
+        same = other.family in (self.family, "none") and set(other.parameters) <= set(self.parameters)
+        return other != self and other.transformation in films and same
+
+    def of(self, network: Network, values: Mapping[str, float], half_mm: Mapping[str, tuple[float, float]]) -> Network:
+        """The network with this model, its parameters free. values: where they start, by their names in a result."""
+        cameras = []
+        for camera in network.cameras:
+            given = camera.distortion
+            start = {name: values.get(f"IO.{camera.name}.{name}", 0.0) for name in self.parameters}
+            distortion = replace(
+                given,
+                family=self.family,
+                parameters={name: Prior(value, np.inf) for name, value in start.items()},
+                half_mm=given.half_mm if all(given.half_mm) else half_mm.get(camera.name, given.half_mm),
+            )
+            cameras.append(replace(camera, distortion=distortion))
+        images = tuple(
+            image if image.transformation == "none" else replace(image, transformation=self.transformation)
+            for image in network.images
+        )
+        calibrations = tuple(_without_distortion(each, network) for each in network.calibrations)
+        return replace(network, cameras=tuple(cameras), images=images, calibrations=calibrations)
+
+
+def _without_distortion(calibration: Calibration, network: Network) -> Calibration:
+    """What an earlier calibration says of everything but distortion, which is another in every candidate."""
+    distortion = {f"IO.{camera.name}.{name}" for camera in network.cameras for name in camera.distortion.parameters}
+    kept = [i for i, name in enumerate(calibration.names) if name not in distortion]
+    return Calibration(
+        tuple(calibration.names[i] for i in kept), calibration.values[kept], calibration.covariance[np.ix_(kept, kept)]
+    )
+
+
+def given_model(network: Network) -> Model:
+    """The network's own: its first camera's, and its images' film transformation."""
+    films = [image.transformation for image in network.images if image.transformation != "none"]
+    distortion = network.cameras[0].distortion
+    estimated = [name for name, prior in distortion.parameters.items() if prior.sigma > 0.0]
+    names = tuple(name for name in parameter_names(distortion.family) if name in estimated)
+    return Model(films[0] if films else "none", distortion.family if names else "none", names)
+
+
+def transformations(network: Network) -> tuple[Transformation, ...]:
+    """The film transformations that every image has fiducial marks enough for; "none" where the images have none."""
+    filmed = {image.name for image in network.images if image.transformation != "none"}
+    if not filmed:
+        return ("none",)
+    observations = network.observations
+    rows = zip(observations.image, observations.kind, strict=True)
+    shown = [image for image, kind in rows if kind == "fiducial" and image in filmed]
+    fewest = min(shown.count(image) for image in filmed)
+    return tuple(kind for kind in TRANSFORMATIONS if marks_needed(kind) <= fewest)
+
+
+def lenses(network: Network, transformation: Transformation, with_sets: bool) -> tuple[Model, ...]:
+    """No distortion, a ladder of the camera's own family (Torlegård's where that is none of PHYSICAL), the sets.
+
+    And the network's own, where it is none of these. Fiducials alone say nothing of a lens: then there is none.
+    """
+    if len(network.idle_cameras) == len(network.cameras):
+        return (Model(transformation),)
+    family = network.cameras[0].distortion.family
+    ladder = family if family in PHYSICAL else "torlegard"
+    models = [Model(transformation)]
+    models += [Model(transformation, ladder, tuple(names.split())) for names in PHYSICAL[ladder]]
+    if with_sets:
+        for name, affinity in SETS.items():
+            films = (transformation, *TRANSFORMATIONS.get(transformation, ()))
+            taken = affinity if "affine" in films else ()  # by the film
+            models.append(Model(transformation, name, tuple(p for p in parameter_names(name) if p not in taken)))
+    own = replace(given_model(network), transformation=transformation)
+    return tuple(models if own in models else [*models, own])

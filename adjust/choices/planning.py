@@ -1,0 +1,126 @@
+"""What a network that nobody has measured yet would give: its adjustment at computed observations."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr
+
+from adjust.adjustment import Options, adjust_problem, with_datum
+from adjust.errors import AdjustmentError
+from adjust.functional_model.functions import blind_mark, computed_observations
+from adjust.functional_model.further_observations import at_computed
+from adjust.least_squares.cofactor import free_cofactor
+from adjust.least_squares.factor import Factor
+from adjust.least_squares.iteration import factorise, linearise
+from adjust.network import Approximations, Network
+from adjust.numbering import Numbering
+from adjust.problem import Problem, number
+from adjust.result import Adjustment, NullDirection
+from adjust.undetermined.null_space import null_vectors
+from adjust.validation import validate
+
+Array = NDArray[np.float64]
+
+STILL = 1e-6  # part of a null direction's motion that is rounding: what moves less is determined
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The expected precision of a network.
+
+    adjustment: that of observations without errors; its cofactor matrix, its redundancy numbers and sigma0, which was
+    given, are those to be expected. singular: what the observations would not see. null (n, d): how all unknowns move
+    in these directions; the adjustment is then that with d unknowns held, and what does not move is the same whichever
+    they are.
+    """
+
+    adjustment: Adjustment
+    sigma0: float
+    singular: tuple[NullDirection, ...]
+    null: Array
+
+    def sigma(self, name: str) -> float:
+        """The expected standard deviation of an unknown: 0 where it is fixed, inf where it is not determined."""
+        i = self.adjustment.index(name)
+        return np.inf if self.null[i].any() else self.sigma0 * float(np.sqrt(self.adjustment.cofactor.variances[i]))
+
+    def sigmas(self, names: Sequence[str], functions: Array) -> Array:
+        """The expected standard deviations (m,) of linear functions (m, k) of k unknowns; inf where not determined."""
+        rows = [self.adjustment.index(name) for name in names]
+        variances = ((functions @ self.adjustment.cofactor_of(names)) * functions).sum(axis=1)
+        moved = np.abs(functions @ self.null[rows])
+        could_move = np.abs(functions) @ np.abs(self.null[rows])
+        determined = (moved <= STILL * could_move).all(axis=1)
+        return np.where(determined, self.sigma0 * np.sqrt(np.maximum(variances, 0.0)), np.inf)
+
+
+def plan(network: Network, values: Approximations, options: Options | None = None, sigma0: float = 1.0) -> Plan:
+    """The precision to be expected of a network whose unknowns have certain values.
+
+    The observations' coordinates are not used but computed, and what is given of the unknowns is taken to be true, so
+    that nothing has to be iterated. sigma0: by how much the a-priori standard deviations are too small, as far as one
+    knows from earlier adjustments.
+
+    Raises AdjustmentError where the network is empty or contradictory, or where a point has no image.
+    """
+    options = options or Options()
+    validate(network)
+    problem = _at_computed_observations(number(network, values))
+    result = adjust_problem(problem, options)
+    singular = result.singular
+    null = np.zeros((len(problem.unknowns), 0))
+    if singular:
+        held, null = _held(with_datum(problem, options))
+        result = adjust_problem(problem, options, held)
+    expected = replace(result, vpv=sigma0**2 * result.redundancy)
+    return Plan(expected, sigma0, singular, null)
+
+
+def _at_computed_observations(problem: Problem) -> Problem:
+    xy_mm = computed_observations(problem, problem.start())
+    if xy_mm is None:
+        raise AdjustmentError(_blind(problem))
+    unknowns = problem.unknowns
+    network = at_computed(problem.network, unknowns, unknowns.start)
+    network = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+    given = np.where(np.isnan(unknowns.given), np.nan, unknowns.start)
+    return replace(problem, network=network, unknowns=replace(unknowns, given=given))
+
+
+def _held(problem: Problem) -> tuple[list[int], Array]:
+    """Positions of unknowns that make a singular problem regular when held, and its null vectors (n, d).
+
+    Held are the pivots of the null vectors, one for each: minimal constraints for whatever is free.
+    """
+    held: list[int] = []
+    null = np.zeros((len(problem.unknowns), 0))
+    while True:
+        numbering = Numbering(replace(problem, unknowns=problem.unknowns.fixed(held)))
+        factor = _factor(numbering)
+        scaled = null_vectors(factor)
+        if scaled.shape[1] == 0:
+            return held, null
+        pivots = qr(scaled.T, mode="r", pivoting=True)[1][: scaled.shape[1]]
+        held += [int(position) for position in numbering.free[pivots]]
+        still = np.abs(scaled) <= STILL * np.abs(scaled).max(axis=0)
+        by_free = free_cofactor(numbering, problem.start(), factor).by_free
+        vectors = np.where(still, 0.0, scaled) / factor.scale[:, None]
+        moved, could_move = by_free @ vectors, abs(by_free) @ np.abs(vectors)
+        null = np.hstack([null, np.where(np.abs(moved) <= STILL * could_move, 0.0, moved)])
+
+
+def _factor(numbering: Numbering) -> Factor:
+    problem = numbering.problem
+    at = linearise(numbering, problem.network.observations.covariance_mm2, problem.start())
+    if at is None:
+        raise AdjustmentError(_blind(problem))
+    return factorise(numbering, at)
+
+
+def _blind(problem: Problem) -> str:
+    return (
+        f"The network cannot be planned: {blind_mark(problem, problem.start())}. Turn the camera towards the field, "
+        f"or leave the point out of that image."
+    )

@@ -1,0 +1,309 @@
+"""The formulas of the film transformations, each with its derivatives and its inverse.
+
+Parameters (..., k) go with coordinates (..., 2). The columns of a polynomial about a far origin are all but dependent,
+so that the adjustment moves centred parameters: those of the same formula in (x - center) / half, with the middle and
+half the extent of what was observed in an image. `design` is the derivative by these, and `by_centred` leads back.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.least_squares.small_matrices import applied, determinant, solved
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+NEWTON_STEPS = 30
+NEWTON_TOLERANCE = 1e-9  # of a coordinate: the error left is the square of the last step
+
+
+class FilmKind(Protocol):
+    """A formula for x', y' in x, y and its own parameters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters, in their order; a1 and b1 are the constants."""
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        """The camera coordinates (..., 2) of comparator coordinates (..., 2)."""
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        """Their derivative (..., 2, 2) by the comparator coordinates."""
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        """Their derivative (..., 2, k) by the centred parameters; center (..., 2), half (...)."""
+
+    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+        """Derivative (..., k, k) of the parameters by the centred ones."""
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        """The comparator coordinates (n, 2), and which of them lie where the formula does not fold over.
+
+        center (2,) or (n, 2): a place in the middle of the image, from which the formula must be regular to the point.
+        """
+
+
+def marks_of(kind: FilmKind) -> int:
+    """How many marks, of two coordinates each, determine the parameters of a formula."""
+    return (len(kind.names) + 1) // 2
+
+
+@dataclass(frozen=True)
+class Identity:
+    """x' = x, y' = y."""
+
+    names: tuple[str, ...] = ()
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        return xy
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        return np.broadcast_to(np.eye(2), (*xy.shape[:-1], 2, 2))
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        return np.zeros((*xy.shape, 0))
+
+    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+        return np.zeros((*np.shape(half), 0, 0))
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        return camera_xy.copy(), np.ones(len(camera_xy), dtype=bool)
+
+
+@dataclass(frozen=True)
+class Congruent:
+    """A turn, a shift and, told beforehand, a mirror."""
+
+    mirrored: bool
+    names: tuple[str, ...] = ("a1", "b1", "angle")
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        return parameters[..., :2] + applied(self._turn(parameters), xy)
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        return np.broadcast_to(self._turn(parameters), (*xy.shape[:-1], 2, 2))
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        design = np.zeros((*xy.shape, 3), dtype=np.result_type(parameters, xy))
+        design[..., :2] = np.eye(2)
+        design[..., 2] = applied(self._turn_by_angle(parameters), xy - center)
+        return design
+
+    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+        result = np.broadcast_to(np.eye(3), (*np.shape(half), 3, 3)).copy()
+        result[..., :2, 2] = -applied(self._turn_by_angle(parameters), center)
+        return result
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        transposed = self._turn(parameters).swapaxes(-1, -2)
+        return applied(transposed, camera_xy - parameters[..., :2]), np.ones(len(camera_xy), dtype=bool)
+
+    def _turn(self, parameters: Array) -> Array:
+        c, s = np.cos(parameters[..., 2]), np.sin(parameters[..., 2])
+        m = -1.0 if self.mirrored else 1.0
+        return np.stack([np.stack([c, -m * s], axis=-1), np.stack([s, m * c], axis=-1)], axis=-2)
+
+    def _turn_by_angle(self, parameters: Array) -> Array:
+        turn = self._turn(parameters)
+        return np.stack([-turn[..., 1, :], turn[..., 0, :]], axis=-2)
+
+
+@dataclass(frozen=True)
+class Conformal:
+    """x' + i y' = sum of (a_k + i b_k) (x + i m y)^(k-1), k = 1 .. order + 1; m = -1 where mirrored."""
+
+    order: int
+    mirrored: bool
+    names: tuple[str, ...]
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        return self._of_powers(parameters, self._powers(xy))
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        powers = self._powers(xy)
+        factors = np.arange(1, self.order + 1)[:, None]
+        by_x = self._of_powers(parameters[..., 2:], powers[..., :-1, :] * factors)
+        m = -1.0 if self.mirrored else 1.0
+        by_y = np.stack([-m * by_x[..., 1], m * by_x[..., 0]], axis=-1)
+        return np.stack([by_x, by_y], axis=-1)
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        powers = self._powers((xy - center) / half[..., None])
+        design = np.empty((*xy.shape, 2 * self.order + 2), dtype=powers.dtype)
+        design[..., 0, 0::2], design[..., 0, 1::2] = powers[..., 0], -powers[..., 1]
+        design[..., 1, 0::2], design[..., 1, 1::2] = powers[..., 1], powers[..., 0]
+        return design
+
+    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+        m = -1.0 if self.mirrored else 1.0
+        origin = -(center[..., 0] + 1j * m * center[..., 1])
+        result = np.zeros((*np.shape(half), 2 * self.order + 2, 2 * self.order + 2))
+        for j in range(self.order + 1):
+            for k in range(j + 1):
+                factor = comb(j, k) * origin ** (j - k) / half**j
+                result[..., 2 * k, 2 * j] = result[..., 2 * k + 1, 2 * j + 1] = factor.real
+                result[..., 2 * k, 2 * j + 1], result[..., 2 * k + 1, 2 * j] = -factor.imag, factor.imag
+        return result
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        return _newton(self, parameters, camera_xy, center, 1 if self.order == 1 else NEWTON_STEPS)
+
+    def _powers(self, xy: Array) -> Array:
+        """Real and imaginary parts (..., order + 1, 2) of (x + i m y)^k."""
+        x, y = xy[..., 0], (-xy[..., 1] if self.mirrored else xy[..., 1])
+        powers = [np.stack([np.ones_like(x), np.zeros_like(x)], axis=-1)]
+        for _ in range(self.order):
+            real, imaginary = powers[-1][..., 0], powers[-1][..., 1]
+            powers.append(np.stack([real * x - imaginary * y, real * y + imaginary * x], axis=-1))
+        return np.stack(powers, axis=-2)
+
+    def _of_powers(self, parameters: Array, powers: Array) -> Array:
+        a, b = parameters[..., 0::2], parameters[..., 1::2]
+        real, imaginary = powers[..., 0], powers[..., 1]
+        return np.stack([(a * real - b * imaginary).sum(-1), (a * imaginary + b * real).sum(-1)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """x' = sum of a_k x^p_k y^q_k, y' = sum of b_k x^p_k y^q_k; exponents (p_k, q_k), the constant first."""
+
+    exponents: tuple[tuple[int, int], ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"{axis}{k}" for axis in "ab" for k in range(1, len(self.exponents) + 1))
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        return self._of_terms(parameters, self._terms(xy))
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        return np.stack([self._of_terms(parameters, self._terms(xy, by)) for by in (0, 1)], axis=-1)
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        terms = self._terms((xy - center) / half[..., None])
+        count = len(self.exponents)
+        design = np.zeros((*xy.shape, 2 * count), dtype=terms.dtype)
+        design[..., 0, :count] = design[..., 1, count:] = terms
+        return design
+
+    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+        count = len(self.exponents)
+        result = np.zeros((*np.shape(half), 2 * count, 2 * count))
+        for j, (p, q) in enumerate(self.exponents):
+            for i, (u, v) in enumerate(self.exponents):
+                if u <= p and v <= q:
+                    shift = (-center[..., 0]) ** (p - u) * (-center[..., 1]) ** (q - v)
+                    result[..., i, j] = comb(p, u) * comb(q, v) * shift / half ** (p + q)
+        result[..., count:, count:] = result[..., :count, :count]
+        return result
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        return _newton(self, parameters, camera_xy, center, 1 if self._degree == 1 else NEWTON_STEPS)
+
+    @cached_property
+    def _degree(self) -> int:
+        return max(p + q for p, q in self.exponents)
+
+    def _terms(self, xy: Array, by: int | None = None) -> Array:
+        """The monomials (..., terms), or their derivatives by x (0) or y (1)."""
+        powers = [np.ones_like(xy)]
+        for _ in range(self._degree):
+            powers.append(powers[-1] * xy)
+        terms = []
+        for exponents in self.exponents:
+            lowered, factor = list(exponents), 1.0
+            if by is not None:
+                factor = float(exponents[by])
+                lowered[by] = max(exponents[by] - 1, 0)
+            terms.append(factor * powers[lowered[0]][..., 0] * powers[lowered[1]][..., 1])
+        return np.stack(terms, axis=-1)
+
+    def _of_terms(self, parameters: Array, terms: Array) -> Array:
+        count = len(self.exponents)
+        first, second = parameters[..., :count], parameters[..., count:]
+        return np.stack([(first * terms).sum(-1), (second * terms).sum(-1)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Projective:
+    """x' = (a1 + a2 x + a3 y) / d, y' = (b1 + b2 x + b3 y) / d, d = 1 + c1 x + c2 y."""
+
+    names: tuple[str, ...] = ("a1", "a2", "a3", "b1", "b2", "b3", "c1", "c2")
+
+    def apply(self, parameters: Array, xy: Array) -> Array:
+        numerators = parameters[..., [0, 3]] + applied(self._linear(parameters), xy)
+        return numerators / self._denominator(parameters, xy)[..., None]
+
+    def gradient(self, parameters: Array, xy: Array) -> Array:
+        bent = self.apply(parameters, xy)[..., :, None] * parameters[..., None, 6:]
+        return (self._linear(parameters) - bent) / self._denominator(parameters, xy)[..., None, None]
+
+    def design(self, parameters: Array, xy: Array, center: Array, half: Array) -> Array:
+        u, v = np.moveaxis((xy - center) / half[..., None], -1, 0)
+        camera_xy = self.apply(parameters, xy)
+        design = np.zeros((*xy.shape, 8), dtype=camera_xy.dtype)
+        for row in (0, 1):
+            terms = np.stack([np.ones_like(u), u, v], axis=-1)
+            design[..., row, 3 * row : 3 * row + 3] = terms
+            design[..., row, 6:] = -camera_xy[..., row, None] * terms[..., 1:]
+        centred = self._denominator(parameters, xy) / self._denominator(parameters, center)
+        return design / centred[..., None, None]
+
+    def by_centred(self, parameters: Array, center: Array, half: Array) -> Array:
+        """With d(center) the factor between both numerators, of which d(0) = 1 takes the derivative along."""
+        factor = self._denominator(parameters, center)[..., None]
+        result = np.zeros((*np.shape(half), 8, 8))
+        size = half[..., None]
+        for first in (0, 3):
+            result[..., first, first] = factor[..., 0]
+            result[..., first, first + 1 : first + 3] = -factor * center / size
+            result[..., [first + 1, first + 2], [first + 1, first + 2]] = factor / size
+        result[..., [6, 7], [6, 7]] = factor / size
+        result[..., :, 6:] += parameters[..., :, None] * (factor * center / size)[..., None, :]
+        return result
+
+    def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
+        bent = camera_xy[..., :, None] * parameters[..., None, 6:]
+        solution, regular = _solved(self._linear(parameters) - bent, camera_xy - parameters[..., [0, 3]])
+        beside = self._denominator(parameters, solution) * self._denominator(parameters, center) > 0.0
+        return solution, np.asarray(regular & beside)  # beyond the horizon the image is upside down
+
+    def _linear(self, parameters: Array) -> Array:
+        return np.stack([parameters[..., 1:3], parameters[..., 4:6]], axis=-2)
+
+    def _denominator(self, parameters: Array, xy: Array) -> Array:
+        return np.asarray(1.0 + (parameters[..., 6:] * xy).sum(-1))
+
+
+def _newton(kind: FilmKind, parameters: Array, camera_xy: Array, center: Array, steps: int) -> tuple[Array, Mask]:
+    """Newton's method from the centre; one step is exact where the formula is linear.
+
+    Found is what the iteration comes to with the orientation that the film has at the centre.
+    """
+    xy = np.broadcast_to(center, camera_xy.shape).astype(np.float64)
+    at_center = kind.gradient(parameters, xy)
+    turn = np.sign(determinant(at_center))
+    found = np.zeros(len(xy), dtype=bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for number in range(steps):
+            gradient = kind.gradient(parameters, xy) if number else at_center
+            step, regular = _solved(gradient, kind.apply(parameters, xy) - camera_xy)
+            xy = xy - step
+            settled = np.abs(step).max(axis=-1) <= NEWTON_TOLERANCE * (1.0 + np.abs(xy).max(axis=-1))
+            found = regular & (settled | (steps == 1))
+            if found.all():
+                break
+        same_side = np.sign(determinant(kind.gradient(parameters, xy))) == turn
+    return xy, np.asarray(found & same_side)
+
+
+def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
+    """The solutions (n, 2) of 2x2 systems (n, 2, 2), and which matrices (n,) are regular."""
+    of = determinant(matrix)
+    regular = np.isfinite(of) & (of != 0.0)
+    return solved(matrix, right, regular, of), regular

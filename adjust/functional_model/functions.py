@@ -1,0 +1,243 @@
+"""The functions F1 to F4 of all observations: the observations that satisfy them, and their derivatives there.
+
+A target obeys T(x, y) = image of its ray, a fiducial T(x, y) = its place in the camera frame. The derivatives are taken
+at computed observations, those that satisfy the functions for the unknowns of the moment: after convergence these are
+the adjusted observations. By elements the distortion is taken at the observed camera point instead: then
+F = T(x, y) - image of the ray - distortion there, which depends on the observations by T alone.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.correction import Imaged
+from adjust.functional_model.distortion import equations_of
+from adjust.functional_model.line_of_sight import SightVectors, sight_vectors
+from adjust.functional_model.projection import camera_from_image, imaged_ray, rays
+from adjust.least_squares.small_matrices import applied, columns, cross, laid_out, of_each, product, zeros
+from adjust.network import Distortion
+from adjust.problem import Films, Part, Problem, State
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+Rows = Indices | slice
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """A (n, 2, 2), by the observation, and B (n, 2, k), by the unknowns at `Problem.columns` (n, k)."""
+
+    by_observation: Array
+    by_unknowns: Array
+
+
+@dataclass(frozen=True)
+class SeenTargets:
+    """The targets of one camera as they appear for a state.
+
+    rows: their observations; rotation (n, 3, 3) of their images; ray (n, 2) and the image of it; in_camera (n, 3): the
+    points in the camera's axes.
+    """
+
+    camera: str
+    rows: Rows
+    sight: SightVectors
+    rotation: Array
+    ray: Array
+    in_camera: Array
+    imaged: Imaged
+
+
+@dataclass(frozen=True)
+class Computed:
+    """Observations (n, 2) in mm that satisfy F1 to F4, in the comparator, and what they were computed from."""
+
+    xy_mm: Array
+    targets: tuple[SeenTargets, ...]
+
+
+def computed_observations(problem: Problem, state: State) -> Array | None:
+    """The comparator coordinates (n, 2) in mm that satisfy F1 to F4; None where some point has no image."""
+    computed = compute(problem, state)
+    return None if computed is None else computed.xy_mm
+
+
+def compute(problem: Problem, state: State) -> Computed | None:
+    """The observations that satisfy F1 to F4, as derivatives are taken at; None where some point has no image."""
+    targets = tuple(_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items())
+    camera_xy = _computed_in_camera(problem, state, targets)
+    if camera_xy is None:
+        return None
+    xy_mm, found = _computed_in_comparator(problem, state, camera_xy)
+    return Computed(xy_mm, targets) if found.all() else None
+
+
+def _computed_in_camera(problem: Problem, state: State, targets: Iterable[SeenTargets]) -> Array | None:
+    """The camera coordinates (n, 2) of all marks; None where some point has no image."""
+    camera_xy = state.values[problem.places.T[:2]].T  # fiducials stay, targets follow
+    observed = _observed_in_camera(problem, state) if problem.by_elements else camera_xy
+    for seen in targets:
+        interior, parameters, distortion = _camera(problem, state, seen.camera)
+        if interior[0] <= 0.0:
+            return None
+        if problem.by_elements:
+            at = equations_of(distortion, interior, parameters, observed[seen.rows], seen.imaged)
+            xy_mm, found = observed[seen.rows] - at.value, np.isfinite(at.value).all(axis=1)
+        else:
+            xy_mm, found = camera_from_image(distortion, interior, parameters, seen.imaged)
+        if not (found & (seen.in_camera[:, 2] < 0.0)).all():
+            return None
+        camera_xy[seen.rows] = xy_mm
+    return camera_xy
+
+
+def _seen(problem: Problem, state: State, camera: str, targets: Indices) -> SeenTargets:
+    """Some targets as they appear from their stations."""
+    rows = _in_order(targets)
+    images = problem.image_numbers[rows]
+    stations = state.values[problem.exterior[:, :3].T[:, images]].T
+    points = state.values[problem.places.T[:, rows]].T
+    sight = sight_vectors(problem.network.line_of_sight, stations, points)
+    rotation = of_each(state.rotations, images)
+    ray, in_camera = rays(rotation, sight.vector)
+    _, parameters, distortion = _camera(problem, state, camera)
+    return SeenTargets(camera, rows, sight, rotation, ray, in_camera, imaged_ray(distortion, parameters, ray))
+
+
+def _camera(problem: Problem, state: State, name: str) -> tuple[Array, Array, Distortion]:
+    """c, x0', y0' and the parameters of the distortion of a camera."""
+    interior, parameters = np.split(state.values[problem.unknowns.camera[name]], [3])
+    return interior, parameters, problem.network.camera_by_name[name].distortion
+
+
+def _observed_in_camera(problem: Problem, state: State) -> Array:
+    """The camera coordinates (n, 2) of the observations as they were made."""
+    camera_xy = np.empty_like(problem.network.observations.xy_mm)
+    for films in problem.films:
+        parameters = state.values[films.positions][films.of]
+        camera_xy[films.rows] = films.kind.apply(parameters, problem.network.observations.xy_mm[films.rows])
+    return camera_xy
+
+
+def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) -> tuple[Array, Mask]:
+    """The comparator coordinates (n, 2) of camera coordinates (n, 2), and which the film transformations give."""
+    xy_mm = np.empty_like(camera_xy)
+    found = np.empty(len(camera_xy), dtype=bool)
+    for films in problem.films:
+        parameters, rows = state.values[films.positions][films.of], _in_order(films.rows)
+        xy_mm[rows], found[rows] = films.kind.inverse(parameters, camera_xy[rows], films.centers_mm)
+    return xy_mm, found
+
+
+def derivatives(problem: Problem, state: State, computed: Computed) -> Derivatives:
+    """The derivatives of F1 to F4 (Torlegård) at computed observations."""
+    xy_mm, parts = computed.xy_mm, problem.parts
+    distorted = problem.network.observations.xy_mm if problem.by_elements else xy_mm  # where distortion is taken
+    film = _film_derivatives(problem, state, xy_mm)
+    at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
+    by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
+    by_unknowns = np.zeros((parts.camera.columns.stop, len(xy_mm), 2)).transpose(
+        1, 2, 0
+    )  # columns, as blocks have them
+    by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
+    straight = problem.network.line_of_sight.is_straight
+    for seen in computed.targets:
+        interior, parameters, distortion = _camera(problem, state, seen.camera)
+        images, rows = problem.image_numbers[seen.rows], seen.rows
+        at = equations_of(distortion, interior, parameters, at_distorted.camera_xy[rows], seen.imaged)
+        by_in_camera = _by_in_camera(at.by_ray, seen)
+        by_vector = product(by_in_camera, seen.rotation)
+        by_attitude = cross(seen.in_camera[:, None, :], by_in_camera)
+        if problem.keeps_angles.any():
+            by_attitude = product(by_attitude, of_each(problem.attitude_by_unknowns(state), images))
+        by_station = -by_vector if straight else product(by_vector, seen.sight.by_station)
+        by_point = by_vector if straight else product(by_vector, seen.sight.by_point)
+        if len(at.value) == len(xy_mm):
+            by_camera_xy = at.by_xy
+        else:
+            by_camera_xy[rows] = at.by_xy
+        by_exterior = by_station, by_attitude
+        _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
+        _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
+        _fill(by_unknowns, rows, parts.camera, [at.by_quantity(k) for k in parts.camera.members])
+    by_film = film.by_parameters + product(by_camera_xy - np.eye(2), at_distorted.by_parameters)
+    _fill(by_unknowns, slice(None), parts.film, [by_film[..., k] for k in parts.film.members])
+    return Derivatives(film.by_xy if problem.by_elements else product(by_camera_xy, film.by_xy), by_unknowns)
+
+
+def _fill(by_unknowns: Array, rows: Rows, part: Part, derivatives: Sequence[Array]) -> None:
+    """Put the derivatives (n, 2) by the members of a part into its columns."""
+    for column, derivative in enumerate(derivatives, part.columns.start):
+        by_unknowns[..., column][rows] = derivative
+
+
+def _by_in_camera(by_ray: Array, seen: SeenTargets) -> Array:
+    """Derivative (n, 2, 3) by U, V, W of what has a derivative (n, 2, 2) by the ray -U/W, -V/W."""
+    by_in_plane = by_ray / -seen.in_camera[:, 2, None, None]
+    return columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, seen.ray)])
+
+
+@dataclass(frozen=True)
+class _FilmDerivatives:
+    """Camera coordinates (n, 2), their derivatives by the comparator's (n, 2, 2) and centred parameters (n, 2, k)."""
+
+    camera_xy: Array
+    by_xy: Array
+    by_parameters: Array
+
+
+def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
+    of_films = [_of_films(films, state, xy_mm) for films in problem.films]
+    if len(of_films) == 1:
+        return of_films[0]
+    count, width = len(xy_mm), max(each.by_parameters.shape[2] for each in of_films)
+    result = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), zeros(count, 2, width))
+    for films, each in zip(problem.films, of_films, strict=True):
+        result.camera_xy[films.rows], result.by_xy[films.rows] = each.camera_xy, each.by_xy
+        result.by_parameters[films.rows, :, : each.by_parameters.shape[2]] = each.by_parameters
+    return result
+
+
+def _of_films(films: Films, state: State, xy_mm: Array) -> _FilmDerivatives:
+    """The derivatives of the films of one kind alone."""
+    parameters, xy = state.values[films.positions][films.of], xy_mm[_in_order(films.rows)]
+    design = films.kind.design(parameters, xy, films.centers_mm, films.halves_mm)
+    return _FilmDerivatives(films.kind.apply(parameters, xy), films.kind.gradient(parameters, xy), design)
+
+
+def _in_order(rows: Indices) -> Rows:
+    """Ascending rows, as a slice, which takes no copy, where none is left out."""
+    whole = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
+    return slice(int(rows[0]), int(rows[-1]) + 1) if whole else rows
+
+
+def blind_mark(problem: Problem, state: State) -> str:
+    """The first mark that has no image in a state, and why; empty where all have one."""
+    observations = problem.network.observations
+    for name, rows in problem.targets_by_camera.items():
+        interior, parameters, distortion = _camera(problem, state, name)
+        if interior[0] <= 0.0:
+            return f"the principal distance of camera {name} is {interior[0]:.6g} mm and must be positive"
+        seen = _seen(problem, state, name, rows)
+        _, found = camera_from_image(distortion, interior, parameters, seen.imaged)
+        for bad, why in (
+            (seen.in_camera[:, 2] >= 0.0, "lies behind the camera"),
+            (~found, "is where the distortion folds over"),
+        ):
+            if bad.any():
+                row = rows[int(np.argmax(bad))]
+                return f"point {observations.point[row]} {why} in image {observations.image[row]}"
+    targets = [_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
+    camera_xy = _computed_in_camera(problem, state, targets)
+    if camera_xy is not None:
+        _, found = _computed_in_comparator(problem, state, camera_xy)
+        row = int(np.argmin(found))
+        image = problem.network.images[problem.image_numbers[row]]
+        return (
+            f"{observations.kind[row]} {observations.point[row]} is where the {image.transformation} transformation of "
+            f"image {image.name} folds over"
+        )
+    return ""

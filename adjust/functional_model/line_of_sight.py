@@ -1,0 +1,87 @@
+"""Where a point appears from a station: straight ahead, or over a curved earth and through the atmosphere.
+
+Map coordinates X, Y and heights Z are laid out on a sphere; the axes at a station are those of the map there, its
+vertical the sphere's. The refracted line of sight meets the film as a straight one would that leads to a point a little
+higher.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.atmosphere import bending
+from adjust.network import LineOfSight
+
+Array = NDArray[np.float64]
+
+EARTH_RADIUS_M = 6.371e6  # mean; the local one differs by half a percent, and the curvature with it
+SMALL_RAD = 1e-2  # angle at the earth's centre below which a series is exact
+
+
+@dataclass(frozen=True)
+class SightVectors:
+    """Vectors (n, 3) from stations to points as these appear, in object units and along the axes of the map.
+
+    by_station, by_point (n, 3, 3): their derivatives by the coordinates of both.
+    """
+
+    vector: Array
+    by_station: Array
+    by_point: Array
+
+
+def sight_vectors(setting: LineOfSight, station: Array, xyz: Array) -> SightVectors:
+    """Points (n, 3) as they appear from stations (3,) or (n, 3)."""
+    stations = np.broadcast_to(station, xyz.shape)
+    seen = _over_the_sphere(setting.unit_m, stations, xyz) if setting.curvature else _straight(stations, xyz)
+    return _refracted(setting.unit_m, stations, xyz, seen) if setting.refraction else seen
+
+
+def _straight(stations: Array, xyz: Array) -> SightVectors:
+    shape = (*xyz.shape, 3)
+    return SightVectors(xyz - stations, np.broadcast_to(-np.eye(3), shape), np.broadcast_to(np.eye(3), shape))
+
+
+def _over_the_sphere(unit_m: float, stations: Array, xyz: Array) -> SightVectors:
+    """Map distances s are arcs at height 0: the point is (R + Z) sin(s/R) away and (R + Z) cos(s/R) - R high."""
+    radius = EARTH_RADIUS_M / unit_m
+    plan = xyz[:, :2] - stations[:, :2]
+    height, angle = xyz[:, 2], np.sqrt((plan**2).sum(axis=1)) / radius
+    stretch, sinc, bent = 1.0 + height / radius, np.sinc(angle / np.pi), _sinc_slope(angle)
+    ahead = (stretch * sinc)[:, None] * plan
+    drop = -2.0 * (radius + height) * np.sin(angle / 2.0) ** 2  # no difference of large numbers
+    vector = np.column_stack([ahead, drop + height - stations[:, 2]])
+    by_point = np.zeros((len(xyz), 3, 3))
+    by_point[:, :2, :2] = (stretch * sinc)[:, None, None] * np.eye(2)
+    by_point[:, :2, :2] += (stretch * bent / radius**2)[:, None, None] * plan[:, :, None] * plan[:, None, :]
+    by_point[:, :2, 2] = sinc[:, None] / radius * plan
+    by_point[:, 2, :2] = -ahead / radius
+    by_point[:, 2, 2] = np.cos(angle)
+    by_station = np.zeros_like(by_point)
+    by_station[:, :, :2] = -by_point[:, :, :2]
+    by_station[:, 2, 2] = -1.0
+    return SightVectors(vector, by_station, by_point)
+
+
+def _sinc_slope(angle: Array) -> Array:
+    """The derivative of sin(a) / a, over a."""
+    small = angle < SMALL_RAD
+    a = np.where(small, 1.0, angle)
+    return np.where(small, -1.0 / 3.0 + angle**2 / 30.0, (np.cos(a) - np.sinc(a / np.pi)) / a**2)
+
+
+def _refracted(unit_m: float, stations: Array, xyz: Array, seen: SightVectors) -> SightVectors:
+    """Points are seen higher by the coefficient times the square of their distance."""
+    air = bending(unit_m * stations[:, 2], unit_m * xyz[:, 2])
+    coefficient = unit_m * air.coefficient
+    square = (seen.vector**2).sum(axis=1)
+    vector, by_station, by_point = seen.vector.copy(), seen.by_station.copy(), seen.by_point.copy()
+    vector[:, 2] += coefficient * square
+    for derivative, by_height, of_vector in (
+        (by_station, air.by_station, seen.by_station),
+        (by_point, air.by_point, seen.by_point),
+    ):
+        derivative[:, 2] += 2.0 * coefficient[:, None] * np.einsum("ni,nij->nj", seen.vector, of_vector)
+        derivative[:, 2, 2] += unit_m**2 * by_height * square
+    return SightVectors(vector, by_station, by_point)

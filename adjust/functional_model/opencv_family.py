@@ -1,0 +1,136 @@
+"""OpenCV's model, which distorts the ideal ray: its documentation of camera calibration, "detailed description"."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.correction import Imaged, undistorted
+from adjust.least_squares.small_matrices import applied, matrices, product, vectors
+
+Array = NDArray[np.float64]
+
+OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1")
+OPENCV_GROUPS = (
+    ("radial", ("k1", "k2", "k3", "k4", "k5", "k6")),
+    ("radial, denominator", ("k4", "k5", "k6")),
+    ("decentering", ("p1", "p2")),
+    ("thin prism", ("s1", "s2", "s3", "s4")),
+    ("tilt", ("tau_x", "tau_y")),
+)
+
+
+def opencv(ray: Array, parameters: Array) -> Imaged:
+    """The image of rays (n, 2) in the camera's axes, y up; the parameters are those of OpenCV's axes, y down.
+
+    tau_x, tau_y, the tilt of the sensor, in rad. b1 scales x: OpenCV's fx is c (1 + b1), its fy is c, both over the
+    pitch.
+    """
+    tau_x, tau_y, b1 = parameters[12:]
+    # From OpenCV's axes to the camera's: the image's y, and the ray's, turn their signs.
+    scale, mirror = np.array([1 + b1, -1.0]), np.array([1.0, -1.0])
+    straight = _lens(ray * mirror, parameters[:12])
+    is_tilted = tau_x != 0.0 or tau_y != 0.0
+    tilted = _tilt(straight.value, tau_x, tau_y) if is_tilted else undistorted(straight.value, parameters)
+
+    def by_parameter(k: int) -> Array:
+        match OPENCV_NAMES[k]:
+            case "b1":
+                return vectors(tilted.value[:, 0], np.zeros_like(tilted.value[:, 0]))
+            case "tau_x" | "tau_y" as name:
+                column = _tilt(straight.value, tau_x, tau_y).by_parameter(name == "tau_y")
+            case _:
+                column = straight.by_parameter(k)
+                column = applied(tilted.by_ray, column) if is_tilted else column
+        return np.asarray(column * scale)
+
+    by_ray = product(tilted.by_ray, straight.by_ray) if is_tilted else straight.by_ray
+    return Imaged(tilted.value * scale, by_ray * scale[:, None] * mirror, by_parameter)
+
+
+def _lens(ray: Array, parameters: Array) -> Imaged:
+    """Radial, tangential and thin prism distortion."""
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = parameters
+    x, y = ray.T
+    r2 = x**2 + y**2
+    above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = above / below
+    above_by_r2 = k1 + r2 * (2 * k2 + 3 * r2 * k3)
+    radial_by_r2 = (above_by_r2 - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / below
+
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2) + s1 * r2 + s2 * r2**2
+    yd = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2
+    xd_by_r2 = x * radial_by_r2 + p2 + s1 + 2 * s2 * r2
+    yd_by_r2 = y * radial_by_r2 + p1 + s3 + 2 * s4 * r2
+    by_ray = matrices(
+        (radial + 2 * p1 * y + 4 * p2 * x + 2 * x * xd_by_r2, 2 * p1 * x + 2 * y * xd_by_r2),
+        (2 * p2 * y + 2 * x * yd_by_r2, radial + 4 * p1 * y + 2 * p2 * x + 2 * y * yd_by_r2),
+    )
+
+    def by_parameter(k: int) -> Array:
+        zero, powers = np.zeros_like(x), (r2, r2 * r2, r2 * r2 * r2)
+        match OPENCV_NAMES[k]:
+            case "p1":
+                return vectors(2 * x * y, r2 + 2 * y**2)
+            case "p2":
+                return vectors(r2 + 2 * x**2, 2 * x * y)
+            case "s1" | "s2" as name:
+                return vectors(powers[int(name[1]) - 1], zero)
+            case "s3" | "s4" as name:
+                return vectors(zero, powers[int(name[1]) - 3])
+            case "k1" | "k2" | "k3" as name:
+                factor = powers[int(name[1]) - 1] / below
+            case name:  # k4, k5, k6
+                factor = -radial * powers[int(name[1]) - 4] / below
+        return vectors(x * factor, y * factor)
+
+    return Imaged(vectors(xd, yd), by_ray, by_parameter)
+
+
+def _tilt(point: Array, tau_x: float, tau_y: float) -> Imaged:
+    """The point on a sensor that is tilted about its axes: R33 (r1 p / r3 p, r2 p / r3 p) - (R13, R23).
+
+    r1, r2, r3 are the rows of R = Ry(tau_y) Rx(tau_x), p = (x, y, 1).
+    """
+    rx, rx_by_angle = _turn(tau_x)
+    ry, ry_by_angle = _turn(tau_y)
+    about_x, about_y = [0, 1, 2], [1, 2, 0]  # the axis of the turn first
+    rotation = _placed(ry, about_y) @ _placed(rx, about_x)
+    moved = (
+        _placed(ry, about_y) @ _placed(rx_by_angle, about_x, 0.0),
+        _placed(ry_by_angle, about_y, 0.0) @ _placed(rx, about_x),
+    )
+    *over, depth = _turned(rotation, point)
+    over, size = [each / depth for each in over], rotation[2, 2] / depth
+    by_point = [
+        [size * (row[i] - at * rotation[2, i]) for i in (0, 1)] for row, at in zip(rotation, over, strict=False)
+    ]
+
+    def by_angle(k: int) -> Array:
+        change = moved[k]
+        *shift, deeper = _turned(change, point)
+        return vectors(
+            *(size * (shift[i] - at * deeper) + change[2, 2] * at - change[i, 2] for i, at in enumerate(over))
+        )
+
+    value = [rotation[2, 2] * at - rotation[axis, 2] for axis, at in enumerate(over)]
+    return Imaged(vectors(*value), matrices(*by_point), by_angle)
+
+
+def _turned(matrix: Array, point: Array) -> list[Array]:
+    """The three coordinates (n,) of a matrix (3, 3) times (x, y, 1)."""
+    x, y = point.T
+    return [row[0] * x + row[1] * y + row[2] for row in matrix]
+
+
+def _turn(angle: float) -> tuple[Array, Array]:
+    """The 2x2 matrix of OpenCV's turn by an angle, and its derivative."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, s], [-s, c]]), np.array([[-s, c], [-c, -s]])
+
+
+def _placed(turn: Array, axes: list[int], along: float = 1.0) -> Array:
+    """The turn (2, 2) as a matrix (3, 3) in the plane of the last two axes; along: what stands on the first."""
+    matrix = np.zeros((3, 3), dtype=turn.dtype)
+    matrix[axes[0], axes[0]] = along
+    matrix[np.ix_(axes[1:], axes[1:])] = turn
+    return matrix

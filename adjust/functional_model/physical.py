@@ -1,0 +1,68 @@
+"""Corrections with a physical cause, of the observed point: Torlegård's and Brown's radial and decentering terms."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.correction import Correction, Settings
+from adjust.least_squares.small_matrices import matrices, vectors
+
+Array = NDArray[np.float64]
+
+TORLEGARD_NAMES = ("k3", "k5", "k7", "p1", "p2", "p3", "p4")
+BROWN_NAMES = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
+TORLEGARD_GROUPS = (("radial", TORLEGARD_NAMES[:3]), ("decentering", TORLEGARD_NAMES[3:5]))
+BROWN_GROUPS = (("radial", BROWN_NAMES[:3]), ("decentering", BROWN_NAMES[3:5]), ("affinity", BROWN_NAMES[5:]))
+
+
+def torlegard(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
+    """Torlegård's radial and decentering terms; `paper`: the decentering terms with x', y' as printed."""
+    return _radial_and_decentering(xy, principal_point, parameters, settings.r0_mm, settings.decentering == "paper")
+
+
+def brown(_: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
+    """Brown's terms of the observed point: Torlegård's with r0 = 0, and an affinity b1, b2 of x'."""
+    b1, b2 = parameters[5:]
+    common = _radial_and_decentering(xy, principal_point, np.concatenate([parameters[:5], np.zeros(2)]), 0.0, False)
+    reduced = xy - principal_point
+    zero = np.zeros(len(xy))
+    by_affinity = matrices((reduced[:, 0], reduced[:, 1]), (zero, zero))
+    affinity = np.array([[b1, b2], [0.0, 0.0]])
+    return Correction(
+        value=common.value + reduced @ affinity.T,
+        by_xy=common.by_xy + affinity,
+        by_principal_point=common.by_principal_point - affinity,
+        by_parameters=np.concatenate([common.by_parameters[..., :5], by_affinity], axis=2),
+    )
+
+
+def _radial_and_decentering(
+    xy: Array, principal_point: Array, parameters: Array, r0_mm: float, literal: bool
+) -> Correction:
+    """literal: the decentering terms with x', y' and not reduced to the principal point."""
+    k3, k5, k7, p1, p2, p3, p4 = parameters
+    reduced = xy - principal_point
+    x, y = (xy if literal else reduced).T
+    r2 = (reduced**2).sum(axis=1)
+    r02 = r0_mm**2
+    rad = k3 * (r2 - r02) + k5 * (r2**2 - r02**2) + k7 * (r2**3 - r02**3)
+    rad_by_r2 = k3 + r2 * (2 * k5 + 3 * r2 * k7)
+    dec = 1 + r2 * (p3 + r2 * p4)
+    dec_by_r2 = p3 + 2 * r2 * p4
+    by_p1 = vectors(r2 + 2 * x**2, 2 * x * y)
+    by_p2 = vectors(2 * x * y, r2 + 2 * y**2)
+    plain = p1 * by_p1 + p2 * by_p2  # the decentering terms before dec
+
+    direction = np.array([p1, p2])
+    by_r2 = reduced * rad_by_r2[:, None] + direction * dec[:, None] + plain * dec_by_r2[:, None]
+    by_reduced = rad[:, None, None] * np.eye(2) + by_r2[:, :, None] * 2 * reduced[:, None, :]
+    by_decentering = dec[:, None, None] * matrices(
+        (4 * p1 * x + 2 * p2 * y, 2 * p2 * x), (2 * p1 * y, 2 * p1 * x + 4 * p2 * y)
+    )
+    radial = [reduced * (r2**power - r02**power)[:, None] for power in (1, 2, 3)]
+    decentering = [by_p1 * dec[:, None], by_p2 * dec[:, None], plain * r2[:, None], plain * r2[:, None] ** 2]
+    return Correction(
+        value=reduced * rad[:, None] + plain * dec[:, None],
+        by_xy=by_reduced + by_decentering,
+        by_principal_point=-by_reduced if literal else -by_reduced - by_decentering,
+        by_parameters=matrices(*zip(*(column.T for column in (*radial, *decentering)), strict=True)),
+    )

@@ -1,0 +1,136 @@
+"""Self-calibration sets of products of orthogonal polynomials: Ebner's 12, Grün's 44 and Legendre polynomials.
+
+With ξ = xr / bx, η = yr / by, xr and yr reduced to the principal point and bx, by half the frame (`half_mm`), all are
+products φm(ξ) φn(η) up to one degree in x and in y, in dx and in dy. The polynomials φ are orthogonal over the points
+-1, 0, 1 (Ebner), over -1, -1/2, 0, 1/2, 1 (Grün) or over -1..1 (Legendre), and so are the products over the grid of
+3 x 3 or 5 x 5 points or the whole frame. Six combinations are left out, those that the exterior and interior
+orientation make themselves: two shifts, a rotation, a change of scale and, of degree two, the two tilts (x², xy),
+(xy, y²). Of the terms that these are made of, the combinations orthogonal to them stay: (ξ, -η), (η, ξ),
+(-t φ2(ξ), ξη) and (ξη, -t φ2(η)), with t = 2, 10/7 and 5/6. In a frame that is not square, all parts of these four are
+weighted with the square root of by / bx or its inverse, so that they stay orthogonal to what is left out.
+
+All parameters are in mm. The published coefficient of a product of degree m + n is ours over b^(m + n).
+
+Sources: H. Ebner, Self calibrating block adjustment, Bildmessung und Luftbildwesen 44 (1976), 128-139. A. Grün,
+Experiences with self-calibrating bundle adjustment, ACSM-ASP Convention, Washington 1978. R. Tang, D. Fritsch,
+M. Cramer, W. Schneider, A flexible mathematical method for camera calibration in digital aerial photogrammetry,
+Photogrammetric Engineering and Remote Sensing 78 (2012), 1069-1077.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.polynomial import legendre as series
+from numpy.typing import NDArray
+
+from adjust.functional_model.correction import Correction, Settings
+
+Array = NDArray[np.float64]
+
+STRETCH, SHEAR, TILT_X, TILT_Y = "stretch", "shear", "tilt x", "tilt y"
+Term = str | tuple[int, int, int]  # one of the four combinations, or (0 for dx or 1 for dy, m, n)
+
+
+@dataclass(frozen=True)
+class PolynomialSet:
+    """polynomials: per degree the coefficients of φ, lowest power first. tilt: t above. terms: one a parameter."""
+
+    polynomials: tuple[tuple[float, ...], ...]
+    tilt: float
+    names: tuple[str, ...]
+    terms: tuple[Term, ...]
+
+
+def legendre(order: int) -> PolynomialSet:
+    """a and b are the coefficients of dx and dy; their first index is the degree in x, the second in y."""
+    polynomials = [tuple(series.leg2poly([0.0] * degree + [1.0]).tolist()) for degree in range(order + 1)]
+    combined: dict[str, Term] = {"a10": STRETCH, "a01": SHEAR, "a11": TILT_Y, "b11": TILT_X}
+    single: dict[str, Term] = {f"{'ab'[axis]}{m}{n}": (axis, m, n) for axis, m, n in _single_terms(order)}
+    return _set(polynomials, 5 / 6, combined | single)
+
+
+def _single_terms(degree: int) -> list[tuple[int, int, int]]:
+    """The products that are parameters by themselves: dx before dy, low degrees first."""
+    combined = {(0, 0), (1, 0), (0, 1), (1, 1)}
+    products = sorted(((m, n) for m in range(degree + 1) for n in range(degree + 1)), key=lambda mn: (sum(mn), mn[1]))
+    return [
+        (axis, m, n)
+        for axis, tilted in ((0, (2, 0)), (1, (0, 2)))
+        for m, n in products
+        if (m, n) not in combined | {tilted}
+    ]
+
+
+def _set(polynomials: Sequence[tuple[float, ...]], tilt: float, terms: dict[str, Term]) -> PolynomialSet:
+    return PolynomialSet(tuple(polynomials), tilt, tuple(terms), tuple(terms.values()))
+
+
+EBNER = _set(
+    ((1.0,), (0.0, 1.0), (-2 / 3, 0.0, 1.0)),
+    2.0,
+    {
+        "b1": STRETCH, "b2": SHEAR, "b3": TILT_X, "b4": TILT_Y, "b5": (0, 0, 2), "b6": (1, 2, 0), "b7": (0, 1, 2),
+        "b8": (1, 2, 1), "b9": (0, 2, 1), "b10": (1, 1, 2), "b11": (0, 2, 2), "b12": (1, 2, 2),
+    },
+)  # fmt: skip
+# Grün's a and b are the coefficients of dx and dy; their first index is 1 + the degree in y, the second in x.
+GRUEN = _set(
+    ((1.0,), (0.0, 1.0), (-1 / 2, 0.0, 1.0), (0.0, -17 / 20, 0.0, 1.0), (9 / 70, 0.0, -31 / 28, 0.0, 1.0)),
+    10 / 7,
+    {"a12": STRETCH, "a21": SHEAR, "a22": TILT_Y, "b22": TILT_X}
+    | {f"{'ab'[axis]}{n + 1}{m + 1}": (axis, m, n) for axis, m, n in _single_terms(4)},
+)
+
+
+def by_degree(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    """The parameters of every degree in x and y together."""
+    combined = {STRETCH: 1, SHEAR: 1, TILT_X: 2, TILT_Y: 2}
+    degrees = [combined[term] if isinstance(term, str) else sum(term[1:]) for term in of.terms]
+    return tuple(
+        (f"degree {degree}", tuple(name for name, own in zip(of.names, degrees, strict=True) if own == degree))
+        for degree in sorted(set(degrees))
+    )
+
+
+def correct(of: PolynomialSet, settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
+    """The correction of a set, which is subtracted from the observed point."""
+    half = np.array(settings.half_mm)
+    coefficients = _coefficients(of, float(half[1] / half[0]))
+    scaled = (xy - principal_point) / half
+    (x, x_slope), (y, y_slope) = (_polynomials(of, scaled[:, axis]) for axis in (0, 1))
+    count = len(of.polynomials) ** 2
+    products = (x[:, :, None] * y[:, None, :]).reshape(len(xy), count)
+    by_parameters = (products @ coefficients.reshape(-1, count).T).reshape(len(xy), 2, len(of.terms))
+    summed = np.einsum("akij,k->aij", coefficients, parameters)
+    by_scaled = [np.einsum("aij,ni,nj->na", summed, *pair) for pair in ((x_slope, y), (x, y_slope))]
+    by_xy = np.stack(by_scaled, axis=2) / half
+    return Correction(by_parameters @ parameters, by_xy, -by_xy, by_parameters)
+
+
+@lru_cache
+def _coefficients(of: PolynomialSet, ratio: float) -> Array:
+    """(2, k, degree + 1, degree + 1): the products that every parameter adds to dx and dy. ratio: by / bx."""
+    size = len(of.polynomials)
+    q = np.sqrt(ratio)
+    combinations = {
+        STRETCH: (((0, 1, 0), q), ((1, 0, 1), -1 / q)),
+        SHEAR: (((0, 0, 1), 1 / q), ((1, 1, 0), q)),
+        TILT_X: (((0, 2, 0), -of.tilt * q), ((1, 1, 1), 1 / q)),
+        TILT_Y: (((0, 1, 1), q), ((1, 0, 2), -of.tilt / q)),
+    }
+    coefficients = np.zeros((2, len(of.terms), size, size))
+    for number, term in enumerate(of.terms):
+        for (axis, m, n), factor in combinations[term] if isinstance(term, str) else ((term, 1.0),):
+            coefficients[axis, number, m, n] = factor
+    return coefficients
+
+
+def _polynomials(of: PolynomialSet, t: Array) -> tuple[Array, Array]:
+    """All polynomials at t (n,) and their derivatives, both (n, degree + 1)."""
+    size = len(of.polynomials)
+    matrix = np.array([[*each, *[0.0] * (size - len(each))] for each in of.polynomials]).T
+    powers = t[:, None] ** np.arange(size)
+    slopes = np.arange(1, size) * powers[:, :-1]
+    return powers @ matrix, slopes @ matrix[1:]

@@ -1,0 +1,146 @@
+"""Film transformations T: comparator (x, y) to camera (x', y'), each explicit in the comparator coordinates.
+
+    none           x' = x                     y' = y
+    congruent      x' = a1 + cos(t) x - m sin(t) y,   y' = b1 + sin(t) x + m cos(t) y,   t the `angle` in rad
+    similarity     x' = a1 + p x - m q y      y' = b1 + q x + m p y
+    affine         x' = a1 + a2 x + a3 y      y' = b1 + b2 x + b3 y
+    projective     x' = (a1 + a2 x + a3 y) / d,       y' = (b1 + b2 x + b3 y) / d,       d = 1 + c1 x + c2 y
+    bilinear       x' = a1 + a2 x + a3 y + a4 xy      y' = b1 + b2 x + b3 y + b4 xy
+    conformal(n)   x' + i y' = (a1 + i b1) + (a2 + i b2) z + ... + (a[n+1] + i b[n+1]) z^n,   z = x + i m y
+    polynomial(n)  x' = a1 + a2 x + a3 y + a4 x² + a5 xy + a6 y² + a7 x³ + a8 x²y + ... of total degree n; y' with b
+
+x, y are comparator coordinates in mm as they were observed, neither centred nor scaled. m is -1 where the scan is
+mirrored, which a congruent, similarity and conformal transformation has to be told, and 1 elsewhere; the others are
+mirrored by their own parameters. conformal(1) is a similarity, and polynomial(1) an affine transformation.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.film_kinds import (
+    Conformal,
+    Congruent,
+    FilmKind,
+    Identity,
+    Mask,
+    Polynomial,
+    Projective,
+    marks_of,
+)
+
+Array = NDArray[np.float64]
+
+HIGHEST_ORDER = 5
+POSSIBLE = (
+    "none, congruent, similarity, affine, projective, bilinear, conformal(n) and polynomial(n) with the order n from 1 "
+    f"to {HIGHEST_ORDER}"
+)
+
+
+@lru_cache
+def film_kind(spelling: str, mirrored: bool = False) -> FilmKind:
+    """The formula of a transformation as it is spelt. Raises ValueError, with what is possible, for any other word."""
+    match spelling:
+        case "none":
+            return Identity()
+        case "congruent":
+            return Congruent(mirrored)
+        case "similarity":
+            return Conformal(1, mirrored, ("a1", "b1", "p", "q"))
+        case "affine":
+            return _polynomial(1)
+        case "projective":
+            return Projective()
+        case "bilinear":
+            return Polynomial(((0, 0), (1, 0), (0, 1), (1, 1)))
+    name, order = _name_and_order(spelling)
+    if name == "polynomial":
+        return _polynomial(order)
+    return Conformal(order, mirrored, tuple(f"{axis}{k}" for k in range(1, order + 2) for axis in "ab"))
+
+
+def _name_and_order(spelling: str) -> tuple[str, int]:
+    form = re.fullmatch(r"(conformal|polynomial)\((\d+)\)", spelling)
+    if form and 1 <= int(form[2]) <= HIGHEST_ORDER:
+        return form[1], int(form[2])
+    why = ""
+    if form:
+        why = f" its order must be from 1 to {HIGHEST_ORDER};"
+    elif spelling in ("conformal", "polynomial"):
+        why = f' it lacks its order, as in "{spelling}(2)";'
+    raise ValueError(f'there is no transformation "{spelling}":{why} possible are {POSSIBLE}')
+
+
+def _polynomial(order: int) -> Polynomial:
+    return Polynomial(tuple((degree - q, q) for degree in range(order + 1) for q in range(degree + 1)))
+
+
+def film_parameter_names(spelling: str) -> tuple[str, ...]:
+    """The names of a transformation's parameters in their order."""
+    return film_kind(spelling).names
+
+
+def marks_needed(spelling: str) -> int:
+    """How many fiducial marks determine a transformation by themselves."""
+    return marks_of(film_kind(spelling))
+
+
+@lru_cache
+def fewest_marks(spelling: str) -> int:
+    """How many fiducial marks an adjustment needs to begin with: those of the simplest transformation of the family."""
+    lower = simpler(spelling)
+    return fewest_marks(lower) if lower else marks_needed(spelling)
+
+
+def simpler(spelling: str) -> str | None:
+    """The transformation of the same family that needs fewer marks, None where there is none."""
+    if spelling in ("projective", "bilinear", "polynomial(2)"):
+        return "affine"
+    if spelling == "conformal(2)":
+        return "similarity"
+    if spelling.startswith(("conformal", "polynomial")):
+        name, order = _name_and_order(spelling)
+        return f"{name}({order - 1})" if order > 1 else None
+    return None
+
+
+def follows_tilts(spelling: str) -> bool:
+    """Whether a transformation can undo what a small tilt of the camera does to the image: x' + t x'², y' + t x'y'.
+
+    A projective one does so exactly, a polynomial as long as it is nearly affine, a conformal one together with
+    decentering distortion.
+    """
+    return spelling == "projective" or (simpler(spelling) is not None and spelling != "bilinear")
+
+
+@dataclass(frozen=True)
+class Film:
+    """The film transformation of one image: its spelling, its parameters (k,), whether the scan is mirrored.
+
+    center_mm (2,): a place in the middle of the image, in the comparator.
+    """
+
+    transformation: str
+    parameters: Array
+    center_mm: Array
+    mirrored: bool = False
+
+    def camera_from_comparator(self, xy_mm: Array) -> Array:
+        """Camera coordinates (n, 2) of comparator coordinates (n, 2), mm."""
+        return self._kind.apply(self.parameters, xy_mm)
+
+    def gradient(self, xy_mm: Array) -> Array:
+        """Their derivatives (n, 2, 2) by the comparator coordinates."""
+        return self._kind.gradient(self.parameters, xy_mm)
+
+    def comparator_from_camera(self, xy_mm: Array) -> tuple[Array, Mask]:
+        """Comparator coordinates (n, 2) of camera coordinates (n, 2), mm; which lie where nothing folds over."""
+        return self._kind.inverse(self.parameters, xy_mm, self.center_mm)
+
+    @property
+    def _kind(self) -> FilmKind:
+        return film_kind(self.transformation, self.mirrored)

@@ -1,0 +1,1 @@
+"""Initial values for an adjustment: nobody has to supply approximations."""

@@ -1,0 +1,101 @@
+"""Absolute orientation: a model of images and points turned, scaled and shifted into the object space."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from adjust.functional_model.rotation import rotation_from_vector
+
+Array = NDArray[np.float64]
+
+STARTS = 400  # attitudes tried, some 25 degrees apart
+REFINED = 12
+AS_GOOD = 1e-5  # sum of squares, relative to that of the coordinates: a solution as good as the best
+SINGULAR = 1e-6  # smallest over largest singular value of the derivatives by a turn
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """object = scale rotation model + shift."""
+
+    scale: float
+    rotation: Array
+    shift: Array
+
+    def apply(self, xyz: Array) -> Array:
+        return np.asarray(self.scale * xyz @ self.rotation.T + self.shift)
+
+
+def absolute_orientation(model: Array, known: Array, stations: Array) -> Similarity | None:
+    """The similarity that brings model points (n, 3) to their known coordinates (n, 3), nan where one is not known.
+
+    stations (k, 3): the cameras in the model. A minimal datum, two points and the height of a third say, has two
+    solutions, mirrored about the line of the two: that with the cameras higher above the points is taken. None where
+    the known coordinates do not determine the similarity. Once the attitude is given, scale and shift are linear; so
+    the attitude is sought from starts all over.
+    """
+    given = ~np.isnan(known)
+    if given.sum() < 7 or not given.any(axis=0).all():
+        return None
+    target = _centred(np.where(given, known, 0.0), given)
+    starts = Rotation.from_quat(np.random.default_rng(0).normal(size=(STARTS, 4))).as_matrix()  # even over all turns
+    costs = np.array([(_misfit(start, model, target, given) ** 2).sum() for start in starts])
+    refined = [_refined(starts[i], model, target, given) for i in np.argsort(costs, kind="stable")[:REFINED]]
+    least = min(cost for cost, _ in refined)
+    candidates = [
+        _similarity(rotation, model, known, given)
+        for cost, rotation in refined
+        if cost <= least + AS_GOOD * (target**2).sum() and _determined(rotation, model, target, given)
+    ]
+    return max(
+        candidates, key=lambda s: float(s.apply(stations)[:, 2].mean() - s.apply(model)[:, 2].mean()), default=None
+    )
+
+
+def _centred(xyz: Array, given: NDArray[np.bool_]) -> Array:
+    """Each axis less its mean over the given coordinates; 0 where not given."""
+    mean = np.where(given, xyz, 0.0).sum(axis=0) / given.sum(axis=0)
+    return np.where(given, xyz - mean, 0.0)
+
+
+def _misfit(rotation: Array, model: Array, target: Array, given: NDArray[np.bool_]) -> Array:
+    """What the best scale and shift leave of the coordinates with this attitude; a negative scale is no solution."""
+    turned = _centred(model @ rotation.T, given)
+    return np.asarray(_scale(turned, target) * turned - target)
+
+
+def _scale(turned: Array, target: Array) -> float:
+    return max(float((turned * target).sum() / (turned**2).sum()), 0.0)
+
+
+def _refined(start: Array, model: Array, target: Array, given: NDArray[np.bool_]) -> tuple[float, Array]:
+    """The sum of squares and the attitude at the minimum near a start."""
+
+    def misfit(turn: Array) -> Array:
+        return np.asarray(_misfit(rotation_from_vector(turn) @ start, model, target, given)[given])
+
+    found = least_squares(misfit, np.zeros(3))
+    return 2.0 * float(found.cost), rotation_from_vector(found.x) @ start
+
+
+def _determined(rotation: Array, model: Array, target: Array, given: NDArray[np.bool_]) -> bool:
+    """Whether every small turn changes the misfit, and the model has a size."""
+    step = 1e-5
+    columns = [
+        _misfit(rotation_from_vector(sign * step * axis) @ rotation, model, target, given)[given]
+        for axis in np.eye(3)
+        for sign in (1.0, -1.0)
+    ]
+    derivatives = np.stack([(columns[2 * i] - columns[2 * i + 1]) / (2 * step) for i in range(3)], axis=1)
+    singular = np.linalg.svd(derivatives, compute_uv=False)
+    return bool(singular[2] > SINGULAR * np.linalg.norm(target))
+
+
+def _similarity(rotation: Array, model: Array, known: Array, given: NDArray[np.bool_]) -> Similarity:
+    turned = model @ rotation.T
+    scale = _scale(_centred(turned, given), _centred(np.where(given, known, 0.0), given))
+    left = np.where(given, known - scale * turned, 0.0)
+    return Similarity(scale, rotation, left.sum(axis=0) / given.sum(axis=0))

@@ -1,0 +1,126 @@
+"""Exterior orientations and unknown points: as given, from known points, or from the images alone."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.errors import AdjustmentError
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.sight import Sight
+from adjust.initial_values.block import Block, extend, intersected, known_field, resected
+from adjust.initial_values.free_model import orient_free_model
+from adjust.initial_values.resection import Pose, image_distances
+from adjust.initial_values.vertical_block import orient_vertical_block
+from adjust.network import Distance, Exterior, Network, Prior
+
+Array = NDArray[np.float64]
+
+CLEARLY_WORSE = 5.0  # a given orientation whose residuals are this many times a resection's is set aside
+
+
+def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pose], dict[str, Array]]:
+    """Poses of all images and coordinates (3,) of all points that are seen or wholly known.
+
+    Raises AdjustmentError for the image or point that cannot be found.
+    """
+    block = Block(sights, _coordinates(network, firm=True), _coordinates(network, firm=False))
+    for image in network.images:
+        if image.exterior is not None and image.name in sights:
+            block.poses[image.name] = _checked(image.exterior, block, image.name)
+    extend(block)
+    if sights and not block.poses:
+        block.poses.update(orient_vertical_block(sights, block.firm) or orient_free_model(sights, block.firm))
+        extend(block)
+        if all(np.isnan(xyz).all() for xyz in block.rough.values()):
+            _scale_by_distances(block, network.distances)
+    missing = sorted(name for name in sights if name not in block.poses)
+    if missing:
+        raise AdjustmentError(_why_not_oriented(block, missing[0]))
+    return block.poses, _all_points(block)
+
+
+def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
+    """What is known of every point (3,), nan where nothing is."""
+    return {
+        point.id: np.array([_value(prior, firm) for prior in (point.X, point.Y, point.Z)]) for point in network.points
+    }
+
+
+def _value(prior: Prior | None, firm: bool) -> float:
+    return np.nan if prior is None or (firm and np.isinf(prior.sigma)) else prior.value
+
+
+def _checked(exterior: Exterior, block: Block, image: str) -> Pose:
+    """The given orientation, or a resection where known points contradict it and it is not held fixed."""
+    given = Pose(rotation_from_angles(exterior.values[3:]), exterior.center)
+    xyz, xy_mm = known_field(block.sights[image], block.firm)
+    if (exterior.sigmas == 0).any() or len(xyz) < 4:
+        return given
+    found = resected(block.sights[image], xyz, xy_mm)
+    if found is None:
+        return given
+    c = block.sights[image].principal_distance_mm
+    left_given = np.median(image_distances(given, xyz, xy_mm, c))
+    left_found = np.median(image_distances(found, xyz, xy_mm, c))
+    return found if left_given > CLEARLY_WORSE * max(left_found, block.sights[image].sigma_mm) else given
+
+
+def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
+    """Scale a model of an arbitrary base so that measured distances come out, on the average."""
+    places = {image: pose.center for image, pose in block.poses.items()} | block.points
+    ratios = [
+        each.value / np.linalg.norm(places[each.end] - places[each.start])
+        for each in distances
+        if each.start in places and each.end in places
+    ]
+    if ratios:
+        scale = float(np.median(ratios))
+        block.poses = {image: Pose(pose.rotation, scale * pose.center) for image, pose in block.poses.items()}
+        block.points = {point: scale * xyz for point, xyz in block.points.items()}
+
+
+def _all_points(block: Block) -> dict[str, Array]:
+    """Every point's coordinates: as known, else intersected, else as roughly given."""
+    points = {**block.rough, **intersected(block, 0.0)}
+    seen_in = defaultdict(list)
+    for image in sorted(block.sights):
+        for name in block.sights[image].points:
+            seen_in[name].append(image)
+    for name in sorted(seen_in):
+        if np.isnan(points[name]).any():
+            raise AdjustmentError(_why_not_intersected(name, seen_in[name]))
+    return {name: xyz for name, xyz in points.items() if not np.isnan(xyz).any()}
+
+
+def _why_not_intersected(point: str, images: Sequence[str]) -> str:
+    if len(images) == 1:
+        return (
+            f"point {point} is unknown and seen in image {images[0]} only; two images are needed to find it. "
+            "Measure it in another image, give its coordinates, or leave it out."
+        )
+    return (
+        f"point {point} is unknown, and its rays from images {', '.join(images)} do not meet in front of the cameras. "
+        "Check its number in these images, or give approximate coordinates."
+    )
+
+
+def _why_not_oriented(block: Block, image: str) -> str:
+    sight = block.sights[image]
+    xyz, _ = known_field(sight, {**block.rough, **block.points})
+    remedy = f"measure more known points, or give the orientation of image {image}."
+    if not block.poses and len(xyz) < 3:
+        return (
+            f"image {image} sees {len(xyz)} known points, no other image sees enough either, and the images alone make "
+            "no model that could be placed: that takes 8 common points of two images, and 7 known coordinates (X and Y "
+            f"of two points and three heights, say). Either add these, {remedy}"
+        )
+    if len(xyz) < 3:
+        return f"image {image} sees {len(xyz)} known points; resection needs 3, and 4 to be unique. Either {remedy}"
+    if len(xyz) == 3:
+        return f"image {image} sees 3 known points, which leave several orientations or none. Either {remedy}"
+    return (
+        f"image {image} sees {len(xyz)} known points, but no orientation brings them where they were measured, or they "
+        f"lie on one line. Check the point numbers, the principal distance and the sign of y, or {remedy}"
+    )

@@ -1,0 +1,302 @@
+"""Resection in space: the exterior orientation of one image from its known points, gross errors tolerated."""
+
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.rotation import rotation_from_vector
+
+Array = NDArray[np.float64]
+
+MAX_TRIPLES = 120  # enough for one free of gross errors among them when every third point is wrong
+MAX_SCORED_POINTS = 200
+REFINED_CANDIDATES = 16  # poses kept for the refinement: the two minima of a flat field must both be among them
+LM_ITERATIONS = 12
+SETTLED = 1e-9  # relative change of a sum of squares that is none
+BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
+EXACT = 1e-12  # squared residual of three points that are met
+SAME_PLACE = 1e-4  # poses nearer than this, in extents of the points, are one
+LINE = 1e-5  # width over length of points that lie on a line, about which a camera may turn
+REJECTION = 13.8  # 0.1 % point of the squared residual's chi-square (2) distribution, in sigma²
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a camera stood: rotation (3, 3) object to camera, center (3,) in object units."""
+
+    rotation: Array
+    center: Array
+
+
+@dataclass(frozen=True)
+class Resection:
+    """A pose and how well it explains the points.
+
+    distances_mm (n,): from observed to projected points, inf behind the camera; inliers (n,): the points that agree;
+    sigma_mm: the robust standard deviation of one image coordinate.
+    """
+
+    pose: Pose
+    distances_mm: Array
+    inliers: NDArray[np.bool_]
+    sigma_mm: float
+
+
+def resect(
+    xyz: Array, xy_mm: Array, principal_distance_mm: float, rng: np.random.Generator, floor_mm: float = 1e-4
+) -> Resection | None:
+    """The pose that explains most of the points best; None where the points decide none (all on one line, say).
+
+    xyz (n, 3) object points, flat or not, n >= 4; xy_mm (n, 2) ideal image coordinates about the principal point, y up.
+    Poses from triples of points are ranked by the sum of the smallest half of the squared residuals (least trimmed
+    squares: Rousseeuw and Van Driessen 2006) and refined on that half. floor_mm: residuals this small are never gross.
+    """
+    field = _Field.of(xyz, xy_mm, principal_distance_mm)
+    triples = _triples(field.tangents, rng)
+    rotations, shifts, _ = triple_poses(field.points[triples], field.tangents[triples])
+    if not len(rotations):
+        return None
+    scored = rng.permutation(len(xyz))[:MAX_SCORED_POINTS] if len(xyz) > MAX_SCORED_POINTS else np.arange(len(xyz))
+    rotations, shifts = _best_of(rotations, shifts, field.points[scored], field.tangents[scored])
+    sigma = max(_robust_sigma(_squared(rotations, shifts, field.points, field.tangents)[0]), floor_mm / field.c)
+    inliers = _squared(rotations, shifts, field.points, field.tangents)[0] < REJECTION * sigma**2
+    if _on_a_line(field.points[inliers]):
+        return None
+    return _fitted(rotations, shifts, field, inliers, sigma * field.c)
+
+
+def refine(resection: Resection, xyz: Array, xy_mm: Array, principal_distance_mm: float) -> Resection:
+    """The same image on the same inliers with another principal distance, by least squares."""
+    field = _Field.of(xyz, xy_mm, principal_distance_mm)
+    rotations = resection.pose.rotation[None]
+    shifts = -rotations @ ((resection.pose.center - field.origin) / field.size)
+    return _fitted(rotations, shifts, field, resection.inliers, resection.sigma_mm)
+
+
+def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
+    """All poses (up to four) from which three points appear where they are observed. xyz (3, 3), xy_mm (3, 2)."""
+    field = _Field.of(xyz, xy_mm, principal_distance_mm)
+    rotations, shifts, _ = triple_poses(field.points[None], field.tangents[None])
+    rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, np.ones((len(rotations), 3)))
+    exact = _squared(rotations, shifts, field.points, field.tangents).max(axis=1) < EXACT
+    poses: list[Pose] = []
+    for rotation, shift in zip(rotations[exact], shifts[exact], strict=True):
+        pose = field.pose(rotation, shift)
+        if all(np.linalg.norm(pose.center - other.center) > SAME_PLACE * field.size for other in poses):
+            poses.append(pose)
+    return poses
+
+
+def image_distances(pose: Pose, xyz: Array, xy_mm: Array, principal_distance_mm: float) -> Array:
+    """Distances (n,) in mm from observed to projected points; inf behind the camera."""
+    shift = -pose.rotation @ pose.center
+    squared = _squared(pose.rotation[None], shift[None], xyz, xy_mm / principal_distance_mm)[0]
+    return _distances(squared, principal_distance_mm)
+
+
+def _distances(squared: Array, principal_distance_mm: float) -> Array:
+    return np.where(squared < BEHIND, principal_distance_mm * np.sqrt(squared), np.inf)
+
+
+@dataclass(frozen=True)
+class _Field:
+    """Points in units of their extent about their mean, image coordinates as tangents, and the way back."""
+
+    points: Array
+    tangents: Array
+    origin: Array
+    size: float
+    c: float
+
+    @classmethod
+    def of(cls, xyz: Array, xy_mm: Array, c: float) -> "_Field":
+        origin, size = xyz.mean(axis=0), max(float(np.linalg.norm(np.ptp(xyz, axis=0))), np.finfo(float).tiny)
+        return cls((xyz - origin) / size, xy_mm / c, origin, size, c)
+
+    def pose(self, rotation: Array, shift: Array) -> Pose:
+        return Pose(rotation, self.origin - self.size * rotation.T @ shift)
+
+
+def _triples(tangents: Array, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Triples of points (m, 3), the slender ones left out: they give poor poses."""
+    n = len(tangents)
+    if comb(n, 3) <= MAX_TRIPLES:
+        return np.array(list(combinations(range(n), 3)), dtype=np.intp)
+    triples = rng.integers(0, n, (4 * MAX_TRIPLES, 3))
+    a, b, c = (tangents[triples[:, i]] for i in range(3))
+    area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    large = (area > 0) & (area >= 0.5 * np.median(area))
+    return np.asarray(triples[large][:MAX_TRIPLES])
+
+
+def triple_poses(points: Array, tangents: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, of every triple, and which one (k,) each is of: points
+    (m, 3, 3), tangents (m, 3, 2).
+
+    Grunert's solution (Haralick et al. 1994, eqs. 7-9): a quartic in the ratio of two of the three distances.
+    """
+    rays = np.concatenate([tangents, np.full((*tangents.shape[:2], 1), -1.0)], axis=2)
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    a2, b2, c2 = (((points[:, i] - points[:, j]) ** 2).sum(axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
+    cos_a, cos_b, cos_g = ((rays[:, i] * rays[:, j]).sum(axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
+    with np.errstate(all="ignore"):  # degenerate triples give nan or inf and are dropped below
+        ratio_v = _quartic_roots(_grunert_quartic(a2 / b2, c2 / b2, cos_a, cos_b, cos_g))
+        d = ((a2 - c2) / b2)[:, None]
+        numerator = (d - 1) * ratio_v**2 - 2 * d * cos_b[:, None] * ratio_v + 1 + d
+        ratio_u = numerator / (2 * (cos_g[:, None] - ratio_v * cos_a[:, None]))
+        first = np.sqrt(b2[:, None] / (1 + ratio_v**2 - 2 * ratio_v * cos_b[:, None]))
+        distances = np.stack([first, ratio_u * first, ratio_v * first], axis=2)  # (m, 4, 3)
+        seen = distances[..., None] * rays[:, None]
+        rotations = _triad(seen) @ np.swapaxes(_triad(points), 1, 2)[:, None]
+        shifts = seen.mean(axis=2) - np.einsum("mkij,mj->mki", rotations, points.mean(axis=1))
+    usable = (distances > 0).all(axis=2) & np.isfinite(rotations).all(axis=(2, 3)) & np.isfinite(shifts).all(axis=2)
+    return rotations[usable], shifts[usable], np.nonzero(usable)[0]
+
+
+def _grunert_quartic(a: Array, c: Array, cos_a: Array, cos_b: Array, cos_g: Array) -> Array:
+    """Coefficients (m, 5), highest first; a, c are the squared sides over b²."""
+    d, s = a - c, a + c
+    return np.stack(
+        [
+            (d - 1) ** 2 - 4 * c * cos_a**2,
+            4 * (d * (1 - d) * cos_b - (1 - s) * cos_a * cos_g + 2 * c * cos_a**2 * cos_b),
+            2 * (d**2 - 1 + 2 * d**2 * cos_b**2 + 2 * (1 - c) * cos_a**2 - 4 * s * cos_a * cos_b * cos_g)
+            + 4 * (1 - a) * cos_g**2,
+            4 * (-d * (1 + d) * cos_b + 2 * a * cos_g**2 * cos_b - (1 - s) * cos_a * cos_g),
+            (1 + d) ** 2 - 4 * a * cos_g**2,
+        ],
+        axis=1,
+    )
+
+
+def _quartic_roots(coefficients: Array) -> Array:
+    """Real parts (m, 4) of the roots: noise turns the double root of a camera over its points into a complex pair."""
+    monic = coefficients[:, 1:] / coefficients[:, :1]
+    sound = np.logical_and.reduce(np.isfinite(monic), axis=1)
+    companion = np.zeros((len(monic), 4, 4))
+    companion[:, 0] = -np.where(sound[:, np.newaxis], monic, 0.0)
+    companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
+    return np.where(sound[:, np.newaxis], np.real(np.linalg.eigvals(companion)), np.nan)
+
+
+def _triad(points: Array) -> Array:
+    """An orthonormal frame (..., 3, 3), axes in columns, fixed to three points (..., 3, 3)."""
+    x = points[..., 1, :] - points[..., 0, :]
+    z = np.cross(x, points[..., 2, :] - points[..., 0, :])
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    z = z / np.linalg.norm(z, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def _squared(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
+    """Squared residuals (k, n) in units of the principal distance."""
+    u, v, w = _in_camera(rotations, shifts, points)
+    x, y = np.moveaxis(tangents, -1, 0)
+    seen = w < 0.0
+    depth = np.where(seen, w, -1.0)
+    squared = (u / depth + x) ** 2 + (v / depth + y) ** 2
+    return np.asarray(np.where(seen & (squared < BEHIND), squared, BEHIND))
+
+
+def _in_camera(rotations: Array, shifts: Array, points: Array) -> Array:
+    """U, V, W (3, k, n) of points (n, 3), or (k, n, 3), in the axes of k cameras."""
+    return np.asarray(np.moveaxis(rotations @ np.swapaxes(points, -1, -2) + shifts[..., None], 1, 0))
+
+
+def _best_of(rotations: Array, shifts: Array, points: Array, tangents: Array) -> tuple[Array, Array]:
+    """The pose (1, 3, 3), (1, 3) of the least trimmed squares, the most promising ones refined first."""
+    order = np.argsort(_trimmed_cost(rotations, shifts, points, tangents), kind="stable")[:REFINED_CANDIDATES]
+    rotations, shifts = rotations[order], shifts[order]
+    for _ in range(2):
+        kept = _smallest_half(_squared(rotations, shifts, points, tangents))
+        rotations, shifts = refined_poses(rotations, shifts, points, tangents, kept)
+    best = int(np.argmin(_trimmed_cost(rotations, shifts, points, tangents)))
+    return rotations[[best]], shifts[[best]]
+
+
+def _half(n: int) -> int:
+    """The number of residuals that least trimmed squares keeps, for poses of three points."""
+    return (n + 4) // 2
+
+
+def _smallest_half(squared: Array) -> Array:
+    """Weights (k, n): 1 for the smallest residuals of each pose."""
+    weights = np.zeros_like(squared)
+    h = _half(squared.shape[1])
+    np.put_along_axis(weights, np.argsort(squared, axis=1, kind="stable")[:, :h], 1.0, axis=1)
+    return weights
+
+
+def _trimmed_cost(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
+    half = _half(len(points))
+    squared = _squared(rotations, shifts, points, tangents)
+    return np.asarray(np.partition(squared, half - 1, axis=1)[:, :half].sum(axis=1))
+
+
+def refined_poses(
+    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
+) -> tuple[Array, Array]:
+    """Levenberg-Marquardt on a rotation vector and a shift, for all poses (k) at once; weights (k, n).
+
+    points (n, 3) and tangents (n, 2) are the same for all, or (k, n, 3) and (k, n, 2).
+    """
+    damping = np.full(len(rotations), 1e-4)
+    cost = (weights * _squared(rotations, shifts, points, tangents)).sum(axis=1)
+    for _ in range(LM_ITERATIONS):
+        normal, right = _normal_equations(rotations, shifts, points, tangents, weights)
+        diagonal = np.einsum("kii->ki", normal)
+        diagonal += damping[:, None] * diagonal + 1e-14  # the constant keeps a pose without a solution harmless
+        step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
+        turn = rotation_from_vector(step[:, :3])
+        new_rotations, new_shifts = turn @ rotations, np.einsum("kij,kj->ki", turn, shifts) + step[:, 3:]
+        new_cost = (weights * _squared(new_rotations, new_shifts, points, tangents)).sum(axis=1)
+        better = new_cost < cost
+        settled = np.abs(cost - new_cost) <= SETTLED * cost
+        rotations = np.where(better[:, None, None], new_rotations, rotations)
+        shifts = np.where(better[:, None], new_shifts, shifts)
+        cost, damping = np.where(better, new_cost, cost), np.where(better, damping / 10, damping * 10)
+        if settled.all():
+            break
+    return rotations, shifts
+
+
+def _normal_equations(
+    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
+) -> tuple[Array, Array]:
+    """J'WJ (k, 6, 6) and J'Wr (k, 6) for a small turn of the camera and a shift in its frame."""
+    u, v, w = _in_camera(rotations, shifts, points)
+    inverse = -1.0 / np.minimum(w, -1e-9)
+    p, q = u * inverse, v * inverse
+    (x, y), n = np.moveaxis(tangents, -1, 0), w.shape[1]
+    jacobian = np.zeros((len(w), 6, 2 * n))  # first all x, then all y
+    for k, (by_p, by_q) in enumerate(
+        ((p * q, 1 + q * q), (-1 - p * p, -p * q), (-q, p), (inverse, 0.0), (0.0, inverse), (p * inverse, q * inverse))
+    ):
+        jacobian[:, k, :n], jacobian[:, k, n:] = by_p, by_q
+    residual = np.concatenate([x - p, y - q], axis=1)[..., None]
+    weighted = jacobian * np.concatenate([weights, weights], axis=1)[:, None]
+    return weighted @ jacobian.swapaxes(1, 2), (weighted @ residual)[..., 0]
+
+
+def _robust_sigma(squared: Array) -> float:
+    """Standard deviation of one coordinate from the smallest half of chi-square (2) distributed squares."""
+    n, h = len(squared), _half(len(squared))
+    left_out = 1 - h / n
+    truncation = 1 + (left_out * np.log(left_out) / (1 - left_out) if left_out > 0 else 0.0)
+    return float(np.sqrt(np.sort(squared)[:h].sum() / max(2 * h - 6, 1) / truncation))
+
+
+def _on_a_line(points: Array) -> bool:
+    length, width = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2]
+    return bool(width < LINE * length)
+
+
+def _fitted(rotations: Array, shifts: Array, field: _Field, inliers: NDArray[np.bool_], sigma_mm: float) -> Resection:
+    """The one pose (1, 3, 3), (1, 3) fitted to its inliers, back in object units."""
+    rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, inliers[None].astype(np.float64))
+    squared = _squared(rotations, shifts, field.points, field.tangents)[0]
+    pose = field.pose(rotations[0], shifts[0])
+    return Resection(pose, _distances(squared, field.c), inliers, sigma_mm)

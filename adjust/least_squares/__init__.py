@@ -1,0 +1,1 @@
+"""The least-squares solution of blocks that share unknowns, and its covariance."""

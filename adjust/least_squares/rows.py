@@ -1,0 +1,148 @@
+"""The weighted rows of an adjustment: whitened pairs F1, F2 and F3, F4 in blocks, and the unknowns' priors."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.functions import Derivatives
+from adjust.functional_model.further_observations import FurtherObservation
+from adjust.least_squares.elimination import Sums
+from adjust.least_squares.factor import Blocks
+from adjust.least_squares.small_matrices import applied, inverse, lower_root, product
+from adjust.numbering import Numbering, Touched
+from adjust.problem import ABSENT, Problem, State
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class WhitenedRows:
+    """Rows of unit weight; in turn the blocks of `Numbering.touched`, put together as asked for.
+
+    A block for each further observation follows. root (n, 2, 2): the factor L of A C A' = L L'; matrix (n, 2, k): by
+    the unknowns at `Problem.columns`; right (n, 2).
+    """
+
+    numbering: Numbering
+    root: Array
+    matrix: Array
+    right: Array
+    further: tuple[Blocks, ...]
+
+    def __iter__(self) -> Iterator[Blocks]:
+        for touched in self.numbering.touched:
+            yield _blocks(touched, self.matrix, self.right)
+        yield from self.further
+
+    def of_discrepancies(self, by_observation: Array, v_mm: Array) -> "WhitenedRows":
+        """The same rows with other v (n, 2) on the right side; by_observation: A (n, 2, 2)."""
+        return replace(self, right=_whitened(self.root, applied(by_observation, v_mm)[..., None])[..., 0])
+
+    def change_mm(self, by_observation: Array, step: Array) -> Array:
+        """How the computed observations (n, 2) change with a step of the unknowns, to the first order: -A^-1 B dx."""
+        by_column = np.append(step, 0.0)[self.numbering.problem.columns]  # the last stands for ABSENT
+        along = applied(self.root, np.einsum("nij,nj->ni", self.matrix, by_column))
+        return -applied(inverse(by_observation), along)
+
+    @property
+    def sums(self) -> Sums:
+        """How these rows are summed up where there are too many to be factorised."""
+        return Sums(_Summed(self), self.numbering.groups)
+
+
+@dataclass(frozen=True)
+class _Summed:
+    """The rows arranged as in `Numbering.summed`, and the further observations."""
+
+    rows: WhitenedRows
+
+    def __iter__(self) -> Iterator[Blocks]:
+        for touched in self.rows.numbering.summed:
+            yield _blocks(touched, self.rows.matrix, self.rows.right)
+        yield from self.rows.further
+
+
+def whitened_rows(
+    numbering: Numbering, values: Array, at: Derivatives, covariance_mm2: Array, v_mm: Array
+) -> WhitenedRows:
+    """The rows B dx = w of all blocks, every pair multiplied by L^-1, where A C A' = L L'.
+
+    At computed observations F is 0, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed less observed. The
+    derivatives B are divided where they are, and are not these any more.
+    """
+    a = at.by_observation
+    root = lower_root(product(product(a, covariance_mm2), a.transpose(0, 2, 1)))
+    right = _whitened(root, applied(a, v_mm)[..., None])[..., 0]
+    further = tuple(_further_block(numbering, each, values) for each in numbering.problem.further)
+    return WhitenedRows(numbering, root, _whitened(root, at.by_unknowns), right, further)
+
+
+def _whitened(root: Array, rows: Array) -> Array:
+    """Rows (n, 2, k) divided by lower triangles (n, 2, 2), in their own memory: it is the largest array of a step."""
+    rows[:, 0] /= root[:, 0, :1]
+    rows[:, 1] -= root[:, 1, :1] * rows[:, 0]
+    rows[:, 1] /= root[:, 1, 1:]
+    return rows
+
+
+def _blocks(touched: Touched, matrix: Array, right: Array) -> Blocks:
+    """The rows of blocks of equal shape, of all (n, 2, k), with every derivative in its unknown's column."""
+    (count, height), width = touched.rows.shape, touched.own.shape[1] + touched.shared.shape[1]
+    of_blocks = _of_rows(right, touched.rows).reshape(count, 2 * height)
+    if touched.columns.shape[:2] == (1, 1) and np.array_equal(touched.columns[0, 0], np.arange(width)):
+        as_they_are = _of_rows(matrix, touched.rows).reshape(count, 2 * height, width)
+        return Blocks(touched.own, touched.shared, as_they_are, of_blocks)
+    by_column = np.zeros((count, width + 1, height, 2))  # what an operation on a column takes stands together
+    if touched.columns.shape[:2] == (1, 1):
+        for k, column in enumerate(touched.columns[0, 0]):
+            by_column[:, column] = _of_rows(matrix[..., k], touched.rows)
+    elif len(touched.columns) == 1 and height <= count:
+        for row, columns in enumerate(touched.columns[0]):
+            by_column[:, columns, row] = matrix[touched.rows[:, row]].swapaxes(1, 2)
+    else:
+        columns = np.broadcast_to(touched.columns[:, :, None, :], (count, height, 2, matrix.shape[2]))
+        np.put_along_axis(by_column.transpose(0, 2, 3, 1), columns, matrix[touched.rows], axis=3)
+    dense = by_column[:, :width].reshape(count, width, 2 * height).swapaxes(1, 2)
+    return Blocks(touched.own, touched.shared, dense, of_blocks)
+
+
+def _of_rows(values: Array, rows: Indices) -> Array:
+    """Values (b, m, ...), of all (n, ...), of some rows (b, m); without a copy where they stand in order."""
+    first, count = int(rows[0, 0]) if rows.size else 0, rows.size
+    if np.array_equal(rows.ravel(), np.arange(first, first + count)):
+        return values[first : first + count].reshape(*rows.shape, *values.shape[1:])
+    return np.asarray(values[rows])
+
+
+def _further_block(numbering: Numbering, further: FurtherObservation, values: Array) -> Blocks:
+    """The rows f'(x) dx = l - f(x) of a further observation; what it touches is shared."""
+    numbers = numbering.numbers[further.positions]
+    free = numbers != ABSENT
+    root = np.linalg.cholesky(further.covariance)
+    matrix = np.linalg.solve(root, further.by_unknowns(values)[:, free])
+    right = np.linalg.solve(root, further.observed - further.computed(values))
+    return Blocks(np.empty((1, 0), dtype=np.intp), numbers[None, free], matrix[None], right[None])
+
+
+def prior_root_weights(numbering: Numbering) -> Array:
+    """One over the standard deviation of every free unknown's prior (f,), 0 where it has none."""
+    return np.asarray(1.0 / numbering.problem.unknowns.sigma[numbering.free])
+
+
+def of_cameras(numbering: Numbering) -> NDArray[np.bool_]:
+    """Which free unknowns (f,) are those of cameras: fiducials, interior orientation, distortion (F5 to F9)."""
+    unknowns = numbering.problem.unknowns
+    positions = [*unknowns.camera.values(), *unknowns.fiducial.values()]
+    return np.isin(numbering.free, np.concatenate(positions))
+
+
+def prior_differences(problem: Problem, state: State) -> Array:
+    """Given less present values (n,) of all quantities, angles within half a turn; 0 where nothing is given."""
+    unknowns = problem.unknowns
+    differences = np.where(np.isnan(unknowns.given), 0.0, unknowns.given - state.values)
+    angles = problem.exterior[:, 3:]
+    differences[angles] = (differences[angles] + np.pi) % (2.0 * np.pi) - np.pi
+    return np.asarray(differences)

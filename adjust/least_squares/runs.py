@@ -1,0 +1,167 @@
+"""Adjustments one after the other, until the residuals ask for no other weights."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from adjust.errors import AdjustmentError
+from adjust.functional_model.functions import blind_mark
+from adjust.least_squares.factor import Factor
+from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
+from adjust.numbering import Numbering
+from adjust.options import Options
+from adjust.problem import Problem, State
+from adjust.quality.reliability import Misfits, misfits, statistics
+from adjust.quality.reweighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
+from adjust.quality.snooping import Contradiction, contradictions, limits, search
+from adjust.quality.tested import TestedUnits
+from adjust.quality.variance_components import refined_factors
+from adjust.result import NullDirection, Termination
+from adjust.undetermined.diagnosis import singular_directions
+
+ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most
+ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway
+
+
+def run(problem: Problem, options: Options) -> "Run":
+    """Adjust a problem, whose datum is settled, from where it starts.
+
+    Raises AdjustmentError where a point has no image there.
+    """
+    return _snooping(problem, options) if options.snooping else _settled(_first(problem, options), options)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One adjustment with given weights, and where it ended.
+
+    problem: as it was given, `numbering` holds it with the priors' weights. singular: what is not determined at the
+    end, be that a solution or not. settled: whether the residuals ask for no other weights. removed: what data snooping
+    has taken out.
+    """
+
+    problem: Problem
+    numbering: Numbering
+    weighting: Weighting
+    solution: Solution
+    singular: tuple[NullDirection, ...]
+    factor: Factor
+    settled: bool = True
+    removed: tuple[Contradiction, ...] = ()
+
+    @cached_property
+    def found(self) -> Misfits | None:
+        """What everything that is tested contradicts the others by; None where something is not determined."""
+        return None if self.singular else misfits(self.numbering, self.end, self.factor)
+
+    @property
+    def end(self) -> Linearised:
+        return self.solution.end
+
+    @property
+    def converged(self) -> bool:
+        return self.solution.termination == "converged"
+
+    @property
+    def has_solution(self) -> bool:
+        return self.solution.factor is not None
+
+
+def _first(problem: Problem, options: Options) -> Run:
+    units = TestedUnits(problem)
+    factors = {group: 1.0 for group in options.groups if (units.groups == group).any()}
+    return _run(problem, Weighting(np.ones(len(units)), factors), problem.start(), options.iteration_limit)
+
+
+def _settled(last: Run, options: Options) -> Run:
+    """Adjust until the weights that robust estimation and variance components ask for are those that were used."""
+    limit = min(options.iteration_limit, ITERATIONS_A_ROUND) if options.robust else options.iteration_limit
+    for function in options.weight_functions or (None,):
+        for _ in range(ROUNDS):
+            refined = _reweighted(last, options, function)
+            if not refined.differs(last.weighting):
+                break
+            last = again(last, refined, limit)
+        else:
+            last = replace(last, settled=False)
+    if options.robust and last.solution.termination == "iteration limit":
+        last = replace(again(last, last.weighting, options.iteration_limit), settled=last.settled)
+    return last
+
+
+def _reweighted(last: Run, options: Options, function: WeightFunction | None) -> Weighting:
+    """The weights that the residuals of a run ask for; its own where there is nothing to ask, or not to be trusted."""
+    if not (function or (last.weighting.factors and last.converged)) or last.found is None:
+        return last.weighting
+    weighting = refined_factors(last.numbering, last.found, last.weighting)
+    if function:
+        tests = statistics(last.found, last.weighting.weights)
+        observed = len(last.end.v_mm)
+        weighting = replace(weighting, weights=robust_weights(tests.statistic, tests.sizes, observed, function))
+    return weighting
+
+
+def again(last: Run, weighting: Weighting, limit: int, state: State | None = None) -> Run:
+    """Adjust again with other weights, from where the last run ended or from another state."""
+    return replace(_run(last.problem, weighting, state or last.end.state, limit), removed=last.removed)
+
+
+def _snooping(problem: Problem, options: Options) -> Run:
+    """Adjust without what contradicts the others, until nothing does and what was taken out would do so again.
+
+    Variance components come second: those of contaminated groups would hide what contaminates them.
+    """
+    plain = replace(options, variance_components=False)
+    last = _snooped(_first(problem, plain), plain)
+    if not options.groups:
+        return last
+    factors = {group: 1.0 for group in options.groups if (TestedUnits(problem).groups == group).any()}
+    return _snooped(_settled(replace(last, weighting=replace(last.weighting, factors=factors)), options), options)
+
+
+def _snooped(last: Run, options: Options) -> Run:
+    earlier: set[frozenset[int]] = set()
+    for _ in range(ROUNDS):
+        if last.found is None:
+            return last
+        tests = search(last.numbering, last.end, last.factor, last.found, last.weighting, options.probabilities)
+        statistic = statistics(last.found, last.weighting.weights).statistic
+        reach = limits(tests)
+        confirmed = [each for each in last.removed if statistic[each.unit] > reach[each.unit]]
+        removed = (*confirmed, *contradictions(tests))
+        out = frozenset(each.unit for each in removed)
+        if out == {each.unit for each in last.removed}:
+            return last
+        if out in earlier:
+            break
+        earlier.add(out)
+        weights = np.ones(len(last.weighting.weights))
+        weights[list(out)] = NO_WEIGHT
+        last = replace(last, removed=removed)
+        last = _settled(again(last, replace(last.weighting, weights=weights), options.iteration_limit), options)
+    return replace(last, settled=False)
+
+
+def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
+    weighted, covariance = weighting.applied(problem)
+    numbering = Numbering(weighted)
+    start = linearise(numbering, covariance, state)
+    if start is None:
+        raise AdjustmentError(
+            f"The adjustment cannot start: with the approximations, {blind_mark(problem, state)}. Check the "
+            f"approximate orientation of the image, and the sign of W: M rotates from object to camera, which looks "
+            f"along its negative z axis."
+        )
+    singular = singular_directions(weighted, state, numbering.free, start.factor)
+    if singular:
+        solution = Solution(start, None, "singular", ())
+        return Run(problem, numbering, weighting, solution, singular, start.factor)
+    solution = iterate(numbering, covariance, start, limit)
+    factor = solution.end.factor
+    singular = singular_directions(weighted, solution.end.state, numbering.free, factor)
+    if singular:
+        ended: Termination = "singular" if solution.termination == "converged" else "diverged"
+        solution = replace(solution, factor=None, termination=ended)
+        return Run(problem, numbering, weighting, solution, singular, factor)
+    return Run(problem, numbering, weighting, solution, (), factor)

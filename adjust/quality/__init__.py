@@ -1,0 +1,1 @@
+"""What the result says of itself: residuals, tests, reliability, significance."""

@@ -1,0 +1,156 @@
+"""What an adjustment tells of its observations: residuals and their tests, warnings; computed where it is asked for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from adjust.functional_model.transformation import marks_needed
+from adjust.least_squares.iteration import factorise
+from adjust.least_squares.runs import ROUNDS, Run
+from adjust.problem import Problem
+from adjust.quality.probabilities import Probabilities
+from adjust.quality.reliability import Misfits, reliability
+from adjust.quality.residuals import further_residuals, groups, residuals
+from adjust.quality.snooping import contradictions, search, suspects
+from adjust.quality.suspicions import suspicions
+from adjust.quality.tested import TestedUnits
+from adjust.quality.variance_components import factor_sigmas
+from adjust.result import Cofactor, FurtherResidual, Group, Reliability, Residuals, Suspect
+from adjust.undetermined.diagnosis import undetermined, weak_directions
+
+
+@dataclass(frozen=True)
+class RunAssessment:
+    """The `Assessment` of a run; nothing is computed twice."""
+
+    run: Run
+    cofactor: Cofactor
+    probabilities: Probabilities
+
+    @cached_property
+    def conditions(self) -> int:
+        """Equations, without what the adjustment does without."""
+        problem = self.run.problem
+        further = sum(len(each.observed) for each in problem.further)
+        return int(TestedUnits(problem).sizes[self.run.weighting.used].sum()) + further
+
+    @property
+    def redundancy(self) -> int:
+        return self.conditions - len(self.run.numbering.free)
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        return residuals(self.run.end.v_mm, self._found, self.run.weighting)
+
+    @cached_property
+    def further(self) -> tuple[FurtherResidual, ...]:
+        run, delta = self.run, self.probabilities.noncentrality(1)
+        of_state = run.problem, run.end.state, run.end.rows.further
+        return tuple(further_residuals(*of_state, run.solution.factor, delta))
+
+    @cached_property
+    def groups(self) -> Mapping[str, Group]:
+        run = self.run
+        return groups(run.problem, run.end.state, run.end.v_mm, self._found, run.weighting, self.further)
+
+    @cached_property
+    def variance_sigmas(self) -> Mapping[str, float]:
+        run, found = self.run, self._found
+        if found is None or not run.weighting.factors:
+            return {}
+        return factor_sigmas(run.numbering, run.end, run.factor, found, run.weighting)
+
+    @cached_property
+    def reliability(self) -> Reliability | None:
+        run, found = self.run, self._found
+        if found is None:
+            return None
+        at, weights = (run.numbering, run.end, run.factor, found), run.weighting.weights
+        sigma0 = float(np.sqrt(run.end.vpv / self.redundancy)) if self.redundancy > 0 else 1.0
+        return reliability(*at, weights, sigma0, self.redundancy, self.probabilities)
+
+    @cached_property
+    def suspects(self) -> tuple[Suspect, ...]:
+        run, found = self.run, self._found
+        if found is None or self.reliability is None:
+            return ()
+        tests = search(run.numbering, run.end, run.factor, found, run.weighting, self.probabilities)
+        contradicting = contradictions(tests)
+        return suspects(tests, contradicting, run.removed, self.reliability, self.probabilities, self.redundancy)
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        doubts = suspicions(self.run.problem.network.observations, self.residuals) if self.run.converged else []
+        return (*_warnings(self.run, self.cofactor), *doubts)
+
+    @property
+    def _found(self) -> Misfits | None:
+        return self.run.found if self.run.has_solution else None
+
+
+def _warnings(last: Run, cofactor: Cofactor) -> list[str]:
+    """What the user should look at in a result."""
+    problem = last.numbering.problem
+    warnings = []
+    if last.solution.termination == "iteration limit":
+        warnings.append(
+            f"The iteration did not stand still within {len(last.solution.history)} steps: the values are not final. "
+            f"The largest residuals are those of {_worst(last)}."
+        )
+    if last.solution.termination == "diverged":
+        warnings.append(
+            f"The iteration diverged: it came to no minimum. Look for wrong point numbers and wrong approximations; "
+            f"the largest residuals are those of {_worst(last)}."
+        )
+        warnings += [f"Where it ended, the equations are singular: {each.cause}" for each in last.singular]
+    if not last.settled:
+        warnings.append(
+            f"The weights did not settle within {ROUNDS} rounds of robust estimation, variance components or data "
+            f"snooping."
+        )
+    without_priors = factorise(last.numbering, last.end, camera_priors=False)
+    weak = weak_directions(problem, last.end.state, last.numbering.free, without_priors, last.singular)
+    warnings += [
+        f"Practically singular without priors: {', '.join(each.parameters)}. {each.cause} {each.remedy}"
+        for each in weak
+    ]
+    if last.converged:
+        warnings += filter(None, [undetermined(problem, last.end.state, cofactor.variances)])
+    return warnings + _unseen(problem) + _films_by_targets(problem)
+
+
+def _worst(last: Run) -> str:
+    """The observations with the largest residuals."""
+    observations = last.numbering.problem.network.observations
+    size = np.abs(last.end.v_mm).max(axis=1)
+    rows = np.argsort(-size)[:3]
+    return ", ".join(
+        f"{observations.kind[i]} {observations.point[i]} in image {observations.image[i]} ({size[i]:.3g} mm)"
+        for i in rows
+    )
+
+
+def _unseen(problem: Problem) -> list[str]:
+    """What is given and that no image shows."""
+    points = [point.id for point in problem.network.points if point.id not in problem.unknowns.point]
+    if not points:
+        return []
+    shown = ", ".join(points[:5]) + (f" and {len(points) - 5} more" if len(points) > 5 else "")
+    return [f"No image shows the object points {shown}: they take no part."]
+
+
+def _films_by_targets(problem: Problem) -> list[str]:
+    """Images whose film transformation takes more than their fiducial marks."""
+    images = problem.network.images
+    shown = np.bincount(problem.image_numbers[problem.is_fiducial], minlength=len(images))
+    few = [i for i, image in enumerate(images) if shown[i] < marks_needed(image.transformation)]
+    if not few:
+        return []
+    first = images[few[0]]
+    others = f" {len(few) - 1} more images are alike." if len(few) > 1 else ""
+    return [
+        f"Image {first.name} shows {shown[few[0]]} fiducial marks, and its {first.transformation} transformation takes "
+        f"{marks_needed(first.transformation)} of its own: the targets determine the rest of it.{others}"
+    ]

@@ -1,0 +1,115 @@
+"""Residuals of the observations, and their sums by group."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.further_observations import square_sum
+from adjust.least_squares.factor import Blocks, Factor
+from adjust.least_squares.rows import prior_differences
+from adjust.problem import ABSENT, Problem, State
+from adjust.quality.reliability import UNCHECKED, Misfits, redundancies, statistics
+from adjust.quality.reweighting import Weighting
+from adjust.quality.tested import TestedUnits
+from adjust.result import FurtherResidual, Group, Residuals
+
+Array = NDArray[np.float64]
+
+UM_PER_MM = 1000.0
+
+
+def residuals(v_mm: Array, found: Misfits | None, weighting: Weighting) -> Residuals:
+    """The residuals of the observations with their redundancy numbers and standardised; found None: no solution."""
+    if found is None:
+        return Residuals(v_mm, np.zeros_like(v_mm), np.zeros_like(v_mm))
+    count = len(v_mm)
+    return Residuals(v_mm, redundancies(found)[:count], statistics(found, weighting.weights).w[:count])
+
+
+def further_residuals(
+    problem: Problem, state: State, rows: Sequence[Blocks], factor: Factor | None, noncentrality: float
+) -> Iterator[FurtherResidual]:
+    """The residuals of further observations, whose rows these are; without a factor nothing is said of their check.
+
+    With C = L L' and H the cofactor matrix of the adjusted rows, which are of unit weight: Q_vv = L (I - H) L'.
+    """
+    for each, block in zip(problem.further, rows, strict=True):
+        v = each.computed(state.values) - each.observed
+        root = np.linalg.cholesky(each.covariance)
+        free = np.zeros_like(root) if factor is None else _surplus(block, factor)
+        cofactor_v = root @ free @ root.T
+        weighted = np.linalg.inv(root).T @ free @ np.linalg.inv(root)
+        redundancy = np.einsum("ij,ji->i", cofactor_v, np.linalg.inv(each.covariance))
+        checked = redundancy > UNCHECKED
+        w = np.where(checked, v / np.sqrt(np.where(checked, np.diag(cofactor_v), 1.0)), 0.0)
+        smallest = np.where(checked, noncentrality / np.sqrt(np.where(checked, np.diag(weighted), 1.0)), np.inf)
+        sigma = np.sqrt(np.diag(each.covariance))
+        for row in zip(each.names, each.observed, v, sigma, redundancy, w, smallest, strict=True):
+            yield FurtherResidual(each.group, row[0], *map(float, row[1:]))
+
+
+def _surplus(block: Blocks, factor: Factor) -> Array:
+    """I - H (m, m) of a block without own unknowns."""
+    roots = (block.matrix / factor.scale[block.shared][:, None, :] @ factor.triangle.root_of(block.shared))[0]
+    return np.asarray(np.eye(len(roots)) - roots @ roots.T)
+
+
+def groups(
+    problem: Problem,
+    state: State,
+    v_mm: Array,
+    found: Misfits | None,
+    weighting: Weighting,
+    further: Sequence[FurtherResidual],
+) -> dict[str, Group]:
+    """The groups of observations: target, tie and fiducial in the comparator, and the priors.
+
+    control: object coordinates, whose rms is in millionths of the object unit; datum: the fiducials' given places
+    (F5, F6); interior: c, x0', y0' and distortion; exterior; and those of further observations. All behind datum have
+    no rms. target, fiducial and control are always there. What the adjustment does without is in none of them.
+    """
+    units = TestedUnits(problem)
+    result = {}
+    for name in ("target", "tie", "fiducial", "control", "datum", "interior", "exterior"):
+        members = (units.groups == name) & weighting.used
+        if not members.any() and name not in ("target", "fiducial", "control"):
+            continue
+        vpv, redundancy = group_sums(units, found, members) if found else (0.0, 0.0)
+        result[name] = _group(vpv, redundancy, *_rms_um(problem, state, v_mm, name, members))
+    for name in dict.fromkeys(each.group for each in problem.further):
+        vpv = square_sum(tuple(each for each in problem.further if each.group == name), state.values)
+        result[name] = _group(vpv, sum(each.redundancy for each in further if each.group == name), 0.0, 0.0)
+    return result
+
+
+def _group(vpv: float, redundancy: float, rms_x_um: float, rms_y_um: float) -> Group:
+    sigma0 = float(np.sqrt(vpv / redundancy)) if redundancy > UNCHECKED else 0.0
+    return Group(sigma0, rms_x_um, rms_y_um, redundancy)
+
+
+def group_sums(units: TestedUnits, found: Misfits, members: NDArray[np.bool_]) -> tuple[float, float]:
+    """v'Pv and redundancy of some of what is tested."""
+    vpv = float((found.residual[members] ** 2).sum())
+    # Behind a single coordinate stands a 1 in the hat matrix.
+    return vpv, float(2 * members.sum() - np.trace(found.hat[members], axis1=1, axis2=2).sum())
+
+
+def _rms_um(problem: Problem, state: State, v_mm: Array, group: str, members: NDArray[np.bool_]) -> tuple[float, float]:
+    """The rms of a group by axis, in um or in millionths of the object unit; 0 where units are mixed."""
+    count = len(v_mm)
+    if group in problem.network.observations.kind or group in ("target", "fiducial"):
+        v_um = UM_PER_MM * v_mm[members[:count]]
+        return _rms(v_um[:, 0]), _rms(v_um[:, 1])
+    if group not in ("control", "datum"):
+        return 0.0, 0.0
+    given = TestedUnits(problem).positions[members[count:]].ravel()
+    given = given[given != ABSENT]
+    names = np.array(problem.unknowns.names)[given]
+    v = (1e6 if group == "control" else UM_PER_MM) * prior_differences(problem, state)[given]
+    x, y = (".X", ".Y") if group == "control" else (".x", ".y")
+    return _rms(v[np.char.endswith(names, x)]), _rms(v[np.char.endswith(names, y)])
+
+
+def _rms(v: Array) -> float:
+    return float(np.sqrt(np.mean(v**2))) if len(v) else 0.0

@@ -1,0 +1,105 @@
+"""Variance components: how much the variances given for groups of observations are to be multiplied by."""
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from adjust.least_squares.factor import Factor
+from adjust.least_squares.iteration import Linearised
+from adjust.least_squares.normal_equations import spread_squares
+from adjust.numbering import Numbering
+from adjust.quality.reliability import Misfits, unit_rows
+from adjust.quality.residuals import group_sums
+from adjust.quality.reweighting import Weighting
+from adjust.quality.tested import TestedUnits
+
+Array = NDArray[np.float64]
+
+COLUMNS_AT_ONCE = 500  # of the cofactor matrix of the shared unknowns
+LEAST_REDUNDANCY = 1.0  # a group with less redundancy keeps its variance
+
+
+def refined_factors(numbering: Numbering, found: Misfits, weighting: Weighting) -> Weighting:
+    """The weighting with every factor multiplied by its group's v'Pv over redundancy.
+
+    Repeated until nothing changes this is Helmert's estimate, and the restricted maximum likelihood of normally
+    distributed errors. Source: W. Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten, 1979.
+    """
+    units = TestedUnits(numbering.problem)
+    factors = {}
+    for group, factor in weighting.factors.items():
+        members = (units.groups == group) & weighting.used
+        vpv, redundancy = group_sums(units, found, members)
+        lacking = vpv / redundancy if redundancy > LEAST_REDUNDANCY and vpv > 0.0 else 1.0
+        factors[group] = factor * lacking
+    return Weighting(weighting.weights, factors)
+
+
+def factor_sigmas(
+    numbering: Numbering, end: Linearised, factor: Factor, found: Misfits, weighting: Weighting
+) -> dict[str, float]:
+    """The standard deviations of the settled factors.
+
+    Twice the inverse of Helmert's matrix, S_gh = trace of (P Q_v)_gh (P Q_v)_hg, over all groups that were estimated
+    together; their correlations are in it. 0 for a group that has kept its variance. Source: K.-R. Koch, Parameter
+    Estimation and Hypothesis Testing in Linear Models, section 36.
+    """
+    units = TestedUnits(numbering.problem)
+    names = list(weighting.factors)
+    members = [(units.groups == group) & weighting.used for group in names]
+    helmert = _traces(numbering, end, factor, members)
+    redundancies = np.array([group_sums(units, found, of_group)[1] for of_group in members])
+    helmert += np.diag(2.0 * redundancies - [units.sizes[of_group].sum() for of_group in members])
+    estimated = np.flatnonzero(redundancies > LEAST_REDUNDANCY)
+    sigmas = dict.fromkeys(names, 0.0)
+    variances = np.diag(np.linalg.pinv(helmert[np.ix_(estimated, estimated)]))
+    for name, variance in zip([names[i] for i in estimated], variances, strict=True):
+        sigmas[name] = float(weighting.factors[name] * np.sqrt(2.0 * variance))
+    return sigmas
+
+
+def _traces(numbering: Numbering, end: Linearised, factor: Factor, members: Sequence[NDArray[np.bool_]]) -> Array:
+    """The squared norms (g, g) of the parts of the hat matrix between groups.
+
+    Rows of one block share its own columns; between blocks only the shared unknowns meet, and what the groups tell of
+    these is summed up first.
+    """
+    within = np.zeros((len(members), len(members)))
+    normals = [csr_array((factor.shared_count, factor.shared_count)) for _ in members]
+    belongs = np.append(
+        np.array(members), np.zeros((len(members), 1), dtype=bool), axis=1
+    )  # the last stands for ABSENT
+    for rows in unit_rows(numbering, end, factor):
+        count = len(rows.units)
+        masks = belongs[:, rows.units][..., None, None]
+        shape = len(members), count, 2 * rows.units.shape[1]
+        own = (masks * rows.own).reshape(*shape, rows.own.shape[3])
+        through = (masks * rows.through).reshape(*shape, rows.through.shape[3])
+        roots = through @ factor.triangle.root_of(rows.shared)
+        for i, j in product(range(len(members)), repeat=2):
+            between = roots[i] @ roots[j].swapaxes(1, 2)
+            within[i, j] += ((own[i] @ own[j].swapaxes(1, 2) + between) ** 2).sum() - (between**2).sum()
+        for i, of_group in enumerate(through):
+            normals[i] = normals[i] + spread_squares(
+                rows.shared, of_group.swapaxes(1, 2) @ of_group, factor.shared_count
+            )
+    return within + _between(factor, normals)
+
+
+def _between(factor: Factor, normals: Sequence[csr_array]) -> Array:
+    """The traces (g, g) of N_i Q N_j Q, with N (s, s) what a group tells of the shared unknowns and Q their cofactors.
+
+    Some columns of Q at a time: all of it would be too large in a large network.
+    """
+    traces = np.zeros((len(normals), len(normals)))
+    for first in range(0, factor.shared_count, COLUMNS_AT_ONCE):
+        unit = np.eye(factor.shared_count, COLUMNS_AT_ONCE, -first)
+        some = slice(first, first + COLUMNS_AT_ONCE)
+        columns = factor.triangle.cofactor_times(unit)
+        for j, of_group in enumerate(normals):
+            told = factor.triangle.cofactor_times(of_group @ columns)
+            traces[:, j] += [np.trace(normal[some] @ told) for normal in normals]
+    return traces

@@ -1,0 +1,222 @@
+"""Which mark of an image is which object point, where nothing is known of the image's orientation.
+
+Hypothesis and test. Three object points that lie close together are taken to be three marks that do; the poses from
+which they would be are tested on the points about them, the best ones grow over the whole image, and what has grown is
+believed only if chance would hardly do as well (a contrario: Desolneux, Moisan and Morel 2008). Then it is tried
+whether the same marks could bear other names: a field that looks the same from another side has none, and that is said.
+
+Where the principal distance is not known, either, some far apart are tried: what lies about three points looks nearly
+the same with any, and the growing finds the right one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.initial_values.resection import Pose, resect
+from adjust.target_names.naming_growth import OF_POSE, Grown, View, grow, log10_of_chance
+from adjust.target_names.naming_hypotheses import Cluster, Poses, clusters, mark_triples, point_triples, promising
+from adjust.target_names.unnamed_marks import Marks
+
+Array = NDArray[np.float64]
+
+LEAST_POINTS = 5
+MOST_LOG10_CHANCE = -6.0
+LEAST_SHARE = 0.4  # of the points that the image should show
+ALIKE_SHARE = 0.7  # of the named marks, from which on other names explain the image as well
+MOST_POSES = 1_000_000  # that are tried: they bound the time
+MOST_LOG10_CHANCE_OF_CODES = -3.0  # of codes that agree: they were not chosen among many
+LEAST_CODES = 4  # three always give a pose
+KNOWN_SIGMA = 0.05  # of a principal distance that is known, relative
+# Where it is not known, over the frame's diagonal, the usual ones first; none is farther off than a factor of 1.41:
+UNKNOWN, UNKNOWN_SIGMA = (1.2, 0.6, 2.4, 0.3, 4.8), 0.3
+OTHER_CLUSTERS = 8  # named clusters that are tried as other points: with half of them seen, one case in 256 escapes
+
+
+@dataclass(frozen=True, eq=False)
+class Names:
+    """mark: the mark (index) of each object point (index) that has one. pose, principal_distance_mm, radial: from which
+    they are seen so, images being p (1 + radial p²), p in principal distances; expected: how many points the image
+    should show; log10_chance: of the expected number of agreements as good by chance; gate_mm: how far marks may lie
+    from their points' places."""
+
+    mark: dict[int, int]
+    pose: Pose
+    principal_distance_mm: float
+    radial: float
+    expected: int
+    log10_chance: float
+    gate_mm: float
+
+
+def name_marks(
+    xyz: Array,
+    normals: Array,
+    xy_mm: Array,
+    frame_mm: tuple[Array, Array],
+    principal_distance_mm: float | None,
+    sigma_mm: float,
+) -> Names | str:
+    """Name the marks of an image of known points; or why they have no names.
+
+    xyz (n, 3), normals (n, 3): where the points face, nan where that is not known; xy_mm (m, 2): ideal coordinates of
+    the marks about the principal point, y up, sigma_mm each; frame_mm: the least and the greatest (2,) that were
+    searched; principal_distance_mm: right to some percent, or None. The same input gives the same names.
+    """
+    n, m = len(xyz), len(xy_mm)
+    if min(n, m) < LEAST_POINTS:
+        return f"{m} marks and {n} points are too few: {LEAST_POINTS} that agree are needed"
+    unit = _Unit.of(xyz)
+    own = unit.of_points(xyz)
+    tried = clusters(own, normals, m / n)
+    assumed = _assumed(xy_mm, frame_mm, principal_distance_mm, sigma_mm)
+    search, found = _first([_Search(own, normals, marks, tried) for marks in assumed])
+    if found is None:
+        return f"the {m} marks found do not make the pattern that the {n} points would from any side"
+    other = search.other(found)
+    if other is not None:
+        return (
+            f"the points look the same from another side, or moved on, as a regular grid does: {len(found.mark)} marks "
+            f"agree with one naming, {len(other.mark)} with another one"
+        )
+    return unit.names(found, search.marks.c)
+
+
+def name_coded(
+    xyz: Array,
+    normals: Array,
+    xy_mm: Array,
+    frame_mm: tuple[Array, Array],
+    principal_distance_mm: float | None,
+    sigma_mm: float,
+    codes: Mapping[int, int],
+) -> Names | str:
+    """The same where codes say which points (by index) some of the marks (by index) are; not all of them need be right.
+
+    The pose that most codes agree with names the other marks. A mark whose code says another point has no name.
+    """
+    if len(codes) < LEAST_CODES:
+        return f"{len(codes)} coded targets were recognised, and {LEAST_CODES} are needed"
+    unit = _Unit.of(xyz)
+    assumed = _assumed(xy_mm, frame_mm, principal_distance_mm, sigma_mm)
+    grown = [(marks, one) for marks in assumed if (one := _grown_from_codes(unit, xyz, normals, marks, codes))]
+    if not grown:
+        return f"the {len(codes)} coded targets recognised lie on one line and do not orient the image"
+    marks, best = min(grown, key=lambda one: one[1].log10_chance)
+    right = sum(best.mark.get(point) == mark for mark, point in codes.items())
+    if best.log10_chance + np.log10(len(assumed)) > MOST_LOG10_CHANCE_OF_CODES:
+        return f"{right} of the {len(codes)} coded targets recognised lie as their points would, which may be chance"
+    numbers = set(codes.values())
+    named = {
+        point: mark
+        for point, mark in best.mark.items()
+        if codes.get(mark, point) == point and (mark in codes or point not in numbers)
+    }
+    return unit.names(replace(best, mark=named), marks.c)
+
+
+def _grown_from_codes(
+    unit: "_Unit", xyz: Array, normals: Array, marks: Marks, codes: Mapping[int, int]
+) -> Grown | None:
+    """What the pose that most codes agree with grows to, and how likely the codes would agree by chance; None where
+    they are on one line."""
+    coded, points = np.array(list(codes)), np.array(list(codes.values()))
+    resection = resect(xyz[points], marks.places[coded], 1.0, np.random.default_rng(1), marks.sigma)
+    if resection is None:
+        return None
+    shift = -resection.pose.rotation @ ((resection.pose.center - unit.origin) / unit.size)
+    view, agree = View(resection.pose.rotation, shift), resection.inliers
+    grown = grow(view, points[agree], coded[agree], unit.of_points(xyz), normals, marks)
+    right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
+    area = float(np.prod(marks.greatest - marks.least))
+    chance = min(np.pi * (2.0 * grown.gate) ** 2 / area, 1.0)
+    return replace(grown, log10_chance=log10_of_chance(right, len(codes), chance, float(comb(len(codes), OF_POSE))))
+
+
+def _assumed(
+    xy_mm: Array, frame_mm: tuple[Array, Array], principal_distance_mm: float | None, sigma_mm: float
+) -> list[Marks]:
+    """The marks in units of the principal distance, or of each that is tried where it is not known."""
+    if principal_distance_mm is not None:
+        return [Marks.of(xy_mm, *frame_mm, sigma_mm, principal_distance_mm, KNOWN_SIGMA)]
+    diagonal = float(np.linalg.norm(frame_mm[1] - frame_mm[0]))
+    return [Marks.of(xy_mm, *frame_mm, sigma_mm, share * diagonal, UNKNOWN_SIGMA) for share in UNKNOWN]
+
+
+@dataclass(frozen=True, eq=False)
+class _Unit:
+    """The field's middle and its size, in which the search reckons."""
+
+    origin: Array
+    size: float
+
+    @classmethod
+    def of(cls, xyz: Array) -> "_Unit":
+        return cls(xyz.mean(axis=0), float(np.linalg.norm(np.ptp(xyz, axis=0))))
+
+    def of_points(self, xyz: Array) -> Array:
+        return np.asarray((xyz - self.origin) / self.size)
+
+    def names(self, found: Grown, c: float) -> Names:
+        pose = Pose(found.view.rotation, self.origin - self.size * found.view.rotation.T @ found.view.shift)
+        scaled = c * (1.0 + found.view.scale)
+        return Names(found.mark, pose, scaled, found.view.radial, found.expected, found.log10_chance, found.gate * c)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """xyz, normals (n, 3) in units of the field's size about its middle; the marks; clusters to begin with."""
+
+    xyz: Array
+    normals: Array
+    marks: Marks
+    clusters: Sequence[Cluster]
+
+    def begun_with(self, cluster: Cluster) -> tuple[Grown | None, int]:
+        """The likeliest naming that one cluster leads to, if it leads to any, and how many poses were tried."""
+        triples = mark_triples(cluster, self.marks)
+        poses = promising(self.xyz, self.normals, self.marks, cluster.triple[None], triples)
+        return next(iter(self._grown(poses)), None), poses.tried
+
+    def other(self, found: Grown) -> Grown | None:
+        """Another naming that explains the image as well, if there is one: named clusters taken for other points."""
+        named = [cluster for cluster in self.clusters if all(int(point) in found.mark for point in cluster.triple)]
+        for cluster in named[:OTHER_CLUSTERS]:
+            seen = np.array([[found.mark[int(point)] for point in cluster.triple]])
+            points = point_triples(cluster, self.xyz)
+            poses = promising(self.xyz, self.normals, self.marks, points, seen)
+            for grown in self._grown(poses):
+                same = sum(found.mark.get(point) == mark for point, mark in grown.mark.items())
+                if same < 0.5 * len(grown.mark) and len(grown.mark) >= ALIKE_SHARE * len(found.mark):
+                    return grown
+        return None
+
+    def _grown(self, poses: Poses) -> list[Grown]:
+        grown = [
+            grow(View(rotation, shift), *named, self.xyz, self.normals, self.marks)
+            for rotation, shift, named in zip(poses.rotations, poses.shifts, poses.named, strict=True)
+        ]
+        enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
+        return sorted(enough, key=lambda one: one.log10_chance)
+
+
+def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
+    """The first naming that is believed, the clusters that need fewest trials first; the likeliest, if several
+    principal distances lead to one."""
+    most = MOST_LOG10_CHANCE - np.log10(len(searches))
+    tried = 0
+    for cluster in searches[0].clusters:
+        believed = []
+        for search in searches:
+            found, count = search.begun_with(cluster)
+            tried += count
+            if found is not None and found.log10_chance < most:
+                believed.append((search, found))
+        if believed:
+            return min(believed, key=lambda one: one[1].log10_chance)
+        if tried > MOST_POSES * len(searches):
+            break
+    return searches[0], None

@@ -1,0 +1,221 @@
+"""Hypotheses of how marks are named: three points that lie together are three marks that do; the points about them
+test the poses from which they would be."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from adjust.initial_values.resection import refined_poses, triple_poses
+from adjust.target_names.unnamed_marks import Marks
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_DIRECTIONS = 24  # from which the field is looked at to learn how near in a picture its clusters stay
+_NEARBY = 6  # next points in space, two of which make a cluster with a point
+_RANK_SHARE = 0.8  # of the directions, in which a cluster's points stay so near neighbours
+_SLENDER = 0.25  # width of a triangle over its length, below which it gives a poor pose
+_ABOUT = 16  # points about a cluster that test it...
+_FARTHER = 40  # ...and those that test it again after it was fitted to them
+_DETECTED = 0.75  # of the points that are in the frame
+_REACH, _LATER_REACH = (
+    0.07,
+    0.02,
+)  # of the distance from the cluster: what a pose of three marks leaves, and a fitted one
+_NOISE = 3.0  # standard deviations of a mark
+_SELF_REACH = 1.3  # how much farther apart than a cluster's points others may be that are taken for them
+_KEPT, _RETURNED = 96, 6
+_CHUNK = 20_000  # hypotheses tested at a time: they bound the memory
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """rotations (k, 3, 3), shifts (k, 3): camera = R X + t, those that explain most first; named: the points about the
+    cluster (indices) that agree, and the marks that they are, for each; tried: how many poses were tested."""
+
+    rotations: Array
+    shifts: Array
+    named: list[tuple[Indices, Indices]]
+    tried: int
+
+
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """triple (3,): points; ranks (2,): among how many next marks of the first one the others are sought."""
+
+    triple: Indices
+    ranks: tuple[int, int]
+
+
+def clusters(xyz: Array, normals: Array, marks_per_point: float) -> list[Cluster]:
+    """Clusters to begin with, those that need fewest hypotheses first, each point at the head of one at most."""
+    near = _next(xyz, min(_NEARBY, len(xyz) - 1))
+    ranks = _ranks(xyz, normals, near) * max(marks_per_point, 1.0) + 2.0
+    first, second = np.triu_indices(near.shape[1], 1)
+    triples = np.stack(
+        [np.broadcast_to(np.arange(len(xyz))[:, None], (len(xyz), len(first))), near[:, first], near[:, second]], axis=2
+    )
+    cost = ranks[:, first] * ranks[:, second]
+    corners = xyz[triples]
+    along, across = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
+    longest = np.maximum(np.maximum((along**2).sum(2), (across**2).sum(2)), ((along - across) ** 2).sum(2))
+    slender = np.linalg.norm(np.cross(along, across), axis=2) < _SLENDER * longest
+    best = np.argmin(np.where(slender, np.inf, cost), axis=1)
+    rows = np.arange(len(xyz))
+    usable = ~slender[rows, best]
+    order = rows[usable][np.argsort(cost[rows, best][usable], kind="stable")]
+    chosen = [
+        Cluster(triples[i, best[i]], (int(ranks[i, first[best[i]]]), int(ranks[i, second[best[i]]]))) for i in order
+    ]
+    return _apart(chosen)
+
+
+def _apart(ordered: Sequence[Cluster]) -> list[Cluster]:
+    """Those that share no point come first: what hides one cluster does not hide the next."""
+    used: set[int] = set()
+    first: list[Cluster] = []
+    later: list[Cluster] = []
+    for cluster in ordered:
+        own = set(cluster.triple.tolist())
+        (later if own & used else first).append(cluster)
+        used |= own
+    return first + later
+
+
+def _next(xyz: Array, count: int) -> Indices:
+    """(n, count) the points next to each."""
+    index = np.asarray(cKDTree(xyz).query(xyz, k=np.arange(1, count + 2))[1])
+    others = index != np.arange(len(xyz))[:, None]
+    others[others.all(axis=1), -1] = False  # of points at one place any may count as the point itself
+    return np.asarray(index[others].reshape(len(xyz), count), dtype=np.intp)
+
+
+def _ranks(xyz: Array, normals: Array, near: Indices) -> Array:
+    """(n, k) the rank, in most pictures, of each near point among a point's neighbours in the picture."""
+    n = len(xyz)
+    ranks = []
+    for direction in _directions():
+        towards = normals @ direction
+        if np.isfinite(towards).all() and (towards > 0.3).mean() < 0.5:
+            continue
+        flat = xyz @ np.linalg.svd(direction[None])[2][1:].T
+        own = np.linalg.norm(flat[near] - flat[:, None], axis=2)
+        ranks.append(np.stack([_count_within(flat, own[:, k]) for k in range(near.shape[1])], axis=1))
+    return np.quantile(ranks, _RANK_SHARE, axis=0) if ranks else np.full(near.shape, float(n - 1))
+
+
+def _count_within(flat: Array, reach: Array) -> Indices:
+    return np.asarray(cKDTree(flat).query_ball_point(flat, reach, return_length=True), dtype=np.intp)
+
+
+def _directions() -> Array:
+    """(k, 3) unit vectors spread over the sphere (Fibonacci's lattice)."""
+    i = np.arange(_DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * i / _DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * i
+    r = np.sqrt(1.0 - z**2)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+
+
+def mark_triples(cluster: Cluster, marks: Marks) -> Indices:
+    """(k, 3) the marks that a cluster could be: any mark, and two of those next to it."""
+    m = len(marks.places)
+    first, second = (min(rank, m - 1) for rank in cluster.ranks)
+    near = _next(marks.places, max(first, second))
+    b, c = (grid.ravel() for grid in np.meshgrid(np.arange(first), np.arange(second), indexing="ij"))
+    b, c = b[b != c], c[b != c]
+    heads = np.repeat(np.arange(m), len(b))
+    return np.stack([heads, near[:, b].ravel(), near[:, c].ravel()], axis=1)
+
+
+def point_triples(cluster: Cluster, xyz: Array) -> Indices:
+    """(k, 3) the points that a cluster could be confused with: any point, and two as near to it."""
+    head, *others = xyz[cluster.triple]
+    reach = [float(np.linalg.norm(other - head)) for other in others]
+    tree = cKDTree(xyz)
+    triples = [
+        (a, b, c)
+        for a, place in enumerate(xyz)
+        for b in tree.query_ball_point(place, _SELF_REACH * reach[0])
+        for c in tree.query_ball_point(place, _SELF_REACH * reach[1])
+        if len({a, b, c}) == 3
+    ]
+    return np.array(triples, dtype=np.intp).reshape(-1, 3)
+
+
+def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: Indices) -> Poses:
+    """The poses that explain best what lies about three points (k or 1, 3) if they are three marks (k or 1, 3)."""
+    count = max(len(points), len(named))
+    about = _about(xyz, points, _ABOUT)
+    kept: list[tuple[Array, Array, Indices, Array]] = []
+    tried = 0
+    for start in range(0, count, _CHUNK):
+        rows = np.arange(start, min(start + _CHUNK, count))
+        own, seen = _rows(points, rows), _rows(named, rows)
+        rotations, shifts, of = triple_poses(xyz[own], marks.places[seen])
+        tried += len(of)
+        facing = _facing(rotations, shifts, xyz, normals, own[of])
+        rotations, shifts, of = rotations[facing], shifts[facing], of[facing]
+        anchors = marks.places[seen[of]].mean(axis=1)
+        evidence, _, _ = _tested(rotations, shifts, xyz[_rows(about, rows)[of]], anchors, marks, _REACH)
+        best = np.argsort(-evidence, kind="stable")[:_KEPT]
+        kept.append((rotations[best], shifts[best], rows[of[best]], evidence[best]))
+    rotations, shifts, of, evidence = (np.concatenate(part) for part in zip(*kept, strict=True))
+    best = np.argsort(-evidence, kind="stable")[:_KEPT]
+    rotations, shifts, of = rotations[best], shifts[best], of[best]
+    own, seen = _rows(points, of), _rows(named, of)
+    anchors = marks.places[seen].mean(axis=1)
+    for count_about, reach in ((_ABOUT, _REACH), (_FARTHER, _LATER_REACH)):
+        ring = _rows(_about(xyz, points, count_about), of)
+        _, nearest, hit = _tested(rotations, shifts, xyz[ring], anchors, marks, reach)
+        fitted = np.concatenate([own, ring], axis=1), np.concatenate([seen, nearest], axis=1)
+        weights = np.concatenate([np.ones(own.shape), hit], axis=1)
+        rotations, shifts = refined_poses(rotations, shifts, xyz[fitted[0]], marks.places[fitted[1]], weights)
+    ring = _rows(_about(xyz, points, _FARTHER), of)
+    evidence, nearest, hit = _tested(rotations, shifts, xyz[ring], anchors, marks, _LATER_REACH)
+    best = np.argsort(-evidence, kind="stable")[:_RETURNED]
+    agreeing = [(np.append(own[i], ring[i, hit[i]]), np.append(seen[i], nearest[i, hit[i]])) for i in best]
+    return Poses(rotations[best], shifts[best], agreeing, tried)
+
+
+def _rows(table: Indices, rows: Indices) -> Indices:
+    """The rows of a table, of which there may be one for all."""
+    return table[rows] if len(table) > 1 else np.broadcast_to(table, (len(rows), table.shape[1]))
+
+
+def _about(xyz: Array, points: Indices, count: int) -> Indices:
+    """(k, count) the points next to the heads of clusters, the clusters' own points left out."""
+    count = min(count, len(xyz) - 3)
+    near = np.asarray(cKDTree(xyz).query(xyz[points].mean(axis=1), k=np.arange(1, count + 4))[1])
+    own = (near[:, :, None] == points[:, None, :]).any(axis=2)
+    order = np.argsort(own, axis=1, kind="stable")[:, :count]
+    return np.asarray(np.take_along_axis(near, order, axis=1), dtype=np.intp)
+
+
+def _facing(rotations: Array, shifts: Array, xyz: Array, normals: Array, points: Indices) -> NDArray[np.bool_]:
+    """Whether all three points turn their faces to the camera; where a point faces is not always known."""
+    stations = -np.einsum("kji,kj->ki", rotations, shifts)
+    towards = np.einsum("kpi,kpi->kp", normals[points], stations[:, None] - xyz[points])
+    return np.asarray(~(towards <= 0.0).any(axis=1))
+
+
+def _tested(
+    rotations: Array, shifts: Array, points: Array, anchors: Array, marks: Marks, reach: float
+) -> tuple[Array, Indices, NDArray[np.bool_]]:
+    """The evidence (k,) for poses, and for each of the points (k, p, 3) the nearest mark and whether it agrees."""
+    places = projected(rotations, shifts, points)
+    nearest = marks.nearest(places)
+    gate = _NOISE * marks.sigma + reach * np.linalg.norm(places - anchors[:, None], axis=2)
+    hit = np.linalg.norm(places - marks.places[nearest], axis=2) <= gate
+    chance = np.clip(marks.chance(places, gate), 1e-9, _DETECTED)
+    gain = np.where(hit, np.log(_DETECTED / chance), np.log((1.0 - _DETECTED) / (1.0 - chance)))
+    return np.where(marks.inside(places), gain, 0.0).sum(axis=1), nearest, hit & marks.inside(places)
+
+
+def projected(rotations: Array, shifts: Array, points: Array) -> Array:
+    """(k, p, 2) images of points (k, p, 3), in principal distances; nan behind the camera."""
+    camera = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
+    depth = np.where(camera[..., 2:] < 0.0, -camera[..., 2:], np.nan)
+    return np.asarray(camera[..., :2] / depth)

@@ -1,0 +1,1 @@
+"""The datum, and everything else that the observations do not determine."""

@@ -1,0 +1,162 @@
+"""The datum of the object space: the similarity transformations that no observation sees, and how they are fixed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.rotation import angles_near, rotation_from_vector
+from adjust.problem import Problem, State
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+EXACT = 1e-9  # what a generator may move of a given quantity and still be unhindered: rounding
+FLAT = 1e-3  # the same where relief, in parts of the field's extent, is too little to carry a datum
+CENTERINGS = 10  # the transformation is all but linear: two or three do
+LEVERAGES = (0.4, 0.1)  # part of a coordinate's motion that other datum values must leave open: at first, at the least
+
+
+@dataclass(frozen=True)
+class ObjectDatum:
+    """The similarity transformations of the object space about a centre (3,).
+
+    generators (n, 7): how every unknown moves with three shifts, three rotations and a scale, such that a point at the
+    distance `extent` from the centre moves by one unit. free (7, d): the combinations that nothing given hinders.
+    """
+
+    center: Array
+    extent: float
+    generators: Array
+    free: Array
+
+
+def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> ObjectDatum:
+    """The similarity transformations that change nothing given: coordinates, stations, attitudes and distances."""
+    placed = _point_positions(problem) if problem.unknowns.point else problem.exterior[:, :3]
+    center = state.values[placed].mean(axis=0)
+    extent = float(np.sqrt(((state.values[placed] - center) ** 2).sum(axis=1).mean())) or 1.0
+    generators = _generators(problem, state, center, extent)
+    moved = generators.copy()
+    moved[problem.exterior[:, 3:]] *= extent  # an angle's motion as that of a point
+    hindered = moved[np.isfinite(problem.unknowns.sigma)]
+    rows = np.vstack([hindered / np.sqrt(max(len(hindered), 1)), _further_motions(problem, state, generators)])
+    _, singular, right = np.linalg.svd(rows, full_matrices=False)
+    return ObjectDatum(center, extent, generators, right[singular <= tolerance].T)
+
+
+def _further_motions(problem: Problem, state: State, generators: Array) -> Array:
+    """How further observations change (m, 7), each by one unit at most, however short a distance may be."""
+    rows = [np.zeros((7, 7))]
+    for further in problem.further:
+        by_unknowns = further.by_unknowns(state.values)
+        motions = by_unknowns @ generators[further.positions]
+        lengths = np.linalg.norm(motions, axis=1, keepdims=True)
+        seen = lengths[:, 0] > EXACT * np.linalg.norm(by_unknowns, axis=1)
+        rows.append(motions[seen] / lengths[seen])
+    return np.vstack(rows)
+
+
+def _point_positions(problem: Problem) -> Indices:
+    """(points, 3) positions of all object coordinates."""
+    return np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
+
+
+def _generators(problem: Problem, state: State, center: Array, extent: float) -> Array:
+    generators = np.zeros((len(problem.unknowns), 7))
+    placed = np.concatenate([_point_positions(problem), problem.exterior[:, :3]])
+    lever = (state.values[placed] - center) / extent
+    generators[placed, :3] = np.eye(3)
+    for axis in range(3):
+        generators[placed, 3 + axis] = np.cross(np.eye(3)[axis], lever)
+    generators[placed, 6] = lever
+    # A rotation R of the object turns M into M R', which is the rotation vector -M r on top of M.
+    turned = np.linalg.solve(problem.attitude_by_unknowns(state), -state.rotations) / extent
+    generators[problem.exterior[:, 3:], 3:6] = turned
+    for name in problem.network.unoriented:
+        generators[problem.unknowns.exterior[name]] = 0.0
+    return generators
+
+
+def minimal_datum(problem: Problem) -> Indices:
+    """Positions of the coordinates that fix what is free of the datum, without strain.
+
+    Planimetry of two points far apart and the heights of these and of a third one off their line, as far as other
+    things do not fix them. A field flatter than a thousandth of its extent gives no scale by its heights alone.
+    """
+    state = problem.start()
+    datum = object_datum(problem, state, FLAT)
+    chosen: list[int] = []
+    motions = np.zeros((0, datum.free.shape[1]))
+    for leverage, position in product(LEVERAGES, _candidates(problem, state)):
+        if len(chosen) == datum.free.shape[1]:
+            break
+        motion = datum.generators[position] @ datum.free
+        rest = motion - motions.T @ (motions @ motion)
+        if np.linalg.norm(rest) > leverage * np.linalg.norm(motion):
+            chosen.append(int(position))
+            motions = np.vstack([motions, rest / np.linalg.norm(rest)])
+    return np.array(chosen, dtype=np.intp)
+
+
+def _candidates(problem: Problem, state: State) -> list[int]:
+    """Free coordinates, of points that two images show at least, in the order in which they are to be fixed."""
+    positions = _point_positions(problem)
+    free = np.isinf(problem.unknowns.sigma[positions[:, :2]]).all(axis=1)
+    rays = np.bincount(problem.places[~problem.is_fiducial, 0], minlength=len(problem.unknowns))
+    usable = positions[free & (rays[positions[:, 0]] >= 2)]
+    if len(usable) == 0:
+        return []
+    plan = state.values[usable[:, :2]]
+    a = int(np.argmax(((plan - plan.mean(axis=0)) ** 2).sum(axis=1)))
+    b = int(np.argmax(((plan - plan[a]) ** 2).sum(axis=1)))
+    along = plan[b] - plan[a]
+    c = int(np.argmax(np.abs((plan - plan[a]) @ np.array([-along[1], along[0]]))))
+    order = [*usable[a], *usable[b], usable[c, 2], *usable[c, :2]]
+    return [int(position) for position in order if np.isinf(problem.unknowns.sigma[position])]
+
+
+def centered(problem: Problem, state: State, members: Indices) -> State:
+    """The state after the similarity transformation that brings some coordinates nearest to their approximations."""
+    for _ in range(CENTERINGS):
+        datum = object_datum(problem, state, FLAT)
+        motion = datum.generators[members] @ datum.free
+        amount = np.linalg.lstsq(motion, problem.unknowns.start[members] - state.values[members])[0]
+        state = _transformed(problem, state, datum, datum.free @ amount)
+        if np.abs(amount).max(initial=0.0) <= EXACT * datum.extent:
+            break
+    return state
+
+
+def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:
+    """Positions of the object coordinates, of some points or of all, of which nothing is given."""
+    of = problem.unknowns.point
+    positions = np.concatenate([of[point] for point in points]) if points else _point_positions(problem).ravel()
+    return np.asarray(positions[np.isinf(problem.unknowns.sigma[positions])])
+
+
+def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Array) -> State:
+    shift, turn, growth = amounts[:3], amounts[3:6] / datum.extent, amounts[6] / datum.extent
+    rotation = rotation_from_vector(turn)
+    values = state.values.copy()
+    placed = np.concatenate([_point_positions(problem), problem.exterior[:, :3]])
+    moved = datum.center + shift + (1.0 + growth) * (values[placed] - datum.center) @ rotation.T
+    values[placed] = np.where(problem.unknowns.sigma[placed] == 0.0, values[placed], moved)
+    rotations = state.rotations @ rotation.T
+    for i, positions in enumerate(problem.exterior[:, 3:]):
+        if problem.unknowns.sigma[positions].any():
+            values[positions] = angles_near(rotations[i], values[positions])
+    return State(values, np.where(_held(problem)[:, None, None], state.rotations, rotations))
+
+
+def _held(problem: Problem) -> NDArray[np.bool_]:
+    """Images whose attitude is fixed."""
+    return np.asarray((problem.unknowns.sigma[problem.exterior[:, 3:]] == 0.0).all(axis=1))
+
+
+def free_motion(problem: Problem, state: State) -> Array:
+    """How all quantities move (n, d) with what is free of the datum."""
+    datum = object_datum(problem, state, FLAT)
+    return np.asarray(datum.generators @ datum.free)

@@ -1,0 +1,280 @@
+"""Each fiducial mark checked by what else is known of it: its place by another method, the lines of opposite marks, and
+the camera's other frames.
+
+Every check is a test at a stated probability of doubting any good mark of all the camera's frames (Bonferroni: divided
+by the number of tests). A mark that fails one is weak: the reason says why, and its covariance is enlarged by what was
+found, for it is known no better than that. What all frames have in common is the camera's, and no error.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from measure.marks.shapes import FiducialLayout
+from measure.results import FrameMeasurement, MarkMeasurement
+from measure.status import Status
+
+Array = NDArray[np.float64]
+
+_CHANCE = 0.01  # of doubting any good mark, of each check
+_FILM_MM = 0.005  # scatter of marks by film and scanner, where one frame has to be judged alone
+_GIVEN_MM = 0.1  # a datum's standard deviation may be a millimetre: the given places are better than that
+_OPPOSITE_MM = 0.3  # how far from being opposite about the centre two given marks may be: an affinity keeps midpoints
+_TOLD = np.log(100.0)  # log-odds at which one mark rather than another is taken for the one that is off
+_ROUNDS = 10  # of fitting the frames to the median of all, which comes to rest after a few
+_MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Why a mark is no longer called measured, and how far off that puts it."""
+
+    reason: str
+    off_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The marks of a frame that are observations: their places in the layout (n,), camera mm (n, 2) through the frame's
+    own transformation, standard deviations sigma_mm (n,); mm: of a pixel."""
+
+    index: NDArray[np.intp]
+    camera_mm: Array
+    sigma_mm: Array
+    mm: float
+
+    def without(self, places: Sequence[int]) -> "_Seen":
+        kept = np.setdiff1d(np.arange(len(self.index)), places)
+        return replace(self, index=self.index[kept], camera_mm=self.camera_mm[kept], sigma_mm=self.sigma_mm[kept])
+
+
+def cross_checked(frames: Sequence[FrameMeasurement], layout: FiducialLayout) -> tuple[FrameMeasurement, ...]:
+    """The frames of one camera after all checks of their fiducials."""
+    for check in (_by_other_method, _by_other_frames, _by_midpoints):
+        frames = tuple(_doubted(frame, doubts) for frame, doubts in zip(frames, check(frames, layout), strict=True))
+    return tuple(frames)
+
+
+def _doubted(frame: FrameMeasurement, doubts: Mapping[str, Doubt]) -> FrameMeasurement:
+    marks = tuple(
+        _weakened(mark, doubts[mark.point]) if mark.kind == "fiducial" and mark.point in doubts else mark
+        for mark in frame.marks
+    )
+    return replace(frame, marks=marks)
+
+
+def _weakened(mark: MarkMeasurement, doubt: Doubt) -> MarkMeasurement:
+    """Its variance enlarged by the mean square, an axis, of how far it is off."""
+    assert mark.covariance_px2 is not None  # an observation has one
+    reason = f"{mark.reason}; {doubt.reason}" if mark.reason else doubt.reason
+    covariance = mark.covariance_px2 + doubt.off_px**2 / 2 * np.eye(2)
+    return replace(mark, status=Status.WEAK, reason=reason, covariance_px2=covariance)
+
+
+def _observed(frame: FrameMeasurement) -> list[MarkMeasurement]:
+    return [mark for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation]
+
+
+def _by_other_method(frames: Sequence[FrameMeasurement], _: FiducialLayout) -> Iterator[dict[str, Doubt]]:
+    """The place by the mark's edges must not differ from the matched one by more than noise explains."""
+    name = "second_method_sigmas"
+    tests = sum(name in mark.quality for frame in frames for mark in _observed(frame))
+    for frame in frames:
+        doubts = {}
+        for mark in _observed(frame):
+            sigmas = mark.quality.get(name)
+            if sigmas is not None and stats.chi2.sf(sigmas**2, 2) * tests < _CHANCE:
+                off = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
+                doubts[mark.point] = Doubt(
+                    f"its edges put it {off:.2f} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
+                    "it is damaged or unlike its drawing",
+                    off,
+                )
+        yield doubts
+
+
+def _by_other_frames(frames: Sequence[FrameMeasurement], layout: FiducialLayout) -> Iterator[dict[str, Doubt]]:
+    """Every frame, under an affinity, against the median of the camera's other frames: the frame that is worst off
+    first, and without what is off there the others again."""
+    seen = [_seen(frame, layout) for frame in frames]
+    doubts: list[dict[str, Doubt]] = [{} for _ in frames]
+    while True:
+        others = _others_mm(seen, layout)
+        fits = {
+            place: _Fit(each, reference)
+            for place, (each, reference) in enumerate(zip(seen, others, strict=True))
+            if reference is not None and len(each.index) > 3
+        }
+        if len(fits) < 2:
+            break
+        scatter = _Scatter.of(list(fits.values()))
+        chances = {place: scatter.chance(fit) for place, fit in fits.items()}
+        worst = min(chances, key=lambda place: chances[place])
+        if chances[worst] * len(fits) >= _CHANCE:
+            break
+        # Of two frames nobody knows which one is off.
+        for place in fits if len(fits) == 2 else (worst,):
+            alike, off_mm = _strangers(seen[place], others[place], scatter)
+            names = [layout.marks[seen[place].index[number]].id for number in alike]
+            for name, off in zip(names, off_mm, strict=True):
+                doubts[place][name] = Doubt(_from_others(off, names), off / seen[place].mm)
+            seen[place] = seen[place].without(alike)
+    yield from doubts
+
+
+def _seen(frame: FrameMeasurement, layout: FiducialLayout) -> _Seen:
+    number = {mark.id: place for place, mark in enumerate(layout.marks)}
+    marks = [mark for mark in _observed(frame) if mark.point in number] if frame.pixel_from_camera is not None else []
+    matrix = np.eye(2, 3) if frame.pixel_from_camera is None else frame.pixel_from_camera
+    mm = float(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+    centers = np.array([mark.center_px for mark in marks]).reshape(-1, 2)
+    sigma = [np.sqrt(np.trace(mark.covariance_px2) / 2) for mark in marks if mark.covariance_px2 is not None]
+    camera = (centers - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
+    return _Seen(np.array([number[mark.point] for mark in marks], dtype=np.intp), camera, mm * np.array(sigma), mm)
+
+
+def _others_mm(seen: Sequence[_Seen], layout: FiducialLayout) -> list[Array | None]:
+    """For each frame its marks (n, 2) as the median of all other frames has them; None where one is in no other.
+
+    The median is found in turns: frames fitted to it by affinities, then together anew; the given places hold the
+    datum.
+    """
+    common = np.array([mark.xy_mm for mark in layout.marks])
+    fitted = np.full((len(seen), *common.shape), np.nan)
+    for _ in range(_ROUNDS):
+        for each, places in zip(seen, fitted, strict=True):
+            places[:] = np.nan
+            if len(each.index) > 3:
+                design = _affine(each.camera_mm)
+                places[each.index] = design @ np.linalg.lstsq(design, common[each.index], rcond=None)[0]
+        found = np.isfinite(fitted[..., 0]).any(axis=0)
+        common[found] = np.nanmedian(fitted[:, found], axis=0)
+    result: list[Array | None] = []
+    for place, each in enumerate(seen):
+        rest = np.delete(fitted, place, axis=0)[:, each.index]
+        known = len(each.index) > 0 and bool(np.isfinite(rest[..., 0]).any(axis=0).all())
+        result.append(np.nanmedian(rest, axis=0) if known else None)
+    return result
+
+
+def _affine(places: Array) -> Array:
+    return np.column_stack([places, np.ones(len(places))])
+
+
+class _Fit:
+    """A frame fitted by an affinity to a reference, in mm of the camera, on the marks kept (n,), all unless said: off
+    (all, 2), of every mark, residuals (n, 2) and leverage (n,) of those kept, degrees of freedom."""
+
+    def __init__(self, seen: _Seen, reference: Array | None, kept: NDArray[np.bool_] | None = None) -> None:
+        assert reference is not None
+        kept = np.ones(len(seen.index), dtype=bool) if kept is None else kept
+        design = _affine(seen.camera_mm)
+        q = np.linalg.qr(design[kept])[0]
+        solution = np.linalg.lstsq(design[kept], reference[kept], rcond=None)[0]
+        self.off = reference - design @ solution  # of those left out, too
+        self.residuals = self.off[kept]
+        self.leverage: Array = np.asarray((q**2).sum(axis=1))
+        self.sigma = seen.sigma_mm[kept]
+        self.degrees = 2 * (int(kept.sum()) - 3)
+
+
+@dataclass(frozen=True)
+class _Scatter:
+    """What film and scanner scatter a mark by, an axis, and on how many degrees of freedom that is known."""
+
+    variance_mm2: float
+    degrees: float
+
+    @classmethod
+    def of(cls, fits: Sequence[_Fit]) -> "_Scatter":
+        """From the median of the squared residuals, freed of what the fits take up: marks that are off do not widen it.
+        Half of Rayleigh's squares are below 2 ln 2."""
+        squares = np.concatenate([(fit.residuals**2).sum(axis=1) / np.maximum(1 - fit.leverage, 1e-6) for fit in fits])
+        variance = float(np.median(squares)) / (2 * np.log(2))
+        return cls(max(variance, 1e-12), _MEDIAN_EFFICIENCY * sum(fit.degrees for fit in fits))
+
+    def chi_square(self, fit: _Fit) -> float:
+        return float(((fit.residuals**2).sum(axis=1) / (self.variance_mm2 + fit.sigma**2)).sum())
+
+    def chance(self, fit: _Fit) -> float:
+        """The probability that a frame of good marks leaves as much."""
+        if fit.degrees <= 0:
+            return 1.0
+        return float(stats.f.sf(self.chi_square(fit) / fit.degrees, fit.degrees, max(self.degrees, 1.0)))
+
+
+def _strangers(seen: _Seen, reference: Array | None, scatter: _Scatter) -> tuple[list[int], list[float]]:
+    """The mark of a frame that is off, or those that it cannot be told from, and how far, mm, each is."""
+    everything = np.ones(len(seen.index), dtype=bool)
+    without = []
+    for place in range(len(everything)):
+        rest = everything.copy()
+        rest[place] = False
+        without.append(_Fit(seen, reference, rest))
+    misfits = np.array([scatter.chi_square(fit) for fit in without])
+    alike = np.flatnonzero(misfits - misfits.min() < 2 * _TOLD).tolist()
+    fit = without[alike[0]] if len(alike) == 1 else _Fit(seen, reference)
+    return alike, [float(np.hypot(*fit.off[place])) for place in alike]
+
+
+def _from_others(off_mm: float, names: Sequence[str]) -> str:
+    if len(names) == 1:
+        return f"it lies {off_mm:.3f} mm from where the camera's other frames have it, more than they scatter"
+    return (
+        f"one of the marks {', '.join(names)} lies off where the camera's other frames have it, this one by "
+        f"{off_mm:.3f} mm; which one, they do not tell"
+    )
+
+
+def _by_midpoints(frames: Sequence[FrameMeasurement], layout: FiducialLayout) -> Iterator[dict[str, Doubt]]:
+    """The midpoints of opposite marks lie in one point, as far as the given places have them there."""
+    pairs = _opposite(layout)
+    seen = [_seen(frame, layout) for frame in frames]
+    whole = [[pair for pair in pairs if np.isin(pair, each.index).all()] for each in seen]
+    tests = sum(len(own) for own in whole if len(own) > 1)
+    for each, own in zip(seen, whole, strict=True):
+        yield _off_midpoint(each, own, _CHANCE / max(tests, 1), layout) if len(own) > 1 else {}
+
+
+def _opposite(layout: FiducialLayout) -> list[tuple[int, int]]:
+    xy = np.array([mark.xy_mm for mark in layout.marks])
+    middle = xy.mean(axis=0)
+    return [
+        (first, second)
+        for first, second in combinations(range(len(xy)), 2)
+        if np.hypot(*(xy[first] + xy[second] - 2 * middle)) < _OPPOSITE_MM
+    ]
+
+
+def _off_midpoint(
+    seen: _Seen, pairs: Sequence[tuple[int, int]], chance: float, layout: FiducialLayout
+) -> dict[str, Doubt]:
+    """The marks of the pair whose midpoint is farthest, in standard deviations, from that of the others."""
+    given = np.array([mark.xy_mm for mark in layout.marks])
+    sigma = np.array([min(max(mark.sigma_mm), _GIVEN_MM) for mark in layout.marks])
+    off = np.zeros((len(layout.marks), 2))
+    variance = np.full(len(layout.marks), np.inf)
+    off[seen.index] = seen.camera_mm - given[seen.index]
+    variance[seen.index] = seen.sigma_mm**2 + sigma[seen.index] ** 2 + _FILM_MM**2
+    midpoints = np.array([off[list(pair)].mean(axis=0) for pair in pairs])
+    spread = np.array([variance[list(pair)].sum() / 4 for pair in pairs])
+    count = len(pairs)
+    apart = (midpoints - midpoints.mean(axis=0)) * count / (count - 1)  # from the mean of the others
+    spread = spread + (spread.sum() - spread) / (count - 1) ** 2
+    squares = (apart**2).sum(axis=1) / spread
+    worst = int(squares.argmax())
+    if stats.chi2.sf(squares[worst], 2) > chance:
+        return {}
+    guilty = pairs if count == 2 else [pairs[worst]]
+    distance = float(np.hypot(*apart[worst]))
+    lines = " and ".join("-".join(layout.marks[place].id for place in pair) for pair in guilty)
+    reason = (
+        f"the lines of opposite marks do not meet: the midpoint of {lines} lies {distance:.3f} mm off, "
+        f"{np.sqrt(squares[worst]):.1f} standard deviations: a mark of these is off, or film or "
+        "scanner bent"
+    )
+    return {layout.marks[place].id: Doubt(reason, distance / seen.mm) for pair in guilty for place in pair}

@@ -1,0 +1,1 @@
+"""Targets that name themselves: ring codes, sheets of dots, calibration boards."""

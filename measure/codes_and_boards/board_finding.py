@@ -1,0 +1,159 @@
+"""Where a calibration board lies in a scan, to a pixel: OpenCV's detectors on a reduced picture."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.codes_and_boards.board_specs import ArucoSpec, CharucoSpec, ChessboardSpec, aruco_dictionary
+from measure.scans.scan import Scan
+
+Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+FIRST_SIZE_PX, LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
+LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
+
+
+@dataclass(frozen=True)
+class FoundCorner:
+    """A corner to a pixel. center_px (2,) in the scan; steps_px (2, 2): its columns are the sides of the square that
+    begins here (its right and its lower neighbour), or of the marker: the edges leaving the corner."""
+
+    center_px: Array
+    steps_px: Array
+
+
+@dataclass(frozen=True)
+class FoundBoard:
+    """The corners found, by id; none, and the reason why."""
+
+    corners: dict[str, FoundCorner]
+    reason: str = ""
+
+
+def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> FoundBoard:
+    """Search a board at a size that shows it whole, then finer: small boards in large scans need it."""
+    reason = ""
+    for factor in search_factors(scan):
+        picture, reason = searchable(scan, factor)
+        if reason:
+            return FoundBoard({}, reason)
+        if isinstance(spec, ChessboardSpec):
+            found = find_chessboard(picture, spec)
+        elif isinstance(spec, CharucoSpec):
+            found = find_charuco(picture, spec)
+        else:
+            found = find_aruco(picture, spec)
+        if found.corners:
+            return FoundBoard({name: in_scan(corner, factor) for name, corner in found.corners.items()})
+        reason = found.reason
+    return FoundBoard({}, reason)
+
+
+def search_factors(scan: Scan) -> list[int]:
+    """Reductions of the scan to search, the coarsest first."""
+    longest = max(scan.width_px, scan.height_px)
+    coarse, fine = (max(round(longest / size), 1) for size in (FIRST_SIZE_PX, LAST_SIZE_PX))
+    return [coarse] if coarse == fine else [coarse, fine]
+
+
+def searchable(scan: Scan, factor: int) -> tuple[Bytes, str]:
+    """The reduced scan stretched to 8 bits, and why there is nothing to search in it, if so."""
+    grey = scan.reduced(factor)
+    low, high = np.percentile(grey, (1, 99))
+    if high - low < LEAST_CONTRAST * scan.full_scale_dn:
+        share = 100 * (high - low) / scan.full_scale_dn
+        return np.zeros((1, 1), np.uint8), f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
+    return np.clip((grey - low) * (255 / (high - low)), 0, 255).astype(np.uint8), ""
+
+
+def in_scan(corner: FoundCorner, factor: int) -> FoundCorner:
+    """Pixel (i, j) of a reduced picture has its centre at factor j + (factor - 1) / 2."""
+    return FoundCorner(corner.center_px * factor + (factor - 1) / 2, corner.steps_px * factor)
+
+
+def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
+    """All inner corners of a chessboard that is wholly seen."""
+    size = (spec.columns, spec.rows)
+    for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE, 0):
+        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
+        if found:
+            break
+    else:
+        # The older detector can search for minutes in vain; its fast check refuses a picture without squares first.
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+        found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
+    if not found:
+        return FoundBoard({}, f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen")
+    grid = right_handed(np.asarray(corners, float).reshape(spec.rows, spec.columns, 2))
+    return FoundBoard(
+        {
+            f"r{row}c{column}": FoundCorner(grid[row, column], steps)
+            for (row, column), steps in np.ndenumerate(grid_steps(grid))
+        }
+    )
+
+
+def right_handed(grid: Array) -> Array:
+    """A (rows, columns, 2) grid of which the columns' direction, then the rows', turn as column and row of a scan."""
+    across, down = grid[:, -1] - grid[:, 0], grid[-1] - grid[0]
+    turn = np.linalg.det(np.stack([across.mean(axis=0), down.mean(axis=0)]))
+    return grid if turn > 0 else grid[:, ::-1]
+
+
+def grid_steps(grid: Array) -> NDArray[np.object_]:
+    """(rows, columns) of (2, 2) matrices: the grid's steps to the right and down at each of its points."""
+    steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1)
+    result = np.empty(grid.shape[:2], object)
+    for place in np.ndindex(*result.shape):
+        result[place] = steps[place]
+    return result
+
+
+def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
+    """The inner corners whose neighbouring markers are read."""
+    size = (spec.columns, spec.rows)
+    board = cv2.aruco.CharucoBoard(size, spec.square_mm, spec.marker_mm, aruco_dictionary(spec.dictionary))
+    corners, numbers, _, markers = cv2.aruco.CharucoDetector(board).detectBoard(picture)
+    if corners is None or len(corners) < 4:
+        read = 0 if markers is None else len(markers)
+        return FoundBoard({}, f"{read} markers of {spec.dictionary} were read, too few to place the board's corners")
+    places, ids = np.asarray(corners, float).reshape(-1, 2), np.asarray(numbers, int).ravel()
+    return FoundBoard(
+        {
+            f"c{number}": FoundCorner(place, steps)
+            for number, place, steps in zip(ids, places, charuco_steps(ids, places, spec), strict=True)
+        }
+    )
+
+
+def charuco_steps(ids: NDArray[np.int64], places: Array, spec: CharucoSpec) -> list[Array]:
+    """The squares' sides at each corner, from a homography of the board: neighbours may be missing."""
+    across = spec.columns - 1
+    board = np.stack([ids % across, ids // across], axis=-1).astype(float)
+    homography, _ = cv2.findHomography(board, places)
+    return [homography_steps(np.asarray(homography, float), place) for place in board]
+
+
+def homography_steps(homography: Array, place: Array) -> Array:
+    """(2, 2) derivatives of a homography at a place."""
+    x, y, w = homography @ (*place, 1.0)
+    return np.asarray((homography[:2, :2] - np.outer((x, y), homography[2, :2]) / w) / w)
+
+
+def find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
+    """The corners of the board's markers that are read; steps are the marker's sides that leave the corner."""
+    detector = cv2.aruco.ArucoDetector(aruco_dictionary(spec.dictionary))
+    outlines, numbers, _ = detector.detectMarkers(picture)
+    wanted = range(spec.first_marker, spec.first_marker + spec.columns * spec.rows)
+    found = {}
+    for outline, number in zip(outlines, [] if numbers is None else np.asarray(numbers).ravel(), strict=True):
+        if number not in wanted:
+            continue
+        corners = np.asarray(outline, float).reshape(4, 2)
+        for index, corner in enumerate(corners):
+            sides = np.stack([corners[(index + 1) % 4] - corner, corners[(index - 1) % 4] - corner], axis=-1)
+            found[f"{number}.{index}"] = FoundCorner(corner, sides)
+    return FoundBoard(found, "" if found else f"no marker {wanted[0]} to {wanted[-1]} of {spec.dictionary} was read")

@@ -1,0 +1,165 @@
+"""The points of a calibration board in a scan: found by OpenCV, measured by least-squares matching."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.codes_and_boards.board_finding import FoundCorner, find_board
+from measure.codes_and_boards.board_specs import (
+    ArucoSpec,
+    BoardSpec,
+    CharucoSpec,
+    ChessboardSpec,
+    CircleGridSpec,
+    aruco_dictionary,
+)
+from measure.codes_and_boards.circle_grids import measure_circle_grid
+from measure.codes_and_boards.corners import Corner, Surface, crossing, fit_corner, quarter
+from measure.results import MarkMeasurement
+from measure.scans.scan import Scan
+from measure.scans.scan_window import ScanWindow
+from measure.status import Status
+
+Array = NDArray[np.float64]
+
+# Along the edges, in shares of a square's side:
+REACH = 0.3  # light, lens and paper change little over it
+SHORTEST_REACH_PX = 5.0  # less shows too little of the edges...
+FARTHEST_REACH = 0.6  # ...but beyond this share the neighbouring crossing begins to show
+LONGEST_REACH_PX = 15.0  # enough for a few thousandths of a pixel, whatever the square
+MARKER_REACH = 0.8  # of a marker's module: its black border is one module wide
+WEAK_DAMAGE = 0.25
+
+
+@dataclass(frozen=True)
+class BoardMeasurement:
+    """A board in a scan: one mark for each of its points, found or not; reason: why the board was not found; notes:
+    what the user should know."""
+
+    marks: tuple[MarkMeasurement, ...]
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
+    """Measure a chessboard, circle grid, ArUco or ChArUco board. A board that is not there is no error."""
+    if isinstance(spec, CircleGridSpec):
+        marks, reason, notes = measure_circle_grid(scan, spec)
+        return BoardMeasurement(marks, reason, notes)
+    board = find_board(scan, spec)
+    reach = common_reach_px(board.corners.values()) if board.corners else 0.0
+    fitted = {name: fit_found(scan, found, spec, reach) for name, found in board.corners.items()}
+    notes = ()
+    if isinstance(spec, ChessboardSpec) and fitted:
+        fitted, notes = named_by_colour(fitted, board.corners, spec)
+    missing = board.reason or "not seen: its markers were not read"
+    marks = tuple(as_mark(name, fitted.get(name), missing) for name in spec.object_points())
+    return BoardMeasurement(marks, board.reason, notes)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedCorner:
+    """A corner as fitted, and how far that moved it from where it was found."""
+
+    corner: Corner
+    moved_px: float
+
+
+def fit_found(
+    scan: Scan, found: FoundCorner, spec: ChessboardSpec | ArucoSpec | CharucoSpec, board_reach_px: float
+) -> FittedCorner:
+    """Least-squares matching about a corner that was found."""
+    surface: Surface = quarter if isinstance(spec, ArucoSpec) else crossing
+    if isinstance(spec, ArucoSpec):
+        reach = marker_reach_px(found.steps_px, spec)
+    else:
+        reach = reach_px(found.steps_px, board_reach_px, spec)
+    half = np.ceil(np.abs(found.steps_px / np.hypot(*found.steps_px)) @ reach).astype(int) + 2
+    col0, row0 = np.round(found.center_px).astype(int) - half
+    width, height = 2 * half + 1
+    place_px = int(col0), int(row0), int(width), int(height)
+    window = ScanWindow(scan.window(*place_px), (col0, row0), scan.inside(*place_px))
+    corner = fit_corner(window, found.center_px, found.steps_px, reach, surface)
+    return FittedCorner(corner, float(np.hypot(*(corner.center_px - found.center_px))))
+
+
+def reach_px(steps_px: Array, board_reach_px: float, spec: ChessboardSpec | CharucoSpec) -> Array:
+    """(2,) how far along the square's sides grey values are used: not into a marker in one of the squares."""
+    farthest = FARTHEST_REACH
+    if isinstance(spec, CharucoSpec):
+        farthest = (spec.square_mm - spec.marker_mm) / (2 * spec.square_mm)
+    return np.full(2, min(board_reach_px, farthest * float(np.hypot(*steps_px).min())))
+
+
+def common_reach_px(corners: Iterable[FoundCorner]) -> float:
+    """One reach for a whole board: what a camera's sharpening does to a corner depends on the window, and where all
+    windows are alike it moves all corners alike, and not the near ones otherwise than the far ones."""
+    sides = [float(np.hypot(*corner.steps_px).min()) for corner in corners]
+    return float(np.clip(REACH * np.median(sides), SHORTEST_REACH_PX, LONGEST_REACH_PX))
+
+
+def marker_reach_px(sides_px: Array, spec: ArucoSpec) -> Array:
+    """(2,) the same along a marker's sides."""
+    modules = aruco_dictionary(spec.dictionary).markerSize + 2
+    gap_modules = spec.gap_mm / spec.marker_mm * modules
+    return np.asarray(
+        np.minimum(MARKER_REACH * min(1.0, gap_modules) * np.hypot(*sides_px) / modules, LONGEST_REACH_PX)
+    )
+
+
+def named_by_colour(
+    fitted: dict[str, FittedCorner], found: dict[str, FoundCorner], spec: ChessboardSpec
+) -> tuple[dict[str, FittedCorner], tuple[str, ...]]:
+    """The corners named so that the square r0c0, r0c1, r1c1, r1c0 is dark; a board that looks the same after a half
+    turn is taken as upright. Boards of as many columns as rows are turned by quarters."""
+    quarters = range(4) if spec.columns == spec.rows else (0, 2)
+    names = np.array([[f"r{row}c{column}" for column in range(spec.columns)] for row in range(spec.rows)])
+    turned = [np.rot90(names, quarter_turns) for quarter_turns in quarters]
+    # Turned by a quarter, the square between a corner's steps is its neighbour of the other colour.
+    darkness = np.array(
+        [-((-1) ** turns) * first_square_contrast(fitted, now) for turns, now in zip(quarters, turned, strict=True)]
+    )
+    upright = np.array([steps_right(found, names_now) for names_now in turned])
+    best = max(range(len(turned)), key=lambda index: (darkness[index] > 0, upright[index]))
+    notes: tuple[str, ...] = ()
+    if np.sum(darkness > 0) > 1:
+        notes = ("the board looks the same after a half turn: it was taken as upright in the scan",)
+    return {str(new): fitted[str(old)] for new, old in zip(names.ravel(), turned[best].ravel(), strict=True)}, notes
+
+
+def first_square_contrast(fitted: dict[str, FittedCorner], names: NDArray[np.str_]) -> float:
+    """How much lighter than its neighbours the square at the first corner is, over the whole board."""
+    sign = np.where(np.indices(names.shape).sum(axis=0) % 2 == 0, 1, -1)
+    contrast = np.array([[fitted[str(name)].corner.contrast_dn for name in row] for row in names])
+    return float(np.nanmedian(sign * contrast))
+
+
+def steps_right(found: dict[str, FoundCorner], names: NDArray[np.str_]) -> float:
+    """How far to the right in the scan the first row runs."""
+    first, last = found[str(names[0, 0])].center_px, found[str(names[0, -1])].center_px
+    return float(last[0] - first[0])
+
+
+def as_mark(name: str, fitted: FittedCorner | None, missing: str) -> MarkMeasurement:
+    """The row of a point."""
+    if fitted is None:
+        return MarkMeasurement(name, "target", None, None, Status.ABSENT, missing)
+    corner = fitted.corner
+    if corner.reason:
+        return MarkMeasurement(name, "target", corner.center_px, None, Status.PREDICTED, f"not fitted: {corner.reason}")
+    quality = {
+        "snr": abs(corner.contrast_dn) / max(corner.noise_dn, 1e-9),
+        "contrast_dn": corner.contrast_dn,
+        "noise_dn": corner.noise_dn,
+        "blur_px": corner.blur_px,
+        "damaged_fraction": corner.damaged_fraction,
+        "moved_px": fitted.moved_px,
+    }
+    if corner.junction_px is not None:
+        quality |= {"junction_col_px": corner.junction_px[0], "junction_row_px": corner.junction_px[1]}
+    weak = corner.damaged_fraction > WEAK_DAMAGE
+    reason = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit" if weak else ""
+    status = Status.WEAK if weak else Status.MEASURED
+    return MarkMeasurement(name, "target", corner.center_px, corner.covariance_px2, status, reason, quality)

@@ -1,0 +1,110 @@
+"""Ring-coded targets: a dot with a ring about it that is cut into equal segments, each of them a bit."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.scans.scan import Scan
+from measure.single_targets.disk_patches import Candidate
+
+Array = NDArray[np.float64]
+
+SAMPLES = 16  # along each segment
+RING_SHARES = (0.35, 0.5, 0.65)  # where across the ring it is sampled: its edges are blurred
+CORE = 0.4  # of the dot's radius: the middle of the dot
+GAP_LEVEL = 0.35  # of the dot's contrast: the gap between dot and ring is plain ground
+LEAST_PLAIN = 0.97  # of the gap
+EDGE_SAMPLES = 4  # at either end of a segment, which blur and perspective may give to its neighbour
+SURE = 0.3  # how near to ground or dot a bit must be, in units of the dot's contrast
+
+
+@dataclass(frozen=True)
+class RingCode:
+    """bits: the segments of the ring; ring: its inner and outer radius in units of the dot's radius.
+
+    The default is the common 12-bit code (Schneider, IDENT/VISION 1991), whose ring is as wide as the gap and as the
+    dot's radius. A code's number is the smallest that its segments give.
+    """
+
+    bits: int = 12
+    ring: tuple[float, float] = (2.0, 3.0)
+
+    def __post_init__(self) -> None:
+        if not 4 <= self.bits <= 24:
+            raise ValueError(f"its bits are {self.bits}; 4 to 24 are right")
+        if not 1.2 <= self.ring[0] < self.ring[1]:
+            raise ValueError(f"its ring is {list(self.ring)} of the dot's radius; 1.2 or more, the inner one first")
+
+    def number(self, segments: NDArray[np.bool_]) -> int:
+        """The smallest number that the segments (bits,), in clockwise order, give from any start, first bit highest."""
+        weights = 1 << np.arange(self.bits)[::-1]
+        return min(int(weights @ np.roll(segments, turn)) for turn in range(self.bits))
+
+    def mirrored(self, number: int) -> int:
+        """The number whose ring, seen from behind, reads as this one."""
+        return self.least_turn(int(f"{number:0{self.bits}b}"[::-1], 2))
+
+    def published_numbers(self) -> tuple[int, ...]:
+        """The numbers of DE 197 33 466 A1, in rising order: an even number of set bits, two of them opposite one
+        another. Any other number is read too."""
+        odd = range(1, 2**self.bits - 1, 2)
+        return tuple(number for number in odd if self._is_published(number) and self._is_least(number))
+
+    def _is_published(self, number: int) -> bool:
+        half = self.bits // 2
+        return number.bit_count() % 2 == 0 and bool(number & number >> half & 2**half - 1)
+
+    def _is_least(self, number: int) -> bool:
+        whole = 2**self.bits - 1
+        return all(number <= (number << turn & whole | number >> self.bits - turn) for turn in range(1, self.bits))
+
+    def least_turn(self, number: int) -> int:
+        """The number in the form in which it is read."""
+        return self.number(np.array([number >> bit & 1 for bit in range(self.bits)[::-1]], bool))
+
+
+def read_code(scan: Scan, dot: Candidate, code: RingCode) -> int | None:
+    """The number in the ring about a dot; None where there is no ring, or one that is not of this code.
+
+    The ring is sampled along the dot's own ellipse, enlarged: what perspective does to both is the same but for some
+    percent. Set bits are those that look like the dot.
+    """
+    inner, outer = code.ring
+    angles = 2.0 * np.pi * np.arange(code.bits * SAMPLES) / (code.bits * SAMPLES)
+    gap_radius = (1.0 + inner) / 2.0
+    radii = np.array([CORE, gap_radius, *(inner + share * (outer - inner) for share in RING_SHARES)])
+    core, gap, *ring = _sampled(scan, dot, radii, angles)
+    ground, contrast = float(np.median(gap)), float(np.median(core) - np.median(gap))
+    if contrast * dot.contrast_dn <= 0.0 or np.mean(np.abs(gap - ground) < GAP_LEVEL * abs(contrast)) < LEAST_PLAIN:
+        return None
+    return _decoded(((np.mean(ring, axis=0) - ground) / contrast), code)
+
+
+def _sampled(scan: Scan, dot: Candidate, radii: Array, angles: Array) -> Array:
+    """(radii, angles) grey values on ellipses like the dot's, clockwise as seen."""
+    axes = dot.pixel_from_disk
+    if np.linalg.det(axes) < 0.0:
+        axes = axes * np.array([1.0, -1.0])
+    circle = np.stack([np.cos(angles), np.sin(angles)])
+    places = dot.center_px + radii[:, None, None] * (axes @ circle).T
+    corner = np.floor(places.min(axis=(0, 1))).astype(int) - 1
+    width, height = np.ceil(places.max(axis=(0, 1))).astype(int) + 2 - corner
+    window = scan.window(int(corner[0]), int(corner[1]), int(width), int(height))
+    within = (places - corner).astype(np.float32)
+    return np.asarray(cv2.remap(window, within[..., 0], within[..., 1], cv2.INTER_LINEAR), np.float64)
+
+
+def _decoded(levels: Array, code: RingCode) -> int | None:
+    """The number of a ring's levels (bits * SAMPLES,), 0 the ground and 1 the dot; None where no start of the segments
+    makes all of them plain, or where they are all alike."""
+    turned = np.stack([np.roll(levels, -phase).reshape(code.bits, SAMPLES) for phase in range(SAMPLES)])
+    strays = np.minimum((turned > 0.5).sum(axis=2), (turned <= 0.5).sum(axis=2)).sum(axis=1)
+    segments = turned[int(np.argmin(strays))]
+    middles = segments[:, EDGE_SAMPLES:-EDGE_SAMPLES]
+    set_bits = np.median(middles, axis=1) > 0.5
+    sure = np.where(set_bits[:, None], middles > 1.0 - 1.5 * SURE, middles < SURE)
+    if np.mean(sure) < LEAST_PLAIN or set_bits.all() or not set_bits.any():
+        return None
+    return code.number(set_bits)

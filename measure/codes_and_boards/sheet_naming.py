@@ -1,0 +1,220 @@
+"""Which dot is which point of a flat sheet: two coded dots suggest where the sheet lies, all other dots test it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from measure.codes_and_boards.sheet_view import SheetView, fitted_view, homography_through
+from measure.fitting.noise import robust_scale
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_NEIGHBOURS = 8  # of a named point on the sheet, that are looked for next
+_NEAR = 0.3  # of the distance to the next point in the picture, between where a dot is expected and where it is
+_IDLE_ROUNDS = 3  # after which names that come and go are not followed any further
+_MOST_PAIRS = 150  # of coded dots
+_GROWN = 8  # suggestions, the best ones, that are followed to their end
+_LEAST_NAMED = 8
+_LEAST_SHARE = 0.5  # of the sheet's points in the picture
+_GATE_SIGMAS, _LEAST_GATE_PX = 6.0, 3.0
+_SHAPE = 1.35  # radii of a dot's ellipse over those expected, in any direction, or the reverse
+
+
+@dataclass(frozen=True, eq=False)
+class Dots:
+    """Dots found in a picture: centers_px (m, 2), pixel_from_disk (m, 2, 2), and the points of the sheet (by index)
+    that codes say some of them are."""
+
+    centers_px: Array
+    pixel_from_disk: Array
+    coded: Mapping[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Naming:
+    """places_px (n, 2), pixel_from_disk (n, 2, 2): where and how the points of the sheet should be seen, nan where they
+    cannot; named: the dot of each point; gate_px: how far a dot may lie from its place; strangers: coded dots (index)
+    that are not the point that their code says."""
+
+    places_px: Array
+    pixel_from_disk: Array
+    named: Mapping[int, int]
+    gate_px: float
+    strangers: tuple[int, ...]
+
+
+def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | str:
+    """Name the dots that are points of the sheet; or why none has a name.
+
+    sheet (n, 2): the points' places on it, in any unit and of either hand; size_px: width and height of the picture.
+    Coded dots are as large as one another. A suggestion is taken if it explains most of the points that it puts into
+    the picture.
+    """
+    if len(dots.coded) < 2:
+        return f"{len(dots.coded)} coded targets of the sheet were recognised, and two are needed"
+    views = _suggestions(sheet, dots, size_px)
+    if not views:
+        return "no two of the coded targets recognised can both be what their codes say"
+    near_codes = _neighbourhood(sheet, list(dots.coded.values()))
+    support = [len(_pairs(view, sheet, dots.centers_px, near_codes)) for view in views]
+    best: Naming | None = None
+    for index in np.argsort(-np.array(support), kind="stable")[:_GROWN]:
+        naming = _grown(views[index], sheet, dots)
+        if naming is not None and (best is None or len(naming.named) > len(best.named)):
+            best = naming
+        if best is not None and not best.strangers:
+            break
+    if best is None:
+        return f"the {len(dots.coded)} coded targets recognised do not put the other points of the sheet where dots are"
+    return best
+
+
+def _suggestions(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> list[SheetView]:
+    """A view for each two coded dots, for the sheet's front and for its back, whose coordinates are left-handed."""
+    pairs = [(a, b) for a, b in combinations(dots.coded, 2) if dots.coded[a] != dots.coded[b]]
+    tried = pairs[:: len(pairs) // _MOST_PAIRS + 1]
+    views = []
+    for hand, (first, second) in product((np.diag([1.0, -1.0]), np.eye(2)), tried):
+        points, seen = _by_two(sheet, dots, first, second, hand)
+        empty = SheetView(np.eye(3), np.zeros(2), size_px)
+        homography = homography_through(points, empty.undistorted(seen))
+        if homography is not None:
+            views.append(replace(empty, homography=homography))
+    return views
+
+
+def _by_two(sheet: Array, dots: Dots, first: int, second: int, hand: Array) -> tuple[Array, Array]:
+    """Places on the sheet (10, 2) and in the picture (10, 2) that two dots give: centres and ends of radius vectors.
+
+    Their ellipses are turned so that the line through both is that of the sheet. On this line, a projective map u(t)
+    has u'(0) u'(T) = (u(T) / T)²: that gives the radius on the sheet.
+    """
+    steps = np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], np.float64)
+    along_px, seen = [], []
+    for own, other in ((first, second), (second, first)):
+        axes = _right_handed(dots.pixel_from_disk[own])
+        line_px = dots.centers_px[other] - dots.centers_px[own]
+        on_disk = np.linalg.solve(axes, line_px)
+        turned = axes @ _turn(hand @ (sheet[dots.coded[other]] - sheet[dots.coded[own]]), on_disk) @ hand
+        along_px.append(np.hypot(*line_px) / np.hypot(*on_disk))
+        seen.append(dots.centers_px[own] + steps @ turned.T)
+    apart = np.hypot(*(sheet[dots.coded[second]] - sheet[dots.coded[first]]))
+    radius = apart * np.sqrt(along_px[0] * along_px[1]) / np.hypot(*line_px)
+    points = [sheet[dots.coded[own]] + radius * steps for own in (first, second)]
+    return np.concatenate(points), np.concatenate(seen)
+
+
+def _right_handed(axes: Array) -> Array:
+    return np.asarray(axes * np.array([1.0, np.sign(np.linalg.det(axes))]))
+
+
+def _turn(start: Array, end: Array) -> Array:
+    """The rotation (2, 2) from one direction to another."""
+    angle = np.arctan2(end[1], end[0]) - np.arctan2(start[1], start[0])
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _neighbourhood(sheet: Array, points: list[int]) -> Indices:
+    """Indices of points of the sheet and of those next to them."""
+    count = min(_NEIGHBOURS + 1, len(sheet))
+    _, near = cKDTree(sheet).query(sheet[points], k=np.arange(1, count + 1))
+    return np.unique(near)
+
+
+def _pairs(view: SheetView, sheet: Array, centers_px: Array, among: Indices) -> dict[int, int]:
+    """The dot of each of the points `among`: nearest to one another and nearer than any other point's place."""
+    places = view.places_px(sheet)
+    seen = among[np.isfinite(places[among]).all(axis=1)]
+    if len(seen) < 2 or not len(centers_px):
+        return {}
+    tree = cKDTree(places[np.isfinite(places).all(axis=1)])
+    spacing = np.asarray(tree.query(places[seen], k=[2])[0])[:, 0]
+    distance, dot = (np.asarray(found) for found in cKDTree(centers_px).query(places[seen]))
+    back = np.asarray(cKDTree(places[seen]).query(centers_px)[1])
+    mutual = (back[dot] == np.arange(len(seen))) & (distance < _NEAR * spacing)
+    return {int(point): int(one) for point, one in zip(seen[mutual], dot[mutual], strict=True)}
+
+
+def _grown(view: SheetView, sheet: Array, dots: Dots) -> Naming | None:
+    """Names from the coded dots outward, the view fitted anew in every round; None where it explains too little."""
+    among = _neighbourhood(sheet, list(dots.coded.values()))
+    pairs = _pairs(view, sheet, dots.centers_px, among)
+    idle, most = 0, 0
+    while idle < _IDLE_ROUNDS:
+        if len(pairs) < _LEAST_NAMED // 2:
+            return None
+        fitted = fitted_view(view, sheet[list(pairs)], dots.centers_px[list(pairs.values())])
+        if fitted is None:
+            return None
+        view = fitted
+        new = _pairs(view, sheet, dots.centers_px, _neighbourhood(sheet, list(pairs)))
+        if new == pairs:
+            break
+        pairs = new
+        idle, most = (0, len(pairs)) if len(pairs) > most else (idle + 1, most)
+    return _tested(view, sheet, dots, pairs)
+
+
+def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Naming | None:
+    """The names that lie where the view and their neighbours put them, each dot alone at its place; None where they are
+    too few."""
+    points = np.array(list(pairs))
+    seen = dots.centers_px[list(pairs.values())]
+    places = view.places_px(sheet)
+    places += _unevenness(sheet, points, seen - places[points])
+    off = seen - places[points]
+    gate_px = max(_GATE_SIGMAS * robust_scale(off.ravel()), _LEAST_GATE_PX)
+    tree = cKDTree(dots.centers_px)
+
+    def is_alone(point: int) -> bool:
+        return len(tree.query_ball_point(places[point], gate_px)) == 1
+
+    shapes = _shapes(view, sheet, dots, pairs)
+    like = _alike(dots.pixel_from_disk[list(pairs.values())], shapes[points])
+    named = {
+        point: dot
+        for (point, dot), distance, fits in zip(pairs.items(), np.hypot(*off.T), like, strict=True)
+        if fits and distance <= gate_px and (dots.coded.get(dot) == point or is_alone(point))
+    }
+    expected = int(np.sum(np.all((places >= 0.0) & (places <= np.array(view.size_px) - 1.0), axis=1)))
+    right = sum(named.get(point) == dot for dot, point in dots.coded.items())
+    strangers = tuple(dot for dot, point in dots.coded.items() if named.get(point) != dot)
+    if len(named) < max(min(_LEAST_NAMED, len(sheet)), _LEAST_SHARE * expected) or right < 2 or right <= len(strangers):
+        return None
+    return Naming(places, shapes, named, gate_px, strangers)
+
+
+def _unevenness(sheet: Array, points: Indices, residuals: Array) -> Array:
+    """(n, 2) px by which dots next to each point of the sheet lie off, the point itself not asked: a sheet that is not
+    quite flat takes its dots along."""
+    count = min(_NEIGHBOURS + 1, len(points))
+    _, near = cKDTree(sheet[points]).query(sheet, k=np.arange(1, count + 1))
+    others = np.where(points[near] == np.arange(len(sheet))[:, None], -1, near)
+    of_neighbours = np.where((others < 0)[..., None], np.nan, residuals[near])
+    return np.asarray(np.nanmedian(of_neighbours, axis=1))
+
+
+def _shapes(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Array:
+    """(n, 2, 2) how the dots of all points should look, of the radius on the sheet that most have."""
+    step = 0.01 * float(np.ptp(sheet, axis=0).max())
+    unit = view.pixel_from_disks(sheet, step) / step
+    areas = _areas(dots.pixel_from_disk[list(pairs.values())]) / _areas(unit[list(pairs)])
+    return np.asarray(unit * np.sqrt(np.nanmedian(areas)))
+
+
+def _areas(shapes: Array) -> Array:
+    """(n,) of the parallelograms of (n, 2, 2); nan where a shape is nan."""
+    return np.asarray(np.abs(shapes[:, 0, 0] * shapes[:, 1, 1] - shapes[:, 0, 1] * shapes[:, 1, 0]))
+
+
+def _alike(seen: Array, expected: Array) -> NDArray[np.bool_]:
+    """(n,) whether ellipses (n, 2, 2) are of the size and the shape expected."""
+    known = _areas(expected) > 0.0
+    radii = np.linalg.svd(np.linalg.solve(expected[known], seen[known]), compute_uv=False)
+    known[known] = np.all((radii < _SHAPE) & (radii > 1.0 / _SHAPE), axis=1)
+    return known

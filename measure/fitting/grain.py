@@ -1,0 +1,158 @@
+"""Film grain behind the residuals of a fit: white scanner noise and grain of several sizes, by their shares.
+
+Any noise that is alike in all directions, and the more the nearer, is about a sum of grains of Gaussian correlation: a
+film's needs one or two sizes, a landscape, which has detail of every size, many.
+
+The residuals alone mislead. Each unknown takes noise out of them, most of it where noise is strongest, at low
+frequencies; in a small window little of that is left, and a covariance from the residuals' own autocovariance comes out
+too small. So what a model of noise would leave after the very same fit is compared with what is left, lag by lag; in
+the mark's own window, and in patches of blank film beside it, where there are any.
+"""
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.optimize import nnls
+
+from measure.fitting.blank_film import PATCH_PX, PLANE
+from measure.fitting.noise import NoiseModel, padded
+from measure.fitting.pixel_sums import combined, products
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Single = NDArray[np.float32]
+
+# Standard deviations of the Gaussian that smears white noise into grain, and the coarsest that is still film's.
+GRAIN_PX = (0.4, 0.5, 0.6, 0.7, 0.8, 0.95, 1.1, 1.3, 1.5, 1.8, 2.2)
+_COARSEST_PX = 1.8
+REACH_PX = 8  # grain of 1.5 px is correlated by one in a thousand there
+_HERE = REACH_PX  # index of no lag at all
+_FARTHEST_PX = 3.0  # lags that are compared: beyond it the residuals hold the fit's marks rather than the noise's
+_FARTHEST_BLANK_PX = 5.0
+_ALIKE = 1e-10  # of the largest eigenvalue: what unknowns tell apart by less is no direction of its own
+
+
+def grain_model(
+    residuals: Array, used: Mask, design: Array, neighbour_correlation: float, blank: Array | None = None
+) -> NoiseModel:
+    """The noise model, a sum of white noise and grains, whose residuals after the fit are most like the ones there are.
+
+    residuals (height, width), where used; design (unknowns, height, width): derivatives by the unknowns of the fit.
+    blank (n, PATCH_PX, PATCH_PX): patches of blank film less a plane.
+    """
+    window = _Window(used, design, _FARTHEST_PX)
+    left = window.products(np.where(used, residuals, 0.0)[None]) * window.weights
+    expected = window.expected * window.weights
+    if blank is not None and len(blank) > 0:
+        patch, count = _patch(), len(blank)
+        weights = patch.weights / np.sqrt(count)
+        left = np.concatenate([left, patch.products(blank) * weights])
+        expected = np.concatenate([expected, patch.expected * weights * count], axis=1)
+    shares, _ = nnls(expected.T, left)
+    lags = np.tensordot(shares, _KERNELS, axes=1)
+    variance = float(lags[_HERE, _HERE])
+    # A fit makes residuals less alike than the noise is. If they still are more alike than the coarsest grain, or the
+    # model is, a landscape was taken for grain.
+    alike = max(neighbour_correlation, lags[_HERE, _HERE + 1] / max(variance, 1e-300))
+    is_grain = blank is not None and len(blank) > 0 and bool(alike < _kernel(_COARSEST_PX)[_HERE, _HERE + 1])
+    return NoiseModel(variance, lags, neighbour_correlation, is_grain)
+
+
+def _kernel(grain_px: float | None) -> Array:
+    """Autocorrelation of white noise, smeared by a Gaussian or not, at all lags up to the reach."""
+    index = np.arange(-REACH_PX, REACH_PX + 1)
+    squared = index[:, None] ** 2 + index[None, :] ** 2
+    return np.asarray(squared == 0, float) if grain_px is None else np.exp(-squared / (4.0 * grain_px**2))
+
+
+class _Window:
+    """The pixels of a fit and what it takes out of the noise there; sums over all pairs of pixels so far apart."""
+
+    def __init__(self, used: Mask, design: Array, farthest_px: float) -> None:
+        """used (height, width); design (unknowns, height, width): derivatives, 0 where not used."""
+        self.rings = _rings(farthest_px)
+        border = int(farthest_px)
+        self.used = np.pad(used, border)
+        self.taken = np.pad(_orthonormal(design).astype(np.float32), [(0, 0), (border, border), (border, border)])
+        self.pairs = self.products(self.used[None])
+        self.weights = 1.0 / np.sqrt(np.maximum(self.pairs, 1.0))
+
+    def products(self, images: Array | Mask) -> Array:
+        """(distances,) sums over the images of the products of their pixels so far apart."""
+        shape = padded(images.shape[1:], REACH_PX)
+        lags = fft.irfft2((np.abs(fft.rfft2(images.astype(np.float32), s=shape)) ** 2).sum(axis=0), s=shape)
+        return np.array([lags[ring.index].sum() for ring in self.rings])
+
+    @cached_property
+    def expected(self) -> Array:
+        """(1 + grains, distances) what white noise and noise of each grain leave of these sums, at unit variance.
+
+        The fit leaves M C M of a covariance matrix C, with M = I - Q Q'. Summed over pixels so far apart, by D, that
+        is tr(D C) - 2 tr(Q' C D Q) + tr(Q' D Q Q' C Q): the last two are sums of products of Q's columns, lag by lag,
+        times the autocorrelation at that lag, whatever it is.
+        """
+        shape = padded(self.used.shape, REACH_PX)
+        spectra = np.conj(fft.rfft2(self.taken, s=shape))
+        index = np.arange(-REACH_PX, REACH_PX + 1)
+        taken, used = self.taken.reshape(len(self.taken), -1), self.used.ravel().astype(np.float32)
+        left = []
+        for ring, pairs in zip(self.rings, self.pairs, strict=True):
+            beside = ring.sums(taken, self.used.shape[1]) * used
+            beside = (taken @ beside.T) @ taken - 2 * beside
+            lags = fft.irfft2((spectra * fft.rfft2(beside.reshape(self.taken.shape), s=shape)).sum(axis=0), s=shape)
+            less = _KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel()
+            left.append(pairs * _KERNELS[:, _HERE + ring.lags[0][0], _HERE + ring.lags[0][1]] + less)
+        return np.stack(left, axis=1)
+
+
+def _orthonormal(design: Array) -> Array:
+    """(n, height, width) a base of the space of images (unknowns, height, width)."""
+    size = np.sqrt(np.maximum((design**2).sum(axis=(1, 2)), 1e-300))
+    unit = design / size[:, None, None]
+    values, vectors = np.linalg.eigh(products(unit, unit))
+    told = values > _ALIKE * values[-1]
+    return combined((vectors[:, told] / np.sqrt(values[told])).T, unit)
+
+
+@dataclass(frozen=True)
+class _Ring:
+    """All lags (rows, columns) of one length."""
+
+    lags: tuple[tuple[int, int], ...]
+
+    @property
+    def index(self) -> tuple[list[int], list[int]]:
+        """Of these lags in a picture of all of them that begins with none, negative ones at its end."""
+        return [down for down, _ in self.lags], [right for _, right in self.lags]
+
+    def sums(self, images: Single, width: int) -> Single:
+        """Of the pixels at these lags from each pixel of images (n, pixels), row after row of that width, which are 0
+        in a border as wide as the lags."""
+        total = np.zeros_like(images)
+        most = max(max(abs(down), abs(right)) for down, right in self.lags) * (width + 1)
+        for down, right in self.lags:
+            lag = down * width + right
+            total[:, most : total.shape[1] - most] += images[:, most + lag : total.shape[1] - most + lag]
+        return total
+
+
+def _rings(farthest_px: float) -> list[_Ring]:
+    reach = range(-int(farthest_px), int(farthest_px) + 1)
+    by_square: dict[int, list[tuple[int, int]]] = {}
+    for down, right in product(reach, repeat=2):
+        if down**2 + right**2 <= farthest_px**2:
+            by_square.setdefault(down**2 + right**2, []).append((down, right))
+    return [_Ring(tuple(lags)) for _, lags in sorted(by_square.items())]
+
+
+@cache
+def _patch() -> _Window:
+    whole = np.ones((PATCH_PX, PATCH_PX), dtype=bool)
+    return _Window(whole, PLANE.T.reshape(-1, PATCH_PX, PATCH_PX), _FARTHEST_BLANK_PX)
+
+
+_KERNELS = np.stack([_kernel(grain_px) for grain_px in (None, *GRAIN_PX)])

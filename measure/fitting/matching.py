@@ -1,0 +1,292 @@
+"""Least-squares matching: a mark measured to the noise of the film, by fitting its own picture to the scan.
+
+The model of a window is `gain * picture(mark) + offset + slopes`; unknown are the mark's place, if wished its rotation,
+scale and shear, the blur, and four grey-value parameters, all in one Gauss-Newton adjustment. Dust and scratches
+are first weighted down (Tukey's biweight), then cut out where smoothed residuals stand out; the rest decides.
+Where grain correlates the noise, its autocovariance, from the residuals and from blank film beside the mark, weighs the
+last steps and gives the covariance (generalised least squares).
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.checks.changed_tone import covariance_of_changed_tone
+from measure.checks.linear_fit import LinearFit
+from measure.checks.own_shape import OwnShape, own_shape
+from measure.checks.second_place import SecondPlace, edge_place, sloping_place
+from measure.fitting.blank_film import blank_patches, is_coloured
+from measure.fitting.clipping import Sides
+from measure.fitting.generators import is_round
+from measure.fitting.grain import grain_model
+from measure.fitting.noise import NoiseModel, is_textured, noise_model
+from measure.fitting.picture_fit import PictureFit
+from measure.fitting.picture_model import GREY, PictureModel, State, background_px
+from measure.fitting.pixel_sums import combined, factors
+from measure.fitting.second_order import second_order
+from measure.marks.rendering import extent_px
+from measure.marks.shapes import Mark, MarkTemplate
+from measure.match_options import MatchOptions
+from measure.scans.scan_window import ScanWindow
+
+__all__ = ["Match", "MatchOptions", "match", "window_about"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_SPARE_PX = 2.0  # beyond the margin: room for the mark to move
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A mark as fitted. Where converged is false, reason says why and the numbers are the last approximations.
+
+    center_px (2,), covariance_px2 (2, 2), pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
+    unknowns of the `PictureModel`, None where another model was fitted.
+    contrast_dn: the mark's grey value less the background's, negative for a dark mark. noise_dn: standard deviation of
+    one pixel, of a chip's picture after smoothing. damaged_fraction: share of the pixels about the mark, within
+    plain_px of it, that were cut out. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
+    they were taken as white where covariance_is_white. likeness: correlation of the fitted picture with the window,
+    less its plane background: 1 for a perfect mark, 0 for none.
+    significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
+    share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
+    of its range. edges: the mark's place by another method, to compare;
+    sloping: an ellipse's, if its paint may grow lighter or darker from side to side. own_shape: what the picture says
+    of rotation and scale, where the frame gave them.
+    """
+
+    converged: bool
+    reason: str
+    center_px: Array
+    covariance_px2: Array
+    pixel_from_mark: Array
+    contrast_dn: float
+    noise_dn: float
+    blur_px: float
+    damaged_fraction: float
+    redundancy: int
+    neighbour_correlation: float
+    covariance_is_white: bool
+    likeness: float
+    significance: float
+    blur_sigma: float = np.inf
+    size_sigma: float = np.inf
+    edges: SecondPlace | None = None
+    sloping: SecondPlace | None = None
+    own_shape: OwnShape | None = None
+    covariance: Array | None = None
+
+    @property
+    def sigma_px(self) -> float:
+        """Standard deviation of a coordinate."""
+        return float(np.sqrt(np.trace(self.covariance_px2) / 2))
+
+    @property
+    def snr(self) -> float:
+        return abs(self.contrast_dn) / max(self.noise_dn, 1e-12)
+
+
+def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: MatchOptions | None = None) -> Match:
+    """Fit the mark to a window of the scan.
+
+    pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to the scan's (col, row): its last column is the
+    approximate centre, right to a pixel or two. In a window that was compressed with loss grain tells nothing, and dust
+    is seen otherwise. Never raises for what the picture holds.
+    """
+    options = options or MatchOptions()
+    given = _given(window, mark, pixel_from_mark)
+    part, fit = _fitted(given, options)
+    if not _is_right(fit):
+        detail_part, detail = _fitted(given, options, background_px(mark, given.start))
+        if not detail.reason:
+            whole = _with_ground(given, detail_part, detail) if fit.reason else fit
+            part, fit = detail_part, whole if _is_right(whole) else detail
+    free = given.blank.copy()
+    free[part.rows, part.cols] &= ~fit.area
+    result = _result(fit, given.grey, free)
+    moved = np.array(result.pixel_from_mark)
+    moved[:, 2] += part.corner_px + window.origin_px
+    return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
+
+
+class _Given(NamedTuple):
+    """What is given of the scan about a mark, which is expected at start (2, 3) of the window. grey, usable, sides and
+    blank (height, width): grey values, which of them are known, which are clipped, and which may be blank film."""
+
+    grey: Array
+    usable: Mask
+    sides: Sides
+    blank: Mask
+    mark: Mark
+    start: Array
+    is_lossy: bool
+
+
+def _given(window: ScanWindow, mark: Mark, pixel_from_mark: Array) -> _Given:
+    usable, sides = window.usable, window.sides
+    # A chip's picture is smoothed for the fit, and blank film beside it is not.
+    has_none = window.is_lossy or isinstance(mark, MarkTemplate)
+    blank = np.zeros_like(usable) if has_none else usable & (sides == 0)
+    start = np.array(pixel_from_mark, dtype=float)
+    start[:, 2] -= window.origin_px
+    grey = np.where(usable, np.asarray(window.grey, dtype=float), 0.0)
+    return _Given(grey, usable, sides, blank, mark, start, window.is_lossy)
+
+
+class _Part(NamedTuple):
+    """The rows and columns of a window that a fit uses."""
+
+    rows: slice
+    cols: slice
+
+    @property
+    def corner_px(self) -> Array:
+        return np.array([self.cols.start, self.rows.start], dtype=float)
+
+
+def _fitted(given: _Given, options: MatchOptions, coarse_px: float | None = None) -> tuple[_Part, PictureFit]:
+    """The mark fitted, in the part of the window about it, in that part's pixels. coarse_px: of a background that does
+    not count, if one does not."""
+    part = _part(given, options)
+    fit = _begun(given, part, options, coarse_px)
+    fit.approach()
+    reach_px = options.margin_blurs * fit.model.blur_px
+    if not fit.reason and reach_px > options.margin_px:  # the blur spreads the mark beyond its margin
+        wide = replace(options, margin_px=reach_px)
+        narrow, part = part, _part(given, wide)
+        fit = _begun(given, part, wide, coarse_px, fit.model.state.moved(narrow.corner_px - part.corner_px))
+        fit.choose_area()
+    fit.refine()
+    return part, fit
+
+
+def _is_right(fit: PictureFit) -> bool:
+    """Whether it came to an end and leaves no landscape."""
+    return not fit.reason and not is_textured(fit.model.residuals, fit.telling, fit.floor_dn)
+
+
+def _with_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
+    """The mark fitted with its ground from where its detail alone was fitted: a large speck carries the first steps,
+    which are plain least squares, away from a mark, and not those of its detail."""
+    state = detail.model.state.moved(np.zeros(2))
+    fit = _begun(given, part, detail.options, None, state)
+    fit.choose_area()
+    fit.refine()
+    return fit
+
+
+def _begun(
+    given: _Given, part: _Part, options: MatchOptions, coarse_px: float | None, state: State | None = None
+) -> PictureFit:
+    rows, cols = part
+    start, ends, usable = given.start.copy(), given.sides[rows, cols], given.usable[rows, cols]
+    start[:, 2] -= part.corner_px
+    if coarse_px is not None:
+        # What is left of a clipped grey value without its surroundings is no limit of anything.
+        usable, ends = usable & (ends == 0), np.zeros_like(ends)
+    model = PictureModel(given.grey[rows, cols], ends, given.mark, start, options, coarse_px)
+    model.state = state or model.state
+    return PictureFit(model, usable, given.is_lossy)
+
+
+def _part(given: _Given, options: MatchOptions) -> _Part:
+    col0, row0, width, height = window_about(given.mark, given.start, options.margin_px + _SPARE_PX)
+    return _Part(
+        *(
+            slice(min(max(first, 0), size - 1), max(first + count, 1))
+            for first, count, size in zip((row0, col0), (height, width), given.grey.shape, strict=True)
+        )
+    )
+
+
+def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[int, int, int, int]:
+    """col0, row0, width, height of the window that holds the mark and margin_px about it."""
+    least, greatest = extent_px(mark, np.asarray(pixel_from_mark, dtype=float))
+    col0, row0 = np.floor(least - margin_px).astype(int)
+    col1, row1 = np.ceil(greatest + margin_px).astype(int)
+    return int(col0), int(row0), int(col1 - col0 + 1), int(row1 - row0 + 1)
+
+
+def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
+    """The match in the pixels of the fit's own window; free: which pixels of the whole window may be blank film."""
+    model, used = fit.model, fit.telling
+    noise = noise_model(model.scores, fit.used, len(model.design), float(model.information[fit.used].sum()))
+    precision = _Precision(np.full((len(model.design),) * 2, np.inf), np.inf)
+    if not fit.reason:
+        patches = blank_patches(window, free, noise.variance_dn2)
+        if not noise.is_white or is_coloured(patches):
+            noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
+        precision = _weighed(fit, used, noise)
+    state, covariance = model.state, precision.covariance
+    return Match(
+        converged=not fit.reason,
+        reason=fit.reason,
+        center_px=state.pixel_from_mark[:, 2],
+        covariance_px2=covariance[:2, :2],
+        pixel_from_mark=state.pixel_from_mark,
+        contrast_dn=float(state.greys[0]),
+        noise_dn=float(np.sqrt(noise.variance_dn2)),
+        blur_px=model.scan_blur_px,
+        damaged_fraction=fit.damaged_fraction,
+        redundancy=int(used.sum()) - len(model.design),
+        neighbour_correlation=noise.neighbour_correlation,
+        covariance_is_white=noise.is_white,
+        likeness=_likeness(fit),
+        significance=fit.contrast_dn / precision.gain_sigma,
+        blur_sigma=_blur_sigma(model, covariance),
+        size_sigma=float(np.sqrt(covariance[2, 2])) if model.tells_size else np.inf,
+        edges=precision.edges,
+        sloping=precision.sloping,
+        own_shape=precision.own_shape,
+        covariance=covariance,
+    )
+
+
+class _Precision(NamedTuple):
+    """What the noise makes of a fit: the covariance of its unknowns (unknowns, unknowns), the standard deviation of the
+    gain, and what the linearised fit says beside the unknowns, as `Match` has it."""
+
+    covariance: Array
+    gain_sigma: float
+    edges: SecondPlace | None = None
+    sloping: SecondPlace | None = None
+    own_shape: OwnShape | None = None
+
+
+def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel) -> _Precision:
+    """The fit ended with the weights of its noise. used: the pixels that said how large this is."""
+    model = fit.model
+    covariance, by_grey = fit.weigh(noise)
+    priors_dn2 = model.prior_weights() * noise.variance_dn2
+    covariance[:2, :2] *= 1 + second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
+    if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
+        change = fit.contrast_dn / float(np.ptp(model.mark.image))
+        covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
+    linear = LinearFit(model.residuals, used, model.design, by_grey, noise)
+    freedom = model.options.freedom
+    tells_shape = freedom == "similarity" and not is_round(model.mark)
+    return _Precision(
+        covariance,
+        gain_sigma=float(np.sqrt(max(covariance[-GREY, -GREY], 1e-12))),
+        edges=edge_place(linear, model.blur_px),
+        sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
+        own_shape=own_shape(linear, model.linear, model.departures()) if tells_shape else None,
+    )
+
+
+def _blur_sigma(model: PictureModel, covariance: Array) -> float:
+    if model.blur is None or model.blur_is_at_limit:
+        return np.inf
+    return float(np.sqrt(covariance[model.blur, model.blur]) / (2 * model.seen_blur_px**2))
+
+
+def _likeness(fit: PictureFit) -> float:
+    counts = fit.used * fit.model.steadiness
+    background, grey = fit.model.ground * counts, fit.model.grey * counts
+    if fit.used.sum() <= len(background):
+        return 0.0
+    without = grey - combined(factors(background, grey), background)
+    unexplained = np.sum(fit.model.residuals[fit.used] ** 2) / max(np.sum(without**2), 1e-12)
+    return float(np.sqrt(max(1 - unexplained, 0.0)))

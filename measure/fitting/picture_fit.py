@@ -1,0 +1,255 @@
+"""One mark's adjustment: plain, then robust, then on what is undamaged, and at last weighed by the grain."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.fitting.clipping import noise_scale
+from measure.fitting.noise import NoiseModel, correlated, may_be_noise, robust_scale
+from measure.fitting.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
+from measure.fitting.pixel_sums import combined, products
+from measure.fitting.robust import damage, damage_where_lossy, grown, solution, tukey_loss, tukey_weights
+from measure.fitting.sandwich_covariance import sandwich_covariance
+from measure.fitting.weighting import weighted
+from measure.marks.rendering import chip_mask, picture
+from measure.marks.shapes import MarkTemplate
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale: without it clean data drive it to nothing
+_FLOOR = 0.005  # of the contrast: residuals below it may be the drawing's own
+_ITERATIONS, _HALVINGS = 15, 4  # more steps, or shorter ones, settle no fit that these do not
+_DAMAGE_SIGMAS = 3.2  # of smoothed residuals: one pixel in seven hundred of a window without damage goes beyond
+_PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
+_LEAST_VARIANCE_DN2 = 1e-12
+_WEIGHTED_STEPS, _CLOSE_PX, _SETTLED_PX = 4, 0.002, 0.02
+_UNSETTLED = "the adjustment did not converge"
+_OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
+
+
+class PictureFit:
+    """The fit in progress. area: the pixels about the mark that are there; used: those of them that are undamaged;
+    reason: why it failed. is_lossy: whether the picture was compressed with loss."""
+
+    def __init__(self, model: PictureModel, usable: Mask, is_lossy: bool) -> None:
+        self.model, self.usable, self.is_lossy = model, usable, is_lossy
+        self.options = model.options
+        self.area = self.used = usable
+        self.far = np.zeros_like(usable)
+        self.variance_dn2 = 1.0
+        self.reason = ""
+
+    def approach(self) -> None:
+        """Plain, then roughly robust; stops with a reason where something gives way."""
+        self.choose_area()
+        if not self.reason and np.ptp(self.model.grey[self.area]) == 0.0:
+            self.reason = "the picture is even there: nothing stands out"
+        if not self.reason:
+            self.model.bent = ROUGHLY_BENT
+            self._adjust(robust=False, tolerance_px=0.1)
+        if self.reason == _UNSETTLED:  # dust may keep squares from settling, and not what holds against it
+            self.reason = ""
+        if not self.reason:
+            self.choose_area()
+        if not self.reason:
+            self._adjust(robust=True, tolerance_px=0.05)
+
+    def refine(self) -> None:
+        """Robust from there, then on what is undamaged."""
+        self.model.bent = BENT
+        if not self.reason:
+            self._adjust(robust=True, tolerance_px=0.005)
+        for round_ in range(self.options.damage_rounds):
+            if self.reason:
+                return
+            shown = self.area & self.model.tells
+            damaged = damage_where_lossy if self.is_lossy else damage
+            undamaged = self.area & ~damaged(self.model.residuals, shown, _DAMAGE_SIGMAS, self.floor_dn)
+            if round_ > 0 and np.array_equal(undamaged, self.used):
+                return
+            self.used = undamaged
+            if self.telling.sum() < 3 * len(self.model.design):
+                self.reason = "too little of the mark is undamaged"
+                return
+            if round_ == 0 and not self._is_plain():
+                self.reason = "the ground about the mark is not plain"
+                return
+            self._adjust(robust=False, tolerance_px=0.002)
+
+    def _is_plain(self) -> bool:
+        """Whether undamaged pixels far from the mark vary as the nearer ones do."""
+        near, far = self._clear & ~self.far, self._clear & self.far
+        squares = self.model.residuals**2
+        plain = far.sum() >= _PLAIN_SHARE * (self.area & self.far).sum()
+        return bool(
+            not far.any() or (plain and squares[far].mean() < _PLAIN * (squares[near].mean() + self.floor_dn**2))
+        )
+
+    def weigh(self, noise: NoiseModel) -> tuple[Array, Array]:
+        """Adjust once more with the weights of grain, if it is grain: the unknowns' covariance (unknowns, unknowns),
+        and their derivatives by the grey values (unknowns, height, width)."""
+        if not noise.is_grain:
+            return self._plain_covariance(noise)
+        model, before = self.model, self.model.state
+        weights, smeared = weighted(model.design, self.used, noise, self.contrast_dn)
+        moved = self._step_by(weights)
+        if moved is not None:
+            weighed = self._covariance(weights, smeared)
+            # What has more weight now measures the same place, or the noise is not what it was taken for. The plain
+            # covariance, which decides, takes its time and is larger than the weighed one, but for approximations.
+            if may_be_noise(moved, weighed[0][:2, :2]) or may_be_noise(moved, self._plain_covariance(noise)[0][:2, :2]):
+                return weighed
+        model.state = before
+        model.linearise(self.used)
+        covariance, by_grey = self._plain_covariance(noise)
+        if moved is not None:  # a hair along a line, say: neither place is known better than they differ
+            covariance[:2, :2] += np.sum(moved**2) / 2 * np.eye(2)
+        return covariance, by_grey
+
+    def _plain_covariance(self, noise: NoiseModel) -> tuple[Array, Array]:
+        """As `weigh` gives them, of an adjustment that took the noise as white."""
+        variance = max(noise.variance_dn2, _LEAST_VARIANCE_DN2)
+        design, bent = self.model.design * self.used, np.sqrt(self.model.curvature)
+        plain = design * bent / variance  # of residuals that are as large as their information says
+        smeared = plain * variance if noise.is_white else correlated(plain, noise) * self.used
+        return self._covariance(plain * bent, smeared / bent)
+
+    def _covariance(self, weights: Array, smeared: Array) -> tuple[Array, Array]:
+        """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these."""
+        priors = np.diag(self.model.prior_weights())
+        inverse: Array = np.asarray(np.linalg.inv(products(weights, self.model.design) + priors))
+        covariance = np.asarray(inverse @ (products(weights, smeared) + priors) @ inverse.T)
+        if not np.all(np.linalg.eigvalsh(covariance[:2, :2] + covariance[:2, :2].T) > 0):
+            covariance = inverse  # lags that are noise themselves: as if it were white
+        if isinstance(self.model.mark, MarkTemplate):
+            uneven = sandwich_covariance(inverse, weights, self.model.residuals, self.used)
+            covariance = max(covariance, uneven, key=lambda each: float(np.trace(each[:2, :2])))
+        return np.asarray((covariance + covariance.T) / 2), combined(inverse, weights)
+
+    def _step_by(self, weights: Array) -> Array | None:
+        """Gauss-Newton with weighted derivatives: how far the mark moved, (2,) px; None where it does not settle."""
+        model, priors, start = self.model, self.model.prior_weights(), self.model.state.pixel_from_mark[:, 2]
+        for _ in range(_WEIGHTED_STEPS):
+            normal = products(weights, model.design) + np.diag(priors)
+            right = products(weights, model.residuals[None])[:, 0] - priors * model.departures()
+            step: Array = np.asarray(np.linalg.solve(normal, right), float)
+            if model.blur_is_held(step):
+                free = np.arange(len(step)) != model.blur
+                step = np.zeros(len(right))
+                step[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free])
+            moved = model.step(step)
+            model.linearise(self.used)
+            if moved < _CLOSE_PX:
+                break
+        settled = moved < _SETTLED_PX and not model.ran_away()
+        return np.asarray(model.state.pixel_from_mark[:, 2] - start) if settled else None
+
+    @property
+    def contrast_dn(self) -> float:
+        return abs(float(self.model.state.greys[0]))
+
+    @property
+    def floor_dn(self) -> float:
+        """Residuals that tell nothing of the film."""
+        return _FLOOR * self.contrast_dn
+
+    @property
+    def telling(self) -> Mask:
+        """The pixels used whose residuals say how large the noise is."""
+        return self.used & self.model.tells
+
+    @property
+    def damaged_fraction(self) -> float:
+        """Of the pixels about the mark, as far as the ground has to be plain there: those on damage or next to it."""
+        near = self.area & ~self.far
+        return 1.0 - float((near & self._clear).sum() / max(near.sum(), 1))
+
+    @property
+    def _clear(self) -> Mask:
+        """The pixels used that do not touch damage."""
+        return self.used if self.is_lossy else self.used & ~grown(self.area & ~self.used)
+
+    def choose_area(self) -> None:
+        """The pixels within margin_px of the mark: beyond it the background only disturbs."""
+        height, width = self.model.grey.shape
+        mark, place = self.model.mark, self.model.place_drawn()
+        if isinstance(mark, MarkTemplate):
+            # Where it is known how steady each pixel is, those count by it that are not.
+            shown = mark if mark.steadiness is None else replace(mark, steady=None)
+            near = chip_mask(shown, place, width, height)
+        else:
+            outside = (picture(mark, place, width, height, _OUTLINE_BLUR_PX) < _SHOWN).astype(np.uint8)
+            distance = cv2.distanceTransform(outside, cv2.DIST_L2, 5)
+            near, self.far = distance <= self.options.margin_px, distance > self.options.plain_px
+            if outside.all():
+                self.reason = "the mark lies outside of its window"
+        self.area = self.used = self.usable & near
+        if self.area.sum() < 0.5 * near.sum() or self.area.sum() < 40:
+            self.reason = self.reason or "most of the mark lies outside of the scan"
+
+    def _adjust(self, robust: bool, tolerance_px: float) -> None:
+        """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""
+        model = self.model
+        if model.is_clipped:
+            noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
+            if self.used is not self.area:  # damage is cut out: what is left is noise
+                least_dn = max(self.floor_dn, ROUNDING_DN)
+                noise_dn = noise_scale(model.uncensored[self.used], model.clipped[self.used], noise_dn, least_dn)
+            model.take_noise(noise_dn)
+        model.linearise(self.used)
+        tukey_dn = self._tukey_scale()
+        self.variance_dn2 = tukey_dn**2
+        scale_dn = tukey_dn if robust else np.inf
+        cost = self._cost(scale_dn)
+        for _ in range(_ITERATIONS):
+            step = self._solve(self.used * tukey_weights(model.residuals, scale_dn))
+            if step is None:
+                self.reason = "the picture does not determine the mark's place"
+                return
+            before, cost_before = model.state, cost
+            moved = model.step(step)
+            model.linearise(self.used)
+            if moved < tolerance_px:
+                return
+            cost = self._cost(scale_dn)
+            for _ in range(_HALVINGS):
+                if cost <= cost_before:
+                    break
+                step = step / 2
+                model.state = before
+                moved = model.step(step)
+                model.linearise(self.used)
+                cost = self._cost(scale_dn)
+            if cost > cost_before and float(np.hypot(*step[:2])) < tolerance_px:
+                # No part of the step improves the fit: where size, blur and contrast hang together it ends flat.
+                model.state, moved = before, 0.0
+                model.linearise(self.used)
+            self.reason = model.ran_away()
+            if self.reason or moved < tolerance_px:
+                return
+        self.reason = _UNSETTLED
+
+    def _cost(self, scale_dn: float) -> float:
+        """What the adjustment makes small: Tukey's loss, squares where the scale is infinite, and the priors'."""
+        priors = np.sum(self.model.prior_weights() * self.model.departures() ** 2)
+        return float(tukey_loss(self.model.residuals * self.used, scale_dn) + self.variance_dn2 * priors)
+
+    def _tukey_scale(self) -> float:
+        return max(robust_scale(self.model.residuals[self.telling]), _SCALE_FLOOR * self.contrast_dn, 1e-9)
+
+    def _solve(self, weights: Array) -> Array | None:
+        """The step, None where it is not determined. A blur at its limit stays there instead of pulling the others."""
+        model = self.model
+        priors = model.prior_weights() * self.variance_dn2
+        weighted = model.design * weights
+        normal = products(weighted, model.design) + np.diag(priors)
+        right = products(weighted, model.residuals[None])[:, 0] - priors * model.departures()
+        free = np.ones(len(right), dtype=bool)
+        step = solution(normal, right, free)
+        if step is not None and model.blur_is_held(step):
+            free[model.blur] = False
+            step = solution(normal, right, free)
+        return step

@@ -1,0 +1,311 @@
+"""The model of a window that shows a mark: `gain * picture(mark) + offset + slopes`, its state and its derivatives."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.fitting.clipping import Sides, censored, tells
+from measure.fitting.generators import generators
+from measure.fitting.pixel_sums import combined, factors
+from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
+from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
+from measure.match_options import MatchOptions
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+GREY = 4  # unknowns: gain, offset and two slopes, the last ones
+ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values adds
+_AS_NOISY = 0.02
+_LEAST = 1e-300  # squared slope of a clipped grey value that tells nothing
+_BLUR_RANGE_PX = (0.3, 6.0)
+BENT, ROUGHLY_BENT = 0.075, 0.4  # of the mark's outline, times the blur: so far a series replaces a new drawing
+_MOST_DISTORTION = 0.3  # of scale, rotation (rad) and shear: more is another mark
+PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur
+_LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # of a step: beyond it the linearisation tells nothing
+_MOST_BLURRED = 2.0  # times the blur, likewise
+_LINEAR = 0.015  # times the blur: within it a linearisation is as good as a new one, to 1e-4 of the blur
+_CHIP_SMOOTHED_PX = 0.7  # and of what it is compared with: as sharp as pixels, edges are sampled falsely in both
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """pixel_from_mark (2, 3); variance_px2 of the blur; greys (4,): gain, offset, slopes, 0 until fitted."""
+
+    pixel_from_mark: Array
+    variance_px2: float
+    greys: Array
+
+    def moved(self, shift_px: Array) -> "State":
+        """The same state where all places are (2,) px farther on; the greys are still to be fitted there."""
+        place = self.pixel_from_mark.copy()
+        place[:, 2] += shift_px
+        return State(place, self.variance_px2, np.zeros(GREY))
+
+
+class PictureModel:
+    """The model at its present state: design (unknowns, height, width) and residuals (height, width). The unknowns are
+    column and row, the generators' parameters, the blur's variance if it is estimated, and the greys.
+
+    bent: how far, in units of the blur, a series may bend the drawing before it is drawn anew.
+    start: where the mark is expected, where the state begins too.
+    ground (3, height, width): offset and slopes of the background.
+    clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
+    values need; tells (height, width): False where a clipped one says nothing of it. slopes and information (height,
+    width), 1 where a grey value is ordinary: as `censored` gives them. uncensored (height, width): residuals as if
+    none were clipped, where some are.
+    Of a chip (height, width): steadiness, as `chip_steadiness` gives it, which weighs residuals and design; half_tones,
+    as `covariance_of_changed_tone` needs it."""
+
+    def __init__(
+        self,
+        grey: Array,
+        clipped: Sides,
+        mark: Mark,
+        start: Array,
+        options: MatchOptions,
+        background_px: float | None = None,
+    ) -> None:
+        self.mark, self.start, self.options = mark, start, options
+        self.background_px = background_px
+        self.clipped, self.noise_dn = clipped, ROUNDING_DN
+        self.is_clipped = bool(clipped.any())
+        self.tells = np.ones(grey.shape, dtype=bool)
+        self.slopes, self.information = np.ones(grey.shape), np.ones(grey.shape)
+        self.uncensored = np.zeros(grey.shape)
+        is_chip = isinstance(mark, MarkTemplate)
+        self.smoothed_px2 = _CHIP_SMOOTHED_PX**2 if is_chip else 0.0
+        seen = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), dtype=float) if is_chip else grey
+        self.grey = self._detail(seen)
+        self.generators = generators(options.freedom, mark)
+        self.linear = slice(2, 2 + len(self.generators))
+        self.blur = 2 + len(self.generators) if options.estimate_blur else None
+        # A chip already has its scan's blur: where none is estimated, none is added.
+        added_px2 = 0.0 if is_chip and not options.estimate_blur else options.blur_px**2
+        self.state = State(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
+        # The state that the design is of, and its residuals.
+        self._linearised: tuple[State, Array] | None = None
+        self.bent = BENT
+        self._draw(start[:, :2])
+        self.reach_px = reach_px(mark, start[:, :2])
+        self.mark_from_start: Array = np.linalg.inv(start[:, :2]).astype(float)
+        self.ground = _planes(*grey.shape)
+        self.steadiness, self.half_tones = np.ones(grey.shape), np.zeros(grey.shape)
+        self.residuals = np.zeros_like(grey)
+        self.design = np.zeros((2 + len(self.generators) + options.estimate_blur + GREY, *grey.shape))
+
+    def linearise(self, used: Mask) -> None:
+        """Design and residuals of the present state; the greys from a linear fit to what is used, at first. Close to
+        where the design was last computed it stays, and the residuals follow from it."""
+        if self._linearised is not None:
+            at, residuals = self._linearised
+            change = self._change(at)
+            if self._length_px(change) < _LINEAR * self.seen_blur_px and not self._is_bent():
+                self.residuals = residuals - combined(change, self.design)
+                return
+        height, width = self.grey.shape
+        place = self.state.pixel_from_mark
+        shown = self._shown(width, height)
+        greys = self.design[-GREY:]
+        greys[0], greys[1:] = self._detail(shown.value), self.ground
+        if not self.state.greys.any():
+            self.state = State(place, self.state.variance_px2, factors(greys * used, self.grey))
+        columns = self.design[:-GREY]
+        columns[0], columns[1] = shown.by_col, shown.by_row
+        col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
+        moves = np.stack([slope * along for slope in columns[:2] for along in (col, row)])
+        # The blur does not bend with the mark: else a soft disk's size, blur and contrast run away together.
+        moves += self.seen_blur_px**2 * np.stack([shown.by_col_col, *[shown.by_col_row] * 2, shown.by_row_row])
+        columns[self.linear] = combined(self.generators.reshape(-1, 4), moves)
+        if self.blur is not None:
+            columns[self.blur] = -0.5 * shown.laplacian
+        if self.background_px is not None:
+            columns[:] = [self._detail(column) for column in columns]
+        columns *= -self.state.greys[0]
+        self.residuals = self.grey - combined(self.state.greys, greys)
+        self._censor()
+        if isinstance(self.mark, MarkTemplate):
+            self.half_tones = self.state.greys[0] * self._detail(4 * shown.value * (1 - shown.value))
+            self.steadiness = chip_steadiness(self.mark, place, width, height)
+            for each in (self.residuals, self.design, self.half_tones):
+                each *= self.steadiness
+        self._linearised = self.state, self.residuals
+
+    def take_noise(self, noise_dn: float) -> None:
+        """Judge clipped grey values by noise of that standard deviation, unless it changes nothing of their part."""
+        if abs(noise_dn / self.noise_dn - 1) > _AS_NOISY:
+            self.noise_dn, self._linearised = noise_dn, None
+
+    def _change(self, before: State) -> Array:
+        """(unknowns,) from a state before to the present one, both alike."""
+        change = np.zeros(len(self.design))
+        place, linear = self.state.pixel_from_mark, before.pixel_from_mark[:, :2]
+        change[:2] = place[:, 2] - before.pixel_from_mark[:, 2]
+        change[self.linear] = self._parameters(place[:, :2] @ np.linalg.inv(linear) - np.eye(2))
+        if self.blur is not None:
+            change[self.blur] = self.state.variance_px2 - before.variance_px2
+        change[-GREY:] = self.state.greys - before.greys
+        return change
+
+    def _length_px(self, change: Array) -> float:
+        """How far a change moves the mark's outline; blurring counts double, for the standard deviations' sake."""
+        length = float(np.hypot(*change[:2])) + self.reach_px * float(np.abs(change[self.linear]).max(initial=0.0))
+        if self.blur is None:
+            return length
+        variance = self.state.variance_px2
+        return length + 2 * abs(float(np.sqrt(variance) - np.sqrt(variance - change[self.blur])))
+
+    def _parameters(self, change: Array) -> Array:
+        """The generators' parameters of a change (2, 2) of the linear part."""
+        return np.asarray(self.generators.reshape(-1, 4) @ change.ravel() / 2)  # of two ones each
+
+    def _censor(self) -> None:
+        """Clipped grey values hold the model on their side of the limit only."""
+        at = self.clipped != 0
+        if at.any():
+            self.uncensored = self.residuals.copy()
+            said = censored(self.residuals[at], self.clipped[at], self.noise_dn)
+            self.residuals[at], self.slopes[at], self.information[at] = said
+            self.design[:, at] *= said.slopes
+            self.tells[at] = tells(said.slopes)
+
+    @property
+    def scores(self) -> Array:
+        """(height, width) the residuals times their slopes: what each pixel adds to the normal equations. They are 0 on
+        average and vary with the information."""
+        return self.residuals * self.slopes
+
+    @property
+    def curvature(self) -> Array:
+        """(height, width) the information over the square of the slopes, one to two: what a residual's bend adds."""
+        return np.maximum(self.information / np.maximum(self.slopes**2, _LEAST), 1.0)
+
+    @property
+    def tells_size(self) -> bool:
+        """Whether the size is an unknown: then it is the first of the generators' parameters."""
+        return len(self.generators) > 0
+
+    @property
+    def blur_px(self) -> float:
+        return float(np.sqrt(self.state.variance_px2))
+
+    @property
+    def scan_blur_px(self) -> float:
+        """The scan's own blur; beside a chip only what it has more than that."""
+        return float(np.sqrt(max(self.state.variance_px2 - self.smoothed_px2, 0.0)))
+
+    @property
+    def seen_blur_px(self) -> float:
+        """The standard deviation of blur and pixel."""
+        return float(np.sqrt(self.state.variance_px2 + PIXEL_VARIANCE_PX2))
+
+    def place_drawn(self) -> Array:
+        """(2, 3) the present place of the mark as it was last drawn: its linear part is close to the present one."""
+        place = self.state.pixel_from_mark
+        if self._is_bent():
+            self._draw(place[:, :2])
+        return np.column_stack([self._drawn, place[:, 2]])
+
+    def _is_bent(self) -> bool:
+        """Whether the present mark is bent farther than a series reaches; column by column of the linear part."""
+        most = float(np.hypot(*self._bent()).max()) * self.reach_px
+        return most > self.bent * self.seen_blur_px
+
+    def _draw(self, linear: Array) -> None:
+        self._drawn, self._mark_from_drawn = linear.copy(), np.linalg.inv(linear)
+
+    def _bent(self) -> Array:
+        """(2, 2) how far the present mark is bent from the one drawn."""
+        return np.asarray(self.state.pixel_from_mark[:, :2] @ self._mark_from_drawn - np.eye(2))
+
+    def _shown(self, width: int, height: int) -> Rendering:
+        place = self.place_drawn()
+        shown = render(self.mark, place, width, height, self.blur_px)
+        change = self._bent()
+        return shown.bent(change, place[:, 2], self.state.variance_px2 + PIXEL_VARIANCE_PX2) if change.any() else shown
+
+    def step(self, step: Array) -> float:
+        """Take a step, shortened where it leaves the range of a linearisation; its length in px."""
+        shift, linear = step[:2], step[self.linear]
+        longest = max(np.hypot(*shift) / _LONGEST_SHIFT_PX, np.abs(linear).max(initial=0.0) / _LONGEST_CHANGE, 1.0)
+        place = self.state.pixel_from_mark.copy()
+        place[:, 2] += shift / longest
+        place[:, :2] += combined(linear / longest, self.generators) @ place[:, :2]
+        variance = self.state.variance_px2
+        if self.blur is not None:
+            # As a change of the standard deviation, the pixel's share included: so a blur far off is near in a step.
+            seen = self.seen_blur_px
+            ratio = np.clip(1 + step[self.blur] / longest / (2 * seen**2), 1 / _MOST_BLURRED, _MOST_BLURRED)
+            variance = float(np.clip((seen * ratio) ** 2 - PIXEL_VARIANCE_PX2, *self._variance_range()))
+        self.state = State(place, variance, self.state.greys + step[-GREY:] / longest)
+        reach = max(self.grey.shape) / 4
+        return float(np.hypot(*shift) + reach * _LONGEST_CHANGE * np.abs(linear).max(initial=0.0))
+
+    def blur_is_held(self, step: Array) -> bool:
+        """Whether a step would take the blur out of its range, at whose limit it is already."""
+        if self.blur is None:
+            return False
+        low, high = self._variance_range()
+        variance, change = self.state.variance_px2, step[self.blur]
+        return bool((variance <= low and change < 0) or (variance >= high and change > 0))
+
+    @property
+    def blur_is_at_limit(self) -> bool:
+        low, high = self._variance_range()
+        return not low < self.state.variance_px2 < high
+
+    def prior_weights(self) -> Array:
+        """1 / variance of the priors of rotation, scale and shear, and of the blur's variance; 0 for all else."""
+        weights = np.zeros(len(self.design))
+        weights[self.linear] = 1 / self.options.linear_sigma**2
+        if self.blur is not None:
+            seen = self.options.blur_px**2 + PIXEL_VARIANCE_PX2
+            weights[self.blur] = 1 / (2 * seen * self.options.blur_sigma) ** 2
+        return weights
+
+    def departures(self) -> Array:
+        """How far the parameters under a prior are from where it has them."""
+        departures = np.zeros(len(self.design))
+        departures[self.linear] = self._parameters(self._distortion())
+        if self.blur is not None:
+            departures[self.blur] = self.state.variance_px2 - self.options.blur_px**2
+        return departures
+
+    def ran_away(self) -> str:
+        """Why the present state is no mark where one was expected; empty where it may be."""
+        moved = float(np.hypot(*(self.state.pixel_from_mark[:, 2] - self.start[:, 2])))
+        if moved > self.options.max_shift_px:
+            return f"the fit ran {moved:.1f} px away from where the mark was expected"
+        if np.abs(self._distortion()).max() > _MOST_DISTORTION:
+            return "the fit wants a mark of another size or direction than the one drawn"
+        return ""
+
+    def _detail(self, image: NDArray[np.floating]) -> Array:
+        """Grey values, or their model, without what is coarser than the mark's lines."""
+        if self.background_px is None:
+            return np.asarray(image, float)
+        return np.asarray(image - cv2.GaussianBlur(image, (0, 0), self.background_px))
+
+    def _variance_range(self) -> tuple[float, float]:
+        low, high = _BLUR_RANGE_PX
+        return (0.0 if isinstance(self.mark, MarkTemplate) else low**2), high**2
+
+    def _distortion(self) -> Array:
+        return np.asarray(self.state.pixel_from_mark[:, :2] @ self.mark_from_start - np.eye(2))
+
+
+def _planes(height: int, width: int) -> Array:
+    """(3, height, width) offset and slopes of the background."""
+    scale = max(height, width) / 2
+    planes = np.ones((3, height, width))
+    planes[1] = (np.arange(width) - (width - 1) / 2) / scale
+    planes[2] = (np.arange(height)[:, None] - (height - 1) / 2) / scale
+    return planes
+
+
+def background_px(mark: Mark, pixel_from_mark: Array) -> float:
+    """The standard deviation of a blur that leaves nothing of the mark's lines."""
+    scale = float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
+    return max(1.5 * scale * thinnest_mm(mark), 1.0) + 1.0

@@ -1,0 +1,1 @@
+"""The marks of a frame sighted at full resolution, and the frame fitted to those that agree."""

@@ -1,0 +1,197 @@
+"""A mark that is barely there, at a place that the other marks give: its lines against the texture about it.
+
+Alone such a mark is one of many patterns of chance. Where the constellation is sure, only chance patterns as strong
+and as near to the predicted place are its rivals: how many of them the texture would give is known (Adler, The
+Geometry of Random Fields, 1981: excursions of a Gaussian field), and so is, from the same texture, how far it pulls
+the mark from its true place.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.fitting.matching import Match
+from measure.marks.prediction import MarkPrediction
+from measure.marks.rendering import extent_px, picture
+from measure.scans.scan import Scan
+from measure.search.candidates import FAINT, detail_px
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_BACKGROUND = 1.2  # times the finest detail: the standard deviation of the blur that is taken for background
+_TEXTURE = 2.0  # times that: over which the strength of the texture is averaged
+_CLIP = 3.0  # times the texture's strength: stones and edges count no more
+_RING = 30.0  # times the background's: how far about the mark the texture is asked
+_SELF = 0.1  # of the mark's own response: what is below it tells of the texture alone
+_SHOWN = 0.2  # of the mark's own weight: elsewhere the ground is too dark to tell
+_LINE = 0.25  # of the strongest: what counts as the mark's lines
+_ROUNDS = 3  # of rendering the mark anew where it was found
+_AGAIN_PX = 1.5  # about the place where it was found, for that
+_VERTEX_PX = 0.7  # of a paraboloid's top from the highest pixel, along either axis
+_LEAST_DISTANCE_PX = 1.0  # predictions are no better
+_LEAST_PLACES = 200  # of the texture that a covariance can be taken from
+
+
+@dataclass(frozen=True, eq=False)
+class FaintMark:
+    """fit: the mark; its significance is in standard deviations of what the texture about it answers, and its
+    covariance comes from that texture. chance: how many answers as strong and as near the texture alone would give."""
+
+    fit: Match
+    chance: float
+
+    @property
+    def sigma_px(self) -> float:
+        """The standard deviation of its place, in the direction in which it is known least."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.fit.covariance_px2)[-1]))
+
+
+def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
+    """The strongest response to the mark within the search radius of its predicted place, None where there is no
+    contrast.
+
+    extreme_dn: the lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as
+    light or as dark it does not show.
+    """
+    field = _Field(scan, expected, extreme_dn)
+    center, reach_px = expected.center_px - field.origin, expected.search_px
+    response = field.response(center, blur_px)
+    for _ in range(_ROUNDS):
+        response = field.response(center, blur_px)
+        place = response.highest(center, reach_px)
+        if place is None:
+            return None
+        center, reach_px = place, _AGAIN_PX
+    return field.seen(response, center, blur_px)
+
+
+@dataclass(frozen=True, eq=False)
+class _Response:
+    """value: the weighted correlation at every pixel, for a mark whose centre is off the pixel's by fraction.
+    norm: of the weighted template there."""
+
+    value: Array
+    norm: Array
+    template: Array
+    fraction: Array
+
+    def highest(self, center: Array, reach_px: float) -> Array | None:
+        """The top within reach of the centre, by a paraboloid; None at the window's edge."""
+        rows, cols = np.indices(self.value.shape)
+        near = np.hypot(cols + self.fraction[0] - center[0], rows + self.fraction[1] - center[1]) <= reach_px
+        row, col = np.unravel_index(int(np.where(near, self.value, -np.inf).argmax()), self.value.shape)
+        if not (0 < row < self.value.shape[0] - 1 and 0 < col < self.value.shape[1] - 1) or self.value[row, col] <= 0:
+            return None
+        gradient, hessian = _paraboloid(self.value[row - 1 : row + 2, col - 1 : col + 2])
+        top: Array = np.array([col, row]) + self.fraction
+        if not np.all(np.linalg.eigvalsh(hessian) < 0):
+            return top
+        return np.asarray(top + np.clip(-np.linalg.solve(hessian, gradient), -_VERTEX_PX, _VERTEX_PX))
+
+
+class _Field:
+    """The window about a predicted place, freed of everything coarser than the mark's lines."""
+
+    def __init__(self, scan: Scan, expected: MarkPrediction, extreme_dn: float) -> None:
+        self.mark, self.linear, self.polarity = expected.mark, expected.linear, expected.polarity
+        self.predicted = expected.center_px
+        self.coarse_px = _BACKGROUND * detail_px(self.mark, self.linear)
+        least, greatest = extent_px(self.mark, np.column_stack([self.linear, np.zeros(2)]))
+        self.half = int(np.ceil(max(-least.min(), greatest.max()) + 2 * self.coarse_px)) + 1
+        side = self.half + int(np.ceil(max(expected.search_px, _RING)))
+        first = np.floor(self.predicted).astype(int) - side
+        self.origin = first.astype(float)
+        window = (int(first[0]), int(first[1]), 2 * side + 1, 2 * side + 1)
+        grey = scan.window(*window, expected.weights)
+        ground = cv2.GaussianBlur(grey, (0, 0), self.coarse_px)
+        detail = grey - ground
+        spread = cv2.GaussianBlur(detail**2, (0, 0), _TEXTURE * self.coarse_px)
+        self.texture_dn: Array = np.sqrt(spread + (FAINT * scan.full_scale_dn) ** 2)
+        room_dn = np.maximum(self.polarity * (extreme_dn - ground), 0.0)
+        self.room_dn = np.where(scan.inside(*window), room_dn, 0.0).astype(np.float32)
+        self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
+        self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
+
+    def response(self, center: Array, blur_px: float) -> _Response:
+        """The response to the mark as it looks with its centre where given between the pixels."""
+        fraction = center - np.rint(center)
+        size = 2 * self.half + 1
+        shown = picture(self.mark, np.column_stack([self.linear, fraction + self.half]), size, size, blur_px)
+        template: Array = np.asarray(shown - cv2.GaussianBlur(shown, (0, 0), self.coarse_px), dtype=float)
+        norm = np.sqrt(np.maximum(_correlated(self.room**2, template**2), 0.0) + 1e-6)
+        return _Response(_correlated(self.detail * self.room, template) / norm, norm, template, fraction)
+
+    def seen(self, response: _Response, center: Array, blur_px: float) -> FaintMark | None:
+        """What the response at the mark's place is worth, against what the texture about it answers."""
+        col, row = (int(index) for index in np.rint(center - response.fraction))
+        patch = np.s_[row - self.half : row + self.half + 1, col - self.half : col + self.half + 1]
+        height = float(response.value[row, col])
+        amplitude = height / float(response.norm[row, col])
+        own = np.zeros_like(self.room, dtype=float)
+        own[patch] = amplitude * self.room[patch] * response.template
+        signal = _correlated(own * self.room, response.template) / response.norm
+        texture = self._texture(response, signal, (row, col))
+        bend = _paraboloid(signal[row - 1 : row + 2, col - 1 : col + 2])[1]
+        if texture.sum() < _LEAST_PLACES or not np.all(np.linalg.eigvalsh(bend) < 0):
+            return None
+        by_row, by_col = (np.gradient(response.value, axis=axis) for axis in (0, 1))
+        slopes = np.asarray(np.cov(np.stack([by_col[texture], by_row[texture]])), dtype=float)
+        scatter = float(np.sqrt(np.mean(response.value[texture] ** 2)))
+        inverse, place = np.linalg.inv(bend), center + self.origin
+        distance_px = float(np.hypot(*(place - self.predicted)))
+        lines = np.abs(response.template)
+        lit = lines * self.room[patch]
+        fit = Match(
+            converged=True,
+            reason="",
+            center_px=place,
+            covariance_px2=inverse @ slopes @ inverse,
+            pixel_from_mark=np.column_stack([self.linear, place]),
+            contrast_dn=self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit)),
+            noise_dn=float(np.average(self.texture_dn[patch], weights=lit)),
+            blur_px=blur_px,
+            damaged_fraction=1 - float((lit > _LINE * lit.max()).sum() / (lines > _LINE * lines.max()).sum()),
+            redundancy=int((lit > 0).sum()) - 3,
+            neighbour_correlation=_neighbour_correlation(self.detail, texture),
+            covariance_is_white=False,
+            likeness=min(height / float(np.linalg.norm(self.detail[patch][lit > _LINE / 5 * lit.max()])), 1.0),
+            significance=height / scatter,
+        )
+        return FaintMark(fit, _chance(height / scatter, slopes / scatter**2, max(distance_px, _LEAST_DISTANCE_PX)))
+
+    def _texture(self, response: _Response, signal: Array, place: tuple[int, int]) -> Mask:
+        """Where about the mark responses are the texture's alone: on ground where the mark could show."""
+        rows, cols = np.indices(signal.shape)
+        near = np.hypot(rows - place[0], cols - place[1]) <= _RING
+        whole = np.zeros(signal.shape, dtype=bool)
+        whole[self.half : -self.half, self.half : -self.half] = True
+        alone = np.abs(signal) < _SELF * signal[place]
+        return np.asarray(near & whole & alone & (response.norm > _SHOWN * response.norm[place]))
+
+
+def _chance(strength: float, slopes: Array, radius_px: float) -> float:
+    """How many maxima of at least this strength a Gaussian field of unit variance has in a circle, slopes (2, 2) being
+    the covariance of its gradient: Adler's expected Euler characteristic of the excursion set."""
+    density = np.sqrt(np.linalg.det(slopes)) * (2 * np.pi) ** -1.5 * strength * np.exp(-(strength**2) / 2)
+    return float(np.pi * radius_px**2 * density)
+
+
+def _neighbour_correlation(detail: Array, texture: Mask) -> float:
+    pairs = texture[:, 1:] & texture[:, :-1]
+    return float(np.corrcoef(detail[:, 1:][pairs], detail[:, :-1][pairs])[0, 1])
+
+
+def _correlated(image: NDArray[np.floating], template: NDArray[np.floating]) -> Array:
+    return np.asarray(cv2.filter2D(np.asarray(image, np.float32), cv2.CV_32F, np.asarray(template, np.float32)), float)
+
+
+def _paraboloid(three: Array) -> tuple[Array, Array]:
+    """Gradient (2,) by (col, row) and Hessian (2, 2) of the paraboloid through 3 x 3 values, by least squares."""
+    by_col, by_row = three.mean(axis=0), three.mean(axis=1)
+    gradient = np.array([by_col[2] - by_col[0], by_row[2] - by_row[0]]) / 2
+    mixed = (three[2, 2] + three[0, 0] - three[0, 2] - three[2, 0]) / 4
+    bends = [side[2] - 2 * side[1] + side[0] for side in (by_col, by_row)]
+    return gradient, np.array([[bends[0], mixed], [mixed, bends[1]]])

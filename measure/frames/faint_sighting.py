@@ -1,0 +1,87 @@
+"""The faint marks of a frame: looked for once more where the marks that agree put them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.frames.faint_marks import FaintMark, find_faint
+from measure.frames.frame_sighter import CHANCE, FrameSighter
+from measure.frames.refinement import Sighting
+from measure.frames.unseen import Ground, reason_unseen
+from measure.marks.prediction import MarkPrediction
+from measure.marks.rendering import extent_px
+from measure.marks.shapes import FrameCorner
+
+Array = NDArray[np.float64]
+
+_FAINT_CONTRAST = 1 / 250  # of full scale: less is a grey level of eight bits, or what compression made of it
+_FAINT_SIGMA_PX = 0.75  # a mark that is known no better is not measured
+_LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
+_SAME_PX = 1.0  # apart: two places of one mark, each of which is known to better than that
+_REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
+_NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
+_EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
+
+
+def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
+    """Look again at every mark that is not clear, or does not lie where the others put it: what stands out of its
+    texture there is this mark, the film being deformed where it lies off. A clear one may be a pattern beside it.
+    """
+    near = sighter.belongs & (sighter.misfit_mm() <= _NEAR * sighter.scatter_mm())
+    faint = [
+        (index, sighting)
+        for index, sighting in enumerate(sighter.sightings)
+        if sighting is not None and sighting.inside and not (sighter.clear(index) and near[index])
+        if not isinstance(sighter.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
+    ]
+    agreeing = [
+        s.fit for s, ok in zip(sighter.sightings, sighter.belongs, strict=True) if ok and s is not None and s.fit
+    ]
+    if not faint or not agreeing:
+        return
+    # The marks that agree tell both better than a faint mark does itself.
+    blur_px = float(np.median([fit.blur_px for fit in agreeing]))
+    usual_dn = float(np.median([abs(fit.contrast_dn) for fit in agreeing]))
+    extremes = np.percentile(sighter.scan.reduced(sighter.placement.reduction, sighter.weights), _EXTREMES)
+    for index, sighting in faint:
+        expected = sighter.expected(index, reach_px)
+        extreme_dn = float(extremes[int(expected.polarity > 0)])
+        seen = find_faint(sighter.scan, expected, extreme_dn, blur_px)
+        known = seen is not None and seen.sigma_px <= _FAINT_SIGMA_PX
+        certain = seen is not None and _is_certain(sighter, seen)
+        unseen = reason_unseen(_ground(sighter, expected, extreme_dn), usual_dn, reach_px, seen, certain)
+        _take(sighter, index, sighting, seen if certain and known else None, unseen)
+
+
+def faint_reach_px(sighter: FrameSighter) -> float:
+    """How far a faint mark can be from where many others put it."""
+    return min(sighter.gate_px, max(_REACH * sighter.scatter_mm() / float(sighter.pitch.mean()), _LEAST_REACH_PX))
+
+
+def _ground(sighter: FrameSighter, expected: MarkPrediction, extreme_dn: float) -> Ground:
+    """About a mark's place; extreme_dn: the grey value that the mark cannot pass."""
+    least, greatest = extent_px(expected.mark, expected.pixel_from_mark)
+    low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
+    grey = sighter.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), sighter.weights).astype(float)
+    room_dn = max(expected.polarity * (extreme_dn - float(np.median(grey))), 0.0)
+    return Ground(expected.polarity > 0, room_dn, float(grey.std()))
+
+
+def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark | None, unseen: str) -> None:
+    """Keep a clear fit where what was seen is the same mark; else what was seen counts, or that nothing was."""
+    clear, away = sighter.clear(index), np.inf
+    if seen is not None and sighting.fit is not None:
+        away = float(np.hypot(*(sighting.fit.center_px - seen.fit.center_px)))
+    # That the same pixels answer twice proves nothing of a clear mark that agreed with the others anyway.
+    again = clear and bool(sighter.belongs[index]) and away <= _SAME_PX
+    sighter.vouched[index] = seen is not None and (bool(sighter.vouched[index]) or not again)
+    if seen is None and not clear:
+        sighter.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
+    elif seen is not None and (not clear or away > _SAME_PX):
+        reason = f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
+        sighter.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
+
+
+def _is_certain(sighter: FrameSighter, seen: FaintMark) -> bool:
+    """Whether neither texture nor rounding feigns it."""
+    strong = abs(seen.fit.contrast_dn) >= _FAINT_CONTRAST * sighter.scan.full_scale_dn
+    return seen.chance <= CHANCE and strong

@@ -1,0 +1,107 @@
+"""What is handed on of a scan's fiducials: a row for each mark, with its status, reason and figures, and the frame's
+problems."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from measure.checks.second_place import SecondPlace
+from measure.frames.frame import Frame
+from measure.frames.frame_fit import AFFINITY_SIGMA
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.scans.scan import Scan
+from measure.search.correlation import CLOSE
+from measure.special_marks.learned import honest_covariance
+from measure.status import Status
+
+_FAINT = "the frame was found at a closer look only, its marks being faint beside what surrounds them"
+_ASSUMED = "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere"
+
+
+def absent_frame(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasurement:
+    """Of a scan in which no frame was found; reason: why, a part of a sentence."""
+    marks = tuple(
+        MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}") for mark in layout.marks
+    )
+    problem = f"no fiducial was measured: {reason}; look whether the camera is that of the scan, and the pitch right."
+    return FrameMeasurement(scan.name, marks, None, None, (problem,))
+
+
+def present_frame(
+    scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, problems: Sequence[str], chance: str
+) -> FrameMeasurement:
+    """Of a frame that was found. problems: why it may lie elsewhere, sentences, beside those that its marks show;
+    chance: why it may be none at all: then none of its marks is certain, nor if it was found at a closer look."""
+    marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
+    if not pose.decided:
+        marks = tuple(_of_assumed_name(row, mark) for row, mark in zip(marks, layout.marks, strict=True))
+    weak = chance or (_FAINT if frame.placement.surroundings == CLOSE else "")
+    if weak:
+        marks = tuple(
+            replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
+        )
+    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, (*problems, *_problems(frame)))
+
+
+def _problems(frame: Frame) -> list[str]:
+    """What the user should look at in the frame itself."""
+    problems = []
+    per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
+    if abs(per_mm[0] / per_mm[1] - 1) > 2 * AFFINITY_SIGMA:
+        problems.append(
+            f"by the marks a pixel is {1000 / per_mm[0]:.1f} um wide and {1000 / per_mm[1]:.1f} um tall: film is never "
+            "stretched so much. Look whether the scanner, or the camera file, is to blame."
+        )
+    used = int(frame.belongs.sum())
+    if used <= 3:
+        problems.append(f"an affine transformation on {used} fiducials has no redundancy: no check.")
+    return problems
+
+
+def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasurement:
+    sighting = frame.sightings[index]
+    fit = sighting.fit
+    if not sighting.inside:
+        return MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, sighting.reason)
+    if fit is None:
+        return MarkMeasurement(mark.id, "fiducial", sighting.predicted_px, None, Status.PREDICTED, sighting.reason)
+    quality = {
+        "snr": fit.snr,
+        "contrast_dn": fit.contrast_dn,
+        "noise_dn": fit.noise_dn,
+        "blur_px": fit.blur_px,
+        "damaged_fraction": fit.damaged_fraction,
+        "likeness": fit.likeness,
+        "significance": fit.significance,
+        "redundancy": float(fit.redundancy),
+        "neighbour_correlation": fit.neighbour_correlation,
+        **_by_edges(fit.edges),
+    }
+    status, reason = frame.verdict(index)
+    covariance = fit.covariance_px2
+    if isinstance(mark.mark, MarkTemplate):
+        covariance = honest_covariance(mark.mark, scan, fit)
+        if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:
+            status, reason = Status.WEAK, "its template is its own picture: nothing checks its place"
+    return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
+
+
+def _of_assumed_name(row: MarkMeasurement, mark: LayoutMark) -> MarkMeasurement:
+    """A drawn mark is the same place under every name. A learned one's origin is where somebody clicked: at another
+    mark that looks like it, it lies elsewhere."""
+    learned = isinstance(mark.mark, MarkTemplate) and mark.mark.learned_mm > 0
+    return replace(row, status=Status.WEAK, reason=_ASSUMED) if learned and row.status is Status.MEASURED else row
+
+
+def _by_edges(edges: SecondPlace | None) -> dict[str, float]:
+    """How far from the matched place the second method puts the mark, and in standard deviations of that."""
+    if edges is None:
+        return {}
+    col, row = edges.offset_px
+    return {
+        "second_method_col_px": float(col),
+        "second_method_row_px": float(row),
+        "second_method_sigmas": edges.sigmas,
+    }

@@ -1,0 +1,110 @@
+"""One frame in one placement: its marks as they were seen, and those told apart that do not belong."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from measure.fitting.matching import Match
+from measure.frames.refinement import Sighting
+from measure.search.constellation import Placement
+from measure.status import Status
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CLEAR_LIKENESS = 0.5  # below it a mark's picture has more in it that is not the mark
+CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be another's
+_CLEAR_SNR = 3.0
+_AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
+_WRONG_PX, _WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
+_FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
+_LEAST_SCATTER_MM = 0.01  # of few marks, which may agree by chance better than film keeps them
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """camera_mm: (n, 2) given. belongs: (n,) marks that were found and agree. misfit_mm: (n,) how far each mark found
+    is from where the frame puts it, nan without one; scatter_mm: the median of those that belong. pixel_from_camera:
+    (2, 3), the placement's own where fewer than two marks belong."""
+
+    placement: Placement
+    camera_mm: Array
+    sightings: tuple[Sighting, ...]
+    belongs: Mask
+    misfit_mm: Array
+    scatter_mm: float
+    pixel_from_camera: Array
+    weights: tuple[float, ...] | None
+
+    @property
+    def fits(self) -> list[Match | None]:
+        """The fits of the marks that belong."""
+        return [s.fit if ok else None for s, ok in zip(self.sightings, self.belongs, strict=True)]
+
+    @property
+    def all_clear(self) -> bool:
+        """Whether every mark that belongs is plainly there."""
+        return all(fit is None or fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
+
+    @property
+    def missed_px(self) -> list[Array]:
+        """Where the frame puts the marks in the scan that were not found."""
+        places = [self.pixel_from_camera @ (*xy, 1.0) for xy in self.camera_mm]
+        missed = [s.inside and not ok for s, ok in zip(self.sightings, self.belongs, strict=True)]
+        return [np.asarray(place) for place, gone in zip(places, missed, strict=True) if gone]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether enough marks agree, clear or not: three, and three in ten of those in the scan."""
+        inside = sum(sighting.inside for sighting in self.sightings)
+        return int(self.belongs.sum()) >= max(self._least, int(np.ceil(_AGREEING_SHARE * inside)))
+
+    @property
+    def accepted(self) -> bool:
+        """Whether enough marks agree for the frame not to be chance, three of them clear ones."""
+        clear = sum(fit is not None and fit.likeness >= CLEAR_LIKENESS for fit in self.fits)
+        return self.agrees and clear >= self._least
+
+    @property
+    def measured(self) -> int:
+        """How many marks are measured without blemish."""
+        return sum(self.verdict(int(index))[0] is Status.MEASURED for index in np.flatnonzero(self.belongs))
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it is accepted, as many marks being measured as have to agree: a frame that is seen elsewhere than it
+        lies has hardly any."""
+        return self.accepted and self.measured >= self._least
+
+    @property
+    def _least(self) -> int:
+        return max(min(_AGREEING, len(self.sightings)), 2)
+
+    def misfit(self) -> str:
+        """A sentence for a frame that is not accepted."""
+        return (
+            f"the constellation does not fit: only {int(self.belongs.sum())} of {len(self.sightings)} marks were found "
+            "where the others put them"
+        )
+
+    def verdict(self, index: int) -> tuple[Status, str]:
+        """What became of a mark that was fitted."""
+        fit = self.sightings[index].fit
+        if fit is None or not self.belongs[index]:
+            off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.belongs.sum())} marks put it"
+            return Status.REJECTED, f"what was measured lies {off}"
+        reasons = [self.sightings[index].reason] if self.sightings[index].reason else []
+        if fit.likeness < CLEAR_LIKENESS:
+            reasons.append(f"it correlates with its drawing by only {fit.likeness:.2f}")
+        if fit.snr < _CLEAR_SNR:
+            reasons.append(f"its contrast is only {fit.snr:.1f} times the noise")
+        if fit.damaged_fraction > CLEAR_DAMAGE:
+            reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
+        sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
+        if stats.chi2.sf((_WRONG_PX / sigma_px) ** 2, 2) > _WRONG_CHANCE:
+            reasons.append(f"its standard deviation is {sigma_px:.2f} px")
+        if self.misfit_mm[index] > _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM):
+            reasons.append(f"it lies {self.misfit_mm[index]:.2f} mm from where the others put it: the film is deformed")
+        return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")

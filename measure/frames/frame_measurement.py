@@ -1,0 +1,40 @@
+"""The marks of one frame sighted at full resolution from its placement, and the frame fitted to those that agree."""
+
+from measure.fiducial_options import FiducialOptions
+from measure.frames.faint_sighting import faint_reach_px, look_for_faint
+from measure.frames.frame import Frame
+from measure.frames.frame_settling import compare_shapes, compare_sizes, settle, share_blur
+from measure.frames.frame_sighter import MANY, FrameSighter
+from measure.marks.shapes import FiducialLayout
+from measure.scans.scan import Scan
+from measure.search.constellation import Placement
+
+_ROUNDS = 2  # of looking for faint marks: the first ones tell where the others are
+
+
+def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
+    """Sight all marks from the placement, fit the frame to those that agree, and look again for the others."""
+    sighter = FrameSighter(scan, layout, placement, options)
+    sighter.choose_channels()
+    everything = range(len(layout.marks))
+    sighter.look(everything, sighter.first_search_px)
+    sighter.judge()
+    if sighter.frame().accepted:
+        sighter.look_closer()
+        sighter.judge()
+    if sighter.belongs.sum() >= 2 and not sighter.sure():
+        if len(layout.marks) > MANY:
+            look_for_faint(sighter, sighter.faint_px)
+            sighter.vouched[:] = False  # so far from its place a mark still has to agree with the others
+        else:
+            sighter.look_astray([index for index in everything if not sighter.clear(index)])
+        sighter.judge()
+    for _ in range(_ROUNDS):
+        if sighter.sure():
+            look_for_faint(sighter, faint_reach_px(sighter))
+            sighter.judge()
+    settle(sighter)
+    share_blur(sighter)
+    compare_sizes(sighter)
+    compare_shapes(sighter)
+    return sighter.frame()

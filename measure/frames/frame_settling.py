@@ -1,0 +1,144 @@
+"""The marks of a frame settled by what it says of them: matched again where the frame or the other marks know better,
+and doubted where they look unlike the others."""
+
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.fitting.generators import is_round
+from measure.fitting.matching import Match
+from measure.frames.frame_sighter import FrameSighter
+from measure.frames.mark_comparison import round_moves_px, shared_blurs, shared_shapes, shared_sizes
+from measure.frames.refinement import leans_on_frame, sight, strained_px
+from measure.marks.rendering import reach_px
+from measure.marks.shapes import Disk, Mark, MarkShape, Ring
+from measure.match_options import MatchOptions
+
+Array = NDArray[np.float64]
+
+_STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
+_SETTLED_PX = 1.5  # about a mark that was matched already
+
+
+def settle(sighter: FrameSighter) -> None:
+    """Match marks that do not tell their own rotation and scale once more, with those of the frame; and those that the
+    frame's stretch and shear move, which no match tells."""
+    linear = sighter.pixel_from_camera[:, :2]
+    unsettled = [
+        index
+        for index, fit in _clear(sighter).items()
+        if leans_on_frame(mark := sighter.layout.marks[index].mark)
+        or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
+    ]
+    if unsettled and sighter.belongs.sum() >= 2:
+        frame_sigma = _frame_sigma(sighter)
+        for index in unsettled:
+            _match_again(sighter, index, sighter.options.match, frame_sigma)
+        sighter.judge()
+
+
+def share_blur(sighter: FrameSighter) -> None:
+    """Match marks that hardly tell their own blur once more, with that of the others; what differs from theirs is
+    doubted."""
+    fits = _adjusted(sighter)
+    told = zip(fits, shared_blurs(list(fits.values())), strict=True)
+    shared = {index: blur for index, blur in told if blur is not None}
+    if not shared:
+        return
+    frame_sigma = _frame_sigma(sighter)
+    for index, blur in shared.items():
+        match = replace(sighter.options.match, blur_px=blur.blur_px, blur_sigma=blur.sigma)
+        _match_again(sighter, index, match, frame_sigma)
+        if blur.differs:
+            own_px = fits[index].blur_px
+            sighter.doubt(index, f"its blur is {own_px:.2f} px, where the other marks have {blur.blur_px:.2f}")
+    sighter.judge()
+
+
+def compare_sizes(sighter: FrameSighter) -> None:
+    """Doubt marks of another size than the others that are drawn alike: dust, say, that covers one. A round mark is
+    known no better than its size says."""
+    alike: dict[Mark, list[int]] = defaultdict(list)
+    fits = _adjusted(sighter)
+    for index in fits:
+        mark = sighter.layout.marks[index].mark
+        if not leans_on_frame(mark):
+            alike[mark].append(index)
+    for mark, indices in alike.items():
+        sizes = shared_sizes([fits[index] for index in indices], sighter.pixel_from_camera[:, :2])
+        for index, size in zip(indices, sizes, strict=True):
+            if size is not None and size.differs:
+                reason = f"it is {size.ratio:.2f} times as large as the other marks: something may cover or touch it"
+                sighter.doubt(index, reason)
+            if size is not None and is_round(mark):
+                radius_px = _radius_px(mark, fits[index].pixel_from_mark[:, :2])
+                moved_px = round_moves_px(size, radius_px)
+                sighter.widen(index, size.touched_px2(moved_px, radius_px, fits[index].damaged_fraction > 0))
+
+
+def compare_shapes(sighter: FrameSighter) -> None:
+    """The same of marks that do not tell their own rotation and scale from their place: what their pictures say of
+    these beside the frame's, and beside what the others say."""
+    fits = _adjusted(sighter)
+    own = {
+        index: fit.own_shape
+        for index, fit in fits.items()
+        if fit.own_shape is not None and leans_on_frame(sighter.layout.marks[index].mark)
+    }
+    for (index, shape), other in zip(own.items(), shared_shapes(list(own.values())), strict=True):
+        if other is None:
+            continue
+        if other.differs:
+            turn_deg = np.degrees(other.off[1])
+            reason = (
+                f"its edges make it {other.ratio:.2f} times as large as the other marks, and turned by {turn_deg:.1f}"
+            )
+            sighter.doubt(index, f"{reason} degrees: something may cover or touch it")
+        middle_px = reach_px(sighter.layout.marks[index].mark, fits[index].pixel_from_mark[:, :2]) / 2
+        moved_px = float(np.hypot(*(shape.on_place @ other.off)))
+        sighter.widen(index, other.touched_px2(moved_px, middle_px, fits[index].damaged_fraction > 0))
+
+
+def _radius_px(mark: Mark, linear: Array) -> float:
+    """Of a round mark's outline; linear: (2, 2) px per mm."""
+    parts = mark.parts if isinstance(mark, MarkShape) else ()
+    radius_mm = max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
+    return float(radius_mm * np.sqrt(abs(np.linalg.det(linear))))
+
+
+def _clear(sighter: FrameSighter) -> dict[int, Match]:
+    """The fits of marks that belong and are plainly there."""
+    return {
+        index: sighting.fit
+        for index, sighting in enumerate(sighter.sightings)
+        if sighter.belongs[index] and sighter.clear(index) and sighting is not None and sighting.fit is not None
+    }
+
+
+def _adjusted(sighter: FrameSighter) -> dict[int, Match]:
+    """Those of them that were matched, not only seen as faint marks, and are drawn: a chip has a blur of its own."""
+    return {
+        index: fit
+        for index, fit in _clear(sighter).items()
+        if fit.covariance is not None and isinstance(sighter.layout.marks[index].mark, MarkShape)
+    }
+
+
+def _frame_sigma(sighter: FrameSighter) -> float:
+    """The standard deviation of the frame's rotation (rad) and scale."""
+    belonging = sighter.camera[sighter.belongs]
+    radius_mm = float(np.hypot(*(belonging - belonging.mean(axis=0)).T).mean())
+    return float(np.hypot(sighter.options.film_sigma_mm, sighter.scatter_mm())) / radius_mm
+
+
+def _match_again(sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float) -> None:
+    """Where it was found, with the frame's rotation and scale where it leans on them."""
+    before = sighter.sightings[index]
+    if before is None or before.fit is None:
+        return
+    expected = sighter.expected(index, _SETTLED_PX).moved(before.fit.center_px)
+    after = sight(sighter.scan, expected, options, frame_sigma)
+    if after.fit is not None:
+        sighter.sightings[index] = replace(before, fit=after.fit)

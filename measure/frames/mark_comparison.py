@@ -1,0 +1,172 @@
+"""Each mark of a frame compared with the others: in blur, for one lens and one scanner blur them alike, and in size and
+rotation, for marks of one drawing have one size.
+
+A faint mark, or one on rough ground, hardly tells its own blur. Where noise makes its edges look sharp, its standard
+deviation comes out as small as a sharp mark's. So it is matched with the others' blur as an observation, and where its
+own is not theirs something else than noise is in its picture. A speck that covers a dot looks like a dot of another
+size.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from measure.checks.own_shape import OwnShape
+from measure.fitting.matching import Match
+from measure.fitting.picture_model import PIXEL_VARIANCE_PX2
+
+Array = NDArray[np.float64]
+# The standard deviation of a figure from mark to mark, by the variance that so many marks show beyond their own.
+_Spread = Callable[[float, int], float]
+
+_FEWEST = 3  # other marks: of fewer nobody knows by how much they differ
+_CHANCE = 0.01  # of doubting any good mark of a frame
+_BLUR_SPREAD = 0.05  # of the logarithm: so much blur differs within a field
+_TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no more where its blur is known so well
+# By so much exposure spreads the marks of a frame in the logarithm of their size and, its edges being uneven, in
+# rotation, as if two marks had shown it before. In three frames of ring-crosses it was 0.005 to 0.008, in four of a
+# réseau 0.014 to 0.021: this is their root mean square.
+_SIZE_SPREAD, _BEFORE = 0.014, 2
+# What touches a mark on one side moves its mean outline by so much, rms, and the share of marks that something touches:
+# of those with nothing cut out beside them, and with something.
+_TOUCHED_PX, _WHOLE, _DAMAGED = 0.3, 0.01, 0.03
+# What moves one place of an outline by d moves the mean radius by a share of d, and the centre by twice that share.
+_AS_MUCH = 2.0
+
+
+@dataclass(frozen=True)
+class SharedBlur:
+    """What the other marks tell of a mark's blur: blur_px, and sigma, the standard deviation of its logarithm, the
+    pixel's share included. differs: whether the mark's own is another, by more than chance; else it is just poorly
+    known."""
+
+    blur_px: float
+    sigma: float
+    differs: bool
+
+
+def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
+    """For each mark what the others tell of its blur, None where they need not, for its own picture tells it well and
+    it is as theirs, or where they are too few."""
+    own = np.array([np.log(fit.blur_px**2 + PIXEL_VARIANCE_PX2) / 2 for fit in fits])
+    sigma = np.array([fit.blur_sigma for fit in fits])
+    return [
+        None
+        if told is None or not (told.differs or own_sigma > _TELLING)
+        else SharedBlur(_without_pixel(told.value), told.sigma, told.differs)
+        for told, own_sigma in zip(_told_by_others(own, sigma, _blur_spread), sigma.tolist(), strict=True)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class SharedShape:
+    """A mark's shape beside that of the others: off (k,), the logarithm of its size less theirs, and its rotation (rad)
+    too where the frame gave it; sigma (k,): standard deviations of these. differs: whether it is another by more than
+    chance."""
+
+    off: Array
+    sigma: Array
+    differs: bool
+
+    @property
+    def ratio(self) -> float:
+        """How many times the others' size it has."""
+        return float(np.exp(self.off[0]))
+
+    def touched_px2(self, moved_px: float, reach_px: float, is_damaged: bool) -> float:
+        """The mean square of how far what may touch one side of the mark has moved it, along a coordinate: of a mark
+        that is touched, times the probability that it is.
+
+        moved_px: how far a mark of such a shape is moved; reach_px: from its middle to its outline. is_damaged: whether
+        something was cut out beside it.
+        """
+        share = _DAMAGED if is_damaged else _WHOLE
+        touched = share * np.prod(stats.norm.pdf(self.off, scale=np.hypot(self.sigma, _TOUCHED_PX / reach_px)))
+        untouched = (1 - share) * np.prod(stats.norm.pdf(self.off, scale=self.sigma))
+        return moved_px**2 / 2 * float(touched) / max(float(touched + untouched), 1e-300)
+
+
+def round_moves_px(shape: SharedShape, radius_px: float) -> float:
+    """How far what touches one side of a round mark moves it, where it gives it such a size."""
+    return _AS_MUCH * radius_px * abs(float(shape.off[0]))
+
+
+def shared_sizes(fits: Sequence[Match], linear: Array) -> list[SharedShape | None]:
+    """The size of each mark beside the others', of marks that are drawn alike and tell their own; None where they are
+    too few. linear: (2, 2) px per mm, of the frame."""
+    own = np.array([np.log(np.linalg.det(fit.pixel_from_mark[:, :2]) / np.linalg.det(linear)) / 2 for fit in fits])
+    return _beside_others(own[:, None], np.array([[fit.size_sigma] for fit in fits]))
+
+
+def shared_shapes(shapes: Sequence[OwnShape]) -> list[SharedShape | None]:
+    """The same of marks whose sizes and rotations the frame gave, by what their own pictures say of them."""
+    return _beside_others(np.array([shape.change for shape in shapes]), np.array([shape.sigma for shape in shapes]))
+
+
+def _beside_others(own: Array, sigma: Array) -> list[SharedShape | None]:
+    """own, sigma (n, k): each mark's figures."""
+    told = [_told_by_others(*pair, _size_spread) for pair in zip(own.T, sigma.T, strict=True)]
+    result: list[SharedShape | None] = []
+    for figures, sigmas, each in zip(own, sigma, zip(*told, strict=True), strict=True):
+        known = [one for one in each if one is not None]
+        if len(known) < len(figures):
+            result.append(None)
+            continue
+        off, beside = figures - [one.value for one in known], np.hypot(sigmas, [one.sigma for one in known])
+        result.append(SharedShape(off, beside, any(one.differs for one in known)))
+    return result
+
+
+def _blur_spread(shown: float, marks: int) -> float:
+    return float(np.hypot(np.sqrt(shown), _BLUR_SPREAD))
+
+
+def _size_spread(shown: float, marks: int) -> float:
+    return float(np.sqrt((_BEFORE * _SIZE_SPREAD**2 + (marks - 1) * shown) / (_BEFORE + marks - 1)))
+
+
+def _without_pixel(log_seen_px: float) -> float:
+    return float(np.sqrt(max(np.exp(2 * log_seen_px) - PIXEL_VARIANCE_PX2, 0.0)))
+
+
+@dataclass(frozen=True)
+class _Told:
+    """value: what the others tell, and sigma, its standard deviation for one more mark. differs: whether the mark's own
+    figure is another, by more than chance."""
+
+    value: float
+    sigma: float
+    differs: bool
+
+
+def _told_by_others(own: Array, sigma: Array, spread: _Spread) -> list[_Told | None]:
+    """For each mark what the others tell, None where they are too few.
+
+    own, sigma (n,): each mark's figure and its standard deviation, infinite where it has none.
+    """
+    return [_told(own, sigma, index, spread) for index in range(len(own))]
+
+
+def _told(own: Array, sigma: Array, index: int, spread: _Spread) -> _Told | None:
+    others = np.isfinite(sigma) & (np.arange(len(own)) != index)
+    if others.sum() < _FEWEST:
+        return None
+    mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
+    predicted = float(np.hypot(mean_sigma, apart))
+    off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
+    return _Told(mean, predicted, bool(2 * stats.norm.sf(off) * len(own) < _CHANCE))
+
+
+def _mean(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:
+    """The weighted mean of values that differ by more than their standard deviations, its own standard deviation, and
+    by how much more: by the moments of what they leave (DerSimonian and Laird, 1986)."""
+    weights = 1 / sigma**2
+    rest = values - weights @ values / weights.sum()
+    beyond = weights @ rest**2 - (len(values) - 1)
+    between = max(beyond / (weights.sum() - (weights**2).sum() / weights.sum()), 0.0)
+    apart = spread(float(between), len(values))
+    weights = 1 / (sigma**2 + apart**2)
+    return float(weights @ values / weights.sum()), float(1 / np.sqrt(weights.sum())), apart

@@ -1,0 +1,141 @@
+"""One mark, looked for about a predicted place at full resolution and matched."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.fitting.beyond_edge import beyond_edge
+from measure.fitting.blank_film import BESIDE_PX
+from measure.fitting.matching import Match, MatchOptions, match, window_about
+from measure.frames.first_look import seen
+from measure.marks.prediction import MarkPrediction
+from measure.marks.rendering import extent_px
+from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
+from measure.scans.compression import with_loss
+from measure.scans.scan import Scan
+from measure.scans.scan_window import read_window
+from measure.search.candidates import FAINT
+from measure.search.correlation import CLOSE
+from measure.special_marks.frame_corner import corner_of_edges
+
+Array = NDArray[np.float64]
+
+_DRIFT_PX = 2.0  # of a fit, from the pixel where it begins: what goes farther has found something else, dust say
+_MOST_CONTRAST = (
+    2.0  # times the scanner's range: more than that no light takes, and lines are hardly twice as wide as drawn
+)
+_SURE = 3.0  # standard deviations
+_SOLID_MARGIN_PX = 7.0  # of ground: with 6 a sharp dot loses a hundredth and a notch two, and they cost little
+_SOLID_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart farther off: 4 lose a sixth at 1.6 px
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """What was seen where a mark was predicted: predicted_px (2,); fit is None where nothing could be fitted, and
+    reason says why. inside: whether the predicted place lies in the scan. chance: the expected number of places about
+    it that noise makes look as much like the mark. closer: whether it was seen at a closer look only, where the other
+    marks put it."""
+
+    predicted_px: Array
+    inside: bool
+    fit: Match | None
+    reason: str = ""
+    chance: float = 1.0
+    closer: bool = False
+
+
+def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None) -> Sighting:
+    """Look for the mark within the search radius of its predicted place and match it there.
+
+    frame_sigma: standard deviation of the predicted rotation (rad) and scale, where a frame fitted to all marks gives
+    them.
+    """
+    predicted = expected.center_px.copy()
+    inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
+    if not inside:
+        return Sighting(predicted, False, None, "its place is outside of the scan")
+    fit, chance = _fitted(scan, expected, options, frame_sigma)
+    if fit is None:
+        return Sighting(predicted, True, None, f"nothing within {expected.search_px:.0f} px of its place looks like it")
+    if not fit.converged:
+        return Sighting(predicted, True, None, fit.reason)
+    reason = _unlike(fit, expected, scan.full_scale_dn)
+    if reason:
+        return Sighting(predicted, True, None, reason)
+    fit = replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn))
+    return Sighting(predicted, True, fit, chance=chance)
+
+
+def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> str:
+    """Why what was fitted is no such mark; empty where it may be."""
+    off_px = float(np.hypot(*(fit.center_px - expected.center_px)))
+    if off_px > expected.search_px + _DRIFT_PX:
+        return f"what lies there is {off_px:.0f} px from its place"
+    contrast = abs(fit.contrast_dn) / full_scale_dn
+    if contrast < FAINT:
+        return "there is no contrast at its place"
+    if contrast * (1 - _SURE / max(fit.significance, _SURE)) > _MOST_CONTRAST:
+        return (
+            "what lies there is far wider than the mark's lines: as fine as these, it would have "
+            f"{contrast:.1f} times the contrast that a scan can show"
+        )
+    if fit.contrast_dn * expected.polarity <= 0:
+        return "what lies there has the other polarity"
+    return ""
+
+
+def _fitted(
+    scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None
+) -> tuple[Match | None, float]:
+    """The mark matched where it looks most like itself, and the expected number of places that noise makes look so;
+    None where nothing looks like it."""
+    mark, weights = expected.mark, expected.weights
+    if isinstance(mark, FrameCorner):
+        return corner_of_edges(scan, mark, expected), 1.0
+    look = seen(scan, expected)
+    if look is None:
+        return None, 1.0
+    center_px, chance = look
+    start = expected.moved(center_px).pixel_from_mark
+    window = read_window(scan, window_about(mark, start, options.margin_px + BESIDE_PX), weights)
+    if expected.surroundings == CLOSE and isinstance(mark, MarkShape):
+        inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
+        window = window.without(beyond_edge(window.grey, mark, inner, expected.polarity))
+    return match(window, mark, start, options_for(mark, options, frame_sigma)), chance
+
+
+def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
+    """A solid mark gets more ground. Where the mark leans on the frame, its rotation and scale stay as predicted, or
+    near it."""
+    if _is_solid(mark):
+        options = replace(
+            options,
+            margin_px=max(options.margin_px, _SOLID_MARGIN_PX),
+            margin_blurs=max(options.margin_blurs, _SOLID_MARGIN_BLURS),
+        )
+    if not leans_on_frame(mark):
+        return options
+    if frame_sigma is None:
+        return replace(options, freedom="shift")
+    return replace(options, freedom="similarity", linear_sigma=frame_sigma)
+
+
+def _is_solid(mark: Mark) -> bool:
+    """Whether the mark has an outline only and no lines, whose two edges hold it whatever the ground's slope is."""
+    return isinstance(mark, MarkShape) and all(isinstance(part, Polygon | Disk) for part in mark.parts)
+
+
+def leans_on_frame(mark: Mark) -> bool:
+    """Whether the mark's own picture may not tell its scale from its place, as a wedge's or a notch's edges do not, nor
+    a chip of them: then rotation and scale come from the other marks."""
+    return isinstance(mark, MarkTemplate) or all(isinstance(part, Polygon) for part in mark.parts)
+
+
+def strained_px(mark: Mark, fitted: Array, linear: Array) -> float:
+    """How far about a mark is off because it was fitted with the stretch and shear of fitted (2, 2) instead of those of
+    linear: by as much as they move what of its drawing reaches farther to one side than to the other."""
+    change = linear @ np.linalg.inv(fitted) - np.eye(2)
+    strain = (change + change.T) / 2 - np.trace(change) / 2 * np.eye(2)
+    least, greatest = extent_px(mark, np.column_stack([linear, np.zeros(2)]))
+    return float(np.hypot(*(strain @ (least + greatest))))

@@ -1,0 +1,1 @@
+"""What a mark is, and how it looks in a scan."""

@@ -1,0 +1,162 @@
+"""How much of each pixel a drawn mark covers: the ideal picture of a mark, before film and scanner blur it.
+
+A pixel (col, row) is the unit square about its centre. An affine map takes the mark's millimetres (x right, y up) to
+pixels (col right, row down). Every part is an outline, a circle one of so many corners that it is as good; by Green's
+theorem the area of a part in each pixel follows from the piece of outline in it and in the pixels left of it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.marks.shapes import Bar, Disk, MarkShape, Part, Polygon, Ring
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Integers = NDArray[np.intp]
+
+CELLS = 4  # cells along a pixel's side: more than any blur of a scan tells apart
+_ROUND = 0.002  # cells: how far off its circle an outline may be
+
+
+def coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int) -> Array:
+    """(height, width) shares, 0 to 1, of the pixels' areas that the mark covers.
+
+    pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to (col, row) in this window. A part's share is exact;
+    where parts overlap they count once, to about 0.001 of a pixel.
+    """
+    return pixel_means(cell_coverage(shape, pixel_from_mark, width, height, CELLS), CELLS)
+
+
+def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int, cells: int) -> Single:
+    """The coverage of the cells that a window's pixels are divided into, (height * cells, width * cells)."""
+    cell_from_mark = np.array(pixel_from_mark, dtype=float)
+    cell_from_mark[:, 2] += 0.5
+    cell_from_mark *= cells  # corners of cells are whole numbers
+    covered = np.zeros((height * cells, width * cells), np.float32)
+    for pieces in _pieces_of(shape, cell_from_mark):
+        _add(covered, pieces)
+    return covered
+
+
+def pixel_means(cell_values: NDArray[np.floating], cells: int) -> Array:
+    """Means over the cells of each pixel of an image (rows, columns)."""
+    rows, cols = cell_values.shape
+    size = (cols // cells, rows // cells)
+    return np.asarray(cv2.resize(cell_values, size, interpolation=cv2.INTER_AREA), dtype=float)
+
+
+def outline_mm(part: Part) -> Array:
+    """(n, 2) corners of a convex region that holds the part."""
+    if isinstance(part, Polygon):
+        return np.asarray(part.vertices_mm, dtype=float)
+    if isinstance(part, Bar):
+        start, end = np.asarray(part.from_mm), np.asarray(part.to_mm)
+        along = (end - start) / np.hypot(*(end - start))
+        side = np.array([-along[1], along[0]]) * part.line_mm / 2
+        return np.stack([start - side, start + side, end + side, end - side])
+    reach = part.radius_mm + (part.line_mm / 2 if isinstance(part, Ring) else 0.0)
+    return np.asarray(part.center_mm) + reach * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """The outline of a part in pieces, each within one cell: (n,) the cells they lie in, how far down they go, and the
+    columns of their middles."""
+
+    row: Integers
+    col: Integers
+    tall: Array
+    middle: Array
+
+
+def _pieces_of(shape: MarkShape, cell_from_mark: Array) -> Iterator[_Pieces]:
+    """The outlines of all parts are cut at once."""
+    parts = shape.parts
+    outlines = [_outlines(part, cell_from_mark) for part in parts]
+    corners = np.concatenate([outline for own in outlines for outline in own])
+    ends = np.concatenate([np.roll(outline, -1, axis=0) for own in outlines for outline in own])
+    part_of = np.repeat(np.arange(len(parts)), [sum(map(len, own)) for own in outlines])
+    linear, shift = cell_from_mark[:, :2].T, cell_from_mark[:, 2]
+    start, end, part_of = _split(
+        shape.drawn_at(corners) @ linear + shift, shape.drawn_at(ends) @ linear + shift, part_of, axis=1
+    )
+    start, end, part_of = _split(start, end, part_of, axis=0)
+    tall, middle = end[:, 1] - start[:, 1], (start + end) / 2
+    col, row = np.floor(middle).astype(np.intp).T
+    bounds = np.searchsorted(part_of, np.arange(len(parts) + 1)).tolist()
+    for own in (slice(*pair) for pair in pairwise(bounds)):
+        yield _Pieces(row[own], col[own], tall[own], middle[own, 0])
+
+
+def _outlines(part: Part, cell_from_mark: Array) -> list[Array]:
+    """The part's outlines in mm, (n, 2) each; a hole's runs the other way round."""
+    if isinstance(part, Bar | Polygon):
+        return [outline_mm(part)]
+    if isinstance(part, Disk):
+        return [_circle(part, part.radius_mm, cell_from_mark)]
+    inner, outer = (_circle(part, part.radius_mm + side * part.line_mm / 2, cell_from_mark) for side in (-1, 1))
+    return [outer, inner[::-1]]
+
+
+def _circle(part: Disk | Ring, radius_mm: float, cell_from_mark: Array) -> Array:
+    """Corners of a polygon of the circle's area; none where there is no circle."""
+    if radius_mm <= 0:
+        return np.zeros((0, 2))
+    # A chord and its corners lie off the circle of the same area by no more than a third of radius * half angle².
+    radius = radius_mm * float(np.linalg.norm(cell_from_mark[:, :2], 2))
+    count = max(int(np.ceil(np.pi * np.sqrt(radius / (3 * _ROUND)))), 16)
+    turn = 2 * np.pi / count
+    angles = turn * np.arange(count)
+    corner_mm = radius_mm * np.sqrt(turn / np.sin(turn))
+    return np.asarray(part.center_mm + corner_mm * np.stack([np.cos(angles), np.sin(angles)], axis=1))
+
+
+def _split(start: Array, end: Array, part_of: Integers, axis: int) -> tuple[Array, Array, Integers]:
+    """Lines (n, 2) cut where they cross whole numbers of a coordinate, in order, and the parts (n,) they are of."""
+    first, last = np.floor(start[:, axis]), np.floor(end[:, axis])
+    pieces = np.abs(last - first).astype(np.intp) + 1
+    line = np.repeat(np.arange(len(start)), pieces)
+    number = np.arange(len(line)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    start, step = start[line], (end - start)[line]
+    along = step[:, axis]
+    crossing = first[line] + np.where(along >= 0, number, 1 - number)
+    share = np.divide(crossing - start[:, axis], along, out=np.zeros(len(line)), where=along != 0)
+    cut = start + share[:, None] * step
+    cut[:, axis] = crossing
+    is_first = number == 0
+    cut[is_first] = start[is_first]
+    # A piece ends where the next one of its line begins, the last one at the line's end.
+    cut_end = np.roll(cut, -1, axis=0)
+    is_last = np.roll(is_first, -1)
+    cut_end[is_last] = (start + step)[is_last]
+    return cut, cut_end, part_of[line]
+
+
+def _add(covered: Single, pieces: _Pieces) -> None:
+    """Add a part to what is covered already. Each piece of its outline adds its height to all cells right of it, and to
+    its own what lies right of it there. Only the cells about the part are looked at."""
+    height, width = covered.shape
+    seen = (pieces.row >= 0) & (pieces.row < height) & (pieces.col < width)
+    if not seen.any():
+        return
+    row, col, tall = pieces.row[seen], np.maximum(pieces.col[seen], 0), pieces.tall[seen]
+    own = tall * np.where(pieces.col[seen] < 0, 1.0, col + 1 - pieces.middle[seen])
+    row0, col0, col1 = row.min(), col.min(), min(pieces.col.max() + 1, width)
+    tall_cells, wide_cells = row.max() - row0 + 1, col1 - col0 + 1
+    cell = (row - row0) * wide_cells + col - col0
+    count = tall_cells * wide_cells
+    # In place where it can be: a large mark's cells are many.
+    areas = np.bincount(cell, own, count)
+    areas += np.bincount(cell + 1, tall - own, count)
+    areas = areas.reshape(tall_cells, wide_cells)
+    np.cumsum(areas, axis=1, out=areas)
+    np.minimum(np.abs(areas, out=areas), 1.0, out=areas)
+    about = covered[row0 : row0 + tall_cells, col0:col1]
+    free = 1 - about
+    free *= areas[:, :-1]
+    about += free

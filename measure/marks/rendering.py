@@ -1,0 +1,283 @@
+"""The picture of a mark as film and scanner show it: its coverage, or a chip cut from a scan, under a Gaussian blur,
+with the derivatives that least-squares matching needs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from measure.marks.coverage import CELLS, cell_coverage, outline_mm
+from measure.marks.shapes import Mark, MarkShape, MarkTemplate
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Integers = NDArray[np.int_]
+
+_DRAWINGS = 16  # kept: more than a camera has kinds of marks
+ROUGH_CELLS = 2  # along a pixel's side: of pictures that are right to a hundredth
+_BLOCK = 4  # pixels that are averaged at once: of a matrix for more, too much would be empty
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """A mark's picture and its first and second derivatives by column and row in px, each (height, width)."""
+
+    value: Single
+    by_col: Single
+    by_row: Single
+    by_col_col: Single
+    by_col_row: Single
+    by_row_row: Single
+
+    @property
+    def laplacian(self) -> Single:
+        """Twice the derivative by the blur's variance."""
+        return np.asarray(self.by_col_col + self.by_row_row)
+
+    def bent(self, change: Array, center_px: Array, variance_px2: float) -> "Rendering":
+        """The picture of a mark whose linear part is (I + change) times this one's, by a series to the second order;
+        its second derivatives stay as they are. variance_px2: of blur and pixel, which do not bend with the mark."""
+        (xx, xy), (yx, yy) = (np.eye(2) - np.linalg.inv(np.eye(2) + change)).astype(np.float32)
+        height, width = self.value.shape
+        col = np.arange(width, dtype=np.float32) - np.float32(center_px[0])
+        row = (np.arange(height, dtype=np.float32) - np.float32(center_px[1]))[:, None]
+        right, down = xx * col + xy * row, yx * col + yy * row
+        by_col = self.by_col - self.by_col_col * right - self.by_col_row * down
+        by_row = self.by_row - self.by_col_row * right - self.by_row_row * down
+        spread = np.float32(variance_px2) * change.astype(np.float32)
+        value = self.value - (right * (self.by_col + by_col) + down * (self.by_row + by_row)) / 2
+        value -= spread[0, 0] * self.by_col_col + (spread[0, 1] + spread[1, 0]) * self.by_col_row
+        value -= spread[1, 1] * self.by_row_row
+        return replace(self, value=value, by_col=by_col, by_row=by_row)
+
+
+def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Rendering:
+    """The mark under a Gaussian of standard deviation blur_px, in a window of width x height px.
+
+    A drawn mark is 1 inside and 0 outside; a chip, to whose blur this one is added, spans 0 to 1.
+    pixel_from_mark: (2, 3), from (x_mm, y_mm, 1) to (col, row) of the window.
+    """
+    value, by_col, by_row, by_col_col, by_col_row, by_row_row = _seen(
+        mark, pixel_from_mark, (width, height), blur_px, ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    )
+    return Rendering(value, by_col, by_row, by_col_col, by_col_row, by_row_row)
+
+
+def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float, cells: int = CELLS) -> Array:
+    """(height, width): the mark as `render` makes it, without derivatives; cells: of its drawing along a pixel."""
+    return _seen(mark, pixel_from_mark, (width, height), blur_px, ((0, 0),), cells)[0].astype(float)
+
+
+def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
+    """(2,) least and (2,) greatest column and row that the mark reaches."""
+    points = _outline_mm(mark) @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
+    return points.min(axis=0), points.max(axis=0)
+
+
+def reach_px(mark: Mark, linear: Array) -> float:
+    """How far from its origin the mark reaches; linear (2, 2): px from mm."""
+    return float(np.hypot(*(linear @ _outline_mm(mark).T)).max())
+
+
+@lru_cache(maxsize=_DRAWINGS)
+def _outline_mm(mark: Mark) -> Array:
+    """(n, 2) corners of a region that holds the mark."""
+    if isinstance(mark, MarkTemplate):
+        rows, cols = mark.image.shape
+        corners = np.array([(0, 0), (cols - 1, 0), (cols - 1, rows - 1), (0, rows - 1)], dtype=float)
+        chip_from_mark = _chip_from_mark(mark)
+        return np.asarray((corners - chip_from_mark[:, 2]) @ np.linalg.inv(chip_from_mark[:, :2]).T)
+    return mark.drawn_at(np.concatenate([outline_mm(part) for part in mark.parts]))
+
+
+def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> NDArray[np.bool_]:
+    """(height, width): which pixels lie on the chip, where it is steady."""
+    col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
+    rows, cols = mark.image.shape
+    inside = (col >= 1) & (col <= cols - 2) & (row >= 1) & (row <= rows - 2)
+    if mark.steady is not None:
+        nearest = np.clip(np.rint(row), 0, rows - 1).astype(int), np.clip(np.rint(col), 0, cols - 1).astype(int)
+        inside &= mark.steady[nearest]
+    return np.asarray(inside)
+
+
+def chip_steadiness(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> Array:
+    """(height, width): the chip's steadiness, 1 where it is not known."""
+    if mark.steadiness is None:
+        return np.ones((height, width))
+    col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
+    return np.asarray(ndimage.map_coordinates(mark.steadiness, [row, col], order=1, mode="nearest"))
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawing:
+    """A mark without blur: sharp (rows, columns) in cells, so many along a pixel's side. first: pixel (col, row) of the
+    window that the first cells belong to, and shift_px (2,), how far right and down of it they still have to move."""
+
+    sharp: Single
+    cells: int
+    first: Integers
+    shift_px: Array
+
+
+def _seen(
+    mark: Mark,
+    pixel_from_mark: Array,
+    size: tuple[int, int],
+    blur_px: float,
+    orders: Sequence[tuple[int, int]],
+    cells: int = CELLS,
+) -> list[Single]:
+    """The derivatives of the picture, each of an order by column and by row, in a window of a size (width, height)."""
+    place = np.asarray(pixel_from_mark, dtype=float)
+    if isinstance(mark, MarkTemplate):
+        drawing = _chip_drawing(mark, place, size, blur_px)
+    else:
+        drawing = _drawing(mark, place, blur_px, cells)
+    cells, most = drawing.cells, np.max(orders, axis=0)
+    along = [_Average(blur_px, cells, shift, int(order)) for shift, order in zip(drawing.shift_px, most, strict=True)]
+    # Of the window only what the blurred mark reaches is computed: all else is empty.
+    spare = int(np.ceil(along[0].reach / cells)) + 1
+    low = np.maximum(drawing.first - spare, 0)
+    high = np.minimum(drawing.first + np.array(drawing.sharp.shape[::-1]) // cells + spare, size)
+    images = [np.zeros(size[::-1], np.float32) for _ in orders]
+    if np.any(high <= low):
+        return images
+    (col0, row0), (cols, rows) = low - drawing.first, high - low
+    by_row = along[1].of(drawing.sharp, int(row0), int(rows))
+    by_both = along[0].of(
+        np.ascontiguousarray(by_row.transpose(2, 0, 1)).reshape(len(by_row[0, 0]), -1), int(col0), int(cols)
+    )
+    by_both = by_both.reshape(len(by_both), int(cols), len(by_row), int(rows))
+    for image, (order_col, order_row) in zip(images, orders, strict=True):
+        image[low[1] : high[1], low[0] : high[0]] = by_both[order_col, :, order_row].T
+    return images
+
+
+def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float, cells: int) -> _Drawing:
+    cells = cells if blur_px < 1.5 else max(cells - 1, 2)  # blur hides what coarser cells get wrong
+    whole = np.floor(pixel_from_mark[:, 2])
+    rest = pixel_from_mark[:, 2] - whole
+    # Sharp cells cannot be moved by a part of their own size.
+    drawn_at = np.zeros(2) if blur_px * cells >= 1.0 else rest
+    sharp, origin = _drawn(mark, pixel_from_mark[:, :2].tobytes(), tuple(drawn_at.tolist()), cells)
+    return _Drawing(sharp, cells, whole.astype(int) - origin, rest - drawn_at)
+
+
+@lru_cache(maxsize=_DRAWINGS)
+def _drawn(mark: MarkShape, linear: bytes, origin_px: tuple[float, float], cells: int) -> tuple[Single, Integers]:
+    """The mark's cells, its origin so far right and down of a pixel's centre; and which pixel (col, row) that is. Marks
+    of a camera that are drawn alike share them."""
+    place = np.column_stack([np.frombuffer(linear).reshape(2, 2), origin_px])
+    least, greatest = extent_px(mark, place)
+    low, high = np.floor(least + 0.5).astype(int), np.ceil(greatest + 0.5).astype(int)
+    place[:, 2] -= low
+    width, height = np.maximum(high - low, 1).tolist()
+    return cell_coverage(mark, place, width, height, cells), -low
+
+
+def _chip_drawing(mark: MarkTemplate, pixel_from_mark: Array, size: tuple[int, int], blur_px: float) -> _Drawing:
+    pad = int(np.ceil(4 * blur_px)) + 2
+    shifted = pixel_from_mark.copy()
+    shifted[:, 2] += pad
+    cells = max(1, round(_pixels_per_sample(mark, pixel_from_mark) ** -1))
+    sharp = _sampled(mark, shifted, size[0] + 2 * pad, size[1] + 2 * pad, cells).astype(np.float32)
+    return _Drawing(sharp, cells, np.array([-pad, -pad]), np.zeros(2))
+
+
+class _Average:
+    """The mean over every pixel of blurred cells, and its derivatives in px up to an order, along one axis."""
+
+    def __init__(self, blur_px: float, cells: int, shift_px: float, order: int) -> None:
+        whole = round(shift_px * cells)
+        kernels = _kernels(blur_px * cells, shift_px * cells - whole)[: order + 1]
+        kernels *= cells ** np.arange(order + 1.0)[:, None]
+        reach = kernels.shape[1] // 2
+        summed = np.zeros((order + 1, kernels.shape[1] + 2 * cells))
+        np.cumsum(kernels, axis=1, out=summed[:, cells:-cells])
+        summed[:, -cells:] = summed[:, -cells - 1, None]
+        self.cells = cells
+        self.taps = ((summed[:, cells:] - summed[:, :-cells]) / cells)[:, :-1].astype(np.float32)
+        self.reach = reach + abs(whole)
+        self.first = -reach - whole
+
+    def of(self, sharp: Single, first: int, count: int) -> Single:
+        """(orders, count, columns) of the pixels from the first one on, of cells (rows, columns).
+
+        Pixels are taken in blocks: a matrix for all of them would be nearly empty.
+        """
+        orders, taps = self.taps.shape
+        blocks = -(-count // _BLOCK)
+        span = (_BLOCK - 1) * self.cells + taps
+        band = np.zeros((orders, _BLOCK * (span + self.cells)), np.float32)
+        # Each pixel's taps lie as many cells farther on than the last one's.
+        as_strided(band, (orders, _BLOCK, taps), (band.strides[0], 4 * (span + self.cells), 4))[:] = self.taps[:, None]
+        matrix = band[:, : _BLOCK * span].reshape(-1, span)
+        begin, length = first * self.cells + self.first, (blocks - 1) * _BLOCK * self.cells + span
+        rows = np.zeros((length, sharp.shape[1]), np.float32)
+        inside = slice(max(begin, 0), max(min(begin + length, len(sharp)), 0))
+        rows[inside.start - begin : inside.stop - begin] = sharp[inside]
+        step = rows.strides[0]
+        parts = as_strided(rows, (blocks, span, rows.shape[1]), (_BLOCK * self.cells * step, step, rows.strides[1]))
+        means = (matrix @ parts).reshape(blocks, orders, _BLOCK, -1)
+        return np.asarray(means.swapaxes(0, 1).reshape(orders, blocks * _BLOCK, -1)[:, :count])
+
+
+def _kernels(sigma: float, shift: float) -> Array:
+    """A Gaussian sampled at whole numbers and so far off, and its first and second derivative, normalised so that
+    polynomials come out right."""
+    reach = int(np.ceil(4 * sigma)) + 2
+    place = np.arange(-reach, reach + 1) + shift
+    kernels = np.zeros((3, len(place)))
+    smooth, slope, bend = kernels
+    smooth[:] = np.exp(-0.5 * (place / max(sigma, 1e-3)) ** 2)
+    smooth /= smooth.sum()
+    if sigma < 0.5:
+        # A chip's own detail is hardly coarser than its pixels: differences of the fourth order, over five of them.
+        slope[reach - 2 : reach + 3] = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12
+        bend[reach - 2 : reach + 3] = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / 12
+        return kernels
+    square = place**2
+    slope[:] = place * smooth
+    slope /= place @ slope
+    bend[:] = (square - sigma**2) * smooth
+    bend -= smooth * bend.sum()
+    bend *= 2 / (square @ bend)
+    return kernels
+
+
+def _pixels_per_sample(mark: MarkTemplate, pixel_from_mark: Array) -> float:
+    """How many pixels of the scan one pixel of the chip spans."""
+    scale = float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
+    return max(scale * mark.pitch_um / 1000, 1e-3)
+
+
+def _sampled(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int) -> Array:
+    col, row = _chip_positions(mark, pixel_from_mark, width, height, cells)
+    sampled = ndimage.map_coordinates(mark.image, [row, col], order=3, mode="nearest")
+    return np.asarray((sampled - mark.image.min()) / max(np.ptp(mark.image), 1e-12), dtype=float)
+
+
+def _chip_positions(
+    mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int
+) -> tuple[Array, Array]:
+    """Column and row in the chip of every cell's centre."""
+    place = [(np.arange(size * cells) + 0.5) / cells - 0.5 for size in (width, height)]
+    offset = np.stack(np.meshgrid(*place)) - pixel_from_mark[:, 2, None, None]
+    chip_from_mark = _chip_from_mark(mark)
+    chip_from_pixel = chip_from_mark[:, :2] @ np.linalg.inv(pixel_from_mark[:, :2])
+    col, row = np.tensordot(chip_from_pixel, offset, axes=1) + chip_from_mark[:, 2, None, None]
+    return col, row
+
+
+def _chip_from_mark(mark: MarkTemplate) -> Array:
+    """(2, 3) affine matrix from the mark's mm to the chip's column and row; a turned mark is turned back first."""
+    angle = np.deg2rad(mark.turn_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    scale = 1000 / mark.pitch_um
+    linear = scale * np.array([[1.0, 0.0], [0.0, -1.0]]) @ np.array([[c, s], [-s, c]])
+    return np.column_stack([linear, mark.origin_px])

@@ -1,0 +1,138 @@
+"""Natural features of a scan (SIFT), and which of them two scans share."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.natural_points.multi_image import RADIUS_PX
+from measure.scans.scan import Scan
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+LONGEST_PX = 3000  # side of the reduced scan in which features are sought
+_TILE_PX, _OVERLAP_PX = 1024, 96  # SIFT takes some 130 bytes a pixel: a tile at a time
+_CONTRAST = 0.02  # half of OpenCV's default: fields and water have weak texture
+_RATIO = 0.8  # Lowe's: nine false matches in ten have a second neighbour nearer than that, one right in twenty
+_CELLS = 12  # a side, over which the features kept are spread
+_SURPLUS = 3  # so many times the features wanted are found: some are not usable, and the strongest lie together
+_STRETCH = (0.5, 99.5)  # percentiles of the grey values that become black and white
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """places_px (n, 2): column and row in the scan; descriptors (n, 128); strengths (n,): SIFT's contrast.
+    textures (n,): how well the picture about them fixes a place, in any unit."""
+
+    places_px: Array
+    descriptors: NDArray[np.float32]
+    strengths: Array
+    textures: Array
+
+    def chosen(self, rows: Indices) -> "Features":
+        return Features(self.places_px[rows], self.descriptors[rows], self.strengths[rows], self.textures[rows])
+
+
+def reduction(scan: Scan) -> int:
+    """The factor by which a scan is reduced before features are sought in it."""
+    return -(-max(scan.width_px, scan.height_px) // LONGEST_PX)
+
+
+def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, count: int) -> Features:
+    """At most `count` features, evenly over the scan, the strongest first in every part of it.
+
+    usable: which places (n, 2) in px may hold one. mirrored: whether the scan shows the field as a mirror does; a turn
+    needs no word, for descriptors turn with the picture.
+    """
+    factor = reduction(scan)
+    picture = _eight_bit(scan.reduced(factor))
+    if mirrored:
+        picture = np.ascontiguousarray(picture[:, ::-1])
+    found = _tiled(picture, _SURPLUS * count, 2 * (RADIUS_PX // factor) + 1)
+    places = found.places_px
+    if mirrored:
+        places = np.array([picture.shape[1] - 1, 0]) + places * np.array([-1, 1])
+    found = replace(found, places_px=places * factor + (factor - 1) / 2)
+    found = found.chosen(np.flatnonzero(usable(found.places_px)))
+    return found.chosen(_spread(found, np.array([scan.width_px, scan.height_px]), count))
+
+
+def shared_features(first: Features, second: Features) -> Indices:
+    """(n, 2) indices of features that are each other's nearest by far."""
+    if min(len(first.places_px), len(second.places_px)) < 2:
+        return np.zeros((0, 2), np.intp)
+    there = _nearest(first, second)
+    back = _nearest(second, first)
+    pairs = [(i, j) for i, j in enumerate(there) if j >= 0 and back[j] == i]
+    return np.array(pairs, np.intp).reshape(-1, 2)
+
+
+def _eight_bit(grey: NDArray[np.float32]) -> NDArray[np.uint8]:
+    black, white = np.percentile(grey[::4, ::4], _STRETCH)
+    return np.asarray(np.clip((grey - black) * (255.0 / max(white - black, 1e-9)), 0.0, 255.0), np.uint8)
+
+
+def _tiled(picture: NDArray[np.uint8], count: int, patch_px: int) -> Features:
+    """About `count` features of a picture, found tile by tile, the strongest of each.
+
+    Texture is what the matching of a patch has to go by: the lesser eigenvalue of the grey values' gradients over it
+    (Förstner and Gülch 1987).
+    """
+    places: list[Array] = [np.empty((0, 2))]
+    descriptors, strengths, textures = [np.empty((0, 128), np.float32)], [np.empty(0)], [np.empty(0)]
+    height, width = picture.shape
+    for row0 in range(0, height, _TILE_PX):
+        for col0 in range(0, width, _TILE_PX):
+            top, left = max(row0 - _OVERLAP_PX, 0), max(col0 - _OVERLAP_PX, 0)
+            tile = picture[top : row0 + _TILE_PX + _OVERLAP_PX, left : col0 + _TILE_PX + _OVERLAP_PX]
+            share = int(np.ceil(count * tile.size / picture.size))
+            points, described = cv2.SIFT.create(nfeatures=share, contrastThreshold=_CONTRAST).detectAndCompute(
+                tile, None
+            )
+            if not points:
+                continue
+            found = np.array([point.pt for point in points]) + np.array([left, top])
+            own = np.all(
+                (found >= (col0 - 0.5, row0 - 0.5)) & (found < (col0 + _TILE_PX - 0.5, row0 + _TILE_PX - 0.5)), 1
+            )
+            own &= _first_of_place(found)
+            places.append(found[own])
+            descriptors.append(np.asarray(described, np.float32)[own])
+            strengths.append(np.array([point.response for point in points])[own])
+            col, row = np.round(found[own] - (left, top)).astype(np.intp).T
+            textures.append(cv2.cornerMinEigenVal(tile, patch_px)[row, col].astype(np.float64))
+    return Features(
+        np.concatenate(places), np.concatenate(descriptors), np.concatenate(strengths), np.concatenate(textures)
+    )
+
+
+def _first_of_place(places: Array) -> Mask:
+    """A feature with two directions is found twice; one of them is enough."""
+    first = np.zeros(len(places), dtype=bool)
+    first[np.unique(np.round(places, 2), axis=0, return_index=True)[1]] = True
+    return first
+
+
+def _spread(features: Features, size_px: Array, count: int) -> Indices:
+    """Indices of the strongest features of every cell in turn, until there are enough."""
+    cell = np.floor(features.places_px / size_px * _CELLS).astype(np.intp) @ np.array([1, _CELLS])
+    return in_turn(cell, features.strengths)[:count]
+
+
+def in_turn(group: Indices, strengths: Array) -> Indices:
+    """The order that takes the strongest of every group, then the second of every group, and so on."""
+    order = np.lexsort((-strengths, group))
+    _, starts = np.unique(group[order], return_index=True)
+    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
+    return np.asarray(order[np.lexsort((-strengths[order], rank))], np.intp)
+
+
+def _nearest(first: Features, second: Features) -> list[int]:
+    """For each feature the nearest of the second scan, -1 where another is nearly as near."""
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    pairs = matcher.knnMatch(first.descriptors, second.descriptors, k=2)
+    return [best.trainIdx if best.distance < _RATIO * other.distance else -1 for best, other in pairs]

@@ -1,0 +1,152 @@
+"""Which natural points are worth measuring: features that three scans or more share, and how the ground about them
+maps from scan to scan.
+
+Features of all scans are compared in pairs; what one epipolar geometry explains is joined to tracks, and the tracks are
+ordered so that the first of them, however many, spread evenly over the frames.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.natural_points.epipolar import agreeing
+from measure.natural_points.features import Features, find_features, in_turn, reduction, shared_features
+from measure.natural_points.local_maps import LocalMaps
+from measure.natural_points.multi_image import RADIUS_PX
+from measure.natural_points.tie_frame import TieFrame
+from measure.natural_points.tracks import Track, join_tracks
+from measure.scans.parallel import mapped
+from measure.scans.scan import open_scan
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Shared = Mapping[tuple[int, int], Indices]
+
+_FEATURES = 25  # a scan, for every point wanted; one in five or so has a partner in all frames
+_LEAST_FEATURES = 3000
+_AGREE_PX = 2.0  # in the reduced scan: what a feature's place and a lens leave
+_CELLS = 8  # a side of a frame, over which points are spread
+
+
+@dataclass(frozen=True, eq=False)
+class TieCandidate:
+    """A track: the approximate affine maps (2, 3) from its patch, of radius_px, to the scans, by frame; which frame
+    defines it."""
+
+    reference: int
+    maps: dict[int, Array]
+    radius_px: int = RADIUS_PX
+
+
+def frame_features(wanted: int, frame: TieFrame) -> Features:
+    """The features of a scan from which so many natural points are to come."""
+    count = max(_FEATURES * wanted, _LEAST_FEATURES)
+    with open_scan(frame.scan) as scan:
+        size = (scan.width_px, scan.height_px)
+        return find_features(scan, lambda places: frame.usable(places, size), frame.mirrored, count)
+
+
+def verified(
+    frames: Sequence[TieFrame], features: Sequence[Features], workers: Executor | None
+) -> dict[tuple[int, int], Indices]:
+    """By pair of frames the features that they share, as far as one epipolar geometry explains them."""
+    shared = {}
+    both = list(combinations(range(len(frames)), 2))
+    found = mapped(workers, _shared, [(features[i], features[j]) for i, j in both])
+    for (i, j), pairs in zip(both, found, strict=True):
+        first = frames[i].camera_px(features[i].places_px[pairs[:, 0]])
+        second = frames[j].camera_px(features[j].places_px[pairs[:, 1]])
+        shared[i, j] = pairs[agreeing(first, second, _AGREE_PX * _reduction(frames[i]))]
+    return shared
+
+
+def _shared(pair: tuple[Features, Features]) -> Indices:
+    return shared_features(*pair)
+
+
+def _reduction(frame: TieFrame) -> int:
+    with open_scan(frame.scan) as scan:
+        return reduction(scan)
+
+
+def candidates(
+    frames: Sequence[TieFrame], features: Sequence[Features], shared: Shared, fewest: int
+) -> list[TieCandidate]:
+    """The tracks that at least `fewest` frames may show, the best textured of every part of a frame before its others.
+
+    Where a track has no feature in a frame, but the matches about it put it there, it is sought there too: grain hides
+    many a feature that the matching of the whole patch still finds.
+    """
+    maps = LocalMaps(features, shared)
+    sizes = [_size_px(frame) for frame in frames]
+    found, cells, textures = [], [], []
+    for track in join_tracks(shared):
+        reference = _most_central(frames, features, track)
+        candidate = TieCandidate(reference, _maps(frames, features, sizes, maps, track, reference))
+        if len(candidate.maps) < fewest:
+            continue
+        place = frames[reference].camera_px(candidate.maps[reference][None, :, 2])[0]
+        col, row = np.floor(place * _CELLS / _width_px(frames[reference], sizes[reference])).astype(int)
+        found.append(candidate)
+        cells.append((reference * 1000 + col) * 1000 + row)
+        textures.append(min(features[frame].textures[feature] for frame, feature in track.items()))
+    return [found[k] for k in in_turn(np.array(cells, np.intp), np.array(textures))] if found else []
+
+
+def widened(
+    candidates: Sequence[TieCandidate], radius_px: int, frames: Sequence[TieFrame], fewest: int
+) -> list[TieCandidate]:
+    """The candidates with patches of that radius, as far as at least `fewest` frames, the defining one among them, show
+    these whole."""
+    shown: list[dict[int, Array]] = [{} for _ in candidates]
+    for i, frame in enumerate(frames):
+        own = [k for k, candidate in enumerate(candidates) if i in candidate.maps]
+        places = np.array([candidates[k].maps[i][:, 2] for k in own]).reshape(-1, 2)
+        for k in np.array(own, int)[frame.usable(places, _size_px(frame), radius_px)]:
+            shown[k][i] = candidates[k].maps[i]
+    return [
+        TieCandidate(candidate.reference, maps, radius_px)
+        for candidate, maps in zip(candidates, shown, strict=True)
+        if len(maps) >= fewest and candidate.reference in maps
+    ]
+
+
+def _maps(
+    frames: Sequence[TieFrame],
+    features: Sequence[Features],
+    sizes: Sequence[tuple[int, int]],
+    maps: LocalMaps,
+    track: Track,
+    reference: int,
+) -> dict[int, Array]:
+    """Maps (2, 3) by frame from a grid about the reference's feature to the feature there, or to where it should be."""
+    middle = features[reference].places_px[track[reference]]
+    found = {reference: np.column_stack([np.eye(2), middle])}
+    for frame in maps.reached(reference):
+        local = maps.map(reference, frame, middle)
+        if local is None:
+            continue
+        if frame in track:
+            local[:, 2] = features[frame].places_px[track[frame]]
+        if frame in track or frames[frame].usable(local[None, :, 2], sizes[frame])[0]:
+            found[frame] = local
+    return found
+
+
+def _size_px(frame: TieFrame) -> tuple[int, int]:
+    with open_scan(frame.scan) as scan:
+        return scan.width_px, scan.height_px
+
+
+def _width_px(frame: TieFrame, size_px: tuple[int, int]) -> float:
+    return float(max(size_px)) if frame.frame_mm is None else max(frame.frame_mm) * frame.px_per_mm
+
+
+def _most_central(frames: Sequence[TieFrame], features: Sequence[Features], track: Track) -> int:
+    """The frame that sees the point most nearly along its axis: from there the others' views are least distorted."""
+    off = {i: np.linalg.norm(frames[i].camera_px(features[i].places_px[k][None])) for i, k in track.items()}
+    return min(off, key=lambda i: (off[i], i))

@@ -1,0 +1,256 @@
+"""Natural points measured in all scans that show them, and what speaks against them.
+
+Candidates are measured batch by batch, patches that do not overlap, until enough have come out well. A point is judged
+by its own pictures and by comparison with all others.
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain, combinations, compress
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from measure.fitting.noise import robust_scale
+from measure.natural_points.bending import Bending, bending_variance
+from measure.natural_points.epipolar import contradicting
+from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
+from measure.natural_points.tie_candidates import TieCandidate, widened
+from measure.natural_points.tie_frame import TieFrame
+from measure.scans.parallel import mapped
+from measure.scans.scan import open_scan
+
+Array = NDArray[np.float64]
+Windows = dict[int, tuple[NDArray[np.float32], tuple[int, int]]]
+
+_RADII_PX = (RADIUS_PX, 21, 30)  # of patches: where the texture is too weak for one, of twice its area
+_WIDEST_PX = 2.0 * _RADII_PX[-1]
+_LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
+_FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
+_CHUNK = 16  # points that a worker gets at a time
+_CHANCE = 1e-4  # that a test refuses a right point
+_PRECISE_PX = 0.125  # rms length of the error of the weakest measured point: half a pixel is four times as much
+
+
+@dataclass(eq=False)
+class TiePoint:
+    """A candidate as measured: what was matched, by frame, and what speaks against it."""
+
+    candidate: TieCandidate
+    matched: dict[int, Matched]
+    unmatched: dict[int, str]
+    refused: dict[int, str] = field(default_factory=dict)
+
+    def separation(self, frame: int) -> Array:
+        """(2, 2) covariance of the point in a frame if it is the reference's point exactly, px."""
+        linear = self.matched[frame].scan_from_patch[:, :2]
+        own, reference = self.matched[frame].covariance_px2, self.matched[self.candidate.reference].covariance_px2
+        return np.asarray(own + linear @ reference @ linear.T)
+
+    def error_px(self, frame: int) -> float:
+        """The rms length of its error in a frame, against the place that defines it."""
+        return float(np.sqrt(np.trace(self.separation(frame))))
+
+    def is_sharp(self, frame: int) -> bool:
+        """Whether the texture fixes it as well as a measured point is to be."""
+        return self.error_px(frame) <= _PRECISE_PX
+
+    @property
+    def standing(self) -> list[int]:
+        """The frames in which nothing speaks against it."""
+        return [frame for frame in self.matched if frame not in self.refused and frame not in self.unmatched]
+
+
+def measured_points(
+    frames: Sequence[TieFrame],
+    candidates: Sequence[TieCandidate],
+    wanted: int,
+    fewest: int,
+    workers: Executor | None,
+) -> list[TiePoint]:
+    """Candidates measured, the first of them first, until so many stand sharply in at least `fewest` scans; none behind
+    the last one wanted. Where too few do, those that are not sharp make room for wider patches.
+
+    No two patches overlap: the errors of neighbours would be correlated, and the adjustment takes them for independent.
+    A candidate beside one that could not be matched still has its chance; not one beside a point that is refused by
+    comparison with others, for with more of these it may stand again.
+    """
+    points, matched, sharp = list[TiePoint](), list[TiePoint](), np.zeros(0, dtype=bool)
+    for radius_px in _RADII_PX:
+        left = widened(candidates, radius_px, frames, fewest)
+        if not left or sharp.sum() >= wanted:
+            break
+        settled = [bool(own or point.refused) and bool(point.matched) for own, point in zip(sharp, points, strict=True)]
+        matched, points, sharp = list(compress(matched, settled)), list(compress(points, settled)), sharp[settled]
+        while left and sharp.sum() < wanted:
+            missing = max(wanted - int(sharp.sum()), wanted // _LEAST_BATCH)
+            chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
+            windows = _windows(frames, chosen)
+            matched += mapped(workers, partial(_point, fewest), list(zip(chosen, windows, strict=True)), _CHUNK)
+            points = _straightened(matched)
+            _judge(frames, points)
+            sharp = np.array([sum(map(point.is_sharp, point.standing)) >= fewest for point in points], dtype=bool)
+    return points[: int(np.searchsorted(np.cumsum(sharp), wanted)) + 1]
+
+
+def _apart(
+    candidates: Sequence[TieCandidate], measured: Sequence[TieCandidate], most: int
+) -> tuple[list[TieCandidate], list[TieCandidate]]:
+    """The first candidates whose patches overlap in no frame, neither with each other nor with those that
+    are measured; and the candidates left that may come later."""
+    taken, chosen = _Taken(measured), _Taken()
+    left = []
+    for candidate in candidates:
+        if taken.touches(candidate):
+            continue
+        if len(chosen.members) == most or chosen.touches(candidate):
+            left.append(candidate)
+        else:
+            chosen.add(candidate)
+    return chosen.members, left
+
+
+class _Taken:
+    """Where patches lie already, by frame and by squares as wide as the widest patch."""
+
+    def __init__(self, members: Sequence[TieCandidate] = ()) -> None:
+        self.members: list[TieCandidate] = []
+        self.places: dict[tuple[int, int, int], list[tuple[Array, int]]] = defaultdict(list)
+        for member in members:
+            self.add(member)
+
+    def add(self, candidate: TieCandidate) -> None:
+        self.members.append(candidate)
+        for frame, matrix in candidate.maps.items():
+            col, row = np.floor(matrix[:, 2] / _WIDEST_PX).astype(int)
+            self.places[frame, col, row].append((matrix[:, 2], candidate.radius_px))
+
+    def touches(self, candidate: TieCandidate) -> bool:
+        """Whether its patch overlaps one of these in some frame."""
+        for frame, matrix in candidate.maps.items():
+            place = matrix[:, 2]
+            col, row = np.floor(place / _WIDEST_PX).astype(int)
+            near = [self.places.get((frame, col + i, row + j), ()) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+            for other, radius_px in chain.from_iterable(near):
+                if np.hypot(*(place - other)) < candidate.radius_px + radius_px:
+                    return True
+        return False
+
+
+def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate]) -> list[Windows]:
+    """The windows of every candidate by frame, one scan after the other: no more than one is open at a time."""
+    windows: list[Windows] = [{} for _ in candidates]
+    for i, frame in enumerate(frames):
+        with open_scan(frame.scan) as scan:
+            own = [k for k, candidate in enumerate(candidates) if i in candidate.maps]
+            for k in sorted(own, key=lambda k: candidates[k].maps[i][1, 2]):
+                matrix = candidates[k].maps[i]
+                half = int(np.ceil(candidates[k].radius_px * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
+                col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
+                windows[k][i] = (scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0))
+    return windows
+
+
+def _point(fewest: int, sought: tuple[TieCandidate, Windows]) -> TiePoint:
+    """The candidate measured; a frame that cannot be matched is left out where enough others remain."""
+    candidate, windows = sought
+    members, unmatched = sorted(candidate.maps), dict[int, str]()
+    while True:
+        pieces = [Piece(*windows[i], candidate.maps[i]) for i in members]
+        matched = dict(
+            zip(members, match_pieces(pieces, members.index(candidate.reference), candidate.radius_px), strict=True)
+        )
+        failed = {i: piece.reason for i, piece in matched.items() if piece.reason}
+        if not failed:
+            return TiePoint(candidate, matched, unmatched)
+        unmatched |= failed
+        left = [i for i in members if i not in failed]
+        if candidate.reference in failed or len(left) < fewest:
+            alike = f"cannot be matched: {next(iter(failed.values()))} in another scan"
+            return TiePoint(candidate, {}, {i: unmatched.get(i, alike) for i in candidate.maps})
+        members = left
+
+
+def _straightened(points: Sequence[TiePoint]) -> list[TiePoint]:
+    """The points with their places freed of the ground's bending, as far as all points together tell of it."""
+    known: dict[tuple[int, int], list[Bending]] = defaultdict(list)
+    for point in points:
+        for frame, piece in point.matched.items():
+            if piece.bending is not None and piece.unevenness >= _CHANCE:
+                known[point.candidate.reference, frame].append(piece.bending)
+    variances = {pair: bending_variance(bendings) for pair, bendings in known.items()}
+    nothing = np.zeros((6, 6))
+    return [
+        replace(
+            point,
+            matched={
+                frame: _straight(piece, variances.get((point.candidate.reference, frame), nothing))
+                for frame, piece in point.matched.items()
+            },
+            refused={},
+        )
+        for point in points
+    ]
+
+
+def _straight(piece: Matched, variance: Array) -> Matched:
+    if piece.bending is None:
+        return piece
+    shift, covariance = piece.bending.estimated(variance)
+    linear = piece.scan_from_patch[:, :2]
+    return replace(
+        piece,
+        center_px=piece.center_px - linear @ shift,
+        covariance_px2=piece.covariance_px2 + linear @ covariance @ linear.T,
+    )
+
+
+def _judge(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
+    """What speaks against the points, each compared with all others."""
+    for point in points:
+        point.refused = {
+            frame: "parts of the picture about the point move unlike each other: it is no plane piece of ground"
+            for frame in point.standing
+            if point.matched[frame].unevenness < _CHANCE
+        }
+    _refuse_strange_pictures(points)
+    _refuse_contradictions(frames, points)
+
+
+def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
+    """Where a frame differs from the others' common picture as it does in hardly any other point of it."""
+    strangeness: dict[int, list[tuple[TiePoint, float]]] = defaultdict(list)
+    for point in points:
+        for frame in point.standing:
+            others = [point.matched[other].variance for other in point.standing if other != frame]
+            if others:
+                strangeness[frame].append((point, float(np.log(point.matched[frame].variance / np.mean(others)))))
+    for frame, rows in strangeness.items():
+        values = np.array([value for _, value in rows])
+        limit = np.median(values) + float(norm.isf(_CHANCE)) * robust_scale(values)
+        for point, value in rows:
+            if value > limit:
+                point.refused[frame] = "the picture about the point is unlike that in the other scans: something else"
+
+
+def _refuse_contradictions(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
+    """Where a point lies off the epipolar geometry of two frames, unlike the points about it. It is then wrong in the
+    frame that all its contradictions have in common, or, where it cannot be told, in all."""
+    against: dict[int, list[set[int]]] = defaultdict(list)
+    for i, j in combinations(range(len(frames)), 2):
+        both = [k for k, point in enumerate(points) if i in point.standing and j in point.standing]
+        first, second = (
+            frames[frame].camera_px(np.array([points[k].matched[frame].center_px for k in both]).reshape(-1, 2))
+            for frame in (i, j)
+        )
+        for k in np.array(both, dtype=int)[contradicting(first, second, _FINE_PX)]:
+            against[int(k)].append({i, j})
+    for k, pairs in against.items():
+        common = set.intersection(*pairs)
+        wrong = common if len(pairs) > 1 and len(common) == 1 else set(points[k].standing)
+        for frame in wrong:
+            points[k].refused[frame] = "the point lies off the epipolar lines of the other scans, unlike its neighbours"

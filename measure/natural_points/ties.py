@@ -1,0 +1,137 @@
+"""Natural points: the same points of the terrain in three frames or more, without any target."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from measure.natural_points.epipolar import FEWEST_PAIRS
+from measure.natural_points.tie_candidates import Shared, candidates, frame_features, verified
+from measure.natural_points.tie_frame import TieFrame
+from measure.natural_points.tie_points import TiePoint, measured_points
+from measure.results import MarkMeasurement
+from measure.scans.parallel import mapped
+from measure.status import Status
+
+Progress = Callable[[str, int, int], None]
+
+FEWEST_IMAGES = 3  # two frames cannot contradict each other along the line of sight
+
+
+@dataclass(frozen=True)
+class TieOptions:
+    """wanted: how many points. images: the fewest that must show a point."""
+
+    wanted: int = 300
+    images: int = FEWEST_IMAGES
+
+    def __post_init__(self) -> None:
+        if self.wanted < 1:
+            raise ValueError(f"wanted is {self.wanted}; at least 1 is right")
+        if self.images < FEWEST_IMAGES:
+            raise ValueError(f"images is {self.images}; at least {FEWEST_IMAGES} is right: two prove nothing")
+
+
+@dataclass(frozen=True, eq=False)
+class Ties:
+    """The natural points by image, and what the user should know, a sentence each."""
+
+    marks: Mapping[str, tuple[MarkMeasurement, ...]]
+    problems: tuple[str, ...] = ()
+
+
+def measure_ties(
+    frames: Sequence[TieFrame],
+    options: TieOptions | None = None,
+    progress: Progress | None = None,
+    workers: Executor | None = None,
+) -> Ties:
+    """Find and measure natural points. Never raises for what the pictures show; raises MeasurementError for scans that
+    cannot be read.
+
+    progress: called with what has been done, the steps done and their number. workers: processes that share the work;
+    the result does not depend on their number.
+    """
+    options, tell = options or TieOptions(), progress or (lambda *_: None)
+    steps = len(frames) + 2
+    features = []
+    for frame, found in zip(frames, mapped(workers, partial(frame_features, options.wanted), frames), strict=True):
+        features.append(found)
+        tell(frame.image, len(features), steps)
+    shared = verified(frames, features, workers)
+    tell("pairs of scans", len(frames) + 1, steps)
+    sought = candidates(frames, features, shared, options.images)
+    points = measured_points(frames, sought, options.wanted, options.images, workers)
+    tell("all scans together", steps, steps)
+    return _result(frames, points, len(sought), shared, options)
+
+
+def _result(
+    frames: Sequence[TieFrame],
+    points: Sequence[TiePoint],
+    candidate_count: int,
+    shared: Shared,
+    options: TieOptions,
+) -> Ties:
+    marks: dict[str, list[MarkMeasurement]] = {frame.image: [] for frame in frames}
+    for number, point in enumerate(points, 1):
+        for frame in point.candidate.maps:
+            marks[frames[frame].image].append(_mark(f"tie{number:04d}", point, frame, options))
+    found = sum(len(point.standing) >= options.images for point in points)
+    return Ties(
+        {image: tuple(own) for image, own in marks.items()}, _problems(frames, found, candidate_count, shared, options)
+    )
+
+
+def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMeasurement:
+    place = point.candidate.maps[frame][:, 2]
+    if frame in point.unmatched:
+        return MarkMeasurement(name, "tie", place, None, Status.REJECTED, point.unmatched[frame])
+    piece = point.matched[frame]
+    sigma = float(np.sqrt(np.linalg.eigvalsh(point.separation(frame))[-1]))
+    quality = {
+        "correlation": piece.correlation,
+        "gain": piece.gain,
+        "unevenness": piece.unevenness,
+        "sigma_to_reference_px": sigma,
+        "reference": float(frame == point.candidate.reference),
+        "images": float(len(point.standing)),
+        "size_px": 2.0 * point.candidate.radius_px + 1.0,
+    }
+    status, reason = Status.MEASURED, ""
+    if frame in point.refused:
+        status, reason = Status.REJECTED, point.refused[frame]
+    elif len(point.standing) < options.images:
+        status, reason = (
+            Status.REJECTED,
+            f"only {len(point.standing)} scans agree on the point, {options.images} are to",
+        )
+    elif not point.is_sharp(frame):
+        status, reason = Status.WEAK, f"the texture fixes it to {point.error_px(frame):.2f} px only"
+    return MarkMeasurement(name, "tie", piece.center_px, piece.covariance_px2, status, reason, quality)
+
+
+def _problems(
+    frames: Sequence[TieFrame],
+    found: int,
+    candidate_count: int,
+    shared: Shared,
+    options: TieOptions,
+) -> tuple[str, ...]:
+    """A sentence where fewer points than wanted were found, with the reason."""
+    if found >= options.wanted:
+        return ()
+    if not candidate_count:
+        counts = ", ".join(
+            f"{frames[i].image} and {frames[j].image} {len(pairs)}" for (i, j), pairs in sorted(shared.items())
+        )
+        return (
+            f"No natural point was found: none is in {options.images} scans. Features that pairs of scans share, of "
+            f"{FEWEST_PAIRS} at least: {counts or 'none'}. Overlapping photographs of one season would have some.",
+        )
+    return (
+        f"Of {options.wanted} natural points wanted, {found} were found: {candidate_count} features are in "
+        f"{options.images} scans or more.",
+    )

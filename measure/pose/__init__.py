@@ -1,0 +1,1 @@
+"""Which of the eight ways a frame lies in its scan."""

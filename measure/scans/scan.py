@@ -1,0 +1,259 @@
+"""A scan file, opened by windows."""
+
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from itertools import product
+from math import lcm
+from pathlib import Path
+from types import TracebackType
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.errors import MeasurementError
+from measure.scans.parallel import side_by_side
+from measure.scans.picture_scan import open_picture
+from measure.scans.radiometry import Samples
+from measure.scans.resolution import Pitch
+from measure.scans.segment_cache import SegmentCache
+from measure.scans.segments import Segments
+from measure.scans.tiff_scan import RawRows, open_tiff
+
+Array = NDArray[np.float32]
+
+LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
+SINGLE_CHANNELS = RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
+PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, about
+LARGEST_PART_PX = 2048
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Scan:
+    """An opened scan: its size, its pitch, and windows of grey values that grow with light on the scanner's sensor.
+
+    width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows;
+    rounding_step_dn: of a compression with loss, which is_lossy says that there is; pitch_um: (x, y) from the file's
+    resolution tags, None where it has none that can be believed, and then pitch_note says why;
+    notes: what else is unusual about the file, a sentence each.
+    The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        segments: Segments,
+        pitch: Pitch,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        self.path = path
+        self.name = path.stem
+        self.width_px = segments.width_px
+        self.height_px = segments.height_px
+        self.channels = segments.channels
+        self.full_scale_dn = segments.full_scale_dn
+        self.rounding_step_dn = segments.rounding_step_dn
+        self.is_lossy = self.rounding_step_dn > 0
+        self.pitch_um = pitch.um
+        self.pitch_note = pitch.note
+        self.notes = notes
+        self._segments = segments
+        self._cache = SegmentCache(segments)
+        self._source = segments if isinstance(segments, RawRows) else self._cache
+        self._reduced: dict[int, Array] = {}
+        self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
+
+    @property
+    def weights(self) -> Sequence[float]:
+        """What each channel counts in the grey values, (channels,)."""
+        return self._grey_weights
+
+    @property
+    def samples_dtype(self) -> type[np.uint8] | type[np.uint16]:
+        return np.uint8 if self._segments.sample_bytes == 1 else np.uint16
+
+    @property
+    def rows_kept(self) -> int:
+        """How many rows of the scan stay decoded for the next windows."""
+        return self._cache.rows_kept
+
+    @property
+    def segment_px(self) -> tuple[int, int]:
+        """Height and width of what the file has in one piece."""
+        return self._segments.segment_height_px, self._segments.segment_width_px
+
+    def green(self) -> "Scan":
+        """The same scan with its green for grey value, if it has colours. A lens draws red and blue at scales of their
+        own, some 1e-4 off; a mark in a mixture of all has no one place."""
+        scan = copy(self)
+        if self.channels == len(GREEN):
+            scan._grey_weights = GREEN
+        return scan
+
+    def window(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
+        """(height, width) float32 grey values; parts outside of the scan repeat its edge.
+
+        weights: what each channel counts, (channels,); None is the grey value itself, or the luminance of a colour.
+        """
+        if width < 1 or height < 1:
+            raise ValueError(f"a window has at least one pixel, not {width} x {height}")
+        return weighted(self.samples(col0, row0, width, height), self._weights(weights))
+
+    def samples(self, col0: int, row0: int, width: int, height: int, out: Samples | None = None) -> Samples:
+        """(height, width, channels) values as the file stores them; parts outside of the scan repeat its edge.
+
+        out: an array of that shape and of samples_dtype that is filled, in place of a new one.
+        """
+        samples = np.empty((height, width, self.channels), self.samples_dtype) if out is None else out
+        top, bottom = (min(max(row, 0), self.height_px - 1) for row in (row0, row0 + height - 1))
+        left, right = (min(max(col, 0), self.width_px - 1) for col in (col0, col0 + width - 1))
+        above, before = min(max(-row0, 0), height - 1), min(max(-col0, 0), width - 1)
+        rows = samples[above : above + bottom + 1 - top]
+        inside = rows[:, before : before + right + 1 - left]
+        self._source.fill(inside, top, left)
+        rows[:, :before], rows[:, before + inside.shape[1] :] = inside[:, :1], inside[:, -1:]
+        samples[:above], samples[above + len(rows) :] = rows[0], rows[-1]
+        return samples
+
+    def inside(self, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
+        """(height, width): which pixels of a window are the scan's, and do not repeat its edge."""
+        cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
+        in_rows = (rows >= 0) & (rows < self.height_px)
+        return np.asarray(in_rows[:, None] & (cols >= 0) & (cols < self.width_px))
+
+    def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
+        """The whole scan, area-averaged by an integer factor: pixel (i, j) is the mean over factor x factor pixels,
+        its centre at column factor * j + (factor - 1) / 2. The last partial row and column are dropped.
+
+        The scan is streamed by its segments: memory holds the result, all its channels for the next call, and some
+        segments for each thread.
+        """
+        height, width = self.height_px // factor, self.width_px // factor
+        if factor < 1 or height < 1 or width < 1:
+            raise ValueError(f"{self.name}: cannot be reduced by {factor}: it is {self.width_px} x {self.height_px} px")
+        if factor not in self._reduced:
+            self._reduced.clear()
+            self._reduced[factor] = self._reduced_channels(factor, width, height)
+        return weighted(self._reduced[factor], self._weights(weights))
+
+    def reduced_window(
+        self, factor: int, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None
+    ) -> Array:
+        """(height, width) pixels of the reduced scan from its column col0 and row row0 on, read from the file by
+        themselves; parts outside of the scan repeat its edge."""
+        fine = self.samples(col0 * factor, row0 * factor, width * factor, height * factor)
+        return weighted(means(fine, factor), self._weights(weights))
+
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+        """What the function makes of each item, in their order, by as many threads as OpenCV may use: decoders and
+        filters run side by side."""
+        return side_by_side(function, items)
+
+    def close(self) -> None:
+        self._segments.close()
+
+    def __enter__(self) -> "Scan":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _reduced_channels(self, factor: int, width: int, height: int) -> Array:
+        """(height, width, channels): every segment is decoded once."""
+        result = np.empty((height, width, self.channels), np.float32)
+        tall, wide = self.segment_px
+        cols = width if wide >= self.width_px else reduced_side(wide, factor, PART_PX)
+        rows = reduced_side(tall, factor, max(PART_PX**2 // (cols * factor), 1))
+
+        def fill(part: tuple[int, int]) -> None:
+            row0, col0 = part
+            own = result[row0 : row0 + rows, col0 : col0 + cols]
+            own_rows, own_cols = own.shape[:2]
+            own[:] = means(self.samples(col0 * factor, row0 * factor, own_cols * factor, own_rows * factor), factor)
+
+        self.each(fill, product(range(0, height, rows), range(0, width, cols)))
+        return result
+
+    def _weights(self, weights: Sequence[float] | None) -> Sequence[float]:
+        if weights is None:
+            weights = self._grey_weights
+        if len(weights) != self.channels:
+            raise ValueError(f"{self.name}: {len(weights)} weights for {self.channels} channels")
+        return weights
+
+
+def reduced_side(fine_px: int, factor: int, most_px: int) -> int:
+    """The side of a part of a reduced scan: about most_px of the scan, in whole segments if these are not much
+    larger."""
+    unit = lcm(fine_px, factor)
+    return max((unit * max(most_px // unit, 1) if unit <= LARGEST_PART_PX else most_px) // factor, 1)
+
+
+def means(samples: Samples | Array, factor: int) -> Array:
+    """(height / factor, width / factor, channels) means of samples (height, width, channels), over squares of factor
+    x factor of them."""
+    height, width, channels = samples.shape
+    result = np.empty((height // factor, width // factor, channels), np.float32)
+    rows = max(BAND_PIXELS // (width * factor), 1)
+    for row in range(0, len(result), rows):
+        band = samples[row * factor : (row + rows) * factor].astype(np.float32)
+        for step in steps_of(factor):
+            size = band.shape[1] // step, band.shape[0] // step
+            band = np.asarray(cv2.resize(band, size, interpolation=cv2.INTER_AREA), np.float32)
+        result[row : row + rows] = band.reshape(-1, width // factor, channels)
+    return result
+
+
+def steps_of(factor: int) -> tuple[int, ...]:
+    """Twos, which OpenCV averages fastest, and what is left."""
+    if factor % 2 == 0:
+        return 2, *steps_of(factor // 2)
+    return (factor,) if factor > 1 else ()
+
+
+def open_scan(path: Path) -> Scan:
+    """Open a TIFF, BigTIFF, JPEG or PNG file, told apart by its first bytes and not by its name.
+
+    Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture.
+    """
+    path = Path(path)
+    start = first_bytes(path)
+    if start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        segments, pitch, notes = open_tiff(path)
+    else:
+        segments, pitch, notes = open_picture(path, start)
+    return Scan(path, segments, pitch, notes)
+
+
+def first_bytes(path: Path) -> bytes:
+    """The file's first 16 bytes, or why there are none."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(16)
+    except FileNotFoundError:
+        raise MeasurementError(
+            f"there is no scan {path} (looked for {path.resolve()}): check its name and its folder"
+        ) from None
+    except OSError as error:
+        raise MeasurementError(
+            f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
+        ) from error
+    if not start:
+        raise MeasurementError(f"{path} is empty (0 bytes): copy or scan it anew")
+    return start
+
+
+def weighted(samples: Samples | Array, weights: Sequence[float]) -> Array:
+    """(..., height, width) float32 grey values of (..., height, width, channels) samples."""
+    grey = samples[..., 0].astype(np.float32)
+    if weights[0] != 1.0:
+        grey *= weights[0]
+    for channel in range(1, samples.shape[-1]):
+        grey += weights[channel] * samples[..., channel]
+    return grey

@@ -1,0 +1,1 @@
+"""Where in its scan a camera's frame lies."""

@@ -1,0 +1,256 @@
+"""Where in a scan something looks like a mark: normalised correlation with the rendered mark, at reduced size.
+
+A mark alone gives false answers on every film, so nothing is decided here: the responses go to the constellation.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.marks.rendering import ROUGH_CELLS, extent_px, picture
+from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
+from measure.scans.scan import SINGLE_CHANNELS, Scan
+from measure.search.correlation import WIDE, Map, Surroundings
+
+Array = NDArray[np.float64]
+Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
+
+_EXTENT_PX = 14.0  # of the reduced mark
+_THINNEST_PX = 1.2  # of its thinnest line: below this the line drowns
+_BLUR_PX = 0.6  # of the reduced mark: the averaging's own 0.3, and what is left of the scan's
+_RIM_PX = 2  # of the reduced scan, about the drawing: so far the blur takes it
+_LARGEST_PX = 3000  # of the reduced scan: a larger one costs seconds
+_SHARED_PX = 16  # of the reduced scan: places so near to one another share a window
+_ALIKE = 0.8  # correlation above which two pictures of marks share one response
+_LEARNED = 2.0  # times its finest detail: a notch or block is wider, and would be most of what ground is the median of
+FAINT = 1 / 500  # of full scale: contrast below it is rounding, not a mark
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Correlations with the looks of the marks, over the reduced scan.
+
+    maps: by the kind of look and +1 or -1, (rows, columns) of how much the place looks like the mark lighter or darker
+    than its surroundings. reduction: by which the scan was reduced. origins: (kinds, 2) column and row of the reduced
+    scan where the maps of each kind begin; None: they hold all of it. surroundings: what counts
+    about a mark.
+    """
+
+    maps: Mapping[tuple[int, int], Map]
+    reduction: int
+    origins: NDArray[np.int_] | None = None
+    surroundings: Surroundings = WIDE
+
+    def origin(self, kind: int) -> NDArray[np.int_]:
+        """(2,) pixel of the reduced scan where the maps of a kind begin."""
+        return np.zeros(2, dtype=int) if self.origins is None else self.origins[kind]
+
+    def reduced_px(self, scan_px: Array) -> Array:
+        """Scan pixels (..., 2) in pixels of the reduced scan."""
+        return (scan_px - (self.reduction - 1) / 2) / self.reduction
+
+    def scan_px(self, reduced_px: Array) -> Array:
+        """Pixels of the reduced scan (..., 2) in scan pixels."""
+        return reduced_px * self.reduction + (self.reduction - 1) / 2
+
+    def about(self, kinds: Sequence[int], places_px: Array, reach_px: float) -> tuple["Responses", tuple[int, ...]]:
+        """The same of each kind (n,) only about its place (n, 2) in the scan, as far as reach_px: a kind is then one at
+        one place. And for each which of these is its own."""
+        reach = int(np.ceil(reach_px / self.reduction))
+        middles = [tuple(place) for place in np.rint(self.reduced_px(places_px)).astype(int).tolist()]
+        pairs = list(dict.fromkeys(zip(kinds, middles, strict=True)))
+        size = np.array(next(iter(self.maps.values())).shape[::-1])
+        first = np.clip(np.array([middle for _, middle in pairs]) - reach, 0, size - 1)
+        last = np.clip(np.array([middle for _, middle in pairs]) + reach, first, size - 1)
+        maps = {
+            (number, sign): map_[first[number, 1] : last[number, 1] + 1, first[number, 0] : last[number, 0] + 1]
+            for number, (kind, _) in enumerate(pairs)
+            for (own, sign), map_ in self.maps.items()
+            if own == kind
+        }
+        index = tuple(pairs.index(pair) for pair in zip(kinds, middles, strict=True))
+        return Responses(maps, self.reduction, first, self.surroundings), index
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A mark as one pose shows it: linear is the (2, 2) part of pixel_from_mark in the scan."""
+
+    mark: Mark
+    linear: Array
+
+
+def respond(
+    scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1), surroundings: Surroundings = WIDE
+) -> tuple[Responses, tuple[int, ...]]:
+    """The responses to the looks that differ, lighter (+1) and darker (-1) than their surroundings as signs says, and
+    for every look which of the kinds is its own.
+
+    Of a colour scan every channel is tried, and the one that answers best at a place counts there.
+    """
+    reduction = _reduction(scan, looks)
+    kinds, index = _distinct(_templates(looks, reduction))
+    details = [_reduced_detail_px(looks[index.index(kind)], reduction) for kind in range(len(kinds))]
+    half = max(template.shape[0] for template in kinds) // 2
+    maps: dict[tuple[int, int], Map] = {}
+    for weights in _channel_weights(scan):
+        grey = scan.reduced(reduction, weights)
+        around = np.asarray(cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE), np.float32)
+        for detail in sorted(set(details)):
+            image = surroundings.flattened(around, detail, scan.full_scale_dn * FAINT)
+            for kind in (kind for kind, own in enumerate(details) if own == detail):
+                _strongest(maps, kind, signs, _within(surroundings.correlated(image, kinds[kind], detail), grey.shape))
+    return Responses(maps, reduction, surroundings=surroundings), index
+
+
+def respond_about(
+    scan: Scan, looks: Sequence[Look], places_px: Array, reach_px: float, signs: Collection[int] = (1, -1)
+) -> tuple[Responses, tuple[int, ...]]:
+    """The same, of each look only about its place (n, 2) in the scan, as far as reach_px and a little farther: of the
+    file only these windows are read. A kind is a look at one place."""
+    reduction = _reduction(scan, looks)
+    shapes, shape_of = _distinct(_templates(looks, reduction))
+    detail = _reduced_detail_px(looks[0], reduction)
+    reach, half = int(np.ceil(reach_px / reduction)), max(template.shape[0] for template in shapes) // 2
+    # Row by row: strips of the file that windows share are still decoded for the next one.
+    squares = np.floor(places_px[:, ::-1] / reduction / _SHARED_PX)
+    corners, corner_of = np.unique(squares, axis=0, return_inverse=True)
+    origins = corners[:, ::-1].astype(int) * _SHARED_PX - reach
+    size = _SHARED_PX + 2 * reach
+    kinds = sorted(set(zip(corner_of.tolist(), shape_of, strict=True)))
+
+    def at_corner(corner: int) -> dict[tuple[int, int], Map]:
+        col0, row0 = (origins[corner] - half).tolist()
+        maps: dict[tuple[int, int], Map] = {}
+        for weights in _channel_weights(scan):
+            grey = scan.reduced_window(reduction, col0, row0, size + 2 * half, size + 2 * half, weights)
+            image = WIDE.flattened(grey, detail, scan.full_scale_dn * FAINT)
+            for kind, shape in ((kind, shape) for kind, (own, shape) in enumerate(kinds) if own == corner):
+                _strongest(maps, kind, signs, _within(WIDE.correlated(image, shapes[shape], detail), (size, size)))
+        return maps
+
+    every = {key: map_ for maps in scan.each(at_corner, range(len(corners))) for key, map_ in maps.items()}
+    index = tuple(kinds.index(pair) for pair in zip(corner_of.tolist(), shape_of, strict=True))
+    return Responses(every, reduction, origins[[corner for corner, _ in kinds]]), index
+
+
+def _strongest(maps: dict[tuple[int, int], Map], kind: int, signs: Collection[int], response: Map) -> None:
+    """Keep at every place the strongest response of all channels."""
+    for sign in signs:
+        signed = response if sign > 0 else -response
+        known = maps.setdefault((kind, sign), signed)
+        np.maximum(known, signed, out=known)
+
+
+def peaks(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[Array, Array]:
+    """(n, 2) places (col, row) and (n,) heights of the highest local maxima above least, in order of height."""
+    highest = cv2.dilate(response, np.ones((2 * apart_px + 1, 2 * apart_px + 1), np.uint8))
+    rows, cols = np.nonzero((response == highest) & (response > least))
+    order = np.argsort(-response[rows, cols], kind="stable")[:count]
+    places = np.column_stack([cols, rows])[order].astype(float)
+    return places, response[rows, cols][order].astype(float)
+
+
+def detail_px(mark: Mark, linear: Array) -> float:
+    """The width of the mark's finest detail in px, and no less than one."""
+    return max(float(np.sqrt(abs(np.linalg.det(linear)))) * thinnest_mm(mark), 1.0)
+
+
+def _within(response: Map, shape: tuple[int, ...]) -> Map:
+    """The middle (rows, columns) of a response that reaches as far beyond it on every side."""
+    row0, col0 = ((whole - part) // 2 for whole, part in zip(response.shape, shape, strict=True))
+    return response[row0 : row0 + shape[0], col0 : col0 + shape[1]]
+
+
+def _reduction(scan: Scan, looks: Sequence[Look]) -> int:
+    """The largest that leaves every mark large enough, every line thick enough to be seen, and of the scan a pixel."""
+    limits = []
+    for look in looks:
+        least, greatest = extent_px(look.mark, _centred(look.linear))
+        scale = float(np.sqrt(abs(np.linalg.det(look.linear))))
+        limits.append(min((greatest - least).max() / _EXTENT_PX, scale * thinnest_mm(look.mark) / _THINNEST_PX))
+    needed = max(scan.width_px, scan.height_px) / _LARGEST_PX
+    return min(max(1, int(min(limits)), int(np.ceil(needed))), scan.width_px, scan.height_px)
+
+
+def _reduced_detail_px(look: Look, reduction: int) -> float:
+    """In px of the reduced scan, the width of what is no ground: the finest detail, or of a learned picture more."""
+    wide = _LEARNED if isinstance(look.mark, MarkTemplate) else 1.0
+    return max(wide * detail_px(look.mark, look.linear) / reduction, 1.0)
+
+
+def _templates(looks: Sequence[Look], reduction: int) -> list[Array]:
+    """The picture of every look; the same mark in the same direction shares its own, and one turned by quarters or
+    mirrored has its picture turned."""
+    drawn: dict[Mark, tuple[Array, Array]] = {}
+    shown: dict[tuple[Mark, bytes], Array] = {}
+    for look in looks:
+        key = look.mark, look.linear.tobytes()
+        if key in shown:
+            continue
+        if look.mark not in drawn:
+            drawn[look.mark] = look.linear, _template(look, reduction)
+        linear, template = drawn[look.mark]
+        turn = look.linear @ np.linalg.inv(linear)
+        shown[key] = quarter_turned(template, turn) if _is_quarter(turn) else _template(look, reduction)
+    return [shown[look.mark, look.linear.tobytes()] for look in looks]
+
+
+def quarter_turned(image: Grid, turn: Array) -> Grid:
+    """The image under a turn (2, 2) of its columns and rows by whole quarters, after a mirror if there is one."""
+    whole = np.rint(turn)
+    turned = image if whole[0, 0] else image.T
+    across, down = whole.sum(axis=1)
+    return np.ascontiguousarray(turned[:: int(down), :: int(across)])
+
+
+def _is_quarter(turn: Array) -> bool:
+    whole = np.rint(turn)
+    return bool(np.allclose(turn, whole, atol=1e-9) and np.array_equal(np.abs(whole).sum(axis=0), [1, 1]))
+
+
+def _template(look: Look, reduction: int) -> Array:
+    linear = _centred(look.linear) / reduction
+    least, greatest = extent_px(look.mark, linear)
+    half = int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + _RIM_PX
+    linear[:, 2] = half
+    return picture(look.mark, linear, 2 * half + 1, 2 * half + 1, _BLUR_PX, ROUGH_CELLS)
+
+
+def _centred(linear: Array) -> Array:
+    return np.column_stack([linear, np.zeros(2)])
+
+
+def _distinct(templates: Sequence[Array]) -> tuple[list[Array], tuple[int, ...]]:
+    """Templates that differ, and which of them stands for each."""
+    own = list({id(template): template for template in templates}.values())
+    likeness = _likeness(own)
+    kinds: list[int] = []
+    kind_of: dict[int, int] = {}
+    for number, template in enumerate(own):
+        alike = likeness[number, kinds]
+        if not (alike > _ALIKE).any():
+            kinds.append(number)
+            alike = likeness[number, kinds]
+        kind_of[id(template)] = int(alike.argmax())
+    return [own[number] for number in kinds], tuple(kind_of[id(template)] for template in templates)
+
+
+def _likeness(templates: Sequence[Array]) -> Array:
+    """(n, n) correlations of templates about one centre, the smaller of two filled up with nothing."""
+    sizes = np.array([template.shape[0] for template in templates])
+    flat = np.stack([np.pad(each, (sizes.max() - len(each)) // 2).ravel() for each in templates])
+    sums, count = flat.sum(axis=1), np.maximum(sizes[:, None], sizes) ** 2
+    squares = (flat**2).sum(axis=1)
+    spread = squares[:, None] - sums[:, None] ** 2 / count
+    return np.asarray((flat @ flat.T - np.outer(sums, sums) / count) / np.sqrt(spread * spread.T))
+
+
+def _channel_weights(scan: Scan) -> tuple[tuple[float, ...], ...]:
+    if scan.channels == 1:
+        return ((1.0,),)
+    return SINGLE_CHANNELS

@@ -1,0 +1,67 @@
+"""A frame that lies about in the middle of a large scan: its marks are looked for where it puts them, and only the file
+about them is read. Where any of them is not plainly there, the whole scan is searched."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from measure.frames.frame import Frame
+from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.scans.scan import Scan
+
+Array = NDArray[np.float64]
+
+_LARGE_PX = 1 << 24  # a smaller scan is read whole in no time
+_REACH = 0.025  # of the frame's side: laid by hand it is off by some millimetres and a degree
+_LARGEST_SHARE = 0.25  # of the scan: where windows hold more, the whole of it tells more
+_LEAST_MARKS = 4  # that agree: an affine transformation through them has a check
+_FINE = 0.05  # of how near steps are alike
+_ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step aside could be one step off
+
+
+def reach_mm(layout: FiducialLayout) -> float:
+    """How far from its place in a centred frame a mark is looked for."""
+    return _REACH * max(layout.frame_mm)
+
+
+def is_worth_a_look(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> bool:
+    """Whether windows about the marks are a small part of a large scan, and would not mistake one mark for the next."""
+    side_px = 2 * reach_mm(layout) / np.asarray(pitch_mm)
+    size_px = scan.width_px * scan.height_px
+    share = len(layout.marks) * float(np.prod(side_px)) / size_px
+    return size_px >= _LARGE_PX and share < _LARGEST_SHARE and not is_lattice(layout)
+
+
+def is_lattice(layout: FiducialLayout) -> bool:
+    """Whether one step takes more than half of the marks to others."""
+    xy, near = np.array([mark.xy_mm for mark in layout.marks]), reach_mm(layout) / 2
+    steps = (xy[:, None] - xy[None]).reshape(-1, 2)
+    # Of a large lattice there are a million steps, and few that differ.
+    rounded = np.round(steps[np.hypot(*steps.T) > near] / (_FINE * near))
+    fine, times = np.unique(rounded @ [1, 1j], return_counts=True)
+    places = _FINE * near * np.stack([fine.real, fine.imag], axis=1)
+    alike = [times[others].sum() for others in cKDTree(places).query_ball_point(places, near)] if len(places) else []
+    return max(alike, default=0) > _ALIKE * len(xy)
+
+
+def outermost(marks: Sequence[LayoutMark]) -> tuple[LayoutMark, ...]:
+    """The four marks toward the corners, which say where a frame lies: the others are then looked for where these put
+    them. All marks where the constellation has no such four."""
+    diagonal = np.array([mark.xy_mm for mark in marks]) @ [(1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)]
+    outer = np.unique(diagonal.argmax(axis=0))
+    return tuple(marks[index] for index in outer) if len(outer) == _LEAST_MARKS else tuple(marks)
+
+
+def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Array) -> Array:
+    """(n, 2) where the marks are in the scan if the middle of their constellation is that of the scan;
+    pixel_from_camera: (2, 2), of a pose."""
+    xy = np.array([mark.xy_mm for mark in layout.marks])
+    middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
+    return np.asarray((xy - middle) @ pixel_from_camera.T + np.array([scan.width_px - 1, scan.height_px - 1]) / 2)
+
+
+def is_complete(frame: Frame) -> bool:
+    """Whether the frame needs no other search: every mark plainly seen where the others put it."""
+    return bool(frame.accepted and len(frame.belongs) >= _LEAST_MARKS and frame.belongs.all() and frame.all_clear)

@@ -1,0 +1,110 @@
+"""Whether a frame that shows only some of its marks may be chance: how often places beside the marks look like marks.
+
+A dot on a rough ground is like many a speck, a ring-cross like nothing else; no threshold holds for both. So the marks
+are sought, in the same way, where they are not, and the share of those places that answer as strongly as the weakest of
+the marks found says what these are worth.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from measure.fiducial_options import FiducialOptions
+from measure.frames.first_look import strongest
+from measure.frames.frame import CLEAR_LIKENESS, Frame
+from measure.frames.frame_sighter import first_search_px
+from measure.marks.prediction import MarkPrediction
+from measure.marks.shapes import FiducialLayout
+from measure.scans.scan import Scan
+from measure.search.constellation import sign_of
+from measure.search.frame_search import FrameSearch
+
+Array = NDArray[np.float64]
+
+_LIKELY = 0.05  # probability of chance above which a frame is doubted
+_PLACES = 64  # that are looked at beside the marks: enough to tell three marks of four from chance
+_BESIDE = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
+_FREE = 2  # marks that a similarity goes through wherever they lie
+_SURE = 12  # marks that agree: no speck feigns so many
+_FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
+
+
+def doubt(search: FrameSearch, frame: Frame) -> str:
+    """A sentence where chance may have made the frame; empty where it is unlikely to."""
+    inside = [index for index, sighting in enumerate(frame.sightings) if sighting.inside]
+    clear = {
+        index: fit.center_px
+        for index, fit in enumerate(frame.fits)
+        if fit
+        and fit.likeness >= CLEAR_LIKENESS
+        and not frame.sightings[index].closer  # those were seen for the others
+    }
+    if frame.belongs.sum() >= _SURE:
+        return ""
+    if len(clear) == len(inside):
+        return _by_the_scan(search, frame, clear)
+    return _by_places_beside(search.scan, search.layout, frame, search.options, inside, clear)
+
+
+def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> str:
+    """Where every mark was found: whether the scan has many places that answer as strongly. Few frames lie in the
+    middle of it, and windows about the marks tell of no others."""
+    if len(clear) <= _FREE or not search.was_everywhere(frame):
+        return ""
+    expected = search.expected_where_seen(frame, clear)
+    if expected <= _LIKELY:
+        return ""
+    return (
+        f"so much of the scan looks like the {len(clear)} marks found that chance would make {expected:.2g} such "
+        "frames in it, and the frame may lie elsewhere"
+    )
+
+
+def _by_places_beside(
+    scan: Scan,
+    layout: FiducialLayout,
+    frame: Frame,
+    options: FiducialOptions,
+    inside: Sequence[int],
+    clear: dict[int, Array],
+) -> str:
+    """Where some marks were not found: whether places beside them look as much like marks as those that were."""
+    found = len(clear)
+
+    def response(index: int, place: Array, radius_px: float) -> float:
+        mark = layout.marks[index].mark
+        start = np.column_stack([frame.pixel_from_camera[:, :2], place])
+        sign = sign_of(mark, frame.placement.polarity)
+        expected = MarkPrediction(mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)
+        return strongest(scan, expected)[1]
+
+    radius = first_search_px(frame.placement, layout, options)
+    places = _beside(scan, frame, inside, radius)
+    weakest = min((response(index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
+    hits = sum(response(index, place, radius) >= weakest for index, place in places)
+    share = (hits + 1) / (len(places) + 2)  # Laplace: none of sixty does not mean never
+    chance = float(stats.binom.sf(found - _FREE - 1, len(inside) - _FREE, share))
+    if chance <= _LIKELY:
+        return ""
+    return (
+        f"only {found} of {len(inside)} marks were clearly found, and {hits} of {len(places)} places beside them look "
+        f"as much like marks: chance finds as many with a probability of {chance:.2f}, and the frame may lie elsewhere"
+    )
+
+
+def _beside(scan: Scan, frame: Frame, inside: Sequence[int], radius_px: float) -> list[tuple[int, Array]]:
+    """Places about the marks in the scan, in eight directions, each with the mark that is sought there."""
+    angles = np.arange(8) * np.pi / 4
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    size = np.array([scan.width_px, scan.height_px])
+    every = [
+        (index, np.asarray(frame.pixel_from_camera @ (*frame.camera_mm[index], 1.0) + off * radius_px * direction))
+        for off in _BESIDE
+        for direction in directions
+        for index in inside
+    ]
+    within = [(index, place) for index, place in every if np.all(place >= 0) and np.all(place < size)]
+    step = max(1, len(within) // _PLACES)
+    return within[::step][:_PLACES]

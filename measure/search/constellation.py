@@ -1,0 +1,273 @@
+"""The frame's place in its scan: the small similarity, in each pose, under which most marks have a response.
+
+Places are complex numbers here, x + iy in mm of the scan's own axes (right, up), so that a similarity is `a w + b`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from measure.marks.poses import up_from_camera
+from measure.marks.shapes import LayoutMark, Mark
+from measure.search.candidates import Responses
+from measure.search.correlation import WIDE, Surroundings
+from measure.search.response_layers import LEAST_TOLERANCE_PX, HeldReaches, Layer, Reach, narrowed
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+NARROW = 0.25  # of the tolerance: marks on film that is hardly deformed agree as well
+_LEAST_WEIGHED = 0.1  # of a mark that a placement is refined by
+_PAIRS = 60  # of marks that hypotheses are made from
+_FAR = 0.4  # of the largest distance of two marks: nearer ones tell turn and scale badly
+_KEPT = 12  # placements of a pose that are refined
+_SLID = 3  # of them, in a lattice, that are moved by its steps
+_NEIGHBOURS = 4  # of a mark of a lattice
+_ALIKE = 0.5  # of the marks that a step takes to others: they are a lattice
+_SAME_PX = 10  # of the reduced scan: placements no farther apart put a mark on itself, which is some 14 px large there
+_SAME_SIZE = 0.01  # the same at the frame's edge, a thousand of these pixels off the middle
+_OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What is known of the placement: scale is 1 within scale_tolerance for the pitch at hand; it is turned by turn_rad
+    (from right to up), within rotation_rad; and the camera's middle lies within off_mm of middle_mm."""
+
+    scale_tolerance: float
+    rotation_rad: float
+    misfit_mm: float
+    turn_rad: float = 0.0
+    middle_mm: complex = 0j
+    off_mm: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A frame in its scan. score: how much of the constellation answers; supported: how many marks do.
+
+    pixel_from_camera: (2, 3). polarity: of the marks that are not drawn with one, +1 lighter than their surroundings,
+    -1 darker. reduction: of the scan, and pitch_mm and surroundings that it was found with.
+    """
+
+    pose: str
+    pixel_from_camera: Array
+    score: float
+    supported: int
+    polarity: int
+    reduction: int
+    pitch_mm: tuple[float, float]
+    surroundings: Surroundings = WIDE
+
+    def same_place(self, other: "Placement") -> bool:
+        """Whether both put the frame at the same place and size, however its marks are named."""
+        shift = np.hypot(*(self.pixel_from_camera[:, 2] - other.pixel_from_camera[:, 2]))
+        sizes = [np.sqrt(abs(np.linalg.det(each.pixel_from_camera[:, :2]))) for each in (self, other)]
+        return bool(shift < _SAME_PX * self.reduction and abs(sizes[0] / sizes[1] - 1) < _SAME_SIZE)
+
+    def posed(self, pose: str) -> "Placement":
+        """The same place of the frame, its marks named as in another pose."""
+        turn = np.linalg.inv(up_from_camera(self.pose)) @ up_from_camera(pose)
+        linear = self.pixel_from_camera[:, :2] @ turn
+        return replace(self, pose=pose, pixel_from_camera=np.column_stack([linear, self.pixel_from_camera[:, 2]]))
+
+
+def same_picture(
+    marks: Sequence[LayoutMark],
+    first: tuple[str, Sequence[int]],
+    second: tuple[str, Sequence[int]],
+    within_mm: float,
+) -> bool:
+    """Whether two poses, each with the looks of its marks, put like marks in the same places."""
+    xy = np.array([mark.xy_mm for mark in marks])
+    of_first, of_second = (xy @ up_from_camera(pose).T for pose, _ in (first, second))
+    distance = np.hypot(*np.moveaxis(of_first[:, None] - of_second[None], -1, 0))
+    nearest = distance.argmin(axis=1)
+    close = bool((distance.min(axis=1) < within_mm).all())
+    alike = np.array_equal(np.asarray(first[1]), np.asarray(second[1])[nearest])
+    polarities = [mark.mark.polarity for mark in marks]
+    return close and alike and polarities == [polarities[index] for index in nearest]
+
+
+def sign_of(mark: Mark, assumed: int) -> int:
+    """+1 for a mark lighter than its surroundings, -1 for a darker one: as drawn, or else as assumed."""
+    return {"light": 1, "dark": -1, "auto": assumed}[mark.polarity]
+
+
+def signs_of(marks: Sequence[LayoutMark]) -> set[int]:
+    """Which signs the marks can have."""
+    return {sign_of(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
+
+
+def _different(found: Sequence[Placement], marks: Sequence[LayoutMark], tolerance_px: float) -> list[Placement]:
+    kept: list[tuple[Placement, Array]] = []
+    xy = np.array([mark.xy_mm for mark in marks])
+    for placement in found:
+        places = xy @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        if all(np.hypot(*(places - other).T).max() > 2 * tolerance_px for _, other in kept):
+            kept.append((placement, places))
+    return [placement for placement, _ in kept]
+
+
+class PlacementSearch:
+    """The search for placements, in one pose after another, of a frame that bounds are known of."""
+
+    def __init__(
+        self,
+        marks: Sequence[LayoutMark],
+        responses: Responses,
+        pitch_mm: tuple[float, float],
+        bounds: Bounds,
+        held: HeldReaches,
+    ) -> None:
+        self.marks, self.responses, self.bounds = marks, responses, bounds
+        self.pitch = np.asarray(pitch_mm)
+        self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
+        self.layers = {
+            key: Layer(map_, responses.origin(key[0]), self.tolerance_px, held) for key, map_ in responses.maps.items()
+        }
+
+    def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:
+        """The best placements of a pose that differ from one another, best first; none where no two marks respond.
+
+        look_of_mark: of the responses' kinds, that of each mark in this pose.
+        """
+        unsaid = any(mark.mark.polarity == "auto" for mark in self.marks)
+        found: list[Placement] = []
+        for polarity in (1, -1) if unsaid else (1,):
+            signs = [sign_of(mark.mark, polarity) for mark in self.marks]
+            layers = [self.layers[key] for key in zip(look_of_mark, signs, strict=True)]
+            found += _Constellation(self, pose, layers).placements(polarity)
+        found.sort(key=lambda placement: -placement.score)
+        return _different(found, self.marks, self.bounds.misfit_mm / float(self.pitch[0]))
+
+
+class _Constellation:
+    """The marks as one pose names them, each with the layer that answers to it."""
+
+    def __init__(self, search: PlacementSearch, pose: str, layers: Sequence[Layer]) -> None:
+        self.search, self.pose, self.layers = search, pose, layers
+        self.responses, self.bounds, self.pitch = search.responses, search.bounds, search.pitch
+        turned = np.array([mark.xy_mm for mark in search.marks]) @ up_from_camera(pose).T
+        self.camera: Complex = turned[:, 0] + 1j * turned[:, 1]
+
+    def placements(self, polarity: int) -> list[Placement]:
+        scale, offset = self._hypotheses()
+        if len(scale) == 0:
+            return []
+        scores, _ = self._scores([layer.wide for layer in self.layers], scale, offset)
+        kept = np.argsort(-scores, kind="stable")[:_KEPT]
+        slid = self._slid(scale[kept[:_SLID]], offset[kept[:_SLID]])
+        starts = (np.concatenate(each) for each in zip((scale[kept], offset[kept]), slid, strict=True))
+        scale, offset = self._refined(*starts)
+        scores, supported = self._scores([layer.near for layer in self.layers], scale, offset)
+        return [
+            Placement(
+                self.pose,
+                self._pixel_from_camera(a, b),
+                score,
+                count,
+                polarity,
+                self.responses.reduction,
+                (float(self.pitch[0]), float(self.pitch[1])),
+                self.responses.surroundings,
+            )
+            for a, b, score, count in zip(
+                scale.tolist(), offset.tolist(), scores.tolist(), supported.tolist(), strict=True
+            )
+        ]
+
+    def _slid(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
+        """Of a lattice too large for all its marks to be candidates the best hypothesis may be many steps off: these,
+        moved step by step as long as more marks answer. None where the marks are no lattice."""
+        steps = np.concatenate([[0.0], self._steps()])
+        wide = [layer.wide for layer in self.layers]
+        moving = len(steps) > 1
+        while moving:
+            tried = offset[:, None] + scale[:, None] * steps
+            scores = self._scores(wide, np.repeat(scale, len(steps)), tried.ravel())[0].reshape(tried.shape)
+            best = scores.argmax(axis=1)
+            moving = bool(best.any())
+            offset = tried[np.arange(len(best)), best]
+        return (scale, offset) if len(steps) > 1 else (scale[:0], offset[:0])
+
+    def _steps(self) -> Complex:
+        """The steps (mm) from the middle mark to the nearest ones that take most marks to others."""
+        places = np.stack([self.camera.real, self.camera.imag], axis=1)
+        tree = cKDTree(places)
+        order = np.argsort(np.hypot(*(places - places.mean(axis=0)).T), kind="stable")
+        middle = places[order[0]]
+        _, near = tree.query(middle, k=min(len(places), _NEIGHBOURS + 1))
+        steps = places[np.ravel(near)[1:]] - middle
+        onto = [np.mean(tree.query(places + step)[0] < self.bounds.misfit_mm) for step in steps]
+        return np.asarray((steps @ [1.0, 1.0j])[np.array(onto) > _ALIKE])
+
+    def _complex(self, scan_px: Array) -> Complex:
+        scaled = scan_px * self.pitch
+        return np.asarray(scaled[..., 0] - 1j * scaled[..., 1])
+
+    def _scan_px(self, places: Complex) -> Array:
+        return np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.pitch)
+
+    def _hypotheses(self) -> tuple[Complex, Complex]:
+        """Every similarity within bounds that takes two marks to two of their candidates."""
+        candidates = {layer: self._complex(self.responses.scan_px(layer.candidates)) for layer in set(self.layers)}
+        scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
+        upright = np.cos(self.bounds.rotation_rad)
+        for first, second in self._pairs():
+            of_first, of_second = candidates[self.layers[first]], candidates[self.layers[second]]
+            base = self.camera[second] - self.camera[first]
+            scale = (of_second[None, :] - of_first[:, None]) / base
+            size = np.abs(scale)
+            turned = (scale * np.exp(-1j * self.bounds.turn_rad)).real
+            allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (turned > upright * size)
+            offset = of_first[:, None] - scale * self.camera[first]
+            allowed &= np.abs(offset - self.bounds.middle_mm) < self.bounds.off_mm
+            scales.append(scale[allowed])
+            offsets.append(offset[allowed])
+        return np.concatenate(scales), np.concatenate(offsets)
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """Pairs of marks far apart, spread evenly over all marks where there are too many."""
+        first, second = np.triu_indices(len(self.camera), 1)
+        length = np.abs(self.camera[first] - self.camera[second])
+        far = np.flatnonzero(length >= _FAR * length.max())
+        step = max(1.0, len(far) / _PAIRS)
+        chosen = far[(np.arange(min(len(far), _PAIRS)) * step).astype(int)]
+        return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
+
+    def _scores(self, reached: Sequence[Reach], scale: Complex, offset: Complex) -> tuple[Array, Array]:
+        """Scores and numbers of supporting marks of many placements at once."""
+        places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
+        nearest = np.rint(places).astype(int)
+        answers = [reach.strength(nearest[:, k]) for k, reach in enumerate(reached)]
+        strength, inside = (np.stack(each, axis=1) for each in zip(*answers, strict=True))
+        score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
+        return score, (strength > 0).sum(axis=1)
+
+    def _refined(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
+        """The similarities (n,) through the responses about their predictions, each weighed by its strength."""
+        widest = self.search.tolerance_px
+        scale, offset = scale.copy(), offset.copy()
+        moving = np.ones(len(scale), dtype=bool)
+        for tolerance_px in (widest, narrowed(widest)):
+            predicted = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
+            found = [layer.highest(predicted[:, k], tolerance_px) for k, layer in enumerate(self.layers)]
+            tops, heights = (np.stack(each, axis=1) for each in zip(*found, strict=True))
+            weight = np.maximum(heights - _LEAST_WEIGHED, 0.0)
+            moving &= (weight > 0).sum(axis=1) >= 2
+            weight, places = weight[moving], self._complex(self.responses.scan_px(tops[moving]))
+            total = weight.sum(axis=1)
+            mean_from, mean_to = ((weight * p).sum(axis=1) / total for p in (self.camera, places))
+            from_, to = self.camera - mean_from[:, None], places - mean_to[:, None]
+            scale[moving] = (weight * np.conj(from_) * to).sum(axis=1) / (weight * np.abs(from_) ** 2).sum(axis=1)
+            offset[moving] = mean_to - scale[moving] * mean_from
+        return scale, offset
+
+    def _pixel_from_camera(self, scale: complex, offset: complex) -> Array:
+        turn = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ up_from_camera(self.pose)
+        up = np.column_stack([turn, [offset.real, offset.imag]])
+        return np.asarray(np.diag([1.0, -1.0]) @ up / self.pitch[:, None])

@@ -1,0 +1,286 @@
+"""The search for a camera's frame in a scan, under hypotheses about its pitch, and how often chance finds one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import comb
+
+from measure.fiducial_options import FiducialOptions
+from measure.frames.frame import Frame
+from measure.marks.poses import POSES, up_from_camera
+from measure.marks.rendering import extent_px
+from measure.marks.shapes import FiducialLayout
+from measure.scans.scan import Scan
+from measure.search.candidates import Look, Responses, detail_px, respond, respond_about
+from measure.search.centred_frame import centred_places_px, reach_mm
+from measure.search.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
+from measure.search.correlation import WIDE, Surroundings
+from measure.search.exposed_frame import ExposedFrame, exposed_frame
+from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.search.response_layers import HeldReaches
+from measure.status import Status
+
+Array = NDArray[np.float64]
+Pair = tuple[float, float]
+
+_COMPARED = 8  # best placements: the one that chance makes least is among them
+_TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
+# Of the marks' middle from that of the exposed frame: one body carries both, but a gate is no datum.
+_OFF_MIDDLE_MM = 0.5
+_TURNED_RAD = 0.01  # of the marks against the exposed frame's edges, and what these leave open
+
+
+@dataclass(frozen=True, eq=False)
+class _Searched:
+    """One hypothesis searched. looks: by pose, the kind of response of every mark; differ: poses whose marks do not
+    lie within the tolerance of another pose's. whole: the search in the whole scan and its looks, if this one is only
+    about where the frame's edges put the marks."""
+
+    search: PlacementSearch
+    looks: dict[str, tuple[int, ...]]
+    differ: int
+    whole: "_Searched | None" = None
+
+    def share(self, pose: str, index: int, sign: int, place: Array, tolerance_px: float) -> float:
+        """Of all places, those that look as much like a mark as one does within the tolerance of a place (2,) of the
+        reduced scan. About the frame's edges more may than elsewhere: the more frequent of both counts."""
+        reach = self.search.layers[self.looks[pose][index], sign].within(tolerance_px)
+        if self.whole is None:
+            return reach.share(place)
+        everywhere = self.whole.share(pose, index, sign, place, tolerance_px)
+        return max(everywhere, reach.share_elsewhere(place, reach.height(place)))
+
+
+def expected_alike(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> float:
+    """How many constellations that answer as well as the scan's best one chance would find in a scan like it without
+    any frame of this camera: the marks are looked for at reduced size only, so that cameras can be compared quickly."""
+    search, expected, tried = FrameSearch(scan, layout, options), np.inf, 0
+    for hypotheses in pitch_hypotheses(scan, layout, pitch_um, replace(options, pitch_is_right=True)):
+        tried += len(hypotheses)
+        found = search.anywhere(hypotheses)[:_COMPARED]
+        expected = min([expected, *(tried * search.expected_alike(placement) for placement in found)])
+    return expected
+
+
+class FrameSearch:
+    """The search in one scan; it draws and correlates the marks once for hypotheses that share a drawing."""
+
+    def __init__(
+        self, scan: Scan, layout: FiducialLayout, options: FiducialOptions, surroundings: Surroundings = WIDE
+    ) -> None:
+        self.scan, self.layout, self.options, self.surroundings = scan, layout, options, surroundings
+        self.poses = POSES if options.pose == "auto" else (options.pose,)
+        self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
+        self._drawn: tuple[Pair, Responses, tuple[int, ...]] | None = None
+        self._searched: dict[Pair, _Searched] = {}
+        self._held = HeldReaches()
+
+    def anywhere(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
+        """The placements in the whole scan, of all poses asked for, best first."""
+        found: list[Placement] = []
+        for hypothesis in hypotheses:
+            if self._drawn is None or self._drawn[0] != hypothesis.drawn_mm:
+                looks = self._looks(hypothesis, self.poses)
+                self._drawn = (hypothesis.drawn_mm, *respond(self.scan, looks, self._signs, self.surroundings))
+            found += self._everywhere(hypothesis, *self._drawn[1:])
+        return _best_first(found)
+
+    def in_the_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
+        """The same of a frame that lies about in the middle of the scan, of which only that is read."""
+        linear = _flip(hypothesis.mm)
+        places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
+        reach_px = reach_mm(self.layout) / max(hypothesis.mm)
+        about = respond_about(
+            self.scan, self._looks(hypothesis, self.poses), np.concatenate(places), reach_px, self._signs
+        )
+        return _best_first(self._everywhere(hypothesis, *about))
+
+    def within_its_edges(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
+        """The same of a frame whose edges are seen, its marks lying about the middle of what is exposed; it counts on
+        the whole scan having been searched under these hypotheses."""
+        found: list[Placement] = []
+        for hypothesis in hypotheses:
+            whole, edges = self._searched[hypothesis.mm], self._edges(hypothesis)
+            if edges is None:
+                continue
+            frame, poses = edges
+            linear = frame.rotation @ _flip(hypothesis.mm)
+            places = [self._camera_mm @ (linear @ up_from_camera(pose)).T + frame.center_px for pose in poses]
+            kinds = [kind for pose in poses for kind in whole.looks[pose]]
+            reach_px = (_OFF_MIDDLE_MM + self._slack_mm()) / float(np.mean(hypothesis.mm))
+            responses, look_of = whole.search.responses.about(kinds, np.concatenate(places), reach_px)
+            looks = self._looks(hypothesis, poses)
+            responses = _beside_edges(responses, dict(zip(look_of, looks, strict=True)), frame)
+            right, down = frame.center_px * hypothesis.mm
+            bounds = replace(
+                whole.search.bounds,
+                rotation_rad=_TURNED_RAD,
+                turn_rad=-frame.turn_rad,
+                middle_mm=complex(right, -down),
+                off_mm=_OFF_MIDDLE_MM,
+            )
+            found += self._placements(hypothesis, responses, look_of, poses, bounds, whole)
+        return _best_first(found)
+
+    def _edges(self, hypothesis: PitchHypothesis) -> tuple[ExposedFrame, tuple[str, ...]] | None:
+        """The frame that is seen by its edges, and the poses in which it is as wide and as high."""
+        of_size: dict[Pair, list[str]] = {}
+        for pose in self.poses:
+            width, height = np.abs(up_from_camera(pose)) @ self.layout.frame_mm / hypothesis.mm
+            of_size.setdefault((round(float(width), 3), round(float(height), 3)), []).append(pose)
+        turn = float(np.deg2rad(self.options.rotation_deg))
+        seen = [
+            (frame, tuple(poses))
+            for size, poses in of_size.items()
+            if (frame := exposed_frame(self.scan, size, hypothesis.tolerance, turn))
+        ]
+        return max(seen, key=lambda each: each[0].share, default=None)
+
+    def _slack_mm(self) -> float:
+        """How far from its place a mark may lie by turn, film and the given places."""
+        return _TURNED_RAD * float(np.hypot(*self._camera_mm.T).max()) + self.options.search_mm(self.layout)
+
+    def expected_alike(self, placement: Placement) -> float:
+        """How many placements that answer as well chance would find in a scan like this without any frame, by this
+        placement's hypothesis alone.
+
+        Of n marks in the scan k answer, the weakest of them as strongly as a share p of all places do: a frame at
+        random has so many with a probability of about (n over k) p^k. The frames that differ are all pairs of places,
+        one for each of two marks far apart, which the bounds of turn and scale allow.
+        """
+        search = self._searched[placement.pitch_mm].search
+        places = self._camera_mm @ placement.pixel_from_camera[:, :2].T + placement.pixel_from_camera[:, 2]
+        inside = np.all((places >= 0) & (places < (self.scan.width_px, self.scan.height_px)), axis=1)
+        seen = {index: places[index] for index in np.flatnonzero(inside).tolist()}
+        return self._expected(placement, seen, len(seen), search.tolerance_px)
+
+    def expected_as_good(self, frame: Frame) -> float:
+        """The same of a frame that was measured, only its marks without blemish counting as seen."""
+        verdicts = [frame.verdict(index)[0] if fit else None for index, fit in enumerate(frame.fits)]
+        seen = {
+            index: fit.center_px
+            for index, (fit, verdict) in enumerate(zip(frame.fits, verdicts, strict=True))
+            if fit is not None and verdict is Status.MEASURED
+        }
+        return self.expected_where_seen(frame, seen)
+
+    def was_everywhere(self, frame: Frame) -> bool:
+        """Whether the frame was searched in the whole scan, not only in the middle of it."""
+        searched = self._searched.get(frame.placement.pitch_mm)
+        return searched is not None and searched.search.responses.origins is None
+
+    def expected_where_seen(self, frame: Frame, seen_px: dict[int, Array]) -> float:
+        """The same, with the marks that count as seen, by index, and where. Chance puts marks anywhere within the
+        tolerance: those that a similarity fits better are the less likely, the more of them there are."""
+        placement, inside = frame.placement, sum(sighting.inside for sighting in frame.sightings)
+        widest_px = self._searched[placement.pitch_mm].search.tolerance_px
+        tolerances = (widest_px, NARROW * widest_px)
+        kept = [each for each in tolerances if each == widest_px or self._misfit_px(placement, seen_px) <= each]
+        return len(tolerances) * min(self._expected(placement, seen_px, inside, each) for each in kept)
+
+    def _misfit_px(self, placement: Placement, seen_px: dict[int, Array]) -> float:
+        """How far from its place (px of the reduced scan) the best similarity leaves a mark that was seen."""
+        if not seen_px:
+            return 0.0
+        pitch = np.asarray(placement.pitch_mm)
+        given = self._camera_mm[list(seen_px)] @ placement.pixel_from_camera[:, :2].T
+        given, seen = ((each - each.mean(axis=0)) * pitch @ (1, 1j) for each in (given, np.array([*seen_px.values()])))
+        turn = np.vdot(given, seen) / max(float(np.vdot(given, given).real), 1e-12)
+        return float(np.abs(seen - turn * given).max() / pitch.mean() / placement.reduction)
+
+    def _expected(self, placement: Placement, seen_px: dict[int, Array], inside: int, tolerance_px: float) -> float:
+        """seen_px: by index, where marks were seen, within tolerance_px (of the reduced scan) of the frame's places."""
+        searched, shares, same_px = self._searched[placement.pitch_mm], [], 1
+        for index, place in seen_px.items():
+            sign = sign_of(self.layout.marks[index].mark, placement.polarity)
+            reduced = searched.search.responses.reduced_px(place)
+            shares.append(searched.share(placement.pose, index, sign, reduced, tolerance_px))
+            same_px = searched.search.layers[searched.looks[placement.pose][index], sign].within(tolerance_px).area_px
+        counts = np.arange(min(3, inside), len(shares) + 1)
+        if len(counts) == 0:
+            return np.inf
+        likely = comb(inside, counts) * np.sort(shares)[counts - 1] ** counts
+        return float(len(counts) * likely.min() * self._different_frames(searched, same_px))
+
+    def _different_frames(self, searched: _Searched, same_px: int) -> float:
+        """same_px: of the reduced scan: places so near to one another that they answer alike."""
+        search = searched.search
+        span_px = (
+            float(np.hypot(*np.ptp(self._camera_mm, axis=0))) / float(search.pitch.mean()) / search.responses.reduction
+        )
+        middles_px = np.pi * search.bounds.off_mm**2 / float(np.prod(search.pitch))
+        places = min(self.scan.width_px * self.scan.height_px, middles_px) / search.responses.reduction**2
+        of_other = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
+        polarities = 2 if len(self._signs) > 1 else 1
+        return places / same_px * of_other / same_px * searched.differ * polarities
+
+    @property
+    def _signs(self) -> set[int]:
+        return signs_of(self.layout.marks)
+
+    def _looks(self, hypothesis: PitchHypothesis, poses: Sequence[str]) -> list[Look]:
+        linear = _flip(hypothesis.drawn_mm)
+        return [Look(mark.mark, linear @ up_from_camera(pose)) for pose in poses for mark in self.layout.marks]
+
+    def _everywhere(
+        self, hypothesis: PitchHypothesis, responses: Responses, look_of: tuple[int, ...]
+    ) -> list[Placement]:
+        """The placements of a frame that may lie anywhere in the scan."""
+        rotation_rad = float(np.deg2rad(self.options.rotation_deg))
+        bounds = Bounds(hypothesis.tolerance, rotation_rad, self.options.search_mm(self.layout))
+        return self._placements(hypothesis, responses, look_of, self.poses, bounds)
+
+    def _placements(
+        self,
+        hypothesis: PitchHypothesis,
+        responses: Responses,
+        look_of: tuple[int, ...],
+        poses: Sequence[str],
+        bounds: Bounds,
+        whole: _Searched | None = None,
+    ) -> list[Placement]:
+        marks, count = self.layout.marks, len(self.layout.marks)
+        search = PlacementSearch(marks, responses, hypothesis.mm, bounds, self._held)
+        looks: dict[str, tuple[int, ...]] = {}
+        found: dict[str, list[Placement]] = {}
+        differ = 0
+        for number, pose in enumerate(poses):
+            own = look_of[number * count : (number + 1) * count]
+            twin, like = (
+                next((name for name in found if same_picture(marks, (name, looks[name]), (pose, own), within_mm)), "")
+                for within_mm in (_TWIN * bounds.misfit_mm, bounds.misfit_mm)
+            )
+            looks[pose] = own
+            found[pose] = [place.posed(pose) for place in found[twin]] if twin else search.of_pose(pose, own)
+            differ += not like
+        self._searched[hypothesis.mm] = _Searched(search, looks, differ, whole)
+        return [placement for of_pose in found.values() for placement in of_pose]
+
+
+def _beside_edges(responses: Responses, looks: dict[int, Look], frame: ExposedFrame) -> Responses:
+    """The responses, of a look by kind each, that the frame's edges have no part in: its four corners are like one
+    another, and answer as well as four marks, wherever these are sought."""
+    maps, around = {}, responses.surroundings
+    for kind, look in looks.items():
+        margin_px = (around.beside + around.coarse / 2) * detail_px(look.mark, look.linear)
+        least, greatest = extent_px(look.mark, np.column_stack([look.linear, np.zeros(2)]))
+        for key in ((kind, sign) for sign in (1, -1) if (kind, sign) in responses.maps):
+            row, col = np.indices(responses.maps[key].shape)
+            places = responses.scan_px(np.stack([col, row], axis=-1) + responses.origin(kind).astype(float))
+            free = frame.free_of_edges(places, least - margin_px, greatest + margin_px)
+            maps[key] = np.where(free, responses.maps[key], np.float32(0.0))
+    return replace(responses, maps=maps)
+
+
+def _flip(pitch_mm: Pair) -> Array:
+    """(2, 2) from mm right and up to pixels across and down."""
+    return np.diag([1 / pitch_mm[0], -1 / pitch_mm[1]])
+
+
+def _best_first(found: list[Placement]) -> list[Placement]:
+    """Poses that score alike keep their order: of a symmetric camera's eight, "0" comes first."""
+    return sorted(found, key=lambda placement: -round(placement.score, 2))

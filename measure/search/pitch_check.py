@@ -1,0 +1,45 @@
+"""The scan's pitch as the marks' separations have it, against the one that is given."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from measure.frames.frame_fit import AFFINITY_SIGMA
+from measure.marks.shapes import FiducialLayout
+from measure.results import FrameMeasurement
+
+Array = NDArray[np.float64]
+
+CHANCE = 0.01  # of calling a right pitch wrong
+LEAST_MARKS = 3  # with two, a false one makes a pitch of its own
+
+
+def pitch_problem(
+    frame: FrameMeasurement, layout: FiducialLayout, pitch_um: tuple[float, float], source: str
+) -> str | None:
+    """A sentence that names the pitch which the marks suggest, None where the given one (um, by source) is as good.
+
+    Film and scanner stretch by some thousandths, and the given separations have their own standard deviations: what
+    goes beyond both, at a probability of one in a hundred for the two axes together, is the pitch's.
+    """
+    found = {mark.point for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation}
+    marks = [mark for mark in layout.marks if mark.id in found]
+    if frame.pixel_from_camera is None or len(marks) < LEAST_MARKS:
+        return None
+    seen_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film mm for each pixel, across and down
+    places = np.array([mark.xy_mm for mark in marks])
+    lever_mm = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=0)).min())  # of all marks, along one axis
+    given = float(np.median([max(mark.sigma_mm) for mark in marks]))
+    if not lever_mm > given:
+        return None
+    sigma = float(np.hypot(AFFINITY_SIGMA, given / lever_mm))
+    limit = float(stats.norm.isf(CHANCE / 2 / 2)) * sigma
+    excess = seen_um / np.asarray(pitch_um) - 1
+    if np.abs(excess).max() <= limit:
+        return None
+    return (
+        f"{source} gives a pitch of {pitch_um[0]:.2f} x {pitch_um[1]:.2f} um, but the marks' separations suggest "
+        f"{seen_um[0]:.2f} x {seen_um[1]:.2f} um ({100 * excess[0]:+.1f} and {100 * excess[1]:+.1f} %, where they and "
+        f"the film allow {100 * limit:.1f} %): set pitch_um = [{seen_um[0]:.2f}, {seen_um[1]:.2f}] in the project, or "
+        "look whether the camera is the right one."
+    )

@@ -1,0 +1,172 @@
+"""Crosses found in the whole frame, in one pass over its blocks: what is as thin as their lines and hangs together, if
+two bars through its middle explain it."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.fitting.noise import robust_scale
+from measure.scans.scan import Scan
+from measure.single_targets.block_search import search_blocks
+from measure.single_targets.disk_patches import Candidate, DiskSearch, Patches
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+SEARCHED_ARM_PX = 12.0  # scans are reduced until half a cross has about this length, if its lines stay...
+THINNEST_PX = 1.5  # ...so wide
+WIDEST_PX = 1536  # of what is compared with its own noise
+OCTAVE = 2.0  # longest over shortest half cross that one reduction finds
+NOISE_SIGMAS = 5.0
+STEPS_DEG = 5.0  # of the directions that bars may have
+LEAST_ANGLE_DEG = 35.0  # between the bars, right-angled ones seen obliquely
+BLURRED_PX = 0.75  # by which blur widens a bar on either side
+LEAST_FILLED, LEAST_EXPLAINED = 0.85, 0.8  # of the bars by the patch, of the patch by the bars
+
+
+@dataclass(frozen=True)
+class CrossSearch:
+    """half_px: shortest and longest half of a cross, px of the scan; line: width of its bars, in halves; polarity and
+    least_contrast: as for disks."""
+
+    half_px: tuple[float, float]
+    line: float
+    polarity: str = "auto"
+    least_contrast: float = 0.02
+
+    def __post_init__(self) -> None:
+        DiskSearch((2.0 * self.half_px[0], 2.0 * self.half_px[1]), "auto", self.least_contrast)
+        if not 0.0 < self.line < 1.0:
+            raise ValueError(f"line is {self.line} of half a cross; a share between 0 and 1 is right")
+        if self.polarity not in ("light", "dark", "auto"):
+            raise ValueError(f"polarity is {self.polarity!r}; light, dark or auto is right")
+
+
+def cross_candidates(scan: Scan, search: CrossSearch) -> list[Candidate]:
+    """Patches of a cross's shape, the strongest first; the columns of pixel_from_disk are its half bars."""
+    return search_blocks(scan, _octaves(search, scan.full_scale_dn))
+
+
+def _octaves(search: CrossSearch, full_scale_dn: float) -> list["CrossOctave"]:
+    octaves = []
+    shortest, longest = search.half_px
+    while True:
+        upper = min(shortest * OCTAVE, longest)
+        factor = _reduction(shortest, search.line)
+        octaves.append(CrossOctave(factor, (shortest / factor, upper / factor), search, full_scale_dn))
+        if upper >= longest:
+            return octaves
+        shortest = upper
+
+
+def _reduction(half_px: float, line: float) -> int:
+    """A power of two: blocks are whole numbers of every octave's pixels."""
+    most = max(min(half_px / SEARCHED_ARM_PX, line * half_px / THINNEST_PX), 1.0)
+    return int(2 ** np.floor(np.log2(most)))
+
+
+@dataclass(frozen=True)
+class CrossOctave:
+    """A reduction of the scan and the shortest and longest half of a cross, reduced px, in it."""
+
+    factor: int
+    half: tuple[float, float]
+    search: CrossSearch
+    full_scale_dn: float
+    widest_px = WIDEST_PX
+
+    @property
+    def margin_px(self) -> int:
+        return self._margin * self.factor
+
+    @property
+    def _margin(self) -> int:
+        return int(np.ceil(2.0 * self.half[1] + 4))
+
+    def patches(self, small: Image) -> Patches:
+        found = Patches.of(_patches(small, self.half, self.search, self.full_scale_dn))
+        first = self._margin - 0.5
+        last = np.array(small.shape[::-1]) - self._margin - 0.5
+        return found.part(np.all((found.centers >= first) & (found.centers < last), axis=1))
+
+
+def _patches(small: Image, half: tuple[float, float], search: CrossSearch, full_scale_dn: float) -> list[Candidate]:
+    """Crosses with halves of these lengths in a reduced picture."""
+    wide = 2 * int(np.ceil(search.line * half[1]) + 1) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
+    found = []
+    for sign, polarity, operation in ((1.0, "light", cv2.MORPH_TOPHAT), (-1.0, "dark", cv2.MORPH_BLACKHAT)):
+        if search.polarity not in (polarity, "auto"):
+            continue
+        thin = np.asarray(cv2.morphologyEx(small, operation, kernel), np.float32)
+        middle = float(np.median(thin[::3, ::3]))
+        noise = robust_scale(thin[::3, ::3].astype(np.float64) - middle)
+        level = max(0.5 * search.least_contrast * full_scale_dn, middle + NOISE_SIGMAS * noise)
+        found += _crosses(thin, level, half, search, sign)
+    return found
+
+
+def _crosses(thin: Image, level: float, half: tuple[float, float], search: CrossSearch, sign: float) -> list[Candidate]:
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((thin > level).astype(np.uint8))
+    found = []
+    for label, (left, top, wide, tall, area) in enumerate(stats[1:], 1):
+        if not (half[0] < max(wide, tall) < 2.6 * half[1] and area > 4.0 * half[0]):
+            continue
+        crop = slice(top, top + tall), slice(left, left + wide)
+        patch = np.where(labels[crop] == label, thin[crop], 0.0)
+        # Half of what stands out: blur and noise make a patch at the lowest level wider than the cross.
+        patch = np.where(patch > 0.5 * np.quantile(patch[patch > 0.0], 0.8), patch, 0.0)
+        cross = _cross_of(patch, search.line)
+        if cross is None:
+            continue
+        center, bars = cross
+        length = np.hypot(*bars)
+        if half[0] / 1.5 < length.max() < 1.5 * half[1]:
+            contrast = sign * float(np.median(patch[patch > 0.0]))
+            found.append(Candidate(center + np.array([left, top]), bars, contrast))
+    return found
+
+
+def _cross_of(patch: NDArray[np.floating], line: float) -> tuple[Array, Array] | None:
+    """Centre (2,) and half bars (2, 2) in columns of a cross of which a patch (rows, columns) shows the brightness."""
+    rows, cols = np.nonzero(patch)
+    if len(rows) < 12:
+        return None
+    weight = patch[rows, cols]
+    place = np.stack([cols, rows], axis=1).astype(float)
+    center = np.average(place, axis=0, weights=weight)
+    off = place - center
+    directions = np.deg2rad(np.arange(0.0, 180.0, STEPS_DEG))
+    units = np.stack([np.cos(directions), np.sin(directions)])
+    across = off @ np.stack([-units[1], units[0]])
+    reach = float(np.abs(off).max())
+    on_bar = np.abs(across) <= line * reach / 2.0 + BLURRED_PX
+    first = int(np.argmax(on_bar.sum(axis=0)))
+    apart = np.abs((np.arange(len(directions)) - first + len(directions) / 2) % len(directions) - len(directions) / 2)
+    others = np.where(apart * STEPS_DEG >= LEAST_ANGLE_DEG, (on_bar & ~on_bar[:, [first]]).sum(axis=0), -1)
+    second = int(np.argmax(others))
+    explained = (on_bar[:, first] | on_bar[:, second]).mean()
+    if explained < LEAST_EXPLAINED or others[second] == 0:
+        return None
+    bars = np.stack([_bar(off[on_bar[:, k]], units[:, k]) for k in (first, second)], axis=1)
+    filled = min(_filled(patch, center, bar) for bar in (*bars.T, *-bars.T))
+    return (center, bars) if filled >= LEAST_FILLED and abs(np.linalg.det(bars)) >= 1.0 else None
+
+
+def _bar(off: Array, unit: Array) -> Array:
+    """Half a bar: the direction of its pixels, as long as they reach on the shorter side."""
+    values, vectors = np.linalg.eigh(off.T @ off)
+    direction = vectors[:, int(np.argmax(values))]
+    direction = direction * (np.sign(direction @ unit) or 1.0)
+    along = off @ direction
+    return np.asarray(direction * (min(along.max(), -along.min()) + 0.5))
+
+
+def _filled(patch: NDArray[np.floating], center: Array, bar: Array) -> float:
+    """The share of an arm on which the patch lies."""
+    places = np.round(center + np.linspace(0.0, 0.9, 12)[:, None] * bar).astype(int)
+    places = np.clip(places, 0, np.array(patch.shape[::-1]) - 1)
+    return float((patch[places[:, 1], places[:, 0]] > 0.0).mean())

@@ -1,0 +1,212 @@
+"""Round targets measured to the noise of the film: a blurred ellipse fitted by least-squares matching."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.checks.second_place import SecondPlace
+from measure.fitting.blank_film import BESIDE_PX
+from measure.fitting.matching import Match, MatchOptions, match, window_about
+from measure.fitting.noise import may_be_noise
+from measure.fitting.picture_model import GREY
+from measure.marks.shapes import Disk, MarkShape
+from measure.scans.compression import with_loss
+from measure.scans.scan import Scan
+from measure.scans.scan_window import read_window
+from measure.single_targets.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
+from measure.single_targets.disk_patches import LEAST_SNR
+
+Array = NDArray[np.float64]
+
+UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
+LONGEST_MARGIN_PX = 10.0
+NARROWEST_MARGIN_PX = 1.5  # however near a neighbour is: with less, no pixel is ground
+LEAST_SHIFT_PX = 2.0  # from the start: a small disk may have been found so far off
+FORM_SIGMA = 0.2  # of size and shear: as well as the start is known
+PLAIN_MARGIN_PX = 7.0  # where it is plain, for a tenth less noise than with the shortest margin
+MARGIN_BLURS = 4.0  # in a soft scan so many standard deviations of its blur, as other marks get
+LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
+SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
+SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
+WEAK_DAMAGE, MOST_DAMAGE = 0.2, 0.35
+MOST_BLUR = 0.7  # of the shorter half axis
+SURE, MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may be greater, and what that may add to it
+
+
+@dataclass(frozen=True, eq=False)
+class FittedDisk:
+    """An ellipse as fitted. center_px (2,), covariance_px2 (2, 2); pixel_from_disk (2, 2): the unit disk's image, its
+    columns two radius vectors, px; contrast_dn: positive for a light disk; appearance_covariance (5, 5): of the
+    relative changes of its size, its stretch along the columns, its shear and its contrast, and of its blur's variance,
+    px². sloping: where it lies if its paint may slope, None where that is not told. weakness: why it is doubtful;
+    reason: why it is no disk, and then the numbers are the fit's last."""
+
+    center_px: Array
+    covariance_px2: Array
+    pixel_from_disk: Array
+    contrast_dn: float
+    noise_dn: float
+    blur_px: float
+    damaged_fraction: float
+    appearance_covariance: Array
+    sloping: SecondPlace | None = None
+    weakness: str = ""
+    reason: str = ""
+
+    @property
+    def half_axes_px(self) -> Array:
+        """(2,) the longer and the shorter."""
+        return np.asarray(np.linalg.svd(self.pixel_from_disk, compute_uv=False))
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the fit came to an end, whatever was fitted."""
+        return bool(np.all(np.isfinite(self.covariance_px2)))
+
+    @property
+    def is_soft(self) -> bool:
+        """Whether it was fitted, and its edge is as soft as that of a spot, which has none."""
+        return bool(self.is_fitted and self.blur_px > MOST_BLUR * self.half_axes_px[1])
+
+    @property
+    def is_spoilt(self) -> bool:
+        """Whether it was fitted, and too little about it fits a disk."""
+        return bool(self.is_fitted and self.damaged_fraction > MOST_DAMAGE)
+
+    @property
+    def contrast_sigma(self) -> float:
+        """Standard deviation of its contrast, as a share of it."""
+        return float(np.sqrt(self.appearance_covariance[3, 3]))
+
+    @property
+    def lone_doubt(self) -> str:
+        """Why a disk that cannot be compared with others is doubtful: dust and spots look like it; empty otherwise."""
+        shorter = self.half_axes_px[1]
+        if shorter < SMALL_RADIUS_PX:
+            return f"small: half axis {shorter:.1f} px, dust of its size would look the same"
+        return f"its edge is as soft as a spot's: blur {self.blur_px:.1f} px, half axis {shorter:.1f} px" * self.is_soft
+
+    @property
+    def quality(self) -> dict[str, float]:
+        """Named figures for the mark's row."""
+        longer, shorter = self.half_axes_px
+        return {
+            "snr": abs(self.contrast_dn) / max(self.noise_dn, 1e-9),
+            "contrast_dn": self.contrast_dn,
+            "noise_dn": self.noise_dn,
+            "blur_px": self.blur_px,
+            "damaged_fraction": self.damaged_fraction,
+            "longer_half_axis_px": float(longer),
+            "shorter_half_axis_px": float(shorter),
+        }
+
+
+def fit_disk(
+    scan: Scan,
+    center_px: Array,
+    pixel_from_disk: Array,
+    longest_margin_px: float = LONGEST_MARGIN_PX,
+    shape: MarkShape = UNIT_DISK,
+) -> FittedDisk:
+    """Fit an ellipse near center_px (2,), which pixel_from_disk (2, 2) describes to some 20 %.
+
+    longest_margin_px: how far about it grey values may be used; less where a neighbour is near. shape: another drawing
+    of radius 1 that is fitted in the disk's place, with a rotation too.
+    Never raises for what the picture holds: a fit that fails, or shows that there is no disk, has a reason.
+    """
+    start = np.column_stack([pixel_from_disk, center_px])
+    radius = _mean_radius_px(pixel_from_disk)
+    sure = max(MARGIN * radius, LEAST_MARGIN_PX, LEAST_REACH_PX - radius)
+    sure = max(min(sure, longest_margin_px, LONGEST_MARGIN_PX), NARROWEST_MARGIN_PX)
+    wide = max(sure, min(PLAIN_MARGIN_PX, longest_margin_px))
+    fitted = _fit_by_margin(scan, start, shape, sure, wide)
+    disk = fitted(wide)
+    soft = min(MARGIN_BLURS * disk.blur_px, longest_margin_px)
+    # In less ground than its blur reaches, a disk's blur, size and contrast may run away together.
+    if soft > wide and not (disk.reason and disk.is_fitted):
+        softer = fitted(soft)
+        disk = disk if softer.reason else softer
+    if not disk.reason:
+        return disk
+    # A narrow pad or a ring about the disk is no damage of the disk. Dust is, and the wider ground shows it better, as
+    # it does how soft an edge is: what passes with less of it, at another place, may be the dust itself.
+    if disk.is_soft or not sure < wide:
+        return disk
+    narrow = fitted(sure)
+    if narrow.reason or not disk.is_spoilt:
+        return narrow
+    agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
+    return narrow if agree else replace(narrow, weakness=f"with more ground: {disk.reason}")
+
+
+def _fit_by_margin(
+    scan: Scan, start: Array, shape: MarkShape, sure_px: float, wide_px: float
+) -> Callable[[float], FittedDisk]:
+    """The fit from start (2, 3), pixels from the shape, by how much ground about it is used; its window holds wide_px
+    of ground, of which what is within sure_px is the disk's for sure."""
+    options = MatchOptions(
+        freedom="ellipse" if shape is UNIT_DISK else "affine",
+        margin_px=wide_px,
+        margin_blurs=0.0,
+        plain_px=sure_px,
+        max_shift_px=max(_mean_radius_px(start[:, :2]), LEAST_SHIFT_PX),
+        linear_sigma=FORM_SIGMA,
+    )
+    window = read_window(scan, window_about(shape, start, wide_px + BESIDE_PX))
+
+    def fitted(margin_px: float) -> FittedDisk:
+        fit = match(window, shape, start, replace(options, margin_px=margin_px))
+        disk = FittedDisk(
+            center_px=fit.center_px,
+            covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn),
+            pixel_from_disk=fit.pixel_from_mark[:, :2],
+            contrast_dn=fit.contrast_dn,
+            noise_dn=fit.noise_dn,
+            blur_px=fit.blur_px,
+            damaged_fraction=fit.damaged_fraction,
+            appearance_covariance=appearance_covariance(fit),
+            sloping=fit.sloping,
+            reason="" if fit.converged else fit.reason,
+        )
+        return judged(disk, fit)
+
+    return fitted
+
+
+def _mean_radius_px(pixel_from_disk: Array) -> float:
+    """Of the circle of an ellipse's area."""
+    return float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
+
+
+def appearance_covariance(fit: Match) -> Array:
+    """(5, 5) as a fitted disk has it."""
+    assert fit.covariance is not None
+    gain = len(fit.covariance) - GREY
+    figures = [2, 3, 4, gain, gain - 1]
+    per = np.array([1.0, 1.0, 1.0, fit.contrast_dn or 1.0, 1.0])
+    return np.asarray(fit.covariance[np.ix_(figures, figures)] / np.outer(per, per))
+
+
+def judged(disk: FittedDisk, fit: Match) -> FittedDisk:
+    """The disk with its reason or weakness, where the fit's figures give one; residuals of a picture of something else
+    are alike in neighbouring pixels."""
+    if disk.reason:
+        return disk
+    reason = weakness = ""
+    contrast, (_, shorter) = abs(disk.contrast_dn), disk.half_axes_px
+    # White residuals are noise, which also moves a contrast: as strong as it may be, the disk counts.
+    most = contrast * (1 + min(SURE * disk.contrast_sigma, MOST_FAINTER)) if fit.covariance_is_white else contrast
+    worst = WORST_SMOOTH_MISFIT if fit.neighbour_correlation > SMOOTH else WORST_MISFIT
+    if not disk.is_fitted or most < LEAST_SNR * disk.noise_dn:
+        reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
+    elif disk.noise_dn > worst * contrast and not fit.covariance_is_white:
+        reason = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
+    elif disk.is_spoilt:
+        reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
+    elif shorter < SMALLEST_RADIUS_PX:
+        reason = f"too small: half axis {shorter:.1f} px"
+    elif disk.damaged_fraction > WEAK_DAMAGE:
+        weakness = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
+    return replace(disk, reason=reason, weakness=weakness)

@@ -1,0 +1,195 @@
+"""Marks that nobody has drawn: pictures of the same mark in all frames of a camera, aligned and averaged.
+
+Every frame's picture is matched with the mean of the others (shift, gain and offset), the mean is made anew of the
+aligned pictures, and so on until nothing moves. The noise of the mean falls with the square root of their number. Where
+its origin lies on the mark is a convention, the same one in every frame: a shift of the fiducial's coordinates.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from measure.fitting.matching import Match
+from measure.fitting.noise import robust_scale
+from measure.fitting.robust import tukey_weights
+from measure.marks.rendering import render
+from measure.marks.shapes import MarkTemplate
+from measure.scans.scan import Scan
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_PHASES = 2  # of rounds: what differs from frame to frame is known once the pictures are aligned
+_ROUNDS = 12  # of aligning and averaging; three or four are enough
+_SETTLED_PX = 0.005  # the mean has settled once no frame moves further
+_REWEIGHTINGS = 5
+_NOISE_FLOOR = 0.002  # of the mean's range: under a picture's noise, for clean pictures have none
+_LEAST_WEIGHT = 1e-6  # of a pixel that lies off in all pictures
+_SMOOTH_PX = 0.7  # before slopes are taken: they are then free of most noise
+_ROOM_PX = 10  # about the chip, to move in
+_SPREAD_PX = 1.0  # over which it is averaged, for a few pictures alone hardly tell it, yet it changes at the edges
+_GRAIN_PX = 1.0  # taken where one picture cannot tell how far its grain reaches
+
+
+@dataclass(frozen=True, eq=False)
+class Chip:
+    """A window of a scan about one mark: grey (rows, columns), its top-left pixel at origin_px (col, row) of the scan;
+    pixel_from_mark: (2, 3), mark's mm to the scan's pixels, its last column where the mark is taken to be."""
+
+    scan: str
+    grey: Array
+    origin_px: tuple[int, int]
+    pixel_from_mark: Array
+
+    @property
+    def pitch_um(self) -> float:
+        return 1000.0 / float(np.sqrt(abs(np.linalg.det(self.pixel_from_mark[:, :2]))))
+
+
+def cut(scan: Scan, pixel_from_mark: Array, size_mm: float) -> Chip:
+    """The window of a scan that holds a square of size_mm about the mark however it is turned, and room to move."""
+    matrix = np.array(pixel_from_mark, dtype=float)
+    reach = int(np.ceil(np.abs(matrix[:, :2]).sum(axis=1).max() * size_mm / 2)) + _ROOM_PX
+    col0, row0 = (int(value) - reach for value in np.rint(matrix[:, 2]))
+    grey = scan.window(col0, row0, 2 * reach + 1, 2 * reach + 1).astype(np.float64)
+    return Chip(scan.name, grey, (col0, row0), matrix)
+
+
+def template_of(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
+    """The template that all pictures of one mark have in common. Raises ValueError without any picture."""
+    if not chips:
+        raise ValueError("a template needs a picture of its mark")
+    pitch_um = float(np.median([chip.pitch_um for chip in chips]))
+    side = 2 * int(np.ceil(size_mm * 500 / pitch_um)) + 1  # odd: the origin is the middle pixel
+    places = [np.array(chip.pixel_from_mark) for chip in chips]
+    steady = np.ones((side, side), dtype=bool)
+    for _ in range(_PHASES):
+        for _ in range(_ROUNDS):
+            stack = np.stack([_resampled(*pair, side, pitch_um) for pair in zip(chips, places, strict=True)])
+            levelled, weights, alike = _weighed(stack)
+            moves = _moves(levelled, weights, steady)
+            for place, move in zip(places, moves, strict=True):
+                place[:, 2] += place[:, :2] @ (move * (1.0, -1.0) * pitch_um / 1000)
+            if np.hypot(*moves.T).max() < _SETTLED_PX:
+                break
+        steady = alike
+    image = np.asarray((weights * levelled).sum(axis=0) / weights.sum(axis=0))
+    shares = weights.sum(axis=(1, 2)) / weights.sum()
+    return MarkTemplate(
+        image,
+        pitch_um,
+        (side // 2, side // 2),
+        polarity="light",  # as the chip shows it
+        detail_mm=_detail_px(image) * pitch_um / 1000,
+        noise_dn=float(np.median([_noise_dn(chip.grey) for chip in chips])),
+        shares={chip.scan: float(share) for chip, share in zip(chips, shares, strict=True)},
+        steady=steady,
+        steadiness=_steadiness(levelled, image, steady) if len(chips) > 1 else None,
+        learned_mm=size_mm,
+    )
+
+
+def honest_covariance(template: MarkTemplate, scan: str, fit: Match) -> Array:
+    """(2, 2) px2, of a mark measured in a scan that has a share in its template.
+
+    The scan's noise is in the template too and so is missing from the residuals, in which only the rest, one less its
+    share, is left. Where the template is that scan's picture alone nothing is left: then noise from the picture itself.
+    """
+    share = template.shares.get(scan, 0.0)
+    return fit.covariance_px2 / (1.0 - share) if share < 1.0 else _covariance_of_noise(template, fit)
+
+
+def _resampled(chip: Chip, pixel_from_mark: Array, side: int, pitch_um: float) -> Array:
+    """The chip in the mark's own axes, x right and y up, its origin in the middle pixel."""
+    step = (np.arange(side) - side // 2) * (pitch_um / 1000)
+    mark_mm = np.stack(np.meshgrid(step, -step))
+    col, row = np.tensordot(pixel_from_mark[:, :2], mark_mm, axes=1) + (
+        pixel_from_mark[:, 2] - np.array(chip.origin_px)
+    ).reshape(2, 1, 1)
+    return np.asarray(ndimage.map_coordinates(chip.grey, [row, col], order=3, mode="nearest"))
+
+
+def _weighed(stack: Array) -> tuple[Array, Array, Mask]:
+    """The pictures (n, side, side) brought to the grey values of their mean, the weight of every pixel in it: by its
+    picture's noise, and by Tukey's function where it lies off (dust, the landscape behind the mark); and where the
+    pictures are alike, more of them than not."""
+    weights, alike = np.ones(stack.shape), np.ones(stack.shape)
+    levelled = np.stack([_levelled(image, stack[0], weights[0]) for image in stack])
+    for round_ in range(_REWEIGHTINGS):
+        mean = np.median(levelled, axis=0) if round_ == 0 else _mean(levelled, weights)
+        levelled = np.stack([_levelled(*each) for each in zip(stack, [mean] * len(stack), weights, strict=True)])
+        floor = _NOISE_FLOOR * float(np.ptp(mean))
+        alike = np.zeros(stack.shape)
+        for index, residual in enumerate(levelled - mean):
+            scale = max(robust_scale(residual), floor)
+            alike[index] = tukey_weights(residual, scale)
+            weights[index] = (alike[index] + _LEAST_WEIGHT) / scale**2
+    return levelled, weights, cv2.GaussianBlur(alike.mean(axis=0), (0, 0), _SMOOTH_PX) > 0.5
+
+
+def _steadiness(levelled: Array, image: Array, steady: Mask) -> Array:
+    """(side, side) standard deviation of noise, which is what most of the steady pixels have, over that of the
+    differences between the pictures (n, side, side) and their mean."""
+    squares = ((levelled - image) ** 2).mean(axis=0)
+    about = np.sqrt(cv2.GaussianBlur(squares, (0, 0), _SPREAD_PX))
+    noise = max(float(np.median(about[steady])) if steady.any() else 0.0, _NOISE_FLOOR * float(np.ptp(image)), 1e-9)
+    return np.asarray(noise / np.maximum(about, noise))
+
+
+def _mean(stack: Array, weights: Array) -> Array:
+    return np.asarray((weights * stack).sum(axis=0) / weights.sum(axis=0))
+
+
+def _levelled(image: Array, like: Array, weights: Array) -> Array:
+    """The image with the gain and offset that make it most like another."""
+    centre, wanted = np.average(image, weights=weights), np.average(like, weights=weights)
+    product = float((weights * (image - centre) * (like - wanted)).sum())
+    gain = product / max(float((weights * (image - centre) ** 2).sum()), 1e-12)
+    return np.asarray(wanted + gain * (image - centre))
+
+
+def _moves(stack: Array, weights: Array, used: Mask) -> Array:
+    """(n, 2) px by column and row: how far each picture has to move onto the mean of the others, by the pixels used,
+    their sum being none. A picture is not compared with itself: that would hold it where it is."""
+    if len(stack) == 1:
+        return np.zeros((1, 2))
+    total, sums = weights.sum(axis=0), (weights * stack).sum(axis=0)
+    moves = np.empty((len(stack), 2))
+    for index, (image, weight) in enumerate(zip(stack, weights, strict=True)):
+        others = (sums - weight * image) / (total - weight)
+        by_row, by_col = np.gradient(cv2.GaussianBlur(others, (0, 0), _SMOOTH_PX))
+        design = np.stack([part[used] for part in (by_col, by_row, others, np.ones_like(others))], axis=1)
+        root = np.sqrt(weight[used])
+        step = np.linalg.lstsq(design * root[:, None], (others - image)[used] * root, rcond=None)[0][:2]
+        share = float(weight.sum() / total.sum())  # by which it moves the mean of all
+        moves[index] = (1 - share) * np.clip(step, -1.0, 1.0)
+    return np.asarray(moves - moves.mean(axis=0))
+
+
+def _noise_dn(grey: Array) -> float:
+    """Of one pixel: what is finer than grain gets; lines are finer too, but few."""
+    return robust_scale(grey - cv2.GaussianBlur(grey, (0, 0), 2 * _GRAIN_PX))
+
+
+def _detail_px(image: Array) -> float:
+    """The finest detail: twice the blur that takes half of the picture's variance away, the width of a lone line."""
+    blurs = np.arange(1.0, max(image.shape[0] / 4, 2.0), 0.5)
+    left = [cv2.GaussianBlur(image, (0, 0), blur).var() / max(image.var(), 1e-12) for blur in blurs]
+    return 2 * float(np.interp(-0.5, -np.array(left), blurs))
+
+
+def _covariance_of_noise(template: MarkTemplate, fit: Match) -> Array:
+    """Of a shift, gain and offset, from the picture's slopes and its noise, as grain of _GRAIN_PX correlates it."""
+    side = template.image.shape[0]
+    linear = fit.pixel_from_mark[:, :2]
+    shown = render(template, np.column_stack([linear, np.full(2, side / 2)]), side, side, 0.0)
+    columns = [fit.contrast_dn * shown.by_col, fit.contrast_dn * shown.by_row, shown.value, np.ones_like(shown.value)]
+    design = np.stack([column.ravel() for column in columns], axis=1)
+    size = np.linalg.norm(design, axis=0)
+    inverse = np.linalg.pinv((design / size).T @ (design / size)) / np.outer(size, size)
+    # As many pixels as such grain is wide are one observation: the sum of its correlations.
+    return np.asarray(4 * np.pi * _GRAIN_PX**2 * max(template.noise_dn, 1e-3) ** 2 * inverse[:2, :2])

@@ -1,0 +1,115 @@
+"""What the frames of a camera have in common near a place: a mark that nobody has shown, among changing landscape.
+
+A square that is a mark, or the frame's edge, recurs in every frame; one of landscape does not. An edge recurs all along
+itself, a mark in one place only: so the best square is the one whose best match in other frames most exceeds its
+second best.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from measure.scans.scan import Scan
+from measure.search.candidates import FAINT
+from measure.search.correlation import WIDE
+
+Array = NDArray[np.float64]
+Window = NDArray[np.float32]
+
+_SIDE = 24  # samples along the square
+_STEP = 3  # samples between the squares that are tried
+_APART = _SIDE // 3  # samples: what is nearer is the same place
+_DETAIL = 2.0  # samples: width of the finest detail that counts
+_LEAST_VARIANCE = 0.01  # of pictures whose own is about 1: few frames may agree by chance
+
+
+@dataclass(frozen=True, eq=False)
+class Recurrence:
+    """offset_mm: (2,) from the place given, in the camera's axes. excess: by how much the best match in other frames
+    exceeds the second best, a difference of correlations, the median over the frames."""
+
+    offset_mm: Array
+    excess: float
+
+
+def about(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm: float, reach_mm: float) -> Window:
+    """The picture about a place of the frame, square, in the camera's axes (x right, y up), freed of everything coarse:
+    _SIDE samples to size_mm."""
+    pitch_mm = size_mm / _SIDE
+    half = int(np.ceil((size_mm / 2 + reach_mm) / pitch_mm))
+    step = np.arange(-half, half + 1) * pitch_mm
+    linear = pixel_from_camera[:, :2]
+    reach = int(np.ceil(np.abs(linear).sum(axis=1).max() * half * pitch_mm)) + 2
+    center = linear @ xy_mm + pixel_from_camera[:, 2]
+    col0, row0 = (int(value) - reach for value in np.rint(center))
+    grey = scan.window(col0, row0, 2 * reach + 1, 2 * reach + 1)
+    fine = cv2.GaussianBlur(grey, (0, 0), max(0.5 * pitch_mm * float(np.sqrt(abs(np.linalg.det(linear)))), 0.3))
+    col, row = np.tensordot(linear, np.stack(np.meshgrid(step, -step)), axes=1) + (center - (col0, row0)).reshape(
+        2, 1, 1
+    )
+    sampled = ndimage.map_coordinates(fine, [row, col], order=1, mode="nearest").astype(np.float32)
+    return WIDE.flattened(sampled, _DETAIL, scan.full_scale_dn * FAINT)
+
+
+def recurrence(reference: Window, others: Sequence[Window], size_mm: float) -> Recurrence:
+    """The square of the reference that recurs most plainly in the other windows, moved to where what recurs about it
+    tells most of a place."""
+    span = reference.shape[0] - _SIDE
+    tried = [(row, col) for row in range(0, span + 1, _STEP) for col in range(0, span + 1, _STEP)]
+    excess = [_excess(reference[row : row + _SIDE, col : col + _SIDE], others) for row, col in tried]
+    best = int(np.argmax(excess))
+    row, col = tried[best]
+    square = reference[row : row + _SIDE, col : col + _SIDE]
+    places = [_highest(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED)) for window in others]
+    moved = [_moved(window, col - there[1], row - there[0]) for window, there in zip(others, places, strict=True)]
+    center_row, center_col = _telling(np.stack([reference, *moved]), (row, col))
+    middle = (reference.shape[0] - 1) / 2
+    offset = np.array([center_col - middle, middle - center_row]) * size_mm / _SIDE
+    return Recurrence(offset, float(excess[best]))
+
+
+def _moved(window: Window, right: int, down: int) -> Window:
+    """The window moved by whole samples; where nothing comes in, nothing is."""
+    shift = np.array([[1.0, 0.0, right], [0.0, 1.0, down]], np.float32)
+    return np.asarray(cv2.warpAffine(window, shift, window.shape[::-1], flags=cv2.INTER_NEAREST), np.float32)
+
+
+def _telling(stack: Window, square: tuple[int, int]) -> tuple[int, int]:
+    """Row and column, within the square at (row, col), about which the mean of aligned windows has most information of
+    a place in its worse direction: slopes that recur, over what differs from frame to frame."""
+    mean = stack.mean(axis=0)
+    noise = cv2.GaussianBlur(stack.var(axis=0) / max(len(stack) - 1, 1), (0, 0), _DETAIL) + _LEAST_VARIANCE
+    by_row, by_col = np.gradient(mean)
+    sums = [
+        cv2.GaussianBlur(product / noise, (0, 0), _SIDE / 4, borderType=cv2.BORDER_CONSTANT)
+        for product in (by_col * by_col, by_col * by_row, by_row * by_row)
+    ]
+    least = (sums[0] + sums[2]) / 2 - np.hypot((sums[0] - sums[2]) / 2, sums[1])
+    row, col = square
+    inside = least[row : row + _SIDE, col : col + _SIDE]
+    top = np.unravel_index(int(inside.argmax()), inside.shape)
+    return int(top[0]) + row, int(top[1]) + col
+
+
+def _excess(square: Window, windows: Sequence[Window]) -> float:
+    if square.std() < 1e-3:
+        return 0.0
+    return float(np.median([_best_less_second(cv2.matchTemplate(w, square, cv2.TM_CCOEFF_NORMED)) for w in windows]))
+
+
+def _best_less_second(response: NDArray[np.generic]) -> float:
+    row, col = _highest(response)
+    rest = np.array(response, np.float32)
+    best = float(rest[row, col])
+    rest[max(row - _APART, 0) : row + _APART + 1, max(col - _APART, 0) : col + _APART + 1] = -1.0
+    return best - max(float(rest.max()), 0.0)
+
+
+def _highest(response: NDArray[np.generic]) -> tuple[int, int]:
+    values = np.asarray(response, np.float32)
+    row, col = divmod(int(values.argmax()), values.shape[1])
+    return row, col

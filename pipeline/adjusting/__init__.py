@@ -1,0 +1,1 @@
+"""From comparator coordinates to the adjustment and its files."""

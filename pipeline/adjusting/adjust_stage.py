@@ -1,0 +1,159 @@
+"""Comparator coordinates to the adjustment, disks corrected for their eccentricity on the way."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.adjustment import Options, adjust
+from adjust.functional_model.projection import adjusted_image
+from adjust.initial_values.approximations import approximate
+from adjust.network import Network
+from adjust.result import Adjustment
+from adjust.undetermined.datum_choice import with_held
+from pipeline.adjusting.network import build_network, unmeasured_points
+from pipeline.files.project_file import Project
+from pipeline.measuring.comparator_file import ComparatorPoint
+from pipeline.measuring.disks import across, disk_normals, eccentricity_mm, plane_normal
+from pipeline.wording import listed
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 4  # the correction changes by its own relative error, so the second round is already below the noise
+_SETTLED_SIGMAS = 0.01
+_NOTICEABLE_SIGMAS = 0.2  # of the coordinate: an eccentricity that is not corrected and as large deserves a word
+
+
+def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
+    """Adjust what was measured; what the user should look at stands in the result's warnings.
+
+    Raises InputError or AdjustmentError where an adjustment cannot even begin.
+    """
+    network, left_out = build_network(project, marks)
+    options = adjustment_options(project)
+    adjustment = _adjusted(network, options)
+    uncorrected = np.zeros_like(network.observations.xy_mm)
+    if project.disk_radius > 0.0:
+        adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
+    warnings = (
+        *left_out,
+        *_misnamed(project, marks),
+        *_unmeasured(project, network),
+        *_not_corrected(network, uncorrected),
+    )
+    return replace(adjustment, remarks=(*adjustment.remarks, *warnings))
+
+
+def adjustment_options(project: Project) -> Options:
+    return Options(
+        datum=project.adjust.datum,
+        datum_coordinates=project.adjust.datum_coordinates,
+        datum_points=project.adjust.datum_points,
+        robust=project.adjust.robust,
+        variance_components=project.adjust.variance_components,
+        snooping=project.adjust.snooping,
+        method=project.adjust.method,
+    )
+
+
+def _adjusted(network: Network, options: Options) -> Adjustment:
+    return adjust(network, approximate(with_held(network, options.datum_coordinates)), options)
+
+
+def _without_eccentricity(
+    project: Project, network: Network, adjustment: Adjustment, options: Options
+) -> tuple[Adjustment, Array]:
+    """The adjustment of disks taken to the images of their centres, and the eccentricities (n, 2) not known."""
+    applied = uncorrected = np.zeros_like(network.observations.xy_mm)
+    for _ in range(_ROUNDS):
+        if not adjustment.converged:
+            break
+        wanted, uncorrected = _eccentricities(project, adjustment)
+        if _in_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
+            break
+        applied = wanted
+        adjustment = _adjusted(_shifted(network, -applied), options)
+    return adjustment, uncorrected
+
+
+def _eccentricities(project: Project, adjustment: Adjustment) -> tuple[Array, Array]:
+    """What is to be taken off every observation, and what cannot be for want of a normal: the most it could be."""
+    network = adjustment.network
+    observations = network.observations
+    ids = [point.id for point in network.points]
+    coordinates = np.array([[adjustment.value(f"PT.{id}.{axis}") for axis in "XYZ"] for id in ids]).reshape(-1, 3)
+    row_of = {id: row for row, id in enumerate(ids)}
+    given = project.given_points.normals if project.given_points else {}
+    plane = plane_normal(coordinates)
+    radius = project.disk_radius
+    known_part, unknown_part = np.zeros_like(observations.xy_mm), np.zeros_like(observations.xy_mm)
+    for image in network.images:
+        rows = [
+            i
+            for i, (name, kind) in enumerate(zip(observations.image, observations.kind, strict=True))
+            if name == image.name and kind == "target"
+        ]
+        if not rows:
+            continue
+        at = [row_of[observations.point[i]] for i in rows]
+        model = adjusted_image(adjustment, image.name)
+        normals, known = disk_normals([ids[k] for k in at], coordinates[at], given, plane, model.station)
+        off = eccentricity_mm(model, coordinates[at], normals, radius)
+        known_part[rows] = np.where(known[:, None], off, 0.0)
+        slanted = eccentricity_mm(model, coordinates[at], _slanted(normals, coordinates[at], model.station), radius)
+        unknown_part[rows] = np.where(known[:, None], 0.0, slanted)
+    return known_part, unknown_part
+
+
+def _slanted(normals: Array, coordinates: Array, station: Array) -> Array:
+    """Normals turned 45 degrees away from the line of sight, where the eccentricity is largest."""
+    sight = (station - coordinates) / np.linalg.norm(station - coordinates, axis=1, keepdims=True)
+    slanted: Array = (sight + across(sight)[0]) / np.sqrt(2.0)
+    return slanted
+
+
+def _shifted(network: Network, shift_mm: Array) -> Network:
+    observations = network.observations
+    return replace(network, observations=replace(observations, xy_mm=observations.xy_mm + shift_mm))
+
+
+def _in_sigmas(network: Network, change_mm: Array) -> float:
+    """The largest change of an observation, in its standard deviations."""
+    sigmas = np.sqrt(np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2))
+    return float(np.max(np.abs(change_mm) / sigmas, initial=0.0))
+
+
+def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
+    """Where some images have no line in images.csv and some lines no image, a name is probably misspelt."""
+    if project.given_images is None:
+        return ()
+    images, given = {mark.image for mark in marks}, set(project.given_images.exterior)
+    without_line, without_marks = listed(sorted(images - given)), listed(sorted(given - images))
+    if not without_line or not without_marks:
+        return ()
+    return (
+        f"The file of images says nothing of {without_line}, and names {without_marks}, of which there are no marks. "
+        "Look for a misspelt name.",
+    )
+
+
+def _unmeasured(project: Project, network: Network) -> tuple[str, ...]:
+    lost = unmeasured_points(project, network)
+    if not lost:
+        return ()
+    return (
+        f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {listed(lost)}. "
+        "Look for a wrong point number; a point that no image shows has no part in the adjustment.",
+    )
+
+
+def _not_corrected(network: Network, possible_mm: Array) -> tuple[str, ...]:
+    worst = _in_sigmas(network, possible_mm)
+    if worst <= _NOTICEABLE_SIGMAS:
+        return ()
+    return (
+        f"The disks' eccentricity is not corrected, for their normals are not known; it can reach {worst:.1f} sigma "
+        f"({1000.0 * float(np.abs(possible_mm).max()):.2f} um). Add the columns nX, nY, nZ to the points, or use "
+        "smaller disks.",
+    )

@@ -1,0 +1,271 @@
+"""`adjustment.json`, the result with everything it came from, and `adjustment.npz`, its full covariance."""
+
+import io
+import json
+import math
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.projection import adjusted_image
+from adjust.functional_model.transformation import film_parameter_names
+from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
+from adjust.quality.correlation import correlations
+from adjust.quality.significance import group_tests, parameter_tests
+from adjust.result import Adjustment, FurtherResidual
+from pipeline.adjusting.adjustment_reader import FURTHER_NUMBERS, covariance_path
+from pipeline.adjusting.covariance_arrays import covariance_arrays, covariance_note
+from pipeline.adjusting.reliability_json import point_tests, reliability_json, suspect_json
+from pipeline.files.atomic import atomic_path
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+
+ANGLES = ("omega", "phi", "kappa", "angle")
+DEG_PER_RAD = 180.0 / math.pi
+
+
+def write_adjustment(adjustment: Adjustment, path: Path) -> None:
+    """Write the result to `path` and its covariance beside it, each by way of a temporary file.
+
+    Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity
+    has `given`, what was known of it beforehand, and every residual its place in the camera. A camera without an image
+    and a point that nobody saw are not in it. Where no object point is seen, there is no exterior orientation (null)
+    and no calibration (a camera's values are those given, their sigmas null). Raises InputError where a file cannot be
+    written.
+    """
+    text = json.dumps(without_nan(adjustment_json(adjustment)), indent=1, ensure_ascii=False, allow_nan=False)
+    arrays = io.BytesIO()
+    np.savez_compressed(arrays, allow_pickle=False, **covariance_arrays(adjustment))
+    # Both are whole before either takes its place: a covariance belongs to its adjustment.
+    with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
+        covariance.write_bytes(arrays.getvalue())
+        result.write_text(text + "\n", encoding="utf-8")
+
+
+def adjustment_json(adjustment: Adjustment) -> Json:
+    """The result as `adjustment.json` holds it; numbers that mean nothing are still NaN or infinite."""
+    network = adjustment.network
+    used = {image.camera for image in network.images}
+    names = frozenset(adjustment.names)
+    return {
+        "reseau": version("reseau"),
+        "converged": adjustment.converged,
+        "termination": adjustment.termination,
+        "iterations": adjustment.iterations,
+        # A prior is an observation and a condition; a measured point is two of each.
+        "observations": adjustment.conditions,
+        "conditions": adjustment.conditions,
+        "unknowns": adjustment.unknowns,
+        "redundancy": adjustment.redundancy,
+        "vpv": adjustment.vpv,
+        "sigma0": adjustment.sigma0,
+        "covariance": covariance_note(adjustment),
+        "singular": [
+            {"parameters": list(null.parameters), "cause": null.cause, "remedy": null.remedy}
+            for null in adjustment.singular
+        ],
+        "correlations": [
+            {"parameters": list(each.parameters), "rho": each.rho, "cause": each.cause, "remedy": each.remedy}
+            for each in correlations(adjustment)
+        ],
+        "warnings": list(adjustment.warnings),
+        "variance_factors": dict(adjustment.variance_factors),
+        "variance_sigmas": dict(adjustment.variance_sigmas),
+        "suspects": [suspect_json(suspect) for suspect in adjustment.suspects],
+        "reliability": reliability_json(adjustment),
+        "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras if camera.name in used},
+        "images": {image.name: _image(adjustment, image) for image in network.images},
+        "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
+        "residuals": _residuals(adjustment),
+        "refraction": network.line_of_sight.refraction,
+        "earth_curvature": network.line_of_sight.curvature,
+        "distances": _distances(adjustment),
+        "calibrations": _named(adjustment, "calibration"),
+        "antennas": _named(adjustment, "antenna"),
+        "groups": {
+            name: {
+                "sigma0": group.sigma0,
+                "rms_x_um": group.rms_x_um,
+                "rms_y_um": group.rms_y_um,
+                "redundancy": group.redundancy,
+            }
+            for name, group in adjustment.groups.items()
+        },
+        "history": [step._asdict() for step in adjustment.history],
+    }
+
+
+def _camera(adjustment: Adjustment, camera: Camera) -> Json:
+    idle = camera.name in adjustment.network.idle_cameras
+    tests = {test.name: {"t": test.statistic, "p": test.p} for test in parameter_tests(adjustment, camera)}
+
+    def quantity(name: str, given: Prior | None) -> Json:
+        known = _quantity(adjustment, f"IO.{camera.name}.{name}", given)
+        return known | {"sigma": math.nan} if idle else known | tests.get(name, {})
+
+    distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
+    if camera.distortion.family == "torlegard":
+        distortion["decentering"] = camera.distortion.decentering
+    if family(camera.distortion.family).needs == "half_mm":
+        distortion["half_mm"] = list(camera.distortion.half_mm)
+    for parameter in parameter_names(camera.distortion.family):
+        given = camera.distortion.parameters.get(parameter, Prior(0.0))
+        distortion[parameter] = quantity(parameter, given)
+    return {
+        "principal_distance_mm": quantity("c", camera.principal_distance_mm),
+        "principal_point_mm": {
+            "x": quantity("x0", camera.x0_mm),
+            "y": quantity("y0", camera.y0_mm),
+        },
+        "distortion": distortion,
+        "significance": [
+            {"group": test.name, "parameters": list(test.parameters), "F": test.statistic, "p": test.p}
+            for test in group_tests(adjustment, camera)
+        ],
+        "fiducials": {
+            id: {
+                "x_mm": _quantity(adjustment, f"FID.{camera.name}.{id}.x", fiducial.x_mm),
+                "y_mm": _quantity(adjustment, f"FID.{camera.name}.{id}.y", fiducial.y_mm),
+                "rho": _correlation(adjustment, f"FID.{camera.name}.{id}.x", f"FID.{camera.name}.{id}.y"),
+            }
+            for id, fiducial in camera.fiducials.items()
+        },
+    }
+
+
+def _image(adjustment: Adjustment, image: Image) -> Json:
+    transformation: Json = {"kind": image.transformation, "mirrored": image.name in adjustment.mirrored}
+    for parameter in film_parameter_names(image.transformation):
+        key, scale = (f"{parameter}_deg", DEG_PER_RAD) if parameter in ANGLES else (parameter, 1.0)
+        transformation[key] = _quantity(adjustment, f"T.{image.name}.{parameter}", None, scale)
+    exterior: Json = {}
+    for i, element in enumerate(EXTERIOR_NAMES):
+        known = image.exterior
+        of_antenna = known is not None and known.has_antenna and i < 3
+        given = None if known is None or of_antenna else Prior(float(known.values[i]), float(known.sigmas[i]))
+        name = f"EO.{image.name}.{element}"
+        if element in ANGLES:
+            exterior[f"{element}_deg"] = _quantity(adjustment, name, given, DEG_PER_RAD)
+        else:
+            exterior[element] = _quantity(adjustment, name, given)
+    if image.name in adjustment.network.unoriented:
+        exterior = {key: quantity | {"sigma": math.nan} for key, quantity in exterior.items()}
+    return {"camera": image.camera, "transformation": transformation, "exterior": exterior}
+
+
+def _point(adjustment: Adjustment, point: ObjectPoint) -> Json:
+    given = {"X": point.X, "Y": point.Y, "Z": point.Z}
+    return {axis: _quantity(adjustment, f"PT.{point.id}.{axis}", prior) for axis, prior in given.items()}
+
+
+def _quantity(adjustment: Adjustment, name: str, given: Prior | None = None, scale: float = 1.0) -> Json:
+    """Value and a-posteriori sigma, and what was given: null where nothing was, its sigma null where it was free."""
+    quantity: Json = {"value": scale * adjustment.value(name), "sigma": scale * _sigma(adjustment, name)}
+    if given is not None:
+        quantity["given"] = {"value": scale * given.value, "sigma": scale * given.sigma}
+    return quantity
+
+
+def _sigma(adjustment: Adjustment, name: str) -> float:
+    """NaN where there is no solution: a zero would say that the quantity was fixed."""
+    return adjustment.sigma(name) if _has_solution(adjustment) else math.nan
+
+
+def _correlation(adjustment: Adjustment, name_x: str, name_y: str) -> float:
+    q = adjustment.cofactor_of([name_x, name_y])
+    product = q[0, 0] * q[1, 1]
+    return float(q[0, 1] / math.sqrt(product)) if product > 0.0 and _has_solution(adjustment) else 0.0
+
+
+def _has_solution(adjustment: Adjustment) -> bool:
+    return adjustment.termination in ("converged", "iteration limit")
+
+
+def _residuals(adjustment: Adjustment) -> list[Json]:
+    observations, residuals = adjustment.network.observations, adjustment.residuals
+    sigma_um = 1e3 * np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2))
+    v_um = 1e3 * residuals.v_mm
+    weights = adjustment.weights if adjustment.weights.size else np.ones(len(observations))
+    tests = point_tests(adjustment)
+    camera_mm = _in_camera(adjustment, observations.xy_mm)
+    v_camera_um = 1e3 * (_in_camera(adjustment, observations.xy_mm + residuals.v_mm) - camera_mm)
+    return [
+        {
+            "image": observations.image[i],
+            "point": observations.point[i],
+            "kind": observations.kind[i],
+            "vx_um": float(v_um[i, 0]),
+            "vy_um": float(v_um[i, 1]),
+            "redundancy_x": float(residuals.redundancy[i, 0]),
+            "redundancy_y": float(residuals.redundancy[i, 1]),
+            "w": float(_larger(residuals.w[i])),
+            "w_x": float(residuals.w[i, 0]),
+            "w_y": float(residuals.w[i, 1]),
+            "weight": float(weights[i]),
+            "sx_um": float(sigma_um[i, 0]),
+            "sy_um": float(sigma_um[i, 1]),
+            "x_mm": float(observations.xy_mm[i, 0]),
+            "y_mm": float(observations.xy_mm[i, 1]),
+            "camera_x_mm": float(camera_mm[i, 0]),
+            "camera_y_mm": float(camera_mm[i, 1]),
+            "camera_vx_um": float(v_camera_um[i, 0]),
+            "camera_vy_um": float(v_camera_um[i, 1]),
+            **tests[i],
+        }
+        for i in range(len(observations))
+    ]
+
+
+def _distances(adjustment: Adjustment) -> list[Json]:
+    """In the unit of the object coordinates."""
+    rows = (row for row in adjustment.further if row.group == "distance")
+    return [
+        {"from": given.start, "to": given.end, "distance": row.observed, **_further_numbers(row)}
+        for given, row in zip(adjustment.network.distances, rows, strict=True)
+    ]
+
+
+def _named(adjustment: Adjustment, group: str) -> list[Json]:
+    """One row a quantity of an earlier calibration (mm) or a coordinate of an antenna (object unit), as observed."""
+    return [
+        {"name": row.name, "value": row.observed, **_further_numbers(row)}
+        for row in adjustment.further
+        if row.group == group
+    ]
+
+
+def _further_numbers(row: FurtherResidual) -> Json:
+    return {name: getattr(row, name) for name in FURTHER_NUMBERS}
+
+
+def _in_camera(adjustment: Adjustment, xy_mm: Array) -> Array:
+    """Every observation's comparator coordinates (n, 2) in its own camera, mm."""
+    images = np.array(adjustment.network.observations.image)
+    camera_mm = np.empty_like(xy_mm)
+    for name in sorted(set(images)):
+        rows = images == name
+        camera_mm[rows] = adjusted_image(adjustment, name).camera_from_comparator(xy_mm[rows])
+    return camera_mm
+
+
+def _larger(w: Array) -> float:
+    """The standardised residual of the axis that fits worse; NaN where neither axis is checked."""
+    known = w[np.isfinite(w)]
+    return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
+
+
+def without_nan(value: Any) -> Any:
+    """The same with null for every number that is not finite: JSON knows no others."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(item) for item in value]
+    return value

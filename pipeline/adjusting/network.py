@@ -1,0 +1,277 @@
+"""From the user's files and the comparator coordinates to the network that is adjusted."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.transformation import marks_needed
+from adjust.network import (
+    Calibration,
+    Camera,
+    Distance,
+    Image,
+    LineOfSight,
+    Network,
+    ObjectPoint,
+    Observations,
+    Prior,
+    Transformation,
+)
+from pipeline.adjusting.fiducial_check import check_fiducials
+from pipeline.errors import InputError
+from pipeline.files.adjust_table import AdjustSettings
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.project_file import UNITS_MM, Project
+from pipeline.measuring.comparator_file import ComparatorPoint
+from pipeline.spelling import did_you_mean
+from pipeline.wording import listed
+
+Array = NDArray[np.float64]
+
+
+FEWEST_TARGETS = 3  # in an image whose exterior orientation nobody has observed
+
+
+def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[Network, tuple[str, ...]]:
+    """The network of a project: the images, points and observations that `marks` really hold; and what is left out.
+
+    Raises InputError where a mark names a point, a fiducial or an image that the project does not have.
+    """
+    used = [mark for mark in marks if mark.status.is_observation]
+    if not used:
+        raise InputError(
+            f"{project.comparator}: holds no observation: no mark has the status measured or weak. "
+            "See the reasons in its last column."
+        )
+    check_fiducials(project, used)
+    _check_points(project, used)
+    used, lonely = _locatable(project, used)
+    used, left_out = _orientable(project, used)
+    images = tuple(_image(project, name) for name in dict.fromkeys(mark.image for mark in used))
+    distances, without_end = _distances(project, used)
+    cameras, calibrations = _cameras(project, images, used)
+    network = Network(
+        cameras=cameras,
+        images=images,
+        points=_points(project, used),
+        observations=_observations(project.adjust, used),
+        distances=distances,
+        calibrations=calibrations,
+        line_of_sight=LineOfSight(
+            project.adjust.earth_curvature, project.adjust.refraction, project.unit_mm / UNITS_MM["m"]
+        ),
+    )
+    return network, (*lonely, *left_out, *without_end)
+
+
+def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bool:
+    """Whether an adjustment is asked for: of object points, or at least of the film where fiducials suffice for it."""
+    fiducials = Counter(mark.image for mark in marks if mark.kind == "fiducial" and mark.status.is_observation)
+    return _expects_targets(project) or any(
+        _has_film_transformation(_image(project, name), count) for name, count in fiducials.items()
+    )
+
+
+def check_transformation(project: Project) -> None:
+    """Raises InputError where the film transformation that is asked for needs fiducials that a camera does not have."""
+    for camera in project.cameras.values():
+        _transformation(project, camera)
+
+
+def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
+    """Points that are given but that no image shows."""
+    if project.given_points is None:
+        return ()
+    return tuple(point.id for point in project.given_points.points if point.id not in network.point_by_id)
+
+
+def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
+    """The marks of the points that can be located: of which something is given, or which two images show."""
+    given = {id for id, point in given_points(project).items() if any((point.X, point.Y, point.Z))}
+    images = Counter(mark.point for mark in marks if mark.kind != "fiducial")
+    lonely = {point for point, count in images.items() if count < 2 and point not in given}
+    sentence = (
+        f"Unknown and shown by one image only, and so left out: {listed(sorted(lonely))}. Measure each such point in a "
+        "second image, or give its coordinates."
+    )
+    kept = [mark for mark in marks if mark.kind == "fiducial" or mark.point not in lonely]
+    return kept, (sentence,) if lonely else ()
+
+
+def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
+    """The marks that have a part, and a sentence on every image that cannot be oriented.
+
+    Of an image with too few targets the fiducials remain, where they suffice for its film transformation.
+    """
+    targets = Counter(mark.image for mark in marks if mark.kind != "fiducial")
+    fiducials = Counter(mark.image for mark in marks if mark.kind == "fiducial")
+    images = [_image(project, name) for name in dict.fromkeys(mark.image for mark in marks)]
+    few = [image for image in images if targets[image.name] < FEWEST_TARGETS and not image.is_observed]
+    lost = [image for image in few if not _has_film_transformation(image, fiducials[image.name])]
+    if len(lost) == len(images):
+        raise InputError(f"{project.comparator}: {_why_nothing(lost, targets, fiducials)}")
+    sentences = [
+        f"Image {image.name!r} has no part in the adjustment: it shows {targets[image.name]} targets and needs "
+        f"{FEWEST_TARGETS}. Look at the reasons of its marks; or observe its orientation in images.csv, with standard "
+        "deviations."
+        for image in lost
+    ]
+    sentences += [
+        f"Image {image.name!r} is not oriented: it shows {targets[image.name]} targets and needs {FEWEST_TARGETS}. Its "
+        "film transformation is adjusted from its fiducials. Look at the reasons of its targets."
+        for image in few
+        if image not in lost and _expects_targets(project)
+    ]
+    dropped = {image.name for image in lost}
+    bare = {image.name for image in few}
+    kept = [mark for mark in marks if mark.image not in (dropped if mark.kind == "fiducial" else bare)]
+    return kept, tuple(sentences)
+
+
+def _expects_targets(project: Project) -> bool:
+    """Whether a project has object points to be seen; without them, film transformations are all it can ask for."""
+    return any(part is not None for part in (project.targets, project.ties, project.given_points))
+
+
+def _has_film_transformation(image: Image, fiducials: int) -> bool:
+    return fiducials >= max(marks_needed(image.transformation), 1)
+
+
+def _why_nothing(images: Sequence[Image], targets: Counter[str], fiducials: Counter[str]) -> str:
+    most = max(images, key=lambda image: targets[image.name])
+    shown = max(images, key=lambda image: fiducials[image.name])
+    marks = (
+        f" Nor can a film transformation be found: {shown.name!r} shows the most fiducials, {fiducials[shown.name]}, "
+        f"and its {shown.transformation} transformation needs {marks_needed(shown.transformation)}."
+        if shown.transformation != "none"
+        else ""
+    )
+    return (
+        f"no image can be oriented: {most.name!r} shows the most targets, {targets[most.name]}, and an image needs "
+        f"{FEWEST_TARGETS}.{marks} See the status and reason of every mark in that file."
+    )
+
+
+def _image(project: Project, name: str) -> Image:
+    camera = project.camera_of(name)
+    exterior = project.given_images.exterior.get(name) if project.given_images else None
+    return Image(name, camera.name, _transformation(project, camera), exterior)
+
+
+def _transformation(project: Project, camera: CameraFile) -> Transformation:
+    """As the project says; where it is silent, affine with fiducials and none without."""
+    given = project.adjust.transformation
+    if given is None:
+        return "affine" if camera.fiducials else "none"
+    if given != "none" and not camera.fiducials:
+        raise InputError(
+            f"{project.path}: [adjust] transformation is {given!r}, but {camera.path} has no fiducials for it. "
+            'Write transformation = "none" for a digital camera, or add the fiducials.'
+        )
+    return given
+
+
+def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:
+    """A target is one of the given points, where any are given; a tie point need not be."""
+    given = given_points(project)
+    for mark in marks:
+        if mark.kind == "target" and given and mark.point not in given:
+            raise InputError(
+                f"{project.comparator}, line {mark.line}: image {mark.image!r} shows the target {mark.point!r}, which "
+                f"the given points do not hold.{did_you_mean(mark.point, given)} Add it to them (coordinates may be "
+                "blank), or make it a point of kind tie."
+            )
+
+
+def _cameras(
+    project: Project, images: Sequence[Image], marks: Sequence[ComparatorPoint]
+) -> tuple[tuple[Camera, ...], tuple[Calibration, ...]]:
+    """The cameras that images are of, and the earlier calibrations that take the place of priors."""
+    cameras, calibrations = [], []
+    for file in project.cameras.values():
+        names = {image.name for image in images if image.camera == file.name}
+        if names:
+            xy = np.array([mark.xy_mm for mark in marks if mark.image in names])
+            center = (xy.min(axis=0) + xy.max(axis=0)) / 2 if file.principal_point_mm is None else np.zeros(2)
+            camera = file.camera((float(center[0]), float(center[1])))
+            if file.calibration is not None:
+                camera, calibration = file.calibration.applied(camera)
+                calibrations.append(calibration)
+            cameras.append(camera)
+    return tuple(cameras), tuple(calibrations)
+
+
+def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectPoint, ...]:
+    """Every object point that an image shows: as given, of the board, or unknown where nothing gives it."""
+    given = given_points(project)
+    points = {}
+    for mark in marks:
+        if mark.kind == "fiducial" or mark.point in points:
+            continue
+        points[mark.point] = given.get(mark.point) or _unnamed(project, mark)
+    return tuple(points.values())
+
+
+def _unnamed(project: Project, mark: ComparatorPoint) -> ObjectPoint:
+    """A point that nothing gives; of natural points the ground's height may be known."""
+    if mark.kind == "tie" and project.ties is not None:
+        return project.ties.point(mark.point)
+    return ObjectPoint(mark.point, None, None, None)
+
+
+def given_points(project: Project) -> Mapping[str, ObjectPoint]:
+    """The points of points.csv, or else those of the board, by id."""
+    if project.given_points is not None:
+        return {point.id: point for point in project.given_points.points}
+    if project.targets is None or project.targets.board is None:
+        return {}
+    scale = 1.0 / project.unit_mm
+    board = project.targets.board.object_points()
+    return {id: ObjectPoint(id, *(Prior(scale * value) for value in xyz)) for id, xyz in board.items()}
+
+
+def _distances(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[tuple[Distance, ...], tuple[str, ...]]:
+    """The distances between points and stations that take part, and a sentence on the others."""
+    taking_part = {mark.point for mark in marks if mark.kind != "fiducial"} | {mark.image for mark in marks}
+    known = taking_part | set(given_points(project)) | set(project.given_images.camera if project.given_images else ())
+    known |= set(project.scans)
+    lost = []
+    for given in project.given_distances:
+        for column, end in (("from", given.distance.start), ("to", given.distance.end)):
+            if end not in known:
+                raise given.row.error(column, f"{end!r} is no object point and no image.{did_you_mean(end, known)}")
+            if end not in taking_part:
+                lost.append(f"{given.distance.start} to {given.distance.end}")
+    kept = tuple(
+        given.distance
+        for given in project.given_distances
+        if given.distance.start in taking_part and given.distance.end in taking_part
+    )
+    sentence = (
+        f"Left out, for an end was measured in no image: the distances {listed(list(dict.fromkeys(lost)))}. See the "
+        "status and reason of its marks."
+    )
+    return kept, (sentence,) if lost else ()
+
+
+def _observations(settings: AdjustSettings, marks: Sequence[ComparatorPoint]) -> Observations:
+    return Observations(
+        image=tuple(mark.image for mark in marks),
+        point=tuple(mark.point for mark in marks),
+        kind=tuple(mark.kind for mark in marks),
+        xy_mm=np.array([mark.xy_mm for mark in marks], dtype=np.float64),
+        covariance_mm2=np.array([_covariance(settings, mark) for mark in marks]),
+    )
+
+
+def _covariance(settings: AdjustSettings, mark: ComparatorPoint) -> Array:
+    """The mark's own covariance, or the a-priori one, and that of film and scanner, which no picture shows."""
+    if mark.sigma_mm is None:
+        sigma_um = settings.sigma_fiducial_um if mark.kind == "fiducial" else settings.sigma_target_um
+        covariance = np.eye(2) * (sigma_um / 1000.0) ** 2
+    else:
+        covariance = np.outer(mark.sigma_mm, mark.sigma_mm) * np.array([[1.0, mark.rho], [mark.rho, 1.0]])
+    film: Array = covariance + np.eye(2) * (settings.film_sigma_um / 1000.0) ** 2
+    return film

@@ -1,0 +1,161 @@
+"""An earlier calibration of a camera, `adjustment.json` with its covariance, as an observation of the present one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import parameter_names
+from adjust.network import Calibration, Camera, Distortion, Fiducial, Prior
+from pipeline.adjusting.adjustment_reader import Covariance, read_adjustment, read_covariance
+from pipeline.files.tables import Table
+
+Array = NDArray[np.float64]
+
+INTERIOR = ("c", "x0", "y0")
+
+
+@dataclass(frozen=True)
+class EarlierCalibration:
+    """What an earlier adjustment found of a camera, with the a-posteriori covariance.
+
+    names: "IO.c", "IO.k3", "FID.1.x" and so on, as in `adjustment.npz` less the camera; values and covariance are
+    theirs. held: the values of what that adjustment held fixed.
+    """
+
+    path: Path
+    distortion: Mapping[str, Any]
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    held: Mapping[str, float]
+
+    @property
+    def tells_fiducials(self) -> bool:
+        return any(name.startswith("FID.") for name in (*self.names, *self.held))
+
+    def applied(self, camera: Camera) -> tuple[Camera, Calibration]:
+        """The camera without priors where the calibration takes their place, and the calibration for the network."""
+        given = dict(zip(self.names, self.values.tolist(), strict=True))
+
+        def prior(name: str, otherwise: Prior | None) -> Prior | None:
+            return Prior(given[name], np.inf) if name in given else otherwise
+
+        def sure(name: str, otherwise: Prior) -> Prior:
+            return prior(name, otherwise) or otherwise
+
+        parameters = {
+            name: sure(f"IO.{name}", camera.distortion.parameters.get(name, Prior(0.0, 0.0)))
+            for name in parameter_names(camera.distortion.family)
+        }
+        free = replace(
+            camera,
+            principal_distance_mm=prior("IO.c", camera.principal_distance_mm),
+            x0_mm=prior("IO.x0", camera.x0_mm),
+            y0_mm=prior("IO.y0", camera.y0_mm),
+            distortion=replace(camera.distortion, parameters=parameters),
+            fiducials={
+                id: Fiducial(sure(f"FID.{id}.x", mark.x_mm), sure(f"FID.{id}.y", mark.y_mm))
+                for id, mark in camera.fiducials.items()
+            },
+        )
+        names = tuple(_of_camera(name, camera.name) for name in self.names)
+        return free, Calibration(names, self.values, self.covariance)
+
+
+def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
+    """The earlier calibration that the table [sigma] of a camera file names; None where it names none.
+
+    Raises InputError where there is none of this camera, or of another lens model.
+    """
+    fiducials = sigma.flag("calibration_fiducials", True)
+    if "calibration" not in sigma:
+        return None
+    path = sigma.file.parent / sigma.text("calibration")
+    content, covariance = read_adjustment(path), read_covariance(path)
+    if not content["converged"]:
+        raise sigma.error("calibration", f"{path} holds no calibration: its adjustment did not converge.")
+    name = _camera_in(sigma, path, content, camera.name)
+    distortion = content["cameras"][name]["distortion"]
+    _check_family(sigma, path, distortion, camera.distortion)
+    earlier = _taken(path, distortion, covariance, name, camera, fiducials)
+    if not np.isfinite(earlier.values).all():
+        raise sigma.error("calibration", f"{path} holds no interior orientation: no object point told it.")
+    _check_held(sigma, earlier, camera)
+    return earlier
+
+
+def _of_camera(name: str, camera: str) -> str:
+    kind, quantity = name.split(".", 1)
+    return f"{kind}.{camera}.{quantity}"
+
+
+def _camera_in(sigma: Table, path: Path, content: Mapping[str, Any], name: str) -> str:
+    """The camera of that name; where the file has just one, that one."""
+    names = list(content["cameras"])
+    if name not in names and len(names) != 1:
+        raise sigma.error(
+            "calibration", f"{path} holds the cameras {', '.join(names)}, but none with the name {name!r} of this file."
+        )
+    return name if name in names else names[0]
+
+
+def _check_family(sigma: Table, path: Path, earlier: Mapping[str, Any], distortion: Distortion) -> None:
+    here = {
+        "family": distortion.family,
+        "r0_mm": distortion.r0_mm,
+        "decentering": distortion.decentering,
+        "half_mm": list(distortion.half_mm),
+    }
+    for key, value in here.items():
+        there = earlier.get(key, value)
+        if there != value:
+            raise sigma.error(
+                "calibration",
+                f"{path} was adjusted with {key} = {there!r}, and this camera has {value!r}. A calibration can be "
+                "used with the distortion it was made with: make the two alike.",
+            )
+
+
+def _taken(
+    path: Path, distortion: Mapping[str, Any], covariance: Covariance, there: str, camera: Camera, fiducials: bool
+) -> EarlierCalibration:
+    names = [f"IO.{name}" for name in (*INTERIOR, *parameter_names(camera.distortion.family))]
+    if fiducials:
+        names += [f"FID.{id}.{axis}" for id in camera.fiducials for axis in "xy"]
+    value = dict(zip(covariance.names, covariance.values.tolist(), strict=True))
+    names = [name for name in names if _of_camera(name, there) in value]
+    matrix = covariance.of(_of_camera(name, there) for name in names)
+    values = np.array([value[_of_camera(name, there)] for name in names])
+    free = np.diag(matrix) > 0.0
+    return EarlierCalibration(
+        path=path,
+        distortion=distortion,
+        names=tuple(name for name, is_free in zip(names, free, strict=True) if is_free),
+        values=values[free],
+        covariance=matrix[np.ix_(free, free)],
+        held={name: value for name, value, is_free in zip(names, values.tolist(), free, strict=True) if not is_free},
+    )
+
+
+def _check_held(sigma: Table, earlier: EarlierCalibration, camera: Camera) -> None:
+    """What the earlier adjustment held fixed must be fixed at the same value: the rest is right for that one only."""
+    given: dict[str, Prior | None] = {
+        "IO.c": camera.principal_distance_mm,
+        "IO.x0": camera.x0_mm,
+        "IO.y0": camera.y0_mm,
+        **{f"IO.{name}": prior for name, prior in camera.distortion.parameters.items()},
+    }
+    for id, mark in camera.fiducials.items():
+        given |= {f"FID.{id}.x": mark.x_mm, f"FID.{id}.y": mark.y_mm}
+    for name, value in earlier.held.items():
+        here = given.get(name, Prior(0.0, 0.0))
+        if here is None or here.sigma > 0.0 or not np.isclose(here.value, value, rtol=1e-9, atol=0.0):
+            raise sigma.error(
+                "calibration",
+                f"{earlier.path} held {name.split('.', 1)[1]} fixed at {value:.10g}, and the rest of it is right for "
+                "that value alone. Fix it there in this file, with a standard deviation of 0.",
+            )

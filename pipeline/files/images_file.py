@@ -1,0 +1,66 @@
+"""images.csv: exterior orientations, approximate or observed, and the camera of each image where there are several."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from adjust.network import Exterior
+from pipeline.errors import InputError
+from pipeline.files.csv_table import Row, read_csv
+
+ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
+SIGMAS = tuple(f"s{element}" for element in ELEMENTS)
+
+
+@dataclass(frozen=True)
+class GivenImages:
+    """By image name: exterior orientation (None where the line gives none), the camera file's name ("" where none)."""
+
+    exterior: Mapping[str, Exterior | None]
+    camera: Mapping[str, str]
+
+
+def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
+    """Read images.csv. An image may be named with or without its file's ending. Raises InputError naming the line.
+
+    antenna: the offset of the point whose X0, Y0, Z0 are given from the projection centre, as in `Exterior`.
+    """
+    exterior: dict[str, Exterior | None] = {}
+    camera = {}
+    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera")):
+        name = image_name(row.name("image"))
+        if name in exterior:
+            raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
+        exterior[name] = _exterior(row, antenna)
+        camera[name] = row.text("camera")
+    return GivenImages(exterior, camera)
+
+
+def image_name(text: str) -> str:
+    """An image's name: its file's name without folder and without a picture's ending."""
+    path = Path(text)
+    endings = {".tif", ".tiff", ".jpg", ".jpeg", ".png"}
+    return path.stem if path.suffix.lower() in endings else path.name
+
+
+def _exterior(row: Row, antenna: tuple[float, float, float]) -> Exterior | None:
+    values = [row.number(element) for element in ELEMENTS]
+    if all(value is None for value in values):
+        return None
+    for element, value in zip(ELEMENTS, values, strict=True):
+        if value is None:
+            raise row.error(
+                element, "is blank, but other elements of this orientation are given. Give all six or none."
+            )
+    sigmas = [row.sigma(sigma) for sigma in SIGMAS]
+    if any(antenna) and 0.0 in sigmas[:3]:
+        raise row.error(SIGMAS[sigmas.index(0.0)], "is 0, but an antenna can be observed only: give it a positive one.")
+    to_rad = np.array([1.0, 1.0, 1.0, *[math.pi / 180.0] * 3])
+    return Exterior(
+        np.array(values, dtype=np.float64) * to_rad,
+        np.array([math.inf if sigma is None else sigma for sigma in sigmas]) * to_rad,
+        antenna,
+    )

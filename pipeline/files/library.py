@@ -1,0 +1,97 @@
+"""The camera library: camera files of typical cameras that come with the program, named as `library:NAME`."""
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.spelling import did_you_mean
+
+PREFIX = "library:"
+FOLDER = Path(__file__).parents[1] / "cameras"
+
+Json = dict[str, Any]
+
+
+def camera_path(text: str, folder: Path) -> Path:
+    """The file of a camera that a project names: `library:NAME`, or a path relative to the folder."""
+    return library_path(text.removeprefix(PREFIX)) if text.startswith(PREFIX) else folder / text
+
+
+def library_path(name: str) -> Path:
+    """The file of one camera of the library. Raises InputError with the names near to a misspelt one."""
+    names = library_names()
+    if name not in names:
+        plain = name.casefold().replace(" ", "-").replace("_", "-")
+        begun = [known for known in names if plain and known.startswith(plain)]
+        near = f" Did you mean {' or '.join(map(repr, begun))}?" if begun else did_you_mean(plain, names)
+        raise InputError(f"the camera library has no {name!r}.{near} `reseau cameras` lists them.")
+    return FOLDER / f"{name}.toml"
+
+
+def library_names() -> tuple[str, ...]:
+    return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
+
+
+def read_library() -> dict[str, CameraFile]:
+    """Every camera of the library, by name."""
+    return {name: read_camera(library_path(name)) for name in library_names()}
+
+
+def library_json() -> list[Json]:
+    return [_entry(name, camera) for name, camera in read_library().items()]
+
+
+def print_library(console: Console) -> None:
+    """The library for a person: a line a camera, a source line a kind of camera, and how to use one."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("camera", "frame, mm", "c, mm", "marks", "shape", "reports"):
+        table.add_column(heading, no_wrap=True)
+    sources: dict[str, str] = {}
+    for entry in library_json():
+        c = entry["principal_distance_mm"]
+        table.add_row(
+            entry["name"],
+            " x ".join(f"{side:g}" for side in entry["frame_mm"]),
+            f"{c['value']:.2f} ± {c['sigma']:.2f}",
+            str(entry["fiducials"]),
+            _shape(entry),
+            str(entry["reports"]),
+        )
+        sources[entry["name"].rsplit("-", 1)[0]] = entry["source"]
+    console.print(table)
+    for kind, source in sources.items():
+        console.print(f"{kind}: {source}", highlight=False)
+    console.print(
+        'camera = "library:NAME" in the project takes one; `reseau cameras NAME` prints its file, to start from. '
+        "Marks whose shape is not known are learned from the scans, or passed over.",
+        highlight=False,
+    )
+
+
+def _shape(entry: Json) -> str:
+    drawn, learned = len(entry["drawn"]), len(entry["learned"])
+    if learned:
+        return "learned"
+    return "known" if drawn == entry["fiducials"] else f"of {drawn}" if drawn else "not known"
+
+
+def _entry(name: str, camera: CameraFile) -> Json:
+    return {
+        "name": name,
+        "title": camera.name,
+        "frame_mm": list(camera.frame_mm or ()),
+        "data_strip": camera.data_strip,
+        "principal_distance_mm": {
+            "value": camera.principal_distance_mm,
+            "sigma": camera.principal_distance_sigma_mm,
+        },
+        "fiducials": len(camera.fiducials),
+        "drawn": [mark.id for mark in camera.drawn],
+        "learned": [one.id for one in camera.learned],
+        "reports": camera.source.reports if camera.source else 0,
+        "source": camera.source.text if camera.source else "",
+    }

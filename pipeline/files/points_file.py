@@ -1,0 +1,68 @@
+"""points.csv: object points with their standard deviations, and the normals of disks where they are known."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import ObjectPoint, Prior
+from pipeline.errors import InputError
+from pipeline.files.csv_table import Row, read_csv
+
+REQUIRED = ("point", "X", "Y", "Z")
+OPTIONAL = ("sX", "sY", "sZ", "nX", "nY", "nZ")
+
+
+@dataclass(frozen=True)
+class GivenPoints:
+    """Object points in the user's unit; normals (3,) of unit length for the disks that have one."""
+
+    points: tuple[ObjectPoint, ...]
+    normals: Mapping[str, NDArray[np.float64]]
+
+
+def read_points(path: Path) -> GivenPoints:
+    """Read points.csv. Raises InputError naming the line: a duplicated point, a sigma without a value, no number."""
+    points: dict[str, ObjectPoint] = {}
+    lines: dict[str, int] = {}
+    normals = {}
+    for row in read_csv(path, REQUIRED, OPTIONAL):
+        id = row.name("point")
+        if id in points:
+            raise InputError(
+                f"{path}, line {row.line}: point {id!r} is given already, in line {lines[id]}. Remove or rename one."
+            )
+        points[id] = ObjectPoint(id, *(_coordinate(row, axis) for axis in "XYZ"))
+        lines[id] = row.line
+        normal = _normal(row)
+        if normal is not None:
+            normals[id] = normal
+    if not points:
+        raise InputError(f"{path}: holds no point, only a header.")
+    return GivenPoints(tuple(points.values()), normals)
+
+
+def _coordinate(row: Row, axis: str) -> Prior | None:
+    """0 fixes, a blank sigma frees, a blank coordinate is unknown; without the sigma's column the value is fixed."""
+    value, sigma = row.number(axis), row.sigma(f"s{axis}")
+    if value is None:
+        if sigma is not None:
+            raise row.error(axis, f"is blank, but s{axis} is {sigma:g}. Give the coordinate, or leave both blank.")
+        return None
+    if f"s{axis}" not in row.cells:
+        return Prior(value, 0.0)
+    return Prior(value, math.inf if sigma is None else sigma)
+
+
+def _normal(row: Row) -> NDArray[np.float64] | None:
+    parts = [row.number(f"n{axis}") for axis in "XYZ"]
+    if all(part is None for part in parts):
+        return None
+    normal = np.array([0.0 if part is None else part for part in parts])
+    length = float(np.linalg.norm(normal))
+    if any(part is None for part in parts) or length == 0.0:
+        raise row.error("nX", "a normal needs three numbers, nX, nY and nZ, not all zero; or leave all three blank.")
+    return normal / length

@@ -1,0 +1,252 @@
+"""project.toml: which camera, which scans, what to measure, how to adjust, where to write."""
+
+import glob
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.files.adjust_table import AdjustSettings, read_adjust
+from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.distances_file import GivenDistance, read_distances
+from pipeline.files.images_file import GivenImages, image_name, read_images
+from pipeline.files.library import camera_path
+from pipeline.files.points_file import GivenPoints, read_points
+from pipeline.files.tables import Table, read_toml
+from pipeline.files.target_table import TargetSettings, read_targets
+from pipeline.files.tie_table import TieSettings, read_ties
+
+POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
+FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
+UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
+
+
+@dataclass(frozen=True)
+class Project:
+    """A project file as read; paths are resolved against the file's folder.
+
+    cameras: by file name; the first one serves where images.csv names none. scans: by image name, in their order.
+    unit_mm: how many mm the user's unit of object coordinates has.
+    """
+
+    path: Path
+    cameras: Mapping[str, CameraFile]
+    scans: Mapping[str, Path]
+    comparator: Path
+    pitch_um: tuple[float, float] | None
+    output: Path
+    pose: str
+    targets: TargetSettings | None
+    ties: TieSettings | None
+    given_points: GivenPoints | None
+    given_images: GivenImages | None
+    given_distances: tuple[GivenDistance, ...]
+    unit_mm: float
+    adjust: AdjustSettings
+
+    @property
+    def adjustment_path(self) -> Path:
+        return self.output / "adjustment.json"
+
+    @property
+    def check_path(self) -> Path:
+        return self.output / "check.json"
+
+    @property
+    def choice_path(self) -> Path:
+        return self.output / "choose.json"
+
+    @property
+    def measurement_path(self) -> Path:
+        return self.output / "measurement.json"
+
+    @property
+    def report_path(self) -> Path:
+        return self.output / "report.html"
+
+    @property
+    def disk_radius(self) -> float:
+        """The radius of the disk targets in the unit of the object coordinates; 0 where nothing is said of it."""
+        diameter = self.targets.diameter_mm if self.targets else None
+        return 0.0 if diameter is None else diameter / 2.0 / self.unit_mm
+
+    @property
+    def target_radius(self) -> float:
+        """That of the disks, or half the length of the crosses, in the unit of the object coordinates."""
+        arm = self.targets.arm_mm if self.targets else None
+        return self.disk_radius if arm is None else arm / self.unit_mm
+
+    @cached_property
+    def default_camera(self) -> CameraFile:
+        return next(iter(self.cameras.values()))
+
+    def camera_of(self, image: str) -> CameraFile:
+        name = self.given_images.camera.get(image, "") if self.given_images else ""
+        return self.cameras[name] if name else self.default_camera
+
+
+def read_project(path: Path) -> Project:
+    """Read project.toml and the camera, points, images and distances files it names.
+
+    Raises InputError with file, line and key: for what is wrong in the project file itself before any other file.
+    """
+    table = read_toml(path)
+    objects, measure = table.table("object"), table.table("measure")
+    camera = table.text("camera")
+    patterns = table.texts("scans") if "scans" in table else None
+    named = {key: objects.path_of(key) for key in ("points", "images", "distances") if key in objects}
+    antenna = _antenna(objects)
+    project = Project(
+        path=path,
+        cameras={},
+        scans={},
+        comparator=table.path_of("comparator", "comparator.csv"),
+        pitch_um=_pitch(table),
+        output=table.path_of("output", "out"),
+        pose=measure.text("pose", "auto", ("auto", *POSES)),
+        targets=read_targets(table.table("targets")) if "targets" in table else None,
+        ties=read_ties(table.table("ties")) if "ties" in table else None,
+        given_points=None,
+        given_images=None,
+        given_distances=(),
+        unit_mm=UNITS_MM[objects.text("unit", "m", tuple(UNITS_MM))],
+        adjust=read_adjust(table.table("adjust")),
+    )
+    for each in (table, measure, objects):
+        each.done()
+    _check_named(table, objects, camera, named)
+    images = read_images(named["images"], antenna) if "images" in named else None
+    project = replace(
+        project,
+        cameras=_cameras(table, camera, images),
+        scans={} if patterns is None else _scans(table, patterns),
+        given_points=read_points(named["points"]) if "points" in named else None,
+        given_images=images,
+        given_distances=read_distances(named["distances"]) if "distances" in named else (),
+    )
+    if not project.scans and not project.comparator.exists():
+        raise InputError(
+            f"{path}: there are no scans and no comparator coordinates. Give scans = [...] to measure, or comparator = "
+            f'"..." with the coordinates; looked for {project.comparator.resolve()}.'
+        )
+    _check_written(table, project, named)
+    return project
+
+
+def _antenna(objects: Table) -> tuple[float, float, float]:
+    antenna = objects.triple("antenna_offset", (0.0, 0.0, 0.0))
+    if any(antenna) and "images" not in objects:
+        raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
+    return antenna
+
+
+def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, Path]) -> None:
+    """Name every file that is not there, not just the first."""
+    try:
+        keys = {"camera": (table, camera_path(camera, table.file.parent))}
+    except InputError as error:
+        raise table.error("camera", str(error)) from None
+    keys |= {key: (objects, path) for key, path in named.items()}
+    missing = [
+        str(where.error(key, f"there is no such file. Looked for {path.resolve()}."))
+        for key, (where, path) in keys.items()
+        if not path.exists()
+    ]
+    if missing:
+        raise InputError("\n".join(missing))
+
+
+def _check_written(table: Table, project: Project, named: Mapping[str, Path]) -> None:
+    """Refuse to write results over a file that the project is made from."""
+    for camera in project.cameras.values():
+        earlier = camera.calibration
+        if earlier is not None and earlier.path.resolve() == project.adjustment_path.resolve():
+            raise table.error(
+                "output",
+                f"the adjustment would be written over the earlier calibration that it starts from, {earlier.path}. "
+                "Name another folder.",
+            )
+    if not project.scans:
+        return
+    if project.comparator.is_dir():
+        raise table.error("comparator", f"{project.comparator} is a folder. Name a file to be written there.")
+    cameras = {f"the camera of {camera.name}": camera.path for camera in project.cameras.values()}
+    scans = {f"the scan {name}": path for name, path in project.scans.items()}
+    given = {"the project itself": project.path, **{f"[object] {key}": path for key, path in named.items()}}
+    for what, path in (given | cameras | scans).items():
+        if project.comparator.resolve() == path.resolve():
+            raise table.error(
+                "comparator",
+                f"the measured coordinates would be written over {what}, {path}. Name another file, such as "
+                '"comparator.csv".',
+            )
+
+
+def _cameras(table: Table, default: str, images: GivenImages | None) -> Mapping[str, CameraFile]:
+    folder = table.file.parent
+    names = [default, *sorted({name for name in images.camera.values() if name} if images else set())]
+    cameras = {name: read_camera(camera_path(name, folder)) for name in dict.fromkeys(names)}
+    titles: dict[str, str] = {}
+    for name, camera in cameras.items():
+        if camera.name in titles:
+            raise InputError(
+                f"{camera.path}: the name {camera.name!r} is also that of {titles[camera.name]}. "
+                "Give every camera a name of its own."
+            )
+        titles[camera.name] = name
+    return cameras
+
+
+def _scans(table: Table, patterns: Sequence[str]) -> Mapping[str, Path]:
+    """The scan files that the patterns find, by image name."""
+    folder = table.file.parent
+    scans: dict[str, Path] = {}
+    for pattern in patterns:
+        found = _found(pattern, folder)
+        if not found:
+            raise table.error("scans", _nothing_found(pattern, folder / pattern))
+        for file in found:
+            name = image_name(file.name)
+            if not name.isprintable():
+                raise table.error("scans", f"the file name {file.name!a} is not text in UTF-8 on one line. Rename it.")
+            if scans.get(name, file) != file:
+                raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
+            scans[name] = file
+    if not scans:
+        raise table.error("scans", 'is an empty list. Name files or patterns, such as ["scans/*.tif"].')
+    return scans
+
+
+def _found(pattern: str, folder: Path) -> list[Path]:
+    """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
+    that lead nowhere: a scan that is named is opened or refused."""
+    if (folder / pattern).is_file():
+        return [folder / pattern]
+    names = glob.glob(pattern, root_dir=folder)
+    return [path for path in (folder / name for name in sorted(names)) if not path.is_dir()]
+
+
+def _nothing_found(pattern: str, whole: Path) -> str:
+    folder = whole.parent
+    if whole.is_dir():
+        return f"{pattern!r} is a folder. Name the files in it by a pattern, such as {f'{pattern}/*.tif'!r}."
+    if glob.has_magic(str(Path(pattern).parent)):
+        return f"{pattern!r} finds no file. Looked for {whole}."
+    if not folder.is_dir():
+        return f"{pattern!r} finds no file: there is no folder {folder.resolve()}."
+    endings = sorted({file.suffix for file in folder.iterdir() if file.is_file() and file.suffix})
+    holds = f"It holds files that end in {', '.join(endings)}." if endings else "It holds no files."
+    return f"{pattern!r} finds no file in {folder.resolve()}. {holds}"
+
+
+def _pitch(table: Table) -> tuple[float, float] | None:
+    if "pitch_um" not in table:
+        return None
+    pitch = table.number_or_pair("pitch_um")
+    if not all(0.0 < value < math.inf for value in pitch):
+        raise table.error("pitch_um", f"must be positive, not {list(pitch)}.")
+    if min(pitch) < FINEST_PITCH_UM:
+        raise table.error("pitch_um", f"{min(pitch):g} um is finer than any scanner. Give um: 20.0, not 0.02.")
+    return pitch

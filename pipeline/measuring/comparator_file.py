@@ -1,0 +1,135 @@
+"""comparator.csv: comparator coordinates of every mark, also of those that were not found."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import ObservationKind
+from measure.results import FrameMeasurement, MarkMeasurement
+from measure.status import Status
+from pipeline.errors import InputError
+from pipeline.files.atomic import write_atomically
+from pipeline.files.csv_table import Row, read_csv
+from pipeline.files.images_file import image_name
+
+COLUMNS = (
+    "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
+)  # fmt: skip
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ComparatorPoint:
+    """A mark in an image. xy_mm (2,) and sigma_mm (2,), None where it has none; rho: correlation of x and y."""
+
+    image: str
+    point: str
+    kind: ObservationKind
+    xy_mm: Array | None
+    sigma_mm: Array | None
+    rho: float
+    status: Status
+    reason: str
+    line: int = 0
+
+
+def write_comparator(
+    path: Path, frames: Sequence[FrameMeasurement], pitch_um: Mapping[str, tuple[float, float]]
+) -> None:
+    """Write every mark of every frame; pitch_um by image. Raises InputError where the file cannot be written."""
+    lines = [
+        f"# comparator coordinates, reseau {version('reseau')}",
+        "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
+        "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)",
+        *(f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down" for image, (x, y) in sorted(pitch_um.items())),
+        "# status: only measured and weak are observations",
+        ",".join(COLUMNS),
+    ]
+    for frame in sorted(frames, key=lambda frame: frame.image):
+        lines += [_line(frame.image, mark, pitch_um[frame.image]) for mark in frame.marks]
+    write_atomically(path, "\n".join(lines) + "\n")
+
+
+def comparator_from_pixel(center_px: Array, pitch_um: tuple[float, float]) -> Array:
+    """(..., 2) column and row to x (right) and y (up) in mm."""
+    return np.multiply(center_px, np.array([pitch_um[0], -pitch_um[1]]) / 1000.0)
+
+
+def pixel_from_comparator(xy_mm: Array, pitch_um: tuple[float, float]) -> Array:
+    """(..., 2) x (right) and y (up) in mm to column and row."""
+    return np.divide(xy_mm, np.array([pitch_um[0], -pitch_um[1]]) / 1000.0)
+
+
+def _line(image: str, mark: MarkMeasurement, pitch_um: tuple[float, float]) -> str:
+    place = sigma = pixel = [""] * 2
+    rho = ""
+    if mark.center_px is not None:
+        x, y = comparator_from_pixel(mark.center_px, pitch_um)
+        place, pixel = [f"{x:.7f}", f"{y:.7f}"], [f"{value:.4f}" for value in mark.center_px]
+    if mark.covariance_px2 is not None:
+        covariance = comparator_from_pixel(comparator_from_pixel(mark.covariance_px2, pitch_um).T, pitch_um)
+        sx, sy = np.sqrt(np.diag(covariance))
+        sigma, rho = [f"{sx:.7f}", f"{sy:.7f}"], f"{covariance[0, 1] / (sx * sy):.4f}"
+    cells = [image, mark.point, mark.kind, *place, *sigma, rho, *pixel, mark.status, mark.reason]
+    return ",".join(_quoted(str(cell)) for cell in cells)
+
+
+def _quoted(cell: str) -> str:
+    """The cell as CSV; in quotes, too, where a line that begins with it would be a comment."""
+    return '"' + cell.replace('"', '""') + '"' if cell.startswith("#") or any(c in cell for c in ',"\n') else cell
+
+
+def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:
+    """Read comparator.csv. Raises InputError naming the line: a duplicated mark, an unknown kind, no number."""
+    points: dict[tuple[str, str, str], ComparatorPoint] = {}
+    for row in read_csv(path, COLUMNS[:5], COLUMNS[5:]):
+        point = _point(row)
+        key = (point.image, point.point, "fiducial" if point.kind == "fiducial" else "object")
+        if key in points:
+            raise InputError(
+                f"{path}, line {row.line}: {point.kind} {point.point!r} of image {point.image!r} is given already, "
+                f"in line {points[key].line}. Remove one of the lines."
+            )
+        points[key] = point
+    if not points:
+        raise InputError(f"{path}: holds no mark, only a header.")
+    return tuple(points.values())
+
+
+def _point(row: Row) -> ComparatorPoint:
+    kind, status = row.name("kind"), row.text("status") or Status.MEASURED
+    if kind not in get_args(ObservationKind):
+        raise row.error("kind", f"is {kind!r}; possible are {', '.join(get_args(ObservationKind))}.")
+    if status not in list(Status):
+        raise row.error("status", f"is {status!r}; possible are {', '.join(Status)}.")
+    x, y, sx, sy = row.number("x_mm"), row.number("y_mm"), row.sigma("sx_mm"), row.sigma("sy_mm")
+    xy = None if x is None or y is None else np.array([x, y])
+    if xy is None and Status(status).is_observation:
+        raise row.error("x_mm", f"is blank, but the status is {status!r}. Give x_mm and y_mm, or the status absent.")
+    if sx == 0.0 or sy == 0.0:
+        raise row.error(
+            "sx_mm", "an observation's standard deviation cannot be 0; leave it blank for the project's own."
+        )
+    rho = row.number("rho") or 0.0
+    if not math.fabs(rho) < 1.0:
+        raise row.error("rho", f"is a correlation and must lie between -1 and 1, not {rho:g}.")
+    return ComparatorPoint(
+        image=image_name(row.name("image")),
+        point=row.name("point"),
+        kind=_KINDS[kind],
+        xy_mm=xy,
+        sigma_mm=None if sx is None or sy is None else np.array([sx, sy]),
+        rho=rho,
+        status=Status(status),
+        reason=row.text("reason"),
+        line=row.line,
+    )
+
+
+_KINDS: dict[str, ObservationKind] = {"fiducial": "fiducial", "target": "target", "tie": "tie"}

@@ -1,0 +1,189 @@
+"""Where marks that are to be learned lie in one scan, and their pictures there.
+
+It is shown by clicks, or by what all scans have in common near the given coordinates.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.errors import MeasurementError
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.frames.frame_fit import fit_frame
+from measure.marks import shapes
+from measure.marks.poses import POSES, up_from_camera
+from measure.scans.scan import Scan, open_scan
+from measure.special_marks.learned import cut, template_of
+from measure.special_marks.recurring import Recurrence, Window, about, recurrence
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.learned_table import Clicks, LearnedFrom
+from pipeline.files.project_file import Project
+
+Array = NDArray[np.float64]
+Places = Mapping[str, Array]  # (2,) px by fiducial
+
+_CLICK_MM = 0.3  # how well a mark is clicked
+_REACH = 1.0  # sizes of a mark: how far from its coordinates it is sought
+_COMPARED = 8  # scans: more do not tell better what they have in common
+_LEAST_EXCESS = 0.15  # of correlations, the best less the second best: what chance leaves among landscape is half of it
+_NOT_COMMON = (
+    "the marks cannot be learned from what the scans have in common. Show them by a table [clicks] in one scan: scan = "
+    '"..." and a table [clicks.px] of column and row by fiducial;'
+)
+
+
+def first_pictures(project: Project, camera: CameraFile, names: Sequence[str], workers: Executor) -> CameraFile:
+    """The camera with one scan's pictures in the place of marks that are to be learned, and from which scan they are.
+    names: the scans of this camera. Raises InputError or MeasurementError where nothing shows the marks."""
+    return _clicked(project, camera, camera.clicks) if camera.clicks else _in_common(project, camera, names, workers)
+
+
+def _clicked(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile:
+    if clicks.scan not in project.scans:
+        raise InputError(
+            f"{camera.path}: [clicks] scan names {clicks.scan!r}, which is none of the project's scans. "
+            f"They are {', '.join(list(project.scans)[:5])}{', ...' if len(project.scans) > 5 else ''}."
+        )
+    with open_scan(project.scans[clicks.scan]) as scan:
+        for id, place in clicks.px.items():
+            if not (0 <= place[0] < scan.width_px and 0 <= place[1] < scan.height_px):
+                raise InputError(
+                    f"{camera.path}: the click of fiducial {id!r}, {list(place)}, lies outside of {scan.path.name}, "
+                    f"which has {scan.width_px} x {scan.height_px} px. Give column and row."
+                )
+        px = {id: np.array(place) for id, place in clicks.px.items()}
+        placement = _drawn_placement(project, camera, scan)
+        if placement is None:
+            placement = _through_clicks(project, camera, scan, px)
+        return _start(camera, scan, placement, px, alike=(scan.name,))
+
+
+def _in_common(project: Project, camera: CameraFile, names: Sequence[str], workers: Executor) -> CameraFile:
+    """The marks that recur in all scans near their coordinates."""
+    if len(names) < 2:
+        raise InputError(
+            f"{camera.path}: the marks are to be learned, and with one scan nothing says what is a mark. Show them: "
+            'a table [clicks] with scan = "..." and a table [clicks.px] of column and row by fiducial.'
+        )
+    compared = [names[round(k)] for k in np.linspace(0, len(names) - 1, min(len(names), _COMPARED))]
+    views = list(workers.map(_view, *zip(*[(project, camera, name) for name in compared], strict=True)))
+    seen = [(name, view) for name, view in zip(compared, views, strict=True) if view is not None]
+    if len(seen) < 2:
+        raise MeasurementError(f"{camera.path}: {_NOT_COMMON} the drawn marks were found in {len(seen)} of its scans.")
+    jobs = [
+        (seen[0][1].windows[one.id], [view.windows[one.id] for _, view in seen[1:]], one.learned_mm)
+        for one in camera.learned
+    ]
+    found: list[Recurrence] = list(workers.map(recurrence, *zip(*jobs, strict=True)))
+    lost = [one.id for one, each in zip(camera.learned, found, strict=True) if each.excess < _LEAST_EXCESS]
+    if lost:
+        raise MeasurementError(
+            f"{camera.path}: {_NOT_COMMON} nothing near the coordinates of fiducial {', '.join(lost)} recurs in all of "
+            f"{len(seen)} scans in one place."
+        )
+    name, view = seen[0]
+    matrix = view.placement
+    px = {
+        one.id: matrix[:, :2] @ (np.array(one.xy_mm) + each.offset_mm) + matrix[:, 2]
+        for one, each in zip(camera.learned, found, strict=True)
+    }
+    with open_scan(project.scans[name]) as scan:
+        return _start(camera, scan, matrix, px, alike=tuple(names))
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """About where the frame lies in one scan, and the picture about every learned mark."""
+
+    placement: Array
+    windows: Mapping[str, Window]
+
+
+def _view(project: Project, camera: CameraFile, name: str) -> _View | None:
+    with open_scan(project.scans[name]) as scan:
+        placement = _drawn_placement(project, camera, scan)
+        if placement is None and len(camera.drawn) >= 2:
+            return None
+        if placement is None:
+            placement = _in_the_middle(project, camera, scan)
+        windows = {
+            one.id: about(scan, placement, np.array(one.xy_mm), one.learned_mm, _REACH * one.learned_mm)
+            for one in camera.learned
+        }
+    return _View(placement, windows)
+
+
+def _drawn_placement(project: Project, camera: CameraFile, scan: Scan) -> Array | None:
+    """The frame as the drawn marks give it."""
+    if len(camera.drawn) < 2:
+        return None
+    pitch = project.pitch_um or scan.pitch_um
+    return measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=project.pose)).pixel_from_camera
+
+
+def _in_the_middle(project: Project, camera: CameraFile, scan: Scan) -> Array:
+    """The frame in the middle of its scan, in the pose that the project gives."""
+    pose = "0" if project.pose == "auto" else project.pose
+    pitch = np.array(_pitch_mm(project, camera, scan))
+    linear = np.diag([1.0, -1.0]) @ up_from_camera(pose) / pitch[:, None]
+    return np.column_stack([linear, [(scan.width_px - 1) / 2, (scan.height_px - 1) / 2]])
+
+
+def _pitch_mm(project: Project, camera: CameraFile, scan: Scan) -> tuple[float, float]:
+    """As the project or the file has it, or as if the frame filled the scan."""
+    pitch_um = project.pitch_um or scan.pitch_um
+    if pitch_um is not None:
+        return (pitch_um[0] / 1000, pitch_um[1] / 1000)
+    frame_mm = camera.layout().frame_mm
+    return (max(frame_mm) / max(scan.width_px, scan.height_px),) * 2
+
+
+def _through_clicks(project: Project, camera: CameraFile, scan: Scan, px: Places) -> Array:
+    """The frame as the clicks give it: mirrored where that fits better."""
+    if len(px) == 1:
+        matrix = _in_the_middle(project, camera, scan)
+        xy = next(np.array(one.xy_mm) for one in camera.learned)
+        matrix[:, 2] = next(iter(px.values())) - matrix[:, :2] @ xy
+        return matrix
+    pitch = np.array(_pitch_mm(project, camera, scan))
+    xy = np.array([one.xy_mm for one in camera.learned])
+    up = np.array([px[one.id] for one in camera.learned]) * pitch * (1.0, -1.0)
+    fits = [fit_frame(xy, up, np.full(len(xy), _CLICK_MM), up_from_camera(pose)) for pose in ("0", "0m")]
+    best = min(fits, key=lambda fit: round(fit.chi_square, 6))
+    return np.asarray(np.diag([1.0, -1.0]) @ best.up_from_camera / pitch[:, None])
+
+
+def _start(camera: CameraFile, scan: Scan, placement: Array, px: Places, alike: tuple[str, ...]) -> CameraFile:
+    """One scan's pictures of the marks, which lie in the layout where this scan has them. alike: the scans that are
+    known, or taken, to lie like it."""
+    inverse = np.linalg.inv(placement[:, :2])
+    fiducials = []
+    for one in camera.fiducials:
+        if isinstance(one.mark, shapes.LearnedMark):
+            chip = cut(scan, np.column_stack([placement[:, :2], px[one.id]]), one.mark.size_mm)
+            x, y = inverse @ (px[one.id] - placement[:, 2])
+            one = replace(one, seen_mm=(float(x), float(y)), mark=template_of([chip], one.mark.size_mm))
+        fiducials.append(one)
+    given = _up_from_camera(placement)
+    pose = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
+    learned_from = LearnedFrom(scan.name, digest(scan.path), pose, camera.clicks is not None, alike)
+    return replace(camera, fiducials=tuple(fiducials), learned_from=learned_from)
+
+
+def _up_from_camera(placement: Array) -> Array:
+    """(2, 2) camera's axes to the scan's (right, up), to a turn."""
+    linear = placement[:, :2] / np.sqrt(abs(np.linalg.det(placement[:, :2])))
+    return np.asarray(np.diag([1.0, -1.0]) @ linear)
+
+
+def digest(path: Path) -> str:
+    """The SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,133 @@
+"""Marks that nobody has drawn, learned from the scans of their camera before these are measured.
+
+One scan's pictures, its first ones, find the marks in every other, and the mean over all of them is the template.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.results import FrameMeasurement
+from measure.scans.scan import open_scan
+from measure.special_marks.learned import Chip, cut, template_of
+from pipeline.files.atomic import write_atomically
+from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
+from pipeline.files.camera_text import camera_text
+from pipeline.files.project_file import Project
+from pipeline.files.template_table import saved_in
+from pipeline.measuring.first_pictures import digest, first_pictures
+from pipeline.progress import Reporter
+
+
+def learn_marks(project: Project, reporter: Reporter, workers: Executor) -> Project:
+    """The project with templates in the place of marks that are to be learned; out/learned then holds the templates
+    and a camera file that names them. Raises InputError or MeasurementError where they cannot be learned."""
+    files = _file_names([camera.path for camera in project.cameras.values()])
+    cameras = {
+        name: _learned(project, camera, files[camera.path], reporter, workers)
+        if camera.learned
+        else _known(project, camera)
+        for name, camera in project.cameras.items()
+    }
+    return replace(project, cameras=cameras)
+
+
+def _file_names(cameras: Sequence[Path]) -> Mapping[Path, str]:
+    """Under which name in out/learned each camera's files stand: that of its own file, with a number where several
+    folders hold one of that name."""
+    names: dict[Path, str] = {}
+    stems = {path.stem for path in cameras}
+    for path in dict.fromkeys(cameras):
+        taken = set(names.values())
+        numbered = (f"{path.stem}-{number}" for number in count(2))
+        names[path] = next(name for name in numbered if name not in taken | stems) if path.stem in taken else path.stem
+    return names
+
+
+def _known(project: Project, camera: CameraFile) -> CameraFile:
+    """A camera whose marks were learned before, or drawn. Another scan may have the name of the one they were learned
+    from: then that tells nothing of how this project's scans lie."""
+    learned = camera.learned_from
+    if learned is None or (learned.scan in project.scans and digest(project.scans[learned.scan]) == learned.sha256):
+        return camera
+    return replace(camera, learned_from=None)
+
+
+def _learned(project: Project, camera: CameraFile, file: str, reporter: Reporter, workers: Executor) -> CameraFile:
+    names = [name for name in project.scans if project.camera_of(name).path == camera.path]
+    if not names:
+        return camera
+    with reporter.stage("learning marks of") as tell:
+        tell(f"{camera.name}: their first pictures", 0, 3)
+        start = first_pictures(project, camera, names, workers)
+        tell(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
+        chips = _chips(project, camera.learned, names, start, workers)
+        tell(f"{camera.name}: averaged", 2, 3)
+        mean = _averaged(start, camera.learned, chips, workers)
+    return _stored(project, mean, file)
+
+
+def _chips(
+    project: Project, learned: Sequence[GivenFiducial], names: Sequence[str], start: CameraFile, workers: Executor
+) -> Mapping[str, list[Chip]]:
+    """The pictures of every learned mark, by fiducial."""
+    chips: dict[str, list[Chip]] = {}
+    for of_scan in workers.map(_chips_of, *zip(*[(project, start, learned, name) for name in names], strict=True)):
+        for id, chip in of_scan.items():
+            chips.setdefault(id, []).append(chip)
+    return chips
+
+
+def _chips_of(project: Project, camera: CameraFile, learned: Sequence[GivenFiducial], name: str) -> Mapping[str, Chip]:
+    """The pictures of learned marks in one scan, as far as they are found."""
+    with open_scan(project.scans[name]) as scan:
+        pitch = project.pitch_um or scan.pitch_um
+        options = FiducialOptions(pose=pose_of(project, camera, scan.name))
+        frame = measure_fiducials(scan, camera.layout(), pitch, options)
+        matrix = frame.pixel_from_camera
+        found = {mark.point: mark.center_px for mark in frame.marks if mark.status.is_observation}
+        if matrix is None or not _is_named(frame, camera):
+            return {}
+        return {
+            one.id: cut(scan, np.column_stack([matrix[:, :2], center]), one.learned_mm)
+            for one in learned
+            if (center := found.get(one.id)) is not None
+        }
+
+
+def _is_named(frame: FrameMeasurement, start: CameraFile) -> bool:
+    """Whether the marks found are those of their names for sure, or at least if the scan lies as the one clicked in."""
+    pose, learned = frame.pose, start.learned_from
+    return pose is not None and learned is not None and (pose.decided or pose.name == learned.pose)
+
+
+def pose_of(project: Project, camera: CameraFile, scan: str) -> str:
+    """As the project sets it; a scan whose marks were clicked lies as these say, and what recurs in all scans, nobody
+    having clicked, was looked for in one pose."""
+    learned = camera.learned_from
+    if learned is None or project.pose != "auto":
+        return project.pose
+    return learned.pose if scan in learned.alike else "auto"
+
+
+def _averaged(
+    start: CameraFile, learned: Sequence[GivenFiducial], chips: Mapping[str, list[Chip]], workers: Executor
+) -> CameraFile:
+    found = [one for one in learned if one.id in chips]
+    templates = workers.map(template_of, [chips[one.id] for one in found], [one.learned_mm for one in found])
+    mean = {one.id: template for one, template in zip(found, templates, strict=True)}
+    return replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
+
+
+def _stored(project: Project, camera: CameraFile, file: str) -> CameraFile:
+    """The camera with its templates written as a file that can be used instead, and as that file has them: so what is
+    measured with it is what is measured now."""
+    path = project.output / "learned" / f"{file}.toml"
+    write_atomically(path, camera_text(replace(camera, path=path), saved_in(path.parent, f"{file}-")))
+    return replace(camera, fiducials=read_camera(path).fiducials)

@@ -1,0 +1,200 @@
+"""Scans to marks: the fiducials of every frame first, then the targets that they make predictable."""
+
+import math
+import time
+from collections.abc import Sequence
+from concurrent.futures import Executor, as_completed
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from measure.checks.cross_checks import cross_checked
+from measure.codes_and_boards.coma import one_definition
+from measure.errors import MeasurementError
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.marks.rendering import extent_px
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.scans.scan import Scan, open_scan
+from measure.search.pitch_check import pitch_problem
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.learned_table import LearnedFrom
+from pipeline.files.project_file import Project
+from pipeline.measuring.learn_stage import learn_marks, pose_of
+from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.measuring.target_stage import check_targets, measure_targets
+from pipeline.measuring.tie_stage import check_tie_names, with_ties
+from pipeline.progress import Reporter
+from pipeline.workers import processes, worker_pool
+
+
+def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, ...]:
+    """Measure every scan of the project, in the order of their names.
+
+    All are opened before the first is measured, so that a broken file is known at once. Raises InputError or
+    MeasurementError for scans that cannot be read; a mark that cannot be measured is no error.
+    """
+    if not project.scans:
+        raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
+    check_targets(project)
+    check_tie_names(project)
+    _check_marks(project)
+    _check_readable(list(project.scans.values()))
+    with worker_pool(len(project.scans)) as workers:
+        learned = learn_marks(project, reporter, workers)
+        scans = _measured_scans(learned, reporter, workers)
+        checked = _checked(learned, _one_definition(project, scans))
+        if project.ties is None:
+            return checked
+        with reporter.stage("natural points sought in") as count:
+            return with_ties(project, project.ties, checked, count, workers)
+
+
+def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> list[MeasuredScan]:
+    with reporter.stage("measured") as count:
+        futures = {workers.submit(_timed, project, name): name for name in project.scans}
+        for done, future in enumerate(as_completed(futures), 1):
+            _, seconds = future.result()
+            count(futures[future], done, len(futures))
+            if done == 1 < len(futures):
+                reporter.say(expected_time(seconds, len(futures)))
+    return [future.result()[0] for future in futures]
+
+
+def _timed(project: Project, name: str) -> tuple[MeasuredScan, float]:
+    """A scan measured, and the seconds that it took."""
+    start = time.monotonic()
+    return measure_scan(project, name), time.monotonic() - start
+
+
+def expected_time(first_s: float, scans: int) -> str:
+    """What measuring all scans takes if each takes as long as the first, of which `processes` run at a time."""
+    at_a_time = processes(scans)
+    total_s = first_s * math.ceil(scans / at_a_time)
+    told = f"{total_s / 60:.0f} minutes" if total_s >= 100 else f"{total_s:.0f} s"
+    return f"about {told} for {scans} scans, if all take as long as the first: {first_s:.0f} s, {at_a_time} at a time"
+
+
+def _checked(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
+    """The fiducials of each camera's frames checked against one another."""
+    frames = {scan.scan: scan.frame for scan in measured}
+    for camera in project.cameras.values():
+        own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
+        if camera.drawn:
+            checked = cross_checked([scan.frame for scan in own], camera.layout())
+            frames |= {scan.scan: frame for scan, frame in zip(own, checked, strict=True)}
+    return tuple(replace(scan, frame=frames[scan.scan]) for scan in measured)
+
+
+def _one_definition(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
+    """The crossings of all scans of a camera in one definition of their place."""
+    frames = {scan.scan: scan.frame for scan in measured}
+    for camera in project.cameras.values():
+        own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
+        for scan, marks in zip(own, one_definition([scan.frame.marks for scan in own]), strict=True):
+            frames[scan.scan] = replace(scan.frame, marks=marks)
+    return tuple(replace(scan, frame=frames[scan.scan]) for scan in measured)
+
+
+def _check_marks(project: Project) -> None:
+    """One mark by itself tells neither the turn nor the scale of a frame."""
+    for camera in project.cameras.values():
+        if len(camera.drawn) + len(camera.learned) == 1:
+            raise InputError(
+                f"{camera.path} has one fiducial mark, and a frame is found by two or more. Add the others, or pass it "
+                'over with mark = "none".'
+            )
+
+
+def _check_readable(paths: Sequence[Path]) -> None:
+    """Name every file that cannot be opened, not just the first."""
+    messages = []
+    for path in paths:
+        try:
+            with open_scan(path):
+                pass
+        except MeasurementError as error:
+            messages.append(str(error))
+    if messages:
+        raise MeasurementError("\n".join(messages))
+
+
+def measure_scan(project: Project, name: str) -> MeasuredScan:
+    """Measure one scan of the project: its fiducials, then its targets."""
+    with open_scan(project.scans[name]) as scan:
+        return _measured(project, name, scan)
+
+
+def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
+    camera = project.camera_of(name)
+    frame = _fiducials(project, name, scan, camera)
+    pitch, problems, notes = _pitch(project, scan, camera, frame)
+    frame = replace(frame, problems=(*frame.problems, *problems))
+    notes = (*(f"{note[0].upper()}{note[1:]}." for note in scan.notes), *notes)
+    measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame, notes)
+    return measure_targets(project, scan, measured)
+
+
+def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> FrameMeasurement:
+    if all(fiducial.passed_over for fiducial in camera.fiducials):
+        return FrameMeasurement(name, ())
+    pitch = project.pitch_um or scan.pitch_um
+    layout, options = camera.layout(), FiducialOptions(pose=pose_of(project, camera, scan.name))
+    measured = measure_fiducials(scan, layout, pitch, options)
+    if pitch is not None:
+        source = "the project" if project.pitch_um is not None else "the scan's file"
+        wrong = pitch_problem(measured, layout, pitch, source)
+        measured = replace(measured, problems=(*measured.problems, wrong) if wrong else measured.problems)
+    learned = camera.learned_from
+    if learned is not None and project.pose == "auto" and scan.name in learned.alike and measured.pose is not None:
+        measured = replace(measured, pose=_as_learned(learned, scan))
+    return replace(measured, image=name, marks=_with_sizes(measured, camera, scan, pitch))
+
+
+def _as_learned(learned: LearnedFrom, scan: Scan) -> Pose:
+    if learned.clicked:
+        return Pose(learned.pose, True, ("the clicks in it say so.",))
+    like = f"it is taken to lie as {learned.scan}, from which its marks were learned: {learned.pose} is assumed."
+    return Pose(learned.pose, False, (like,))
+
+
+def _with_sizes(
+    measured: FrameMeasurement, camera: CameraFile, scan: Scan, pitch_um: tuple[float, float] | None
+) -> tuple[MarkMeasurement, ...]:
+    """The marks with how large each is drawn in the scan, px, for whoever shows a picture of it."""
+    if measured.pixel_from_camera is not None:
+        px_per_mm = float(np.sqrt(abs(np.linalg.det(measured.pixel_from_camera[:, :2]))))
+    elif pitch_um is not None:
+        px_per_mm = 1000.0 / pitch_um[0]
+    else:
+        px_per_mm = scan.width_px / camera.layout().frame_mm[0]
+    drawn = np.array([[px_per_mm, 0.0, 0.0], [0.0, -px_per_mm, 0.0]])
+    extents = {mark.id: np.ptp(np.stack(extent_px(mark.mark, drawn)), axis=0).max() for mark in camera.layout().marks}
+    return tuple(
+        replace(mark, quality={**mark.quality, "size_px": float(extents[mark.point])}) for mark in measured.marks
+    )
+
+
+def _pitch(
+    project: Project, scan: Scan, camera: CameraFile, frame: FrameMeasurement
+) -> tuple[tuple[float, float], tuple[str, ...], tuple[str, ...]]:
+    """The pitch of a scan in um, as the project, the file or the marks say it; what needs a look in it, and what is
+    only worth knowing."""
+    if project.pitch_um is not None:
+        return project.pitch_um, (), ()
+    if scan.pitch_um is not None:
+        return scan.pitch_um, (), ()
+    if frame.pixel_from_camera is not None:
+        pitch = 1000.0 / float(np.sqrt(abs(np.linalg.det(frame.pixel_from_camera[:, :2]))))
+        note = f"The pitch of {pitch:.2f} um is from the marks' separations, for {scan.pitch_note}."
+        return (pitch, pitch), (), (note,)
+    if camera.frame_mm is not None:
+        pitch = 1000.0 * max(camera.frame_mm) / max(scan.width_px, scan.height_px)
+        note = f"The pitch is not known ({scan.pitch_note}); {pitch:.1f} um is taken, as if the frame filled the scan."
+        return (pitch, pitch), (note,), ()
+    raise InputError(
+        f"{project.path}: pitch_um is missing, and {scan.path.name} does not say it ({scan.pitch_note}). Give the size "
+        "of a pixel in um; for a digital camera that of the sensor's, or any, with the principal distance to match."
+    )

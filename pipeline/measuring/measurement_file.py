@@ -1,0 +1,110 @@
+"""measurement.json: what comparator.csv has no room for: poses and their evidence, covariances, qualities, problems."""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.status import Status
+from pipeline.errors import InputError
+from pipeline.files.atomic import write_atomically
+
+
+@dataclass(frozen=True)
+class MeasuredScan:
+    """A scan and what was measured in it. notes: what is worth knowing of its file, and needs no action."""
+
+    scan: Path
+    width_px: int
+    height_px: int
+    pitch_um: tuple[float, float]
+    frame: FrameMeasurement
+    notes: tuple[str, ...] = ()
+
+
+def write_measurement(path: Path, scans: Sequence[MeasuredScan]) -> None:
+    """Write measurement.json. Raises InputError where it cannot be written."""
+    images = {scan.frame.image: _image(scan, path.parent) for scan in scans}
+    content = {"reseau": version("reseau"), "images": images}
+    write_atomically(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_measurement(path: Path) -> tuple[MeasuredScan, ...]:
+    """Read it back. Raises InputError for a file that is broken."""
+    try:
+        images = json.loads(path.read_text(encoding="utf-8"))["images"]
+        return tuple(_measured(name, image, path.parent) for name, image in images.items())
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read as a measurement ({error}). Run `reseau measure` again.") from error
+
+
+def _image(measured: MeasuredScan, folder: Path) -> dict[str, Any]:
+    frame = measured.frame
+    matrix = frame.pixel_from_camera
+    return {
+        "scan": _relative(measured.scan, folder),
+        "width_px": measured.width_px,
+        "height_px": measured.height_px,
+        "pitch_um": list(measured.pitch_um),
+        "pose": None if frame.pose is None else _pose(frame.pose),
+        "pixel_from_camera": None if matrix is None else matrix.tolist(),
+        "problems": list(frame.problems),
+        "notes": list(measured.notes),
+        "marks": [_mark(mark) for mark in frame.marks],
+    }
+
+
+def _relative(scan: Path, folder: Path) -> str:
+    """Relative to the output folder, so that a whole project can be moved."""
+    return Path(os.path.relpath(scan.resolve(), folder.resolve())).as_posix()
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    return {"name": pose.name, "decided": pose.decided, "evidence": list(pose.evidence)}
+
+
+def _mark(mark: MarkMeasurement) -> dict[str, Any]:
+    col, row = (None, None) if mark.center_px is None else (float(value) for value in mark.center_px)
+    return {
+        "point": mark.point,
+        "kind": mark.kind,
+        "col_px": col,
+        "row_px": row,
+        "covariance_px2": None if mark.covariance_px2 is None else mark.covariance_px2.tolist(),
+        "status": str(mark.status),
+        "reason": mark.reason,
+        "quality": {name: float(value) for name, value in mark.quality.items() if np.isfinite(value)},
+    }
+
+
+def _measured(name: str, image: Mapping[str, Any], folder: Path) -> MeasuredScan:
+    pose, matrix = image["pose"], image["pixel_from_camera"]
+    frame = FrameMeasurement(
+        image=name,
+        marks=tuple(_read_mark(mark) for mark in image["marks"]),
+        pose=None if pose is None else Pose(pose["name"], pose["decided"], tuple(pose["evidence"])),
+        pixel_from_camera=None if matrix is None else np.array(matrix, dtype=np.float64),
+        problems=tuple(image["problems"]),
+    )
+    pitch = image["pitch_um"]
+    size = (image["width_px"], image["height_px"])
+    return MeasuredScan(folder / image["scan"], *size, (pitch[0], pitch[1]), frame, tuple(image.get("notes", ())))
+
+
+def _read_mark(mark: Mapping[str, Any]) -> MarkMeasurement:
+    covariance = mark["covariance_px2"]
+    return MarkMeasurement(
+        point=mark["point"],
+        kind=mark["kind"],
+        center_px=None if mark["col_px"] is None else np.array([mark["col_px"], mark["row_px"]]),
+        covariance_px2=None if covariance is None else np.array(covariance),
+        status=Status(mark["status"]),
+        reason=mark["reason"],
+        quality=mark["quality"],
+    )

@@ -1,0 +1,180 @@
+"""The targets of one scan: boards name their own points; single disks and crosses get their names by prediction."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.initial_values.resection import resect
+from measure.codes_and_boards.boards import measure_board
+from measure.results import MarkMeasurement
+from measure.scans.scan import Scan
+from measure.single_targets.targets import TargetPrediction
+from measure.status import Status
+from pipeline.errors import InputError
+from pipeline.files.project_file import Project
+from pipeline.files.target_table import TargetSettings
+from pipeline.measuring.camera_model import camera_model
+from pipeline.measuring.coded_field import measure_coded_field
+from pipeline.measuring.coded_sheet import CodedSheet, measure_sheet
+from pipeline.measuring.comparator_file import comparator_from_pixel
+from pipeline.measuring.identification import PatternOptions, assign, log10_of_chance, recognise
+from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.measuring.target_field import Field, measure_single_targets, target_candidates, target_field
+from pipeline.measuring.unoriented import likely_diameters_px, name_field
+
+Array = NDArray[np.float64]
+
+_SEED = 1  # of the resection's random triples: a result must not depend on the run
+_GATE_SHARE = 0.01  # of the scan's size: what tilt and relief leave between the pattern laid on and its marks
+_SLACK_PX = 3.0  # beyond what the resection's residuals say, within which a mark is the target predicted there
+_SLACK_SIGMAS = 6.0
+_LEAST_PAIRS = 4
+_MOST_LOG10_CHANCE = -1.0  # of agreements as good by chance: the project says that the pattern is in the scan
+_STRONGEST = 3  # patches a target, by contrast: dust and texture are weaker than what was painted to be seen
+_NEAR = 0.65  # of the scan's size from its middle: targets there may be in it
+_LEAST_DIAMETER_PX = 2.5
+_SIZE_SLACK = 1.5  # how wrong the approximate distance may make a target's size
+
+
+def check_targets(project: Project) -> None:
+    """Raises InputError for single targets and rings that nothing in the project could name."""
+    settings = project.targets
+    if settings is None or settings.board is not None:
+        return
+    if settings.code is not None:
+        CodedSheet.of(project, settings)
+        return
+    if project.given_points is None:
+        raise InputError(
+            f"{project.path}: [targets] kind {settings.kind!r} is named by the targets' coordinates, and there is no "
+            '[object] points = "...". Give the file of the points, or leave [targets] out to measure fiducials only.'
+        )
+    known = len(target_field(project).ids)
+    if known < _LEAST_PAIRS:
+        raise InputError(
+            f"{project.path}: [object] points: {known} points with X, Y and Z name no targets; give {_LEAST_PAIRS}, if "
+            "only roughly."
+        )
+
+
+def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
+    """The scan with its targets beside its fiducials: a mark for each target that could be in it."""
+    settings = project.targets
+    if settings is None:
+        return measured
+    if settings.code is not None:
+        coded = CodedSheet.of(project, settings)
+        if coded.is_flat:
+            return with_targets(measured, *measure_sheet(scan, coded))
+        return with_targets(measured, *measure_coded_field(scan, coded, project, measured))
+    if settings.board is not None:
+        board = measure_board(scan, settings.board)
+        problems = (f"The board was not found: {board.reason}.",) if board.reason else ()
+        # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
+        notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
+        return with_targets(measured, board.marks, (*problems, *notes))
+    field = target_field(project)
+    predictions, notes = _predictions(project, settings, field, scan, measured)
+    if isinstance(predictions, str):
+        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, predictions) for id in field.ids)
+        return with_targets(measured, marks, (*notes, f"No target has a name: {predictions}."))
+    return with_targets(measured, measure_single_targets(scan, predictions, settings), notes)
+
+
+def with_targets(
+    measured: MeasuredScan, targets: Sequence[MarkMeasurement], problems: Sequence[str] = ()
+) -> MeasuredScan:
+    """The scan with these targets instead of the ones it has."""
+    frame = measured.frame
+    fiducials = tuple(mark for mark in frame.marks if mark.kind == "fiducial")
+    return replace(
+        measured, frame=replace(frame, marks=(*fiducials, *targets), problems=(*frame.problems, *problems))
+    )  # fmt: skip
+
+
+def _predictions(
+    project: Project, settings: TargetSettings, field: Field, scan: Scan, measured: MeasuredScan
+) -> tuple[Sequence[TargetPrediction] | str, tuple[str, ...]]:
+    """Where each target should be, by the approximate orientation or, without one that fits, by the pattern alone; or
+    why not. And what is to be said of the image."""
+    image = measured.frame.image
+    camera = project.camera_of(image)
+    model = camera_model(camera, measured)
+    if isinstance(model, str):
+        return model, ()
+    exterior = project.given_images.exterior.get(image) if project.given_images else None
+    notes: tuple[str, ...] = ()
+    if exterior is not None and camera.principal_distance_mm is not None:
+        approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
+        oriented, why = _oriented(approximate, field, scan, measured, settings)
+        if oriented is not None:
+            return field.predictions(oriented, measured, _SLACK_PX), ()
+        notes = (f"Its orientation in images.csv was not used to name the targets: {why}.",)
+    found = target_candidates(scan, settings, likely_diameters_px(field, measured))
+    named = name_field(field, model, camera, measured, found)
+    return (named if isinstance(named, str) else named.predictions(field, measured)), notes
+
+
+def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredScan) -> tuple[float, float] | None:
+    """The sizes that the targets in or near the scan should have; None where none is large enough."""
+    size = np.array([measured.width_px, measured.height_px])
+    near = [p for p in predictions if np.all(np.abs(p.center_px - size / 2.0) < _NEAR * size)]
+    axes = np.array([p.half_axes_px for p in near]).reshape(-1, 2)
+    if not len(axes) or 2.0 * float(axes.max()) < _LEAST_DIAMETER_PX:
+        return None
+    return 2.0 * float(axes.min()) / _SIZE_SLACK, 2.0 * float(axes.max()) * _SIZE_SLACK
+
+
+def _oriented(
+    model: ImageModel, field: Field, scan: Scan, measured: MeasuredScan, settings: TargetSettings
+) -> tuple[ImageModel | None, str]:
+    """The image with an orientation good to a pixel or two, from the disks found and the pattern they make."""
+    size = float(np.hypot(measured.width_px, measured.height_px))
+    predictions = field.predictions(model, measured, _SLACK_PX)
+    predicted = np.array([prediction.center_px for prediction in predictions]).reshape(-1, 2)
+    diameters = _diameters_px(predictions, measured)
+    if diameters is None:
+        return None, "the approximate orientation puts no target of two pixels or more into the scan"
+    strongest = target_candidates(scan, settings, diameters)[: _STRONGEST * len(predicted)]
+    found = np.array([patch.center_px for patch in strongest]).reshape(-1, 2)
+    placement = recognise(predicted, found, PatternOptions(shift_px=size / 2.0))
+    unlike = f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted"
+    if placement is None:
+        return None, unlike
+    gate_px = _GATE_SHARE * size
+    places = placement.places(predicted)
+    ids = [prediction.point for prediction in predictions]
+    for _ in range(2):
+        pairs = assign(places, found, gate_px)
+        resection = _resected(model, field, [(ids[i], found[j]) for i, j in pairs], measured)
+        if resection is None:
+            return None, unlike
+        model, gate_px = resection
+        predictions = field.predictions(model, measured, gate_px)
+        places, ids = np.array([p.center_px for p in predictions]), [p.point for p in predictions]
+    shown = ((places >= 0.0) & (places <= (measured.width_px - 1, measured.height_px - 1))).all(axis=1)
+    by_chance = log10_of_chance(places[shown], found, gate_px, placement.tried) > _MOST_LOG10_CHANCE
+    return (None, f"{unlike}, but for what chance explains") if by_chance else (model, "")
+
+
+def _resected(
+    model: ImageModel, field: Field, named: Sequence[tuple[str, Array]], measured: MeasuredScan
+) -> tuple[ImageModel, float] | None:
+    """The image oriented by named marks, and how far off they may lie from it, px."""
+    if len(named) < _LEAST_PAIRS:
+        return None
+    row = {id: i for i, id in enumerate(field.ids)}
+    xyz = field.xyz[[row[id] for id, _ in named]]
+    comparator = comparator_from_pixel(np.array([place for _, place in named]), measured.pitch_um)
+    ideal, _ = model.ideal_from_observed(model.camera_from_comparator(comparator))
+    c = float(model.interior[0])
+    resection = resect(xyz, ideal - model.interior[1:], c, np.random.default_rng(_SEED))
+    if resection is None or resection.inliers.sum() < _LEAST_PAIRS:
+        return None
+    sigma_px = 1000.0 * resection.sigma_mm / min(measured.pitch_um)
+    pose = resection.pose
+    return replace(model, rotation=pose.rotation, station=pose.center), _SLACK_PX + _SLACK_SIGMAS * sigma_px

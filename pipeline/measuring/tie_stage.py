@@ -1,0 +1,78 @@
+"""Natural points in the scans of a project, beside the fiducials and targets that are measured already."""
+
+import re
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.natural_points.tie_frame import TieFrame
+from measure.natural_points.ties import measure_ties
+from pipeline.adjusting.network import given_points
+from pipeline.errors import InputError
+from pipeline.files.project_file import Project
+from pipeline.files.tie_table import TieSettings
+from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.progress import Count
+
+Array = NDArray[np.float64]
+
+_TIE_NAME = re.compile(r"tie\d+")
+_LEAST_MARK_PX = 20.0  # about a mark whose size nobody has noted
+
+
+def check_tie_names(project: Project) -> None:
+    """Raises InputError where a given point has a name that a natural point would take."""
+    strangers = sorted(id for id in given_points(project) if _TIE_NAME.fullmatch(id)) if project.ties else []
+    if strangers:
+        raise InputError(
+            f"{project.path}: the given points hold {strangers[0]!r}, a name that [ties] gives to natural points. "
+            "Rename it in points.csv."
+        )
+
+
+def with_ties(
+    project: Project, settings: TieSettings, scans: Sequence[MeasuredScan], count: Count, workers: Executor
+) -> tuple[MeasuredScan, ...]:
+    """The scans with the natural points that they share."""
+    frames = {scan.frame.image: _tie_frame(project, scan) for scan in scans}
+    placed = [frame for frame in frames.values() if frame is not None]
+    ties = measure_ties(placed, settings.options, count, workers)
+    problems: dict[str, tuple[str, ...]] = {
+        image: ("No natural points are sought here: without fiducials nobody knows where the frame lies.",)
+        for image, frame in frames.items()
+        if frame is None
+    }
+    if placed:
+        problems[placed[0].image] = ties.problems
+    return tuple(
+        replace(
+            scan,
+            frame=replace(
+                scan.frame,
+                marks=(*scan.frame.marks, *ties.marks.get(scan.frame.image, ())),
+                problems=(*scan.frame.problems, *problems.get(scan.frame.image, ())),
+            ),
+        )
+        for scan in scans
+    )
+
+
+def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
+    """None where the camera has fiducials and too few of them were measured."""
+    camera = project.camera_of(scan.frame.image)
+    taken = [
+        (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
+        for mark in scan.frame.marks
+        if mark.center_px is not None
+    ]
+    pixel_from_camera, frame_mm = scan.frame.pixel_from_camera, camera.frame_mm
+    if pixel_from_camera is None:
+        if camera.fiducials:
+            return None
+        middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
+        pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
+        frame_mm = None
+    return TieFrame(scan.frame.image, scan.scan, pixel_from_camera, frame_mm, np.array(taken).reshape(-1, 3))

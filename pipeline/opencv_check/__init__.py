@@ -1,0 +1,1 @@
+"""The adjustment checked against OpenCV's calibration."""

@@ -1,0 +1,192 @@
+"""The part of an adjustment that OpenCV can solve: one camera, no film, no priors, known points, equal weights."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.projection import adjusted_image
+from adjust.network import (
+    EXTERIOR_NAMES,
+    Approximations,
+    Camera,
+    Distortion,
+    Image,
+    Network,
+    ObjectPoint,
+    ObservationKind,
+    Observations,
+    Prior,
+)
+from adjust.result import Adjustment
+from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
+from pipeline.opencv_check.opencv_model import NAMES, Freedom
+
+Array = NDArray[np.float64]
+
+GROSS_WEIGHT = 0.5  # observations that robust estimation left less of their weight are no observations here
+
+# A family's parameters beside those of OpenCV; what has no counterpart is held at its adjusted value.
+COUNTERPARTS: Mapping[str, Mapping[str, str]] = {
+    "none": {},
+    "torlegard": {"k3": "k1", "k5": "k2", "k7": "k3", "p1": "p1", "p2": "p2"},
+    "brown": {"k1": "k1", "k2": "k2", "k3": "k3", "p1": "p1", "p2": "p2", "b1": "fy"},
+    "opencv": {name: name for name in parameter_names("opencv") if name != "b1"} | {"b1": "fy"},
+}
+# What OpenCV estimates together or not at all.
+FREE_TOGETHER = (frozenset({"p1", "p2"}), frozenset({"s1", "s2", "s3", "s4"}), frozenset({"tau_x", "tau_y"}))
+
+
+@dataclass(frozen=True)
+class BareProblem:
+    """The problem for the adjustment (network, approximations), and the same for OpenCV (images, freedom).
+
+    sigma_mm: the one standard deviation of all image coordinates; sigma_spread: the largest over the smallest of the
+    observations' own; gross: observations that robust estimation set aside; uncertain_points: how many object points
+    are not held fixed by their priors; left_out: images with too few points for OpenCV.
+    """
+
+    network: Network
+    approximations: Approximations
+    images: tuple[ImagePoints, ...]
+    freedom: Freedom
+    sigma_mm: float
+    sigma_spread: float
+    gross: int
+    uncertain_points: int
+    left_out: tuple[str, ...]
+
+
+def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
+    """All images of one camera that OpenCV can begin, at the values of the adjustment."""
+    network = adjustment.network
+    camera = network.camera_by_name[camera_name]
+    names = [image.name for image in network.images if image.camera == camera_name]
+    shown = {name: _image_points(adjustment, name) for name in names}
+    usable = [name for name in names if can_begin(shown[name][0].xyz)]
+    sigmas = np.concatenate([shown[name][1] for name in usable]) if usable else np.ones(1)
+    sigma_mm = float(np.sqrt((sigmas**2).mean()))
+    points = sorted({point for name in usable for point in shown[name][2]})
+    free = free_parameters(camera)
+    values = {
+        name: adjustment.value(f"IO.{camera_name}.{name}")
+        for name in ("c", "x0", "y0", *parameter_names(camera.distortion.family))
+    }
+    return BareProblem(
+        network=Network(
+            cameras=(_freed(camera, values, free),),
+            images=tuple(Image(name, camera_name, "none") for name in usable),
+            points=tuple(_fixed_point(adjustment, point) for point in points),
+            observations=_observations({name: shown[name] for name in usable}, sigma_mm),
+        ),
+        approximations=Approximations(
+            interior={camera_name: np.array([values["c"], values["x0"], values["y0"]])},
+            exterior={
+                name: np.array([adjustment.value(f"EO.{name}.{each}") for each in EXTERIOR_NAMES]) for name in usable
+            },
+            transformation={name: np.zeros(0) for name in usable},
+            points={point: np.array([adjustment.value(f"PT.{point}.{axis}") for axis in "XYZ"]) for point in points},
+        ),
+        images=tuple(shown[name][0] for name in usable),
+        freedom=_freedom(camera, free),
+        sigma_mm=sigma_mm,
+        sigma_spread=float(sigmas.max() / sigmas.min()),
+        gross=sum(
+            network.observations.image[row] in shown for row in np.flatnonzero(adjustment.weights < GROSS_WEIGHT)
+        ),
+        uncertain_points=sum(not _is_fixed(network.point_by_id[point]) for point in points),
+        left_out=tuple(name for name in names if name not in usable),
+    )
+
+
+def in_opencv_model(problem: BareProblem, parameters: Array) -> BareProblem:
+    """The same problem with OpenCV's own distortion, from parameters (18,) in the order of `opencv_model.NAMES`."""
+    values = dict(zip(NAMES, parameters.tolist(), strict=True))
+    values["b1"] = values["fx"] / values["fy"] - 1
+    free = set(problem.freedom.names) - {"fy"} | ({"b1"} if "fy" in problem.freedom.names else set())
+    priors = {name: Prior(value, np.inf if name in free else 0.0) for name, value in values.items()}
+    camera = replace(
+        problem.network.cameras[0],
+        principal_distance_mm=Prior(values["fy"], priors["fx"].sigma),
+        x0_mm=priors["cx"],
+        y0_mm=priors["cy"],
+        distortion=Distortion("opencv", {name: priors[name] for name in parameter_names("opencv")}),
+    )
+    interior = {camera.name: np.array([values["fy"], values["cx"], values["cy"]])}
+    return replace(
+        problem,
+        network=replace(problem.network, cameras=(camera,)),
+        approximations=replace(problem.approximations, interior=interior),
+    )
+
+
+def free_parameters(camera: Camera) -> set[str]:
+    """c, x0, y0 and the distortion parameters that are estimated in the bare problem, priors or not."""
+    given = camera.distortion.parameters
+    counterparts = COUNTERPARTS[camera.distortion.family]
+    free = {name for name in counterparts if name in given and given[name].sigma > 0}
+    for together in FREE_TOGETHER:
+        if free & together:
+            free |= together
+    interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
+    return free | {name for name, prior in interior.items() if prior is None or prior.sigma > 0}
+
+
+def _freedom(camera: Camera, free: set[str]) -> Freedom:
+    counterparts = {"c": "fx", "x0": "cx", "y0": "cy", **COUNTERPARTS[camera.distortion.family]}
+    return Freedom(tuple(counterpart for name, counterpart in counterparts.items() if name in free))
+
+
+def _freed(camera: Camera, values: Mapping[str, float], free: set[str]) -> Camera:
+    priors = {name: Prior(value, np.inf if name in free else 0.0) for name, value in values.items()}
+    return replace(
+        camera,
+        principal_distance_mm=priors["c"],
+        x0_mm=priors["x0"],
+        y0_mm=priors["y0"],
+        distortion=replace(
+            camera.distortion, parameters={name: priors[name] for name in parameter_names(camera.distortion.family)}
+        ),
+        fiducials={},
+    )
+
+
+def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Array, list[str]]:
+    """What an image shows in the camera frame, the standard deviation (n,) of each observation, and the points."""
+    observations = adjustment.network.observations
+    weights = adjustment.weights if len(adjustment.weights) else np.ones(len(observations))
+    rows = [
+        row
+        for row, (name, kind) in enumerate(zip(observations.image, observations.kind, strict=True))
+        if name == image and kind != "fiducial" and weights[row] >= GROSS_WEIGHT
+    ]
+    points = [observations.point[row] for row in rows]
+    model = adjusted_image(adjustment, image)
+    xyz = np.array([[adjustment.value(f"PT.{point}.{axis}") for axis in "XYZ"] for point in points]).reshape(-1, 3)
+    gradient = model.film.gradient(observations.xy_mm[rows])
+    covariance = gradient @ observations.covariance_mm2[rows] @ gradient.swapaxes(1, 2)
+    sigmas = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+    return ImagePoints(image, xyz, model.camera_from_comparator(observations.xy_mm[rows])), sigmas, points
+
+
+def _fixed_point(adjustment: Adjustment, point: str) -> ObjectPoint:
+    return ObjectPoint(point, *(Prior(adjustment.value(f"PT.{point}.{axis}"), 0.0) for axis in "XYZ"))
+
+
+def _is_fixed(point: ObjectPoint) -> bool:
+    return all(prior is not None and prior.sigma == 0 for prior in (point.X, point.Y, point.Z))
+
+
+def _observations(shown: Mapping[str, tuple[ImagePoints, Array, list[str]]], sigma_mm: float) -> Observations:
+    rows = [(name, point) for name, (_, _, points) in shown.items() for point in points]
+    kinds: list[ObservationKind] = ["target"] * len(rows)
+    coordinates = [image.xy_mm for image, _, _ in shown.values()]
+    return Observations(
+        tuple(image for image, _ in rows),
+        tuple(point for _, point in rows),
+        tuple(kinds),
+        np.concatenate([*coordinates, np.zeros((0, 2))]),
+        np.tile(sigma_mm**2 * np.eye(2), (len(rows), 1, 1)),
+    )

@@ -1,0 +1,250 @@
+"""The adjustment against OpenCV: the same observations through cv2.calibrateCameraExtended, compared in sigmas.
+
+OpenCV knows neither film, nor priors, nor weights, nor uncertain object points. So the comparison is of one problem
+that both programs can solve: the observations in the camera frame by the adjusted transformations, the object points
+at their adjusted coordinates, all observations of one weight, no prior. The adjustment solves it anew, its solution is
+converted to OpenCV's model by a refit over the image, and what the step from the full adjustment to this problem
+changes is told too.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from adjust.adjustment import adjust
+from adjust.errors import AdjustmentError
+from adjust.network import Camera
+from adjust.result import Adjustment
+from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
+from pipeline.opencv_check.check_result import CameraCheck, Check, Row, Verdict
+from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate
+from pipeline.opencv_check.opencv_conversion import Converted, converted
+from pipeline.opencv_check.opencv_model import NAMES, Freedom
+
+LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, for the two models are not quite the same
+LARGEST_SIGMA_RATIO = 1.2  # of the standard deviations; 1.006 to 1.03 is usual
+SAME_MODEL_DIFFERENCE = 0.1  # sigmas, where both programs are given the very same model
+SAME_MODEL_SIGMA_RATIO = 1.02
+LARGEST_DEPARTURE = 3.0  # sigmas that priors, weights and the like may move a parameter by before it is a difference
+NOTABLE_DEPARTURE = 0.1
+LARGEST_REFIT = 0.5  # of the standard deviation of an image coordinate: beyond it OpenCV's model cannot take the lens
+UNDETERMINED = 0.05  # relative sigma of the principal distance above which there is nothing to compare
+WORSE_RMS = 1.02
+ROUNDINGS = 20.0  # rms below which a solution consists of OpenCV's rounding, in that of one coordinate
+NOTABLE_SPREAD = 1.5
+NOTABLE_ROUNDING = 0.01  # of the standard deviation of an image coordinate
+
+
+def check_against_opencv(adjustment: Adjustment) -> Check:
+    """Compare every camera of an adjustment with OpenCV's calibration of the same observations.
+
+    "agrees": no parameter differs by more than one sigma, or a strong lens does not fit OpenCV's model well enough for
+    that and the same observations agree once the adjustment is given OpenCV's model; "differs": one does, or priors and
+    weights moved one by more than three; "not possible": OpenCV, or anyone without priors, cannot solve it. The reason
+    says which.
+    """
+    names = [camera.name for camera in adjustment.network.cameras]
+    return Check({name: _check_camera(adjustment, name) for name in names})
+
+
+def _check_camera(adjustment: Adjustment, name: str) -> CameraCheck:
+    if not adjustment.converged:
+        return CameraCheck("not possible", f"The adjustment itself has no solution: {_without_stop(adjustment)}.")
+    camera = adjustment.network.camera_by_name[name]
+    if name in adjustment.network.idle_cameras:
+        return CameraCheck("not possible", "No image shows object points: the camera is not calibrated.")
+    if not adjustment.network.line_of_sight.is_straight:
+        return CameraCheck("not possible", "OpenCV knows neither refraction nor the curvature of the earth.")
+    hindrance = _hindrance(camera)
+    if hindrance:
+        return CameraCheck("not possible", hindrance)
+    problem = bare_problem(adjustment, name)
+    if not problem.images:
+        return CameraCheck("not possible", "No image shows enough points for OpenCV: 4 in a plane, 6 otherwise.")
+    counts = (len(problem.images), sum(len(image.xyz) for image in problem.images))
+    try:
+        solved = adjust(problem.network, problem.approximations)
+    except AdjustmentError as error:
+        return CameraCheck("not possible", f"Without priors this camera cannot be adjusted: {error}", *counts)
+    undetermined = _undetermined(solved, name)
+    if undetermined:
+        return CameraCheck("not possible", undetermined, *counts)
+    return _compared(adjustment, problem, solved, counts)
+
+
+def _hindrance(camera: Camera) -> str:
+    """Why OpenCV has no model for this camera; empty where it has."""
+    if camera.distortion.family not in COUNTERPARTS:
+        return f"OpenCV has no counterpart of the distortion family {camera.distortion.family}."
+    free = free_parameters(camera)
+    if ("x0" in free) != ("y0" in free):
+        return "OpenCV holds both coordinates of the principal point or neither; here one is fixed."
+    if "b1" in free and "c" not in free:
+        return "OpenCV holds both focal lengths or neither; here the principal distance is fixed and b1 is not."
+    if not free:
+        return "Everything of this camera is fixed: there is nothing to compare."
+    return ""
+
+
+def _undetermined(solved: Adjustment, name: str) -> str:
+    """Why the observations without priors give no camera; empty where they do."""
+    if solved.singular:
+        causes = " ".join(f"{', '.join(direction.parameters)}: {direction.cause}" for direction in solved.singular)
+        return f"Priors carried the solution; the observations of the points alone do not determine it. {causes}"
+    if not solved.converged:
+        return f"Without priors the adjustment finds no solution: {_without_stop(solved)}."
+    c, sigma = solved.value(f"IO.{name}.c"), solved.sigma(f"IO.{name}.c")
+    if sigma > UNDETERMINED * c:
+        return (
+            f"Priors carried the solution: from the observations of the points alone the principal distance has a "
+            f"standard deviation of {sigma:.3g} mm, {sigma / c:.0%} of its value."
+        )
+    return ""
+
+
+def _without_stop(adjustment: Adjustment) -> str:
+    causes = [direction.cause for direction in adjustment.singular] or [adjustment.termination]
+    return " ".join(causes).rstrip(".")
+
+
+def _compared(adjustment: Adjustment, problem: BareProblem, solved: Adjustment, counts: tuple[int, int]) -> CameraCheck:
+    conversion = converted(problem, solved)
+    rms_um, refit_um, sigma_um = _rms_um(solved), 1e3 * conversion.refit.residual_mm, 1e3 * problem.sigma_mm
+    known: dict[str, Any] = {
+        "images": counts[0],
+        "points": counts[1],
+        "rms_reseau_um": rms_um,
+        "refit_residual_um": refit_um,
+    }
+    if refit_um > LARGEST_REFIT * sigma_um:
+        reason = (
+            f"OpenCV's model cannot take this lens: the nearest one is off by {refit_um:.2f} um, rms over the image, "
+            f"where a coordinate's standard deviation is {sigma_um:.2f} um."
+        )
+        return CameraCheck("not possible", reason, **known)
+    try:
+        opencv = calibrate(problem.images, problem.freedom, conversion.refit.parameters)
+    except cv2.error as error:
+        return CameraCheck("not possible", f"OpenCV refuses these observations: {error.err}.", **known)
+    sigmas_tell = rms_um > ROUNDINGS * opencv.rounding_um
+    rows = _rows(problem.freedom, conversion, solved.sigma0 if sigmas_tell else 1.0, opencv)
+    known |= {"rms_opencv_um": opencv.rms_um, "rows": rows}
+    if opencv.rms_um > WORSE_RMS * rms_um + ROUNDINGS * opencv.rounding_um:
+        reason = (
+            f"OpenCV ends in a worse solution, {opencv.rms_um:.2f} um a point against {rms_um:.2f} um: it begins every "
+            "image by itself and did not come to the minimum."
+        )
+        return CameraCheck("not possible", reason, **known)
+    verdict, reason = _agreement(rows, sigmas_tell)
+    if verdict == "differs" and _same_model_agrees(problem, conversion, opencv):
+        verdict, reason = (
+            "agrees",
+            (
+                "Given the very same model both programs agree. OpenCV's own model is not quite this lens: the refit "
+                f"leaves {refit_um:.3f} um, which {counts[1]} points notice. {reason}"
+            ),
+        )
+    if verdict == "agrees" and sigmas_tell:
+        verdict, reason = _with_departure(reason, _departures(adjustment, solved, problem.network.cameras[0]))
+    rms = f"The residuals are {opencv.rms_um:.2f} um rms a point in OpenCV, {rms_um:.2f} um here."
+    return CameraCheck(verdict, f"{reason} {rms} {_notes(problem, opencv, sigmas_tell)}", **known)
+
+
+def _rms_um(solved: Adjustment) -> float:
+    """Per point: the root of the mean squared length of the residuals."""
+    return 1e3 * float(np.sqrt((solved.residuals.v_mm**2).sum(axis=1).mean()))
+
+
+def _rows(freedom: Freedom, conversion: Converted, sigma0: float, opencv: OpenCvCalibration) -> tuple[Row, ...]:
+    return tuple(
+        Row(
+            name,
+            "mm" if name in NAMES[:4] else "rad" if name in NAMES[-2:] else "1",
+            *(float(each[NAMES.index(name)]) for each in (conversion.refit.parameters, sigma0 * conversion.sigmas)),
+            *(float(each[NAMES.index(name)]) for each in (opencv.parameters, opencv.sigmas)),
+        )
+        for name in NAMES
+        if name in freedom.names
+    )
+
+
+def _agreement(rows: Sequence[Row], sigmas_tell: bool) -> tuple[Verdict, str]:
+    """sigmas_tell: whether the residuals, from which the sigmas come, are more than OpenCV's rounding."""
+    worst = max(rows, key=lambda row: row.difference_sigmas)
+    loosest = max(rows, key=_sigma_ratio)
+    found = f"{worst.name} differs most from OpenCV's, by {worst.difference_sigmas:.2f} sigma"
+    if worst.difference_sigmas > LARGEST_DIFFERENCE:
+        return "differs", f"{found}; up to {LARGEST_DIFFERENCE:g} would be in order."
+    if sigmas_tell and _sigma_ratio(loosest) > LARGEST_SIGMA_RATIO:
+        ratio = f"The standard deviations of {loosest.name} differ by a factor of {_sigma_ratio(loosest):.2f}"
+        return "differs", f"{ratio}, up to {LARGEST_SIGMA_RATIO:g} would be in order; {found}."
+    return "agrees", f"All {len(rows)} parameters agree: {found}."
+
+
+def _sigma_ratio(row: Row) -> float:
+    smaller, larger = sorted((row.sigma, row.opencv_sigma))
+    return larger / smaller if smaller > 0 else np.inf
+
+
+def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: OpenCvCalibration) -> bool:
+    """Whether the adjustment with OpenCV's own model comes to OpenCV's solution."""
+    if problem.network.cameras[0].distortion.family == "opencv":
+        return False
+    same = in_opencv_model(problem, conversion.refit.parameters)
+    solved = adjust(same.network, same.approximations)
+    if not solved.converged:
+        return False
+    rows = _rows(same.freedom, converted(same, solved), solved.sigma0, opencv)
+    return all(
+        row.difference_sigmas < SAME_MODEL_DIFFERENCE and _sigma_ratio(row) < SAME_MODEL_SIGMA_RATIO for row in rows
+    )
+
+
+def _departures(adjustment: Adjustment, solved: Adjustment, camera: Camera) -> dict[str, float]:
+    """How far, in the sigmas of the bare problem, the adjustment's own values lie from the bare problem's."""
+    names = {name: f"IO.{camera.name}.{name}" for name in sorted(free_parameters(camera))}
+    return {
+        name: abs(adjustment.value(full) - solved.value(full)) / solved.sigma(full)
+        for name, full in names.items()
+        if solved.sigma(full) > 0
+    }
+
+
+def _with_departure(reason: str, departures: Mapping[str, float]) -> tuple[Verdict, str]:
+    """The agreement on the bare problem, seen with what separates the adjustment from that problem."""
+    farthest = max(departures, key=lambda name: departures[name])
+    sigmas = departures[farthest]
+    alone = f"On the observations alone, {reason[0].lower()}{reason[1:]}"
+    if sigmas > LARGEST_DEPARTURE:
+        return "differs", f"Priors or weights move {farthest} by {sigmas:.1f} sigma, against the observations. {alone}"
+    if sigmas > NOTABLE_DEPARTURE:
+        moved = f"Priors and weights, which OpenCV does not know, move {farthest} by {sigmas:.2f} sigma."
+        return "agrees", f"{alone} {moved}"
+    return "agrees", reason
+
+
+def _notes(problem: BareProblem, opencv: OpenCvCalibration, sigmas_tell: bool) -> str:
+    """What OpenCV was told that is not quite so."""
+    notes = ["Both take film transformations and object points as known, so these sigmas hold for that case"]
+    if not sigmas_tell:
+        notes.append(
+            "the observations leave no more than OpenCV's rounding, so these sigmas are those assumed beforehand"
+        )
+    if problem.uncertain_points:
+        notes.append(
+            f"{problem.uncertain_points} points are in truth uncertain and enter at their adjusted coordinates"
+        )
+    if problem.sigma_spread > NOTABLE_SPREAD:
+        notes.append(
+            "all observations have one weight here, though their standard deviations differ up to "
+            f"{problem.sigma_spread:.1f}-fold"
+        )
+    if problem.gross:
+        notes.append(f"{problem.gross} observations that robust estimation set aside are left out")
+    if problem.left_out:
+        notes.append(f"left out, for too few points: {', '.join(problem.left_out)}")
+    if opencv.rounding_um > NOTABLE_ROUNDING * 1e3 * problem.sigma_mm:
+        notes.append(f"OpenCV's single precision rounds by {opencv.rounding_um:.3f} um")
+    return "; ".join(notes) + "."

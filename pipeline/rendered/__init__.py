@@ -1,0 +1,1 @@
+"""Rendered scenes as projects, and projects against their truth."""

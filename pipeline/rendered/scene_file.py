@@ -1,0 +1,269 @@
+"""SCENE.toml: the scene that is to be rendered, and how well its camera, points and orientations are to be given."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeVar, cast, get_args
+
+import numpy as np
+
+from measure.marks import shapes
+from pipeline.design.settings import read_design
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
+from pipeline.files.library import camera_path
+from pipeline.files.tables import Table, read_toml
+from pipeline.rendered.field_table import read_field
+from pipeline.rendered.scene_project import Given, SceneFile, write_project
+from synthetic_images import areas, scene
+from synthetic_images.render import Progress, render_scene
+
+Made = TypeVar("Made")
+
+TRUTH = "truth.json"
+WRITTEN = ("project.toml", "camera.toml", "points.csv", "images.csv")
+
+
+def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = None) -> None:
+    """`reseau render`: scans, truth.json and the project's files. Raises InputError.
+
+    progress: called with the image's name, the steps done and the steps of the whole scene.
+    """
+    scene_file = read_scene(scene_path)
+    _check_free(out_dir)
+    try:
+        render_scene(scene_file.scene, out_dir, progress)
+    except OSError as error:
+        raise InputError(
+            f"{out_dir}: cannot be written ({error.strerror or error}). Make room, or choose another folder."
+        ) from error
+    write_project(scene_file, out_dir)
+
+
+def _check_free(out_dir: Path) -> None:
+    """Refuse a folder with somebody's own project: one that was rendered has its truth beside it."""
+    own = [name for name in WRITTEN if (out_dir / name).exists()]
+    if own and not (out_dir / TRUTH).exists():
+        raise InputError(
+            f"{out_dir}: holds {' and '.join(own)}, which would be overwritten, and nothing says that they were "
+            "rendered. Name another folder."
+        )
+
+
+def read_scene(path: Path) -> SceneFile:
+    """Read SCENE.toml. Raises InputError naming file, line and key."""
+    return parse_scene(read_toml(path))
+
+
+def parse_scene(table: Table) -> SceneFile:
+    """The scene that stands in the root table of a file."""
+    path = table.file
+    seed = table.whole("seed", 1)
+    camera = _camera(table)
+    field_table = table.table("field")
+    unit = field_table.text("unit", "m", ("m", "dm", "cm", "mm"))
+    field = _made(path, lambda: read_field(field_table, unit, seed))
+    field_table.done()
+    film_table, scanner_table, picture = table.table("film"), table.table("scan"), table.table("picture")
+    film = _made(path, lambda: _film(film_table))
+    scanner = _made(path, lambda: _scanner(scanner_table))
+    laws = _Laws.read(film_table, scanner_table, film.kind)
+    images = table.tables("image")
+    generators = [np.random.default_rng([seed, index, 0]) for index in range(len(images))]
+    made = _made(
+        path,
+        lambda: scene.Scene(
+            name=table.text("name", path.stem),
+            seed=seed,
+            camera=_scene_camera(camera),
+            field=field,
+            images=tuple(_image(image, laws, g) for image, g in zip(images, generators, strict=True)),
+            scanner=scanner,
+            film=film,
+            tones=_tones(picture.table("tones")),
+            background=cast(scene.Background, picture.text("background", "plain", get_args(scene.Background))),
+            ground=picture.number("ground", 0.0),
+            relief=picture.number("relief", 0.0, least=0.0),
+            pad_mm=picture.number("pad_mm", 0.0, least=0.0),
+            corner_radius_mm=picture.number("corner_radius_mm", 0.0, least=0.0),
+        ),
+    )
+    given = _given(table.table("given"))
+    design = read_design(table.table("design"), given.point[0] if given.planimetry else math.inf, given.point[1])
+    for part in (film_table, scanner_table, picture, table):
+        part.done()
+    return SceneFile(path, made, camera, unit, given, design)
+
+
+def _made(path: Path, make: Callable[[], Made]) -> Made:
+    """A part of the scene; what it refuses is an error of the file."""
+    try:
+        return make()
+    except ValueError as error:
+        raise InputError(f"{path}: {error}. Correct the scene file.") from None
+
+
+def _camera(table: Table) -> CameraFile:
+    """The camera, written in the scene file or in a file of its own."""
+    if isinstance(table.values.get("camera"), str):
+        camera = read_camera(camera_path(table.text("camera"), table.file.parent))
+    else:
+        inline = table.table("camera")
+        camera = parse_camera(inline)
+        inline.done()
+    if camera.frame_mm is None or camera.principal_distance_mm is None:
+        raise table.error("camera", "a camera that is to take pictures needs frame_mm and principal_distance_mm.")
+    return camera
+
+
+def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
+    return scene.SceneCamera(
+        name=camera.name,
+        frame_mm=camera.frame_mm or (0.0, 0.0),
+        principal_distance_mm=camera.principal_distance_mm or 0.0,
+        principal_point_mm=camera.principal_point_mm or (0.0, 0.0),
+        distortion=scene.Distortion(
+            cast(scene.Family, camera.distortion.family),
+            {name: prior.value for name, prior in camera.distortion.parameters.items()},
+            camera.distortion.r0_mm,
+            camera.distortion.decentering,
+        ),
+        fiducials=tuple(scene.SceneFiducial(one.id, one.xy_mm, _painted(one.mark)) for one in camera.fiducials),
+    )
+
+
+def _painted(mark: shapes.Mark | shapes.LearnedMark | None) -> scene.DrawnMark | scene.ChipMark | None:
+    """Nothing is painted at a corner of the frame, which is there already, nor where nobody has drawn the mark."""
+    return None if mark is None or isinstance(mark, shapes.LearnedMark | shapes.FrameCorner) else scene_mark(mark)
+
+
+def scene_mark(mark: shapes.Mark) -> scene.DrawnMark | scene.ChipMark:
+    """A mark of no polarity is light, as most are. In a scene polarities are those of the positive."""
+    light = mark.polarity != "dark"
+    if isinstance(mark, shapes.MarkShape):
+        return scene.DrawnMark(tuple(_area(part) for part in mark.parts), light)
+    low, high = float(mark.image.min()), float(mark.image.max())
+    chip = (mark.image - low) / (high - low) if high > low else np.zeros_like(mark.image)
+    return scene.ChipMark(chip, mark.pitch_um, mark.origin_px, mark.turn_deg, light)
+
+
+def _area(part: shapes.Part) -> areas.Area:
+    if isinstance(part, shapes.Disk):
+        return areas.disk(part.center_mm, part.radius_mm)
+    if isinstance(part, shapes.Ring):
+        return areas.ring(part.center_mm, part.radius_mm, part.line_mm)
+    if isinstance(part, shapes.Bar):
+        return areas.bar(part.from_mm, part.to_mm, part.line_mm)
+    return areas.polygon(part.vertices_mm)
+
+
+def _film(table: Table) -> scene.Film:
+    return scene.Film(
+        kind=cast(scene.FilmKind, table.text("transformation", "affine", get_args(scene.FilmKind))),
+        deformation_um=table.number("deformation_um", 0.0),
+        grain=table.number("grain", 0.0),
+        grain_px=table.number("grain_px", 1.0),
+        dust=table.whole("dust", 0),
+        scratches=table.whole("scratches", 0),
+        hairs=table.whole("hairs", 0),
+    )
+
+
+def _scanner(table: Table) -> scene.Scanner:
+    return scene.Scanner(
+        pitch_um=table.number_or_pair("pitch_um"),
+        margin_mm=table.number("margin_mm", 5.0),
+        blur_px=table.number("blur_px", 0.7),
+        noise=table.number("noise", 0.0),
+        bit_depth=cast(Literal[8, 16], table.whole("bit_depth", 16)),
+        colour=table.flag("colour", False),
+        negative=table.flag("negative", False),
+        white_is_zero=table.flag("white_is_zero", False),
+        compression=cast(scene.Compression, table.text("compression", "none", get_args(scene.Compression))),
+        tile_px=table.whole("tile_px", 256),
+    )
+
+
+def _tones(table: Table) -> scene.Tones:
+    usual = scene.Tones()
+    tones = scene.Tones(**{name: table.number(name, value) for name, value in vars(usual).items()})
+    table.done()
+    return tones
+
+
+@dataclass(frozen=True)
+class _Laws:
+    """The chance by which every frame gets its own film transformation and place on the scanner: sigmas."""
+
+    kind: scene.FilmKind
+    scale_ppm: float
+    shear_urad: float
+    turn_deg: float
+    offset_mm: float
+
+    @staticmethod
+    def read(film: Table, scan: Table, kind: scene.FilmKind) -> "_Laws":
+        return _Laws(
+            kind,
+            film.number("scale_sigma_ppm", 0.0, least=0.0),
+            film.number("shear_sigma_urad", 0.0, least=0.0),
+            scan.number("turn_sigma_deg", 0.0, least=0.0),
+            scan.number("offset_sigma_mm", 0.0, least=0.0),
+        )
+
+
+def _image(table: Table, laws: _Laws, generator: np.random.Generator) -> scene.SceneImage:
+    """One frame: what the file does not say of its film and its place on the scanner is left to chance."""
+    scale = 1.0 + generator.normal(0.0, laws.scale_ppm * 1e-6, 2)
+    shear = float(generator.normal(0.0, laws.shear_urad * 1e-6))
+    if laws.kind == "similarity":
+        scale, shear = scale[[0, 0]], 0.0
+    turn = float(generator.normal(0.0, laws.turn_deg))
+    offset = generator.normal(0.0, laws.offset_mm, 2)
+    film = table.table("film")
+    scale_ppm = film.number_or_pair("scale_ppm", ((scale[0] - 1) * 1e6, (scale[1] - 1) * 1e6))
+    image = scene.SceneImage(
+        name=table.text("name"),
+        exterior=_exterior(table),
+        pose=table.text("pose", "0", scene.POSES),
+        turn_rad=math.radians(table.number("turn_deg", turn)),
+        offset_mm=table.pair("offset_mm", (float(offset[0]), float(offset[1]))),
+        film=scene.FilmTransformation(
+            scale=(1.0 + scale_ppm[0] * 1e-6, 1.0 + scale_ppm[1] * 1e-6),
+            shear_rad=film.number("shear_urad", shear * 1e6) * 1e-6,
+            rotation_rad=math.radians(film.number("rotation_deg", 0.0)),
+            shift_mm=film.pair("shift_mm", (0.0, 0.0)),
+        ),
+        covered=table.texts("covered") if "covered" in table else (),
+        neighbour=cast(scene.Side, table.text("neighbour", choices=get_args(scene.Side)))
+        if "neighbour" in table
+        else None,
+        neighbour_gap_mm=table.number("neighbour_gap_mm", 3.0, least=0.0),
+    )
+    film.done()
+    table.done()
+    return image
+
+
+def _exterior(table: Table) -> tuple[float, float, float, float, float, float]:
+    x, y, z = table.triple("position")
+    omega, phi, kappa = (math.radians(angle) for angle in table.triple("angles_deg"))
+    return (x, y, z, omega, phi, kappa)
+
+
+def _given(table: Table) -> Given:
+    given = Given(
+        principal_distance_mm=table.number("principal_distance_error_mm", 0.0, least=0.0),
+        principal_point_mm=table.number("principal_point_error_mm", 0.0, least=0.0),
+        fiducial_mm=table.number("fiducial_error_mm", 0.0, least=0.0),
+        point=table.number_or_pair("point_sigma", (0.0, 0.0)),
+        planimetry=table.text("control", "full", ("full", "heights")) == "full",
+        fixed_points=table.texts("fixed_points") if "fixed_points" in table else (),
+        position=table.number("position_error", 0.01, least=0.0),
+        angle_deg=table.number("angle_error_deg", 1.0, least=0.0),
+    )
+    if min(given.point) < 0.0:
+        raise table.error("point_sigma", "is a standard deviation and cannot be negative.")
+    table.done()
+    return given

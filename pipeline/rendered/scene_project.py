@@ -1,0 +1,221 @@
+"""A rendered scene as a project: what somebody would have who got the scans, with errors as the scene says."""
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.network import Prior
+from measure.marks import shapes
+from pipeline.design.settings import DesignSettings
+from pipeline.files.atomic import write_atomically
+from pipeline.files.camera_file import CameraFile, GivenFiducial
+from pipeline.files.camera_text import camera_text
+from pipeline.files.template_table import saved_in
+from pipeline.rendered.field_table import UNITS_MM
+from synthetic_images.scene import BoardField, CrossFigure, DiskField, FilmKind, RingFigure, Scene, SceneImage
+from synthetic_images.targets import Target, field_targets
+
+Array = NDArray[np.float64]
+
+NEGATIVE: Mapping[shapes.Polarity, shapes.Polarity] = {"light": "dark", "dark": "light", "auto": "auto"}
+
+
+@dataclass(frozen=True)
+class Given:
+    """How well things are known to whoever gets the scans: standard deviations of the errors of what is written.
+
+    principal_distance_mm, principal_point_mm, fiducial_mm: of the given camera. point: of the given coordinates X, Y
+    and Z, object units. planimetry: whether X and Y are control; else they are approximations, of fixed_points exact.
+    position: of the given exterior orientations, as a share of the distance to the field; angle_deg: likewise.
+    """
+
+    principal_distance_mm: float
+    principal_point_mm: float
+    fiducial_mm: float
+    point: tuple[float, float]
+    planimetry: bool
+    fixed_points: tuple[str, ...]
+    position: float
+    angle_deg: float
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A scene file as read. camera: the true camera, with the priors that the given one is to have.
+
+    unit: of the object's coordinates. design: how the same photographs are planned.
+    """
+
+    path: Path
+    scene: Scene
+    camera: CameraFile
+    unit: str
+    given: Given
+    design: DesignSettings
+
+
+def write_project(scene_file: SceneFile, out_dir: Path) -> None:
+    """Write camera.toml, points.csv, images.csv and project.toml. Raises InputError where that cannot be done."""
+    generator = np.random.default_rng([scene_file.scene.seed, 20])
+    camera = replace(_given_camera(scene_file, generator), path=out_dir / "camera.toml")
+    write_atomically(camera.path, camera_text(camera, saved_in(out_dir)))
+    targets = field_targets(scene_file.scene.field)
+    if targets:
+        write_atomically(out_dir / "points.csv", _points_csv(scene_file, targets, generator))
+    middle = _middle(scene_file.scene, targets)
+    write_atomically(out_dir / "images.csv", _images_csv(scene_file, middle, generator))
+    write_atomically(out_dir / "project.toml", _project_text(scene_file))
+
+
+def _middle(scene: Scene, targets: tuple[Target, ...]) -> Array:
+    """Of the field; without targets, the ground below the photographs."""
+    if targets:
+        return np.asarray(np.mean([target.center for target in targets], axis=0))
+    return np.array([*np.mean([image.exterior[:2] for image in scene.images], axis=0), scene.ground])
+
+
+def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> CameraFile:
+    """The true camera with errors; a distortion that is to be found is given as none."""
+    camera, given = scene_file.camera, scene_file.given
+    true = scene_file.scene.camera
+    distance = true.principal_distance_mm + generator.normal(0.0, given.principal_distance_mm)
+    point = np.asarray(true.principal_point_mm) + generator.normal(0.0, given.principal_point_mm, 2)
+    parameters = {
+        name: _given_parameter(prior, generator) for name, prior in sorted(camera.distortion.parameters.items())
+    }
+    return replace(
+        camera,
+        principal_distance_mm=round(float(distance), 4),
+        # Without fiducials the camera frame is the comparator's, and the principal point is left to the points.
+        principal_point_mm=_pair(point) if camera.fiducials else None,
+        distortion=replace(camera.distortion, parameters=parameters),
+        fiducials=tuple(_given_fiducial(one, scene_file, generator) for one in camera.fiducials),
+    )
+
+
+def _given_parameter(prior: Prior, generator: np.random.Generator) -> Prior:
+    if prior.sigma == 0.0:
+        return prior
+    return Prior(0.0 if math.isinf(prior.sigma) else float(generator.normal(prior.value, prior.sigma)), prior.sigma)
+
+
+def _given_fiducial(fiducial: GivenFiducial, scene_file: SceneFile, generator: np.random.Generator) -> GivenFiducial:
+    xy_mm = np.asarray(fiducial.xy_mm) + generator.normal(0.0, scene_file.given.fiducial_mm, 2)
+    mark = fiducial.mark
+    if isinstance(mark, shapes.Mark) and scene_file.scene.scanner.negative:
+        # The scene tells what the positive shows, the project what its scans show.
+        mark = replace(mark, polarity=NEGATIVE[mark.polarity])
+    return replace(fiducial, xy_mm=_pair(xy_mm), mark=mark)
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    """To a tenth of a micrometre, as calibration reports are typed."""
+    return (round(float(values[0]), 4), round(float(values[1]), 4))
+
+
+def _points_csv(scene_file: SceneFile, targets: tuple[Target, ...], generator: np.random.Generator) -> str:
+    rows = []
+    for target in targets:
+        center, sigmas = _given_point(scene_file, target, generator)
+        rows.append([target.id, *(f"{value:.6f}" for value in center), *sigmas, *(f"{n:.6f}" for n in target.normal)])
+    return _csv(("point", "X", "Y", "Z", "sX", "sY", "sZ", "nX", "nY", "nZ"), rows)
+
+
+def _given_point(
+    scene_file: SceneFile, target: Target, generator: np.random.Generator
+) -> tuple[Array, tuple[str, str, str]]:
+    given = scene_file.given
+    plane, height = given.point
+    error = generator.normal(0.0, 1.0, 3) * (plane, plane, height)
+    if given.planimetry:
+        return target.center + error, (f"{plane:g}", f"{plane:g}", f"{height:g}")
+    if target.id in given.fixed_points:
+        return target.center + error * (0.0, 0.0, 1.0), ("0", "0", f"{height:g}")
+    return target.center + error, ("", "", f"{height:g}")
+
+
+def _images_csv(scene_file: SceneFile, middle: Array, generator: np.random.Generator) -> str:
+    columns = ("image", "X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
+    rows = [[image.name, *_given_exterior(scene_file, image, middle, generator)] for image in scene_file.scene.images]
+    return _csv(columns, rows)
+
+
+def _given_exterior(
+    scene_file: SceneFile, image: SceneImage, middle: Array, generator: np.random.Generator
+) -> list[str]:
+    station = np.asarray(image.exterior[:3])
+    spread = scene_file.given.position * float(np.linalg.norm(station - middle))
+    station = station + generator.normal(0.0, 1.0, 3) * spread
+    angles = np.rad2deg(image.exterior[3:]) + generator.normal(0.0, scene_file.given.angle_deg, 3)
+    return [f"{value:.4f}" for value in (*station, *angles)]
+
+
+def _csv(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _project_text(scene_file: SceneFile) -> str:
+    names = ", ".join(f'"scans/{image.name}.tif"' for image in scene_file.scene.images)
+    return f"""# Rendered from the scene "{scene_file.scene.name}"; the truth is in truth.json.
+camera = "camera.toml"
+scans = [{names}]
+comparator = "comparator.csv"
+output = "out"
+
+{_targets_text(scene_file)}
+[object]
+{_points_text(scene_file)}images = "images.csv"
+unit = "{scene_file.unit}"
+
+[adjust]
+transformation = "{film_transformation(scene_file)}"
+{_datum_text(scene_file)}"""
+
+
+def _datum_text(scene_file: SceneFile) -> str:
+    """Natural points bring no planimetric control."""
+    return "" if field_targets(scene_file.scene.field) else 'datum = "minimal"\n'
+
+
+def _points_text(scene_file: SceneFile) -> str:
+    return 'points = "points.csv"\n' if field_targets(scene_file.scene.field) else ""
+
+
+def _targets_text(scene_file: SceneFile) -> str:
+    field, mm = scene_file.scene.field, UNITS_MM[scene_file.unit]
+    if not field_targets(field):
+        # The sigma of heights is that of the ground as given, and so of what its relief leaves unsaid.
+        scene, sigma = scene_file.scene, scene_file.given.point[1]
+        return f"[ties]\nheight = {scene.ground:.6g}\nheight_sigma = {np.hypot(sigma, scene.relief):.6g}\n"
+    if isinstance(field, DiskField) and isinstance(field.figure, CrossFigure):
+        arm = field.diameter / 2.0 * mm
+        return f'[targets]\nkind = "cross"\narm_mm = {arm:.6g}\nline_mm = {field.figure.line * arm:.6g}\n'
+    if isinstance(field, DiskField) and isinstance(field.figure, RingFigure):
+        ring = f"[{field.figure.inner:g}, {field.figure.outer:g}]"
+        return (
+            f'[targets]\nkind = "coded-ring"\nbits = {field.figure.bits}\nring = {ring}\n'
+            f"diameter_mm = {field.diameter * mm:.6g}\n"
+        )
+    if not isinstance(field, BoardField):
+        return f'[targets]\nkind = "disk"\ndiameter_mm = {field.diameter * mm:.6g}\n'
+    text = f'[targets]\nkind = "{field.kind}"\ncolumns = {field.columns}\nrows = {field.rows}\n'
+    if field.kind == "chessboard":
+        return f"{text}square_mm = {field.spacing * mm:.6g}\n"
+    dots = f"spacing_mm = {field.spacing * mm:.6g}\ndiameter_mm = {field.diameter * mm:.6g}\n"
+    return f"{text}{dots}asymmetric = {str(field.asymmetric).lower()}\n"
+
+
+def film_transformation(scene_file: SceneFile) -> FilmKind | Literal["none"]:
+    """The transformation that the scene's film needs; none for a camera without fiducials."""
+    return scene_file.scene.film.kind if scene_file.camera.fiducials else "none"
