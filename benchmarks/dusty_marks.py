@@ -14,6 +14,7 @@ from true_marks import KIND, Kind, TrueMark, some_mark
 
 from measure.fiducial_options import FiducialOptions
 from measure.fitting.matching import match
+from measure.fitting.scan_window import ScanWindow
 from measure.frames.frame_measurement import measure_frame
 from measure.frames.refinement import options_for
 from measure.marks.poses import POSES
@@ -21,7 +22,6 @@ from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from measure.scans.scan_window import ScanWindow
 from measure.search.constellation import Placement
 from measure.single_targets.disks import PLAIN_MARGIN_PX
 from measure.single_targets.targets import TargetPrediction, measure_disks

@@ -10,7 +10,7 @@ from true_marks import TrueMark
 from measure.fiducial_options import FiducialOptions
 from measure.frames.frame import CLEAR_DAMAGE
 from measure.frames.refinement import sight
-from measure.marks.prediction import MarkPrediction
+from measure.search.prediction import MarkPrediction
 from measure.single_targets.disks import fit_disk
 
 Array = NDArray[np.float64]

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from measure.fitting.matching import MatchOptions
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout
+from measure.match_options import MatchOptions
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fiducial_options import FiducialOptions
+from measure.frames.chance import doubt, expected_as_good, expected_where_seen
 from measure.frames.fiducial_rows import absent_frame, present_frame
 from measure.frames.frame import Frame
 from measure.frames.frame_fit import AFFINITY_SIGMA
@@ -16,8 +17,7 @@ from measure.marks.shapes import FiducialLayout
 from measure.pose.pose_decision import decide_pose
 from measure.results import FrameMeasurement, Pose
 from measure.scans.scan import Scan
-from measure.search.centred_frame import is_complete, is_worth_a_look, outermost
-from measure.search.chance import doubt
+from measure.search.centred_frame import is_worth_a_look, outermost
 from measure.search.constellation import Placement
 from measure.search.correlation import CLOSE
 from measure.search.frame_search import FrameSearch
@@ -79,7 +79,7 @@ def _at_first_look(
     """The placements, best first, and the frame in one of them, None where there is none: in the middle of a scan whose
     pitch is given, or anywhere, and under other pitches where that may be no frame of the camera."""
     found, frame = _in_the_middle(search, hypotheses[0][0]) if is_given else ([], None)
-    if frame is None or not is_complete(frame):
+    if frame is None or not frame.is_complete:
         found, frame = _anywhere(search, hypotheses[0])
     tried = len(hypotheses[0])
     for others in hypotheses[1:]:
@@ -134,8 +134,8 @@ def _in_spite_of_pitch(
     chance would hardly make in all the hypotheses tried."""
     found = search.anywhere(hypotheses)
     frames = [_as_its_pictures_say(search, found, place) for place in _hopeful(search, found, tried)]
-    sure = [frame for frame in frames if frame.accepted and tried * search.expected_as_good(frame) <= _CHANCE]
-    return (found, min(sure, key=search.expected_as_good)) if sure else None
+    sure = [frame for frame in frames if frame.accepted and tried * expected_as_good(search, frame) <= _CHANCE]
+    return (found, min(sure, key=lambda frame: expected_as_good(search, frame))) if sure else None
 
 
 def _at_a_closer_look(
@@ -162,7 +162,7 @@ def _hardly_chance(
         frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
         if not frames:
             continue
-        as_measured = min(search.expected_where_seen(frame, _seen_px(frame)) for frame in frames)
+        as_measured = min(expected_where_seen(search, frame, _seen_px(frame)) for frame in frames)
         counts = [as_measured, *(count(place) for count in others)]
         expected = len(counts) * tried * min(counts)
         if expected <= least:

@@ -1,6 +1,7 @@
 """Who may import whom: measure, adjust and synthetic_images know none of the others, pipeline knows them all."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -33,3 +34,22 @@ def test_package_imports_only_what_the_architecture_allows(package: str) -> None
         assert not strangers, f"{file.relative_to(ROOT)} imports {sorted(strangers)}"
         pictures = names & FORBIDDEN_LIBRARIES.get(package, set())
         assert not pictures, f"{file.relative_to(ROOT)} imports {sorted(pictures)}"
+
+
+def test_the_folders_of_measure_use_one_another_in_no_circle() -> None:
+    used = {
+        folder.name: folders_used(folder) - {folder.name} for folder in (ROOT / "measure").iterdir() if folder.is_dir()
+    }
+    assert "frames" in used["pose"]
+    TopologicalSorter(used).prepare()
+
+
+def folders_used(folder: Path) -> set[str]:
+    """The folders of measure from which the files of one import."""
+    modules = {
+        node.module or ""
+        for file in folder.glob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom)
+    }
+    return {name.split(".")[1] for name in modules if name.count(".") == 2 and name.startswith("measure.")}

@@ -1,1 +1,1 @@
-"""What else is known of a measured mark, compared with its place."""
+"""Measured frames checked by what else is known: the pitch of the scan, and the camera's other frames."""

@@ -17,9 +17,9 @@ from measure.codes_and_boards.board_specs import (
 )
 from measure.codes_and_boards.circle_grids import measure_circle_grid
 from measure.codes_and_boards.corners import Corner, Surface, crossing, fit_corner, quarter
+from measure.fitting.scan_window import ScanWindow
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.scans.scan_window import ScanWindow
 from measure.status import Status
 
 Array = NDArray[np.float64]

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.special import erf, ndtr, owens_t
 
 from measure.codes_and_boards.junction import junction
-from measure.fitting.noise import NoiseModel, correlated, noise_model, robust_scale
 from measure.fitting.picture_model import PIXEL_VARIANCE_PX2
-from measure.fitting.pixel_sums import products
-from measure.fitting.robust import tukey_weights
-from measure.scans.scan_window import ScanWindow
+from measure.fitting.scan_window import ScanWindow
+from measure.noise.noise import NoiseModel, correlated, noise_model, robust_scale
+from measure.noise.pixel_sums import products
+from measure.noise.robust import tukey_weights
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

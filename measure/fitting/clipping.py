@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import log_ndtr
 
-from measure.fitting.noise import robust_scale
+from measure.noise.noise import robust_scale
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

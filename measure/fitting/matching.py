@@ -13,23 +13,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.checks.changed_tone import covariance_of_changed_tone
-from measure.checks.linear_fit import LinearFit
-from measure.checks.own_shape import OwnShape, own_shape
-from measure.checks.second_place import SecondPlace, edge_place, sloping_place
-from measure.fitting.blank_film import blank_patches, is_coloured
+from measure.fitting.changed_tone import covariance_of_changed_tone
 from measure.fitting.clipping import Sides
 from measure.fitting.generators import is_round
-from measure.fitting.grain import grain_model
-from measure.fitting.noise import NoiseModel, is_textured, noise_model
+from measure.fitting.linear_fit import LinearFit
+from measure.fitting.own_shape import OwnShape, own_shape
 from measure.fitting.picture_fit import PictureFit
 from measure.fitting.picture_model import GREY, PictureModel, State, background_px
-from measure.fitting.pixel_sums import combined, factors
+from measure.fitting.scan_window import ScanWindow
 from measure.fitting.second_order import second_order
+from measure.fitting.second_place import SecondPlace, edge_place, sloping_place
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Mark, MarkTemplate
 from measure.match_options import MatchOptions
-from measure.scans.scan_window import ScanWindow
+from measure.noise.blank_film import blank_patches, is_coloured
+from measure.noise.grain import grain_model
+from measure.noise.noise import NoiseModel, is_textured, noise_model
+from measure.noise.pixel_sums import combined, factors
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
 

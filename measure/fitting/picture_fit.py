@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.clipping import noise_scale
-from measure.fitting.noise import NoiseModel, correlated, may_be_noise, robust_scale
 from measure.fitting.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
-from measure.fitting.pixel_sums import combined, products
-from measure.fitting.robust import damage, damage_where_lossy, grown, solution, tukey_loss, tukey_weights
 from measure.fitting.sandwich_covariance import sandwich_covariance
-from measure.fitting.weighting import weighted
 from measure.marks.rendering import chip_mask, picture
 from measure.marks.shapes import MarkTemplate
+from measure.noise.noise import NoiseModel, correlated, may_be_noise, robust_scale
+from measure.noise.pixel_sums import combined, products
+from measure.noise.robust import damage, damage_where_lossy, grown, solution, tukey_loss, tukey_weights
+from measure.noise.weighting import weighted
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

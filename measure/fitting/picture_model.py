@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from measure.fitting.clipping import Sides, censored, tells
 from measure.fitting.generators import generators
-from measure.fitting.pixel_sums import combined, factors
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
 from measure.match_options import MatchOptions
+from measure.noise.pixel_sums import combined, factors
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

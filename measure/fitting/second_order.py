@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.picture_model import GREY
-from measure.fitting.pixel_sums import combined, products
+from measure.noise.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

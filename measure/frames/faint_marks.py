@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.matching import Match
-from measure.marks.prediction import MarkPrediction
 from measure.marks.rendering import extent_px, picture
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT, detail_px
+from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

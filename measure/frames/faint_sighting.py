@@ -7,9 +7,9 @@ from measure.frames.faint_marks import FaintMark, find_faint
 from measure.frames.frame_sighter import CHANCE, FrameSighter
 from measure.frames.refinement import Sighting
 from measure.frames.unseen import Ground, reason_unseen
-from measure.marks.prediction import MarkPrediction
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FrameCorner
+from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.checks.second_place import SecondPlace
+from measure.fitting.second_place import SecondPlace
 from measure.frames.frame import Frame
 from measure.frames.frame_fit import AFFINITY_SIGMA
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate

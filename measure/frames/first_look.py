@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from measure.fitting.matching import window_about
-from measure.marks.prediction import MarkPrediction
 from measure.marks.rendering import ROUGH_CELLS, extent_px, picture
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT, detail_px
+from measure.search.prediction import MarkPrediction
 from measure.search.response_layers import highest
 
 Array = NDArray[np.float64]

@@ -18,6 +18,7 @@ CLEAR_LIKENESS = 0.5  # below it a mark's picture has more in it that is not the
 CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be another's
 _CLEAR_SNR = 3.0
 _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
+_CHECKED = 4  # marks that agree: an affine transformation through them has a check
 _WRONG_PX, _WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _LEAST_SCATTER_MM = 0.01  # of few marks, which may agree by chance better than film keeps them
@@ -56,10 +57,14 @@ class Frame:
         return [np.asarray(place) for place, gone in zip(places, missed, strict=True) if gone]
 
     @property
+    def inside(self) -> int:
+        """How many marks it puts within the scan."""
+        return sum(sighting.inside for sighting in self.sightings)
+
+    @property
     def agrees(self) -> bool:
         """Whether enough marks agree, clear or not: three, and three in ten of those in the scan."""
-        inside = sum(sighting.inside for sighting in self.sightings)
-        return int(self.belongs.sum()) >= max(self._least, int(np.ceil(_AGREEING_SHARE * inside)))
+        return int(self.belongs.sum()) >= max(self._least, int(np.ceil(_AGREEING_SHARE * self.inside)))
 
     @property
     def accepted(self) -> bool:
@@ -77,6 +82,11 @@ class Frame:
         """Whether it is accepted, as many marks being measured as have to agree: a frame that is seen elsewhere than it
         lies has hardly any."""
         return self.accepted and self.measured >= self._least
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it needs no other search: every mark plainly seen where the others put it."""
+        return bool(self.accepted and len(self.belongs) >= _CHECKED and self.belongs.all() and self.all_clear)
 
     @property
     def _least(self) -> int:

@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 
 from measure.fiducial_options import FiducialOptions
 from measure.fitting.matching import Match
+from measure.frames.channels import best_weights
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
 from measure.frames.frame_fit import fit_frame, strangers
 from measure.frames.refinement import Sighting, sight
 from measure.marks.poses import up_from_camera
-from measure.marks.prediction import MarkPrediction
 from measure.marks.shapes import FiducialLayout
-from measure.scans.channels import best_weights
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 from measure.search.constellation import NARROW, Placement, sign_of
 from measure.search.correlation import CLOSE
+from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

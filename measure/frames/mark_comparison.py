@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from measure.checks.own_shape import OwnShape
 from measure.fitting.matching import Match
+from measure.fitting.own_shape import OwnShape
 from measure.fitting.picture_model import PIXEL_VARIANCE_PX2
 
 Array = NDArray[np.float64]

@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.beyond_edge import beyond_edge
-from measure.fitting.blank_film import BESIDE_PX
 from measure.fitting.matching import Match, MatchOptions, match, window_about
+from measure.fitting.scan_window import read_window
 from measure.frames.first_look import seen
-from measure.marks.prediction import MarkPrediction
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
+from measure.noise.blank_film import BESIDE_PX
 from measure.scans.compression import with_loss
 from measure.scans.scan import Scan
-from measure.scans.scan_window import read_window
 from measure.search.candidates import FAINT
 from measure.search.correlation import CLOSE
+from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_corner import corner_of_edges
 
 Array = NDArray[np.float64]

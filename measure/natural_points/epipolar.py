@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
-from measure.fitting.noise import robust_scale
+from measure.noise.noise import robust_scale
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import chi2
 
-from measure.fitting.noise import NoiseModel, correlated, noise_model
 from measure.natural_points.bending import Bending
+from measure.noise.noise import NoiseModel, correlated, noise_model
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

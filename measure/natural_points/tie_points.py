@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from measure.fitting.noise import robust_scale
 from measure.natural_points.bending import Bending, bending_variance
 from measure.natural_points.epipolar import contradicting
 from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
 from measure.natural_points.tie_candidates import TieCandidate, widened
 from measure.natural_points.tie_frame import TieFrame
+from measure.noise.noise import robust_scale
 from measure.scans.parallel import mapped
 from measure.scans.scan import open_scan
 

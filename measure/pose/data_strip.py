@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from measure.fitting.noise import robust_scale
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import FiducialLayout, Side
+from measure.noise.noise import robust_scale
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from measure.fitting.matching import Match
-from measure.fitting.noise import robust_scale
-from measure.fitting.robust import tukey_weights
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate
+from measure.noise.noise import robust_scale
+from measure.noise.robust import tukey_weights
 from measure.scans.scan import Scan, means
 from measure.search.candidates import detail_px, quarter_turned
 

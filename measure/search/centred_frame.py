@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from measure.frames.frame import Frame
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.scans.scan import Scan
 
@@ -16,7 +15,7 @@ Array = NDArray[np.float64]
 _LARGE_PX = 1 << 24  # a smaller scan is read whole in no time
 _REACH = 0.025  # of the frame's side: laid by hand it is off by some millimetres and a degree
 _LARGEST_SHARE = 0.25  # of the scan: where windows hold more, the whole of it tells more
-_LEAST_MARKS = 4  # that agree: an affine transformation through them has a check
+_CORNERS = 4
 _FINE = 0.05  # of how near steps are alike
 _ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step aside could be one step off
 
@@ -51,7 +50,7 @@ def outermost(marks: Sequence[LayoutMark]) -> tuple[LayoutMark, ...]:
     them. All marks where the constellation has no such four."""
     diagonal = np.array([mark.xy_mm for mark in marks]) @ [(1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)]
     outer = np.unique(diagonal.argmax(axis=0))
-    return tuple(marks[index] for index in outer) if len(outer) == _LEAST_MARKS else tuple(marks)
+    return tuple(marks[index] for index in outer) if len(outer) == _CORNERS else tuple(marks)
 
 
 def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Array) -> Array:
@@ -60,8 +59,3 @@ def centred_places_px(scan: Scan, layout: FiducialLayout, pixel_from_camera: Arr
     xy = np.array([mark.xy_mm for mark in layout.marks])
     middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
     return np.asarray((xy - middle) @ pixel_from_camera.T + np.array([scan.width_px - 1, scan.height_px - 1]) / 2)
-
-
-def is_complete(frame: Frame) -> bool:
-    """Whether the frame needs no other search: every mark plainly seen where the others put it."""
-    return bool(frame.accepted and len(frame.belongs) >= _LEAST_MARKS and frame.belongs.all() and frame.all_clear)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.noise import robust_scale
+from measure.noise.noise import robust_scale
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT
 from measure.search.correlation import Map

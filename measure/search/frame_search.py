@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.special import comb
 
 from measure.fiducial_options import FiducialOptions
-from measure.frames.frame import Frame
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
@@ -20,7 +19,6 @@ from measure.search.correlation import WIDE, Surroundings
 from measure.search.exposed_frame import ExposedFrame, exposed_frame
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 from measure.search.response_layers import HeldReaches
-from measure.status import Status
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
@@ -158,25 +156,15 @@ class FrameSearch:
         seen = {index: places[index] for index in np.flatnonzero(inside).tolist()}
         return self._expected(placement, seen, len(seen), search.tolerance_px)
 
-    def expected_as_good(self, frame: Frame) -> float:
-        """The same of a frame that was measured, only its marks without blemish counting as seen."""
-        verdicts = [frame.verdict(index)[0] if fit else None for index, fit in enumerate(frame.fits)]
-        seen = {
-            index: fit.center_px
-            for index, (fit, verdict) in enumerate(zip(frame.fits, verdicts, strict=True))
-            if fit is not None and verdict is Status.MEASURED
-        }
-        return self.expected_where_seen(frame, seen)
-
-    def was_everywhere(self, frame: Frame) -> bool:
+    def was_everywhere(self, placement: Placement) -> bool:
         """Whether the frame was searched in the whole scan, not only in the middle of it."""
-        searched = self._searched.get(frame.placement.pitch_mm)
+        searched = self._searched.get(placement.pitch_mm)
         return searched is not None and searched.search.responses.origins is None
 
-    def expected_where_seen(self, frame: Frame, seen_px: dict[int, Array]) -> float:
-        """The same, with the marks that count as seen, by index, and where. Chance puts marks anywhere within the
-        tolerance: those that a similarity fits better are the less likely, the more of them there are."""
-        placement, inside = frame.placement, sum(sighting.inside for sighting in frame.sightings)
+    def expected_where_seen(self, placement: Placement, inside: int, seen_px: dict[int, Array]) -> float:
+        """The same of a frame that was measured: of its marks inside the scan, those that count as seen, by index, and
+        where. Chance puts marks anywhere within the tolerance: those that a similarity fits better are the less likely,
+        the more of them there are."""
         widest_px = self._searched[placement.pitch_mm].search.tolerance_px
         tolerances = (widest_px, NARROW * widest_px)
         kept = [each for each in tolerances if each == widest_px or self._misfit_px(placement, seen_px) <= each]

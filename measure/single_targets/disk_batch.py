@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.noise import SIGMA_OF_DEVIATION
-from measure.fitting.robust import tukey_weights
+from measure.noise.noise import SIGMA_OF_DEVIATION
+from measure.noise.robust import tukey_weights
 from measure.single_targets.block import Block
 from measure.single_targets.disk_model import GREYS, UNKNOWNS, DiskModel, DiskStates, each, solved
 from measure.single_targets.disk_patches import Patches

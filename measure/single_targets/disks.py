@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.checks.second_place import SecondPlace
-from measure.fitting.blank_film import BESIDE_PX
 from measure.fitting.matching import Match, MatchOptions, match, window_about
-from measure.fitting.noise import may_be_noise
 from measure.fitting.picture_model import GREY
+from measure.fitting.scan_window import read_window
+from measure.fitting.second_place import SecondPlace
 from measure.marks.shapes import Disk, MarkShape
+from measure.noise.blank_film import BESIDE_PX
+from measure.noise.noise import may_be_noise
 from measure.scans.compression import with_loss
 from measure.scans.scan import Scan
-from measure.scans.scan_window import read_window
 from measure.single_targets.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
 from measure.single_targets.disk_patches import LEAST_SNR
 

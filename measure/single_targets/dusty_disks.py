@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from measure.fitting.noise import SIGMA_OF_DEVIATION
+from measure.noise.noise import SIGMA_OF_DEVIATION
 from measure.single_targets.disks import FittedDisk
 
 Array = NDArray[np.float64]

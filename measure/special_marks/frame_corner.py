@@ -16,12 +16,12 @@ from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
 from measure.fitting.matching import Match
-from measure.fitting.noise import robust_scale
-from measure.fitting.robust import tukey_weights
-from measure.marks.prediction import MarkPrediction
 from measure.marks.shapes import FrameCorner
+from measure.noise.noise import robust_scale
+from measure.noise.robust import tukey_weights
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT
+from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from measure.fitting.matching import Match
-from measure.fitting.noise import robust_scale
-from measure.fitting.robust import tukey_weights
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
+from measure.noise.noise import robust_scale
+from measure.noise.robust import tukey_weights
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]

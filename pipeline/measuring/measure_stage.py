@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from measure.checks.cross_checks import cross_checked
+from measure.checks.pitch_check import pitch_problem
 from measure.codes_and_boards.coma import one_definition
 from measure.errors import MeasurementError
 from measure.fiducial_options import FiducialOptions
@@ -17,7 +18,6 @@ from measure.fiducials import measure_fiducials
 from measure.marks.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan, open_scan
-from measure.search.pitch_check import pitch_problem
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.learned_table import LearnedFrom

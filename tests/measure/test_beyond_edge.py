@@ -9,10 +9,10 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.fitting.beyond_edge import beyond_edge
 from measure.frames.refinement import sight
-from measure.marks.prediction import MarkPrediction
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon
 from measure.match_options import MatchOptions
 from measure.search.correlation import CLOSE
+from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
+from measure.frames.chance import doubt
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, dot
 from measure.pose.pose_decision import decide_pose
 from measure.scans.scan import Scan
-from measure.search.chance import doubt
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
 from measure.status import Status

@@ -9,7 +9,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.fitting.clipping import censored, clipped_sides, noise_scale
 from measure.fitting.matching import Match
 from measure.frames.refinement import sight
-from measure.marks.prediction import MarkPrediction
+from measure.search.prediction import MarkPrediction
 
 FULL, CONTRAST = 65535.0, 20000.0
 

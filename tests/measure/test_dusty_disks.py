@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from drawn import drawn, ellipse, scan_of, whitened
 
-from measure.checks.second_place import SecondPlace
+from measure.fitting.second_place import SecondPlace
 from measure.single_targets.disks import FittedDisk
 from measure.single_targets.dusty_disks import doubts
 from measure.single_targets.targets import TargetPrediction, measure_disks

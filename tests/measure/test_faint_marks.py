@@ -7,8 +7,8 @@ from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
 from measure.frames.faint_marks import FaintMark, find_faint
-from measure.marks.prediction import MarkPrediction
 from measure.marks.shapes import MarkShape, cross
+from measure.search.prediction import MarkPrediction
 
 CROSS = MarkShape(cross(0.5, 0.05), "dark")
 LINEAR = 36.0 * np.diag([1.0, -1.0])

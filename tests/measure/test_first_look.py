@@ -9,8 +9,8 @@ from true_marks import KIND, some_mark
 from measure.fiducial_options import FiducialOptions
 from measure.frames.first_look import seen
 from measure.frames.refinement import sight
-from measure.marks.prediction import MarkPrediction
 from measure.marks.shapes import MarkShape, cross
+from measure.search.prediction import MarkPrediction
 
 GROUND, CONTRAST = 25000.0, 15000.0
 

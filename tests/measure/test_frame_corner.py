@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.marks.prediction import MarkPrediction
 from measure.marks.shapes import FiducialLayout, LayoutMark, frame_corner
+from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_corner import corner_of_edges
 from measure.status import Status
 

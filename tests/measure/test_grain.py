@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from measure.fitting.grain import grain_model
-from measure.fitting.noise import noise_model
+from measure.noise.grain import grain_model
+from measure.noise.noise import noise_model
 
 
 @pytest.mark.parametrize("grain_px", [0.6, 0.8, 1.1])

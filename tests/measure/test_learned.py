@@ -8,8 +8,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from measure.fitting.matching import MatchOptions, match
+from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkShape, polygon
-from measure.scans.scan_window import ScanWindow
 from measure.special_marks.learned import Chip, honest_covariance, template_of
 from measure.special_marks.recurring import recurrence
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from measure.checks.own_shape import OwnShape
+from measure.fitting.own_shape import OwnShape
 from measure.frames.mark_comparison import SharedShape, round_moves_px, shared_blurs, shared_shapes, shared_sizes
 
 PIXEL = 1 / 12

@@ -5,9 +5,9 @@ import numpy as np
 from drawn import Array, drawn
 
 from measure.fitting.matching import Match, match
+from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkShape, Polygon
 from measure.match_options import MatchOptions
-from measure.scans.scan_window import ScanWindow
 
 SIZE, CONTRAST = 41, 500.0
 PLACE = np.array([6.3, 20.2])

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from measure.checks.pitch_check import pitch_problem
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
 from measure.results import FrameMeasurement, MarkMeasurement
-from measure.search.pitch_check import pitch_problem
 from measure.status import Status
 
 

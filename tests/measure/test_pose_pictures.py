@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.matching import MatchOptions, match
+from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkTemplate
 from measure.pose.pose_pictures import Drawings, Shown, Site
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from measure.scans.scan_window import ScanWindow
 
 SIDE = 61
 FLIP = np.diag([1.0, -1.0])

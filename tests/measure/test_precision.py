@@ -18,8 +18,8 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.fitting.matching import Match
 from measure.frames.refinement import sight
-from measure.marks.prediction import MarkPrediction
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon, turned
+from measure.search.prediction import MarkPrediction
 from measure.single_targets.disks import fit_disk
 
 GROUND, CONTRAST, SNR = 25000.0, 15000.0, 20.0

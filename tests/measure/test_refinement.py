@@ -5,9 +5,9 @@ import pytest
 from brute_marks import brute_picture
 
 from measure.fitting.matching import MatchOptions, match
+from measure.fitting.scan_window import ScanWindow
 from measure.frames.refinement import strained_px
 from measure.marks.shapes import MarkShape, cross, polygon
-from measure.scans.scan_window import ScanWindow
 
 WING = MarkShape(polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35))))
 START = np.array([[36.0, 0.0, 30.3], [0.0, -36.0, 39.6]])

@@ -1,6 +1,6 @@
 import numpy as np
 
-from measure.fitting.robust import damage, damage_where_lossy
+from measure.noise.robust import damage, damage_where_lossy
 
 
 def test_damage_lies_about_its_speck_on_all_sides_alike() -> None:

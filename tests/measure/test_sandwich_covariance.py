@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 from true_marks import KIND, some_mark
 
 from measure.fitting.matching import MatchOptions, match
+from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkTemplate
-from measure.scans.scan_window import ScanWindow
 
 FOLD, SPARE_PX = 4, 6
 SHIFTS = ((2, 0), (0, 2), (1, 1), (3, 2), (2, 3))

@@ -13,11 +13,11 @@ from brute_marks import brute_picture, placed
 from measure.codes_and_boards.board_specs import ChessboardSpec
 from measure.codes_and_boards.boards import measure_board
 from measure.fitting.matching import match
+from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkShape, ring_cross
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from measure.scans.scan_window import ScanWindow
 from pipeline.measuring.comparator_file import read_comparator
 
 RING_CROSS = MarkShape(ring_cross(0.8, 0.12, 0.6, 0.08))

@@ -9,7 +9,7 @@ next to nothing else.
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.pixel_sums import products
+from measure.noise.pixel_sums import products
 
 Array = NDArray[np.float64]
 

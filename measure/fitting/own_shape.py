@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.checks.linear_fit import LinearFit
-from measure.fitting.pixel_sums import combined, products
+from measure.fitting.linear_fit import LinearFit
+from measure.noise.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.fitting.noise import NoiseModel, correlated
-from measure.fitting.pixel_sums import products
+from measure.noise.noise import NoiseModel, correlated
+from measure.noise.pixel_sums import products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from measure.checks.linear_fit import LinearFit
+from measure.fitting.linear_fit import LinearFit
 from measure.fitting.picture_model import GREY
-from measure.fitting.pixel_sums import combined, products
+from measure.noise.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from measure.fitting.noise import NoiseModel, padded
+from measure.noise.noise import NoiseModel, padded
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import nnls
 
-from measure.fitting.blank_film import PATCH_PX, PLANE
-from measure.fitting.noise import NoiseModel, padded
-from measure.fitting.pixel_sums import combined, products
+from measure.noise.blank_film import PATCH_PX, PLANE
+from measure.noise.noise import NoiseModel, padded
+from measure.noise.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

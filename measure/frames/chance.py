@@ -15,11 +15,12 @@ from measure.fiducial_options import FiducialOptions
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
 from measure.frames.frame_sighter import first_search_px
-from measure.marks.prediction import MarkPrediction
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.search.constellation import sign_of
 from measure.search.frame_search import FrameSearch
+from measure.search.prediction import MarkPrediction
+from measure.status import Status
 
 Array = NDArray[np.float64]
 
@@ -48,12 +49,30 @@ def doubt(search: FrameSearch, frame: Frame) -> str:
     return _by_places_beside(search.scan, search.layout, frame, search.options, inside, clear)
 
 
+def expected_as_good(search: FrameSearch, frame: Frame) -> float:
+    """How many frames as good chance would make in the scan, only marks without blemish counting as seen."""
+    return expected_where_seen(
+        search,
+        frame,
+        {
+            index: fit.center_px
+            for index, fit in enumerate(frame.fits)
+            if fit and frame.verdict(index)[0] is Status.MEASURED
+        },
+    )
+
+
+def expected_where_seen(search: FrameSearch, frame: Frame, seen_px: dict[int, Array]) -> float:
+    """The same with the marks that count as seen, by index, and where."""
+    return search.expected_where_seen(frame.placement, frame.inside, seen_px)
+
+
 def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> str:
     """Where every mark was found: whether the scan has many places that answer as strongly. Few frames lie in the
     middle of it, and windows about the marks tell of no others."""
-    if len(clear) <= _FREE or not search.was_everywhere(frame):
+    if len(clear) <= _FREE or not search.was_everywhere(frame.placement):
         return ""
-    expected = search.expected_where_seen(frame, clear)
+    expected = expected_where_seen(search, frame, clear)
     if expected <= _LIKELY:
         return ""
     return (
