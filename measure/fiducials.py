@@ -76,8 +76,10 @@ def measure_fiducials(
 def _at_first_look(
     search: FrameSearch, hypotheses: Sequence[Sequence[PitchHypothesis]], is_given: bool
 ) -> tuple[list[Placement], Frame | None]:
-    """The placements, best first, and the frame in one of them, None where there is none: in the middle of a scan whose
-    pitch is given, or anywhere, and under other pitches where that may be no frame of the camera."""
+    """The placements, best first, and the frame in one of them, None where there is none.
+
+    It is looked for in the middle of the scan where the pitch is given, then anywhere. Where what is found may be
+    chance, other pitches are tried."""
     found, frame = _in_the_middle(search, hypotheses[0][0]) if is_given else ([], None)
     if frame is None or not frame.is_complete:
         found, frame = _anywhere(search, hypotheses[0])
@@ -130,8 +132,8 @@ def _as_its_pictures_say(search: FrameSearch, found: Sequence[Placement], placem
 def _in_spite_of_pitch(
     search: FrameSearch, hypotheses: Sequence[PitchHypothesis], tried: int
 ) -> tuple[list[Placement], Frame] | None:
-    """The same where the pixels are not as given. So much freedom finds false marks too: only a frame counts that
-    chance would hardly make in all the hypotheses tried."""
+    """The placements and the frame under other pitches than the given one, None where there is none. So much freedom
+    finds false frames too: only one counts that chance would hardly make in all the hypotheses tried."""
     found = search.anywhere(hypotheses)
     frames = [_as_its_pictures_say(search, found, place) for place in _hopeful(search, found, tried)]
     sure = [frame for frame in frames if frame.accepted and tried * expected_as_good(search, frame) <= _CHANCE]
@@ -141,8 +143,11 @@ def _in_spite_of_pitch(
 def _at_a_closer_look(
     search: FrameSearch, hypotheses: Sequence[PitchHypothesis]
 ) -> tuple[list[Placement], Frame | None]:
-    """The same where marks are looked at closer by, as the frame's edge may drown them: in the whole scan, and then
-    about where the edges of the exposed frame put them. What the second look tries counts with the first's."""
+    """The placements, best first, and the frame in one of them, None where there is none. Less of what lies beside a
+    mark counts here: the frame's edge may drown it else.
+
+    The whole scan is searched, then only about where the edges of the exposed frame put the marks. The second search
+    counts the hypotheses of the first as tried too."""
     found, tried = search.anywhere(hypotheses), len(hypotheses)
     frame = _hardly_chance(search, found, tried, search.expected_alike)
     if frame is None:
@@ -154,9 +159,10 @@ def _at_a_closer_look(
 def _hardly_chance(
     search: FrameSearch, found: Sequence[Placement], tried: int, *others: Callable[[Placement], float]
 ) -> Frame | None:
-    """The frame in the best placement, if chance would hardly make so many marks that agree, or a placement as good by
-    one of the other counts. Their pictures need not be clear: whether a frame is there is one question, which its pose
-    another."""
+    """The frame that chance is least expected to make, None where it may be chance. others: further estimates of how
+    many such placements chance makes; the least of all estimates counts, times their number.
+
+    The marks' pictures need not be clear: whether a frame is there is one question, which pose it has another."""
     best, least = None, _CHANCE
     for place in _hopeful(search, found, tried):
         frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
@@ -188,7 +194,7 @@ def _seen_px(frame: Frame) -> dict[int, Array]:
 
 
 def _hopeful(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
-    """The best placement and those elsewhere, as far as chance would not make many that answer as well."""
+    """The best placement and its rivals elsewhere, without those of which chance makes many that answer as well."""
     places = (*found[:1], *_others(found))
     return [place for place in places if tried * search.expected_alike(place) <= _HOPELESS]
 

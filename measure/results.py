@@ -68,3 +68,9 @@ class FrameMeasurement:
     pose: Pose | None = None
     pixel_from_camera: Array | None = None
     problems: tuple[str, ...] = ()
+
+    @property
+    def px_per_mm(self) -> float | None:
+        """The scale of pixel_from_camera, the mean of both directions; None without one."""
+        matrix = self.pixel_from_camera
+        return None if matrix is None else float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))

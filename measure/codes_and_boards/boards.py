@@ -30,7 +30,7 @@ SHORTEST_REACH_PX = 5.0  # less shows too little of the edges...
 FARTHEST_REACH = 0.6  # ...but beyond this share the neighbouring crossing begins to show
 LONGEST_REACH_PX = 15.0  # enough for a few thousandths of a pixel, whatever the square
 MARKER_REACH = 0.8  # of a marker's module: its black border is one module wide
-WEAK_DAMAGE = 0.25
+WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out it is weak
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from measure.status import Status
 
 Array = NDArray[np.float64]
 
-SMALLEST_DOT_PX = 5.0
+SMALLEST_DOT_PX = 5.0  # its diameter
 NEAREST_DOTS = 8  # whose places and shapes predict a missing one's
 
 

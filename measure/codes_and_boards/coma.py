@@ -15,7 +15,7 @@ from measure.results import MarkMeasurement
 
 Array = NDArray[np.float64]
 
-NEIGHBOURS = 4
+NEIGHBOURS = 4  # crossings: the next ones along the rows and columns
 FEWEST_CROSSINGS = 30  # with fewer nobody can tell coma from noise
 
 

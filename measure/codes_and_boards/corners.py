@@ -18,7 +18,7 @@ from scipy.special import erf, ndtr, owens_t
 from measure.codes_and_boards.junction import junction
 from measure.fitting.picture_model import PIXEL_VARIANCE_PX2
 from measure.fitting.scan_window import ScanWindow
-from measure.noise.noise import NoiseModel, correlated, noise_model, robust_scale
+from measure.noise.noise import correlated, noise_model, robust_scale
 from measure.noise.pixel_sums import products
 from measure.noise.robust import tukey_weights
 
@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 Surface = Callable[[Array, Array, float], tuple[Array, Array, Array, Array]]
 
 _SCALE_FLOOR = 0.05  # of the contrast, under Tukey's scale: sharpening and tone curves are no damage
-_MAX_ITERATIONS = 30
+_MAX_ITERATIONS = 30  # of a stage
 _LARGEST_WINDOW_PX = 3.5  # the standard deviation of the gradients' window about a crossing
 _UNDAMAGED = 0.05  # the robust weight below which a pixel shows something else
 # Plain, then thrice robust: the scale of the residuals is taken once before each, so that it settles.
@@ -44,8 +44,8 @@ class Corner:
     """A corner as fitted; where reason is not empty the fit failed, and the numbers are its last.
 
     center_px (2,), covariance_px2 (2, 2): as matched; contrast_dn: the grey value between the two steps less that
-    beside them, negative where it is dark between them; blur_px: the standard deviation. junction_px and its
-    covariance: where the gradients' lines meet (`junction`); None where they do not, and for no crossing.
+    beside them, negative where it is dark between them; blur_px: the standard deviation. junction_px (2,): where the
+    gradients' lines meet (`junction`); None where they do not, and for a corner that is no crossing.
     """
 
     center_px: Array
@@ -56,7 +56,6 @@ class Corner:
     damaged_fraction: float
     reason: str = ""
     junction_px: Array | None = None
-    junction_covariance_px2: Array | None = None
 
 
 def fit_corner(window: ScanWindow, start_px: Array, steps_px: Array, reach_px: Array, surface: Surface) -> Corner:
@@ -137,7 +136,7 @@ class _CornerFit:
         design, residuals = self._linearised()
         used = self.weights > 0.05
         covariance, noise = np.full((2, 2), np.inf), float("nan")
-        meeting, meeting_covariance = None, None
+        meeting = None
         if used.sum() > self.unknowns and not self.reason:
             model = noise_model(residuals, used, self.unknowns)
             noise = float(np.sqrt(model.variance_dn2))
@@ -147,7 +146,7 @@ class _CornerFit:
             if not 2 * abs(self.linear[0]) > 4 * noise:
                 self.reason = "no edges stand out from the noise"
             elif self.bends:
-                meeting, meeting_covariance = self._junction(residuals, model)
+                meeting = self._junction(residuals)
         return Corner(
             center_px=self.center + self.origin,
             covariance_px2=(covariance + covariance.T) / 2,
@@ -157,18 +156,15 @@ class _CornerFit:
             damaged_fraction=float(1 - self.weights.sum() / max(self._area().sum(), 1e-9)),
             reason=self.reason,
             junction_px=None if meeting is None else meeting + self.origin,
-            junction_covariance_px2=meeting_covariance,
         )
 
-    def _junction(self, residuals: Array, noise: NoiseModel) -> tuple[Array, Array] | tuple[None, None]:
-        """Where the gradients' lines meet, and its covariance. Damage is painted over with what was fitted."""
+    def _junction(self, residuals: Array) -> Array | None:
+        """Where the gradients' lines meet. Damage is painted over with what was fitted."""
         area = self._area()
         damaged = self.weights < _UNDAMAGED * area
         window_px = min(_LARGEST_WINDOW_PX, float(self.reach.min()) / 2)
-        meeting, by_grey = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, window_px, area)
-        if not np.hypot(*(meeting - self.center)) < window_px:
-            return None, None
-        return meeting, products(by_grey, correlated(by_grey, noise))
+        meeting = junction(self.grey - np.where(damaged, residuals, 0.0), self.center, window_px, area)
+        return meeting if np.hypot(*(meeting - self.center)) < window_px else None
 
     def _adjust(self, tolerance_px: float) -> None:
         for _ in range(_MAX_ITERATIONS):

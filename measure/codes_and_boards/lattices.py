@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Place = tuple[int, int]
 
-NEIGHBOURS = 8
+NEIGHBOURS = 8  # of a point: those that touch its square
 STEP_TOLERANCE = 0.3  # of a step, between where a neighbour is expected and where it is
 SEEDS = 12  # points to begin at, spread over all
 LIKENESS = 0.4  # of the logarithms of size and contrast

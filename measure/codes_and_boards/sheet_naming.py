@@ -19,9 +19,9 @@ _NEAR = 0.3  # of the distance to the next point in the picture, between where a
 _IDLE_ROUNDS = 3  # after which names that come and go are not followed any further
 _MOST_PAIRS = 150  # of coded dots
 _GROWN = 8  # suggestions, the best ones, that are followed to their end
-_LEAST_NAMED = 8
+_LEAST_NAMED = 8  # dots: a homography goes through any four
 _LEAST_SHARE = 0.5  # of the sheet's points in the picture
-_GATE_SIGMAS, _LEAST_GATE_PX = 6.0, 3.0
+_GATE_SIGMAS, _LEAST_GATE_PX = 6.0, 3.0  # of the dots' scatter about their places, how far off one may lie
 _SHAPE = 1.35  # radii of a dot's ellipse over those expected, in any direction, or the reverse
 
 

@@ -24,11 +24,11 @@ Sides = NDArray[np.int8]
 
 _BITS = (8, 10, 12, 14, 16)  # of scanners' converters; their numbers are stored as they are, or moved up
 _LOG_DENSITY = -0.5 * np.log(2 * np.pi)
-_TAIL = 2.0
+_TAIL = 2.0  # standard deviations below the greatest value
 _LEAST_STEPS = 1.5  # of the scan's grey values in a standard deviation: in less noise an even ground is a pile as well
 _FEWEST = 20  # pixels: fewer bend no fit
 _CHANCE = 1e-6  # of a natural end: there are many windows
-_GROSS = 3.5  # standard deviations
+_GROSS = 3.5  # standard deviations: beyond it a residual is damage
 _SCALE_ROUNDS = 8  # each leaves at most two fifths of what was wrong
 _TELLS = 0.5  # derivative of the residual, from which on it is a residual like the others
 

@@ -1,5 +1,4 @@
-"""A fit at its solution, where it is linear: what else the same grey values say, beside the fitted unknowns, starts
-here."""
+"""A fit linearised at its solution: from it follows what else the same grey values say, a second place for example."""
 
 from dataclasses import dataclass
 

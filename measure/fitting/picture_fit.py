@@ -25,7 +25,8 @@ _ITERATIONS, _HALVINGS = 15, 4  # more steps, or shorter ones, settle no fit tha
 _DAMAGE_SIGMAS = 3.2  # of smoothed residuals: one pixel in seven hundred of a window without damage goes beyond
 _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
 _LEAST_VARIANCE_DN2 = 1e-12
-_WEIGHTED_STEPS, _CLOSE_PX, _SETTLED_PX = 4, 0.002, 0.02
+_WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
+_CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
 _UNSETTLED = "the adjustment did not converge"
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
 

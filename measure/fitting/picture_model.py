@@ -18,9 +18,9 @@ Mask = NDArray[np.bool_]
 
 GREY = 4  # unknowns: gain, offset and two slopes, the last ones
 ROUNDING_DN = 0.3  # standard deviation of what rounding to whole grey values adds
-_AS_NOISY = 0.02
+_AS_NOISY = 0.02  # a change of the noise by a smaller share leaves what clipped grey values tell as it is
 _LEAST = 1e-300  # squared slope of a clipped grey value that tells nothing
-_BLUR_RANGE_PX = (0.3, 6.0)
+_BLUR_RANGE_PX = (0.3, 6.0)  # from where pixels hide it to where marks can hardly be seen
 BENT, ROUGHLY_BENT = 0.075, 0.4  # of the mark's outline, times the blur: so far a series replaces a new drawing
 _MOST_DISTORTION = 0.3  # of scale, rotation (rad) and shear: more is another mark
 PIXEL_VARIANCE_PX2 = 1 / 12  # the mean over a pixel's square, taken as a little more blur

@@ -68,8 +68,8 @@ def expected_where_seen(search: FrameSearch, frame: Frame, seen_px: dict[int, Ar
 
 
 def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> str:
-    """Where every mark was found: whether the scan has many places that answer as strongly. Few frames lie in the
-    middle of it, and windows about the marks tell of no others."""
+    """Where every mark was found: whether the scan has many places that answer as strongly. A frame that was looked for
+    in the middle of its scan is not doubted: the windows about its marks tell of no other places."""
     if len(clear) <= _FREE or not search.was_everywhere(frame.placement):
         return ""
     expected = expected_where_seen(search, frame, clear)

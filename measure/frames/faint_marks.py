@@ -58,7 +58,6 @@ def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px:
     """
     field = _Field(scan, expected, extreme_dn)
     center, reach_px = expected.center_px - field.origin, expected.search_px
-    response = field.response(center, blur_px)
     for _ in range(_ROUNDS):
         response = field.response(center, blur_px)
         place = response.highest(center, reach_px)

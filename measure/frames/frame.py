@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 CLEAR_LIKENESS = 0.5  # below it a mark's picture has more in it that is not the mark
 CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be another's
-_CLEAR_SNR = 3.0
+_CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak
 _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
 _CHECKED = 4  # marks that agree: an affine transformation through them has a check
 _WRONG_PX, _WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability

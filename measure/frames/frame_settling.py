@@ -79,8 +79,8 @@ def compare_sizes(sighter: FrameSighter) -> None:
 
 
 def compare_shapes(sighter: FrameSighter) -> None:
-    """The same of marks that do not tell their own rotation and scale from their place: what their pictures say of
-    these beside the frame's, and beside what the others say."""
+    """Doubt marks whose rotation and scale are the frame's, but whose own pictures say otherwise than those of the
+    others. Such a mark is known no better than the difference would move it."""
     fits = _adjusted(sighter)
     own = {
         index: fit.own_shape

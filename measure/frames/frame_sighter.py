@@ -226,12 +226,16 @@ class FrameSighter:
     def _predicted_px(self) -> Array:
         return self.camera @ self.pixel_from_camera[:, :2].T + self.pixel_from_camera[:, 2]
 
+    def _fits(self, index: NDArray[np.intp]) -> list[Match]:
+        """Of marks that were seen."""
+        return [s.fit for s in (self.sightings[i] for i in index) if s is not None and s.fit is not None]
+
     def _up_mm(self, index: NDArray[np.intp]) -> Array:
-        centers = np.array([s.fit.center_px for s in (self.sightings[i] for i in index) if s is not None and s.fit])
+        centers = np.array([fit.center_px for fit in self._fits(index)])
         return np.asarray(centers * self.pitch * (1.0, -1.0))
 
     def _sigma_mm(self, index: NDArray[np.intp]) -> Array:
-        covariances = [s.fit.covariance_px2 for s in (self.sightings[i] for i in index) if s is not None and s.fit]
+        covariances = [fit.covariance_px2 for fit in self._fits(index)]
         measured = np.sqrt(np.trace(np.array(covariances), axis1=1, axis2=2) / 2) * self.pitch.mean()
         given = np.array([min(*self.layout.marks[i].sigma_mm, _GIVEN_SIGMA_MM) for i in index])
         return np.asarray(np.sqrt(measured**2 + given**2 + self.options.film_sigma_mm**2))

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 # Of the coefficients of u², uv and v² of a surface whose curvature has no preferred direction, but for their scale.
 _ISOTROPIC = np.array([[0.75, 0.0, 0.25], [0.0, 1.0, 0.0], [0.25, 0.0, 0.75]])
 _DIRECTIONS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
-_ROUNDS = 8
+_ROUNDS = 8  # of scoring
 _LEAST_EIGENVALUE = 1e-9  # of a covariance, over its largest
 _FEWEST = 20  # patches whose bendings have a variance worth the name
 

@@ -12,8 +12,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FEWEST_PAIRS = 16  # twice what the geometry is computed from
-_CONFIDENCE, _TRIALS = 0.9999, 10000
-_NEIGHBOURS = 8
+_CONFIDENCE, _TRIALS = 0.9999, 10000  # of MAGSAC: that it finds the geometry, and how often it tries at most
+_NEIGHBOURS = 8  # whose median distance is what lens and film bend
 _CHANCE = 1e-4  # that a right point is called a contradiction
 
 

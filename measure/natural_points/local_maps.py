@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _PLACE_PX, _LOCAL = 5.0, 0.1  # how far places depart from an affine map, and that from the whole pair's
-_REWEIGHTINGS = 6
+_REWEIGHTINGS = 6  # of least distances
 _STRETCH = 2.0  # the most by which a small piece of ground can differ in scale between photographs to be matched
 _NEIGHBOURS = 12  # matches whose places give the local map
 

@@ -33,9 +33,9 @@ _SMOOTHING_PX = (2.0, 1.0, 0.0)  # first a smoothed picture, which draws from fa
 _FINEST_START_PX = 1.0  # where grain is strong, a little smoothing leaves the smaller errors
 _EVEN = 1e-6  # of the grey values: what rounding makes of an even picture
 _LEAST_EIGENVALUE = 1e-4  # of the normal equations scaled to unit diagonal
-_ITERATIONS = 30
+_ITERATIONS = 30  # under each smoothing, at most
 _STILL_PX = 0.005  # a last step well below the precision
-_FARTHEST_STEP_PX = 3.0
+_FARTHEST_STEP_PX = 3.0  # beyond it the matching has run away
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PATCH_PX = 15
+PATCH_PX = 15  # a side: thrice as far as film's grain reaches
 BESIDE_PX = 2 * PATCH_PX + 4.0  # how much of the film beside a mark is asked
 _ALIKE = 3.0  # times the variance of the mark's own residuals, or a part of it: beyond it is a picture, text or dust
 _FEWEST = 6  # patches that tell more than the mark's own window

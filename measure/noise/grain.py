@@ -32,7 +32,7 @@ _COARSEST_PX = 1.8
 REACH_PX = 8  # grain of 1.5 px is correlated by one in a thousand there
 _HERE = REACH_PX  # index of no lag at all
 _FARTHEST_PX = 3.0  # lags that are compared: beyond it the residuals hold the fit's marks rather than the noise's
-_FARTHEST_BLANK_PX = 5.0
+_FARTHEST_BLANK_PX = 5.0  # the same of blank film, which has no marks in it
 _ALIKE = 1e-10  # of the largest eigenvalue: what unknowns tell apart by less is no direction of its own
 
 

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_ROUNDS = 8
+_ROUNDS = 8  # of conjugate gradients, at most
 _CLOSE = 0.03  # of a derivative: so little left costs a thousandth of the standard deviation
 _WHITE = 0.02  # of the variance at least is taken as white: no film's grain is known better at the finest frequencies
 _MISFIT = 0.003  # of the contrast: what the drawing itself gets wrong from pixel to pixel

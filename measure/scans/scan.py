@@ -27,7 +27,7 @@ LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
 SINGLE_CHANNELS = RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
 PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, about
-LARGEST_PART_PX = 2048
+LARGEST_PART_PX = 2048  # the side of a part in whole segments: beyond it segments are divided
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 _LARGE_PX = 1 << 24  # a smaller scan is read whole in no time
 _REACH = 0.025  # of the frame's side: laid by hand it is off by some millimetres and a degree
 _LARGEST_SHARE = 0.25  # of the scan: where windows hold more, the whole of it tells more
-_CORNERS = 4
+_CORNERS = 4  # a mark toward each of them
 _FINE = 0.05  # of how near steps are alike
 _ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step aside could be one step off
 

@@ -88,7 +88,8 @@ class FrameSearch:
         return _best_first(found)
 
     def in_the_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
-        """The same of a frame that lies about in the middle of the scan, of which only that is read."""
+        """The placements of a frame that lies about in the middle of the scan, best first. Only the windows are read
+        in which its marks lie then."""
         linear = _flip(hypothesis.mm)
         places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
         reach_px = reach_mm(self.layout) / max(hypothesis.mm)
@@ -98,8 +99,8 @@ class FrameSearch:
         return _best_first(self._everywhere(hypothesis, *about))
 
     def within_its_edges(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
-        """The same of a frame whose edges are seen, its marks lying about the middle of what is exposed; it counts on
-        the whole scan having been searched under these hypotheses."""
+        """The placements of a frame whose edges are seen, best first: its marks lie about the middle of what is
+        exposed. `anywhere` must have searched the whole scan under these hypotheses before."""
         found: list[Placement] = []
         for hypothesis in hypotheses:
             whole, edges = self._searched[hypothesis.mm], self._edges(hypothesis)

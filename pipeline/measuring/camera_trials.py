@@ -264,9 +264,9 @@ def _residual(frame: FrameMeasurement, layout: FiducialLayout) -> tuple[float, f
     """Per axis, in standard deviations and in mm, what an affine transformation of the marks leaves."""
     pairs = [(m, given) for m, given in zip(frame.marks, layout.marks, strict=True) if m.status.is_observation]
     redundancy = 2 * len(pairs) - _AFFINE
-    if redundancy <= 0 or frame.pixel_from_camera is None:
+    px_per_mm = frame.px_per_mm
+    if redundancy <= 0 or px_per_mm is None:
         return None
-    px_per_mm = float(np.sqrt(abs(np.linalg.det(frame.pixel_from_camera[:, :2]))))
     given_mm = np.array([given.xy_mm for _, given in pairs])
     comparator_mm = np.array([mark.center_px for mark, _ in pairs]) * (1.0, -1.0) / px_per_mm
     parameters, mirrored = fit_transformation("affine", comparator_mm, given_mm)

@@ -21,6 +21,7 @@ from pipeline.files.images_file import image_name
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
 )  # fmt: skip
+_KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 Array = NDArray[np.float64]
 
 
@@ -104,8 +105,8 @@ def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:
 
 def _point(row: Row) -> ComparatorPoint:
     kind, status = row.name("kind"), row.text("status") or Status.MEASURED
-    if kind not in get_args(ObservationKind):
-        raise row.error("kind", f"is {kind!r}; possible are {', '.join(get_args(ObservationKind))}.")
+    if kind not in _KINDS:
+        raise row.error("kind", f"is {kind!r}; possible are {', '.join(_KINDS)}.")
     if status not in list(Status):
         raise row.error("status", f"is {status!r}; possible are {', '.join(Status)}.")
     x, y, sx, sy = row.number("x_mm"), row.number("y_mm"), row.sigma("sx_mm"), row.sigma("sy_mm")
@@ -130,6 +131,3 @@ def _point(row: Row) -> ComparatorPoint:
         reason=row.text("reason"),
         line=row.line,
     )
-
-
-_KINDS: dict[str, ObservationKind] = {"fiducial": "fiducial", "target": "target", "tie": "tie"}

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from pathlib import Path
@@ -45,7 +45,8 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     with worker_pool(len(project.scans)) as workers:
         learned = learn_marks(project, reporter, workers)
         scans = _measured_scans(learned, reporter, workers)
-        checked = _checked(learned, _one_definition(project, scans))
+        scans = _of_each_camera(project, scans, _at_one_definition)
+        checked = tuple(_of_each_camera(learned, scans, _cross_checked))
         if project.ties is None:
             return checked
         with reporter.stage("natural points sought in") as count:
@@ -77,25 +78,29 @@ def expected_time(first_s: float, scans: int) -> str:
     return f"about {told} for {scans} scans, if all take as long as the first: {first_s:.0f} s, {at_a_time} at a time"
 
 
-def _checked(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
-    """The fiducials of each camera's frames checked against one another."""
+def _of_each_camera(
+    project: Project,
+    measured: Sequence[MeasuredScan],
+    change: Callable[[CameraFile, Sequence[FrameMeasurement]], Sequence[FrameMeasurement]],
+) -> list[MeasuredScan]:
+    """The scans with the frames of each camera changed, all of a camera together."""
     frames = {scan.scan: scan.frame for scan in measured}
     for camera in project.cameras.values():
         own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
-        if camera.drawn:
-            checked = cross_checked([scan.frame for scan in own], camera.layout())
-            frames |= {scan.scan: frame for scan, frame in zip(own, checked, strict=True)}
-    return tuple(replace(scan, frame=frames[scan.scan]) for scan in measured)
+        changed = change(camera, [scan.frame for scan in own])
+        frames |= {scan.scan: frame for scan, frame in zip(own, changed, strict=True)}
+    return [replace(scan, frame=frames[scan.scan]) for scan in measured]
 
 
-def _one_definition(project: Project, measured: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
-    """The crossings of all scans of a camera in one definition of their place."""
-    frames = {scan.scan: scan.frame for scan in measured}
-    for camera in project.cameras.values():
-        own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
-        for scan, marks in zip(own, one_definition([scan.frame.marks for scan in own]), strict=True):
-            frames[scan.scan] = replace(scan.frame, marks=marks)
-    return tuple(replace(scan, frame=frames[scan.scan]) for scan in measured)
+def _at_one_definition(_: CameraFile, frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:
+    """The crossings of boards in one definition of their place."""
+    marks = one_definition([frame.marks for frame in frames])
+    return [replace(frame, marks=own) for frame, own in zip(frames, marks, strict=True)]
+
+
+def _cross_checked(camera: CameraFile, frames: Sequence[FrameMeasurement]) -> Sequence[FrameMeasurement]:
+    """The fiducials checked against one another, if the camera has any."""
+    return cross_checked(frames, camera.layout()) if camera.drawn else frames
 
 
 def _check_marks(project: Project) -> None:
@@ -164,8 +169,8 @@ def _with_sizes(
     measured: FrameMeasurement, camera: CameraFile, scan: Scan, pitch_um: tuple[float, float] | None
 ) -> tuple[MarkMeasurement, ...]:
     """The marks with how large each is drawn in the scan, px, for whoever shows a picture of it."""
-    if measured.pixel_from_camera is not None:
-        px_per_mm = float(np.sqrt(abs(np.linalg.det(measured.pixel_from_camera[:, :2]))))
+    if measured.px_per_mm is not None:
+        px_per_mm = measured.px_per_mm
     elif pitch_um is not None:
         px_per_mm = 1000.0 / pitch_um[0]
     else:
@@ -186,8 +191,8 @@ def _pitch(
         return project.pitch_um, (), ()
     if scan.pitch_um is not None:
         return scan.pitch_um, (), ()
-    if frame.pixel_from_camera is not None:
-        pitch = 1000.0 / float(np.sqrt(abs(np.linalg.det(frame.pixel_from_camera[:, :2]))))
+    if frame.px_per_mm is not None:
+        pitch = 1000.0 / frame.px_per_mm
         note = f"The pitch of {pitch:.2f} um is from the marks' separations, for {scan.pitch_note}."
         return (pitch, pitch), (), (note,)
     if camera.frame_mm is not None:

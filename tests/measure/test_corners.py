@@ -70,18 +70,13 @@ def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) ->
 
 
 @pytest.mark.parametrize("blur_px", [0.5, 1.5])
-def test_the_junction_errs_as_its_sigma_says(blur_px: float) -> None:
+def test_the_junction_lies_where_the_squares_meet(blur_px: float) -> None:
     rng = np.random.default_rng(7)
-    errors = []
     for _ in range(8):
         center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
-        clean = square_picture(center, steps, blur_px, False)
-        for _ in range(12):
-            corner = fitted(clean + rng.normal(0, NOISE, clean.shape), center, steps, False)
-            assert corner.junction_px is not None
-            assert corner.junction_covariance_px2 is not None
-            errors.append(whitened(corner.junction_px - center, corner.junction_covariance_px2))
-    assert 0.87 < np.sqrt(np.mean(np.square(errors))) < 1.13
+        corner = fitted(square_picture(center, steps, blur_px, False), center, steps, False)
+        assert corner.junction_px is not None
+        assert np.abs(corner.junction_px - center).max() < 0.01
 
 
 def test_trap_pixel_locking() -> None:
