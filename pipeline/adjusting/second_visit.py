@@ -14,6 +14,7 @@ from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field, measure_single_targets, target_field
+from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.target_stage import with_targets
 from pipeline.progress import Reporter
 
@@ -68,6 +69,8 @@ def _visit(field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: T
     found = {mark.point: mark for mark in marks if mark.status.is_observation}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
     fresh = {point: mark for point, mark in found.items() if _is_free(mark, np.array(taken).reshape(-1, 2))}
+    checked = checked_places(tuple((targets | fresh).values()), field, model, scan)
+    fresh = {mark.point: mark for mark in checked if mark.point in fresh and mark.status.is_observation}
     return with_targets(scan, tuple((targets | fresh).values())) if fresh else scan
 
 

@@ -15,6 +15,7 @@ from pipeline.measuring.camera_model import camera_model
 from pipeline.measuring.coded_sheet import CodedSheet, coded_candidates, coded_points, none_coded, read_numbers
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field, target_field
+from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.unoriented import NamedField, name_field
 from pipeline.wording import listed
 
@@ -55,7 +56,8 @@ def measure_coded_field(
     seen = {mark.point: mark for mark in measure_disks(scan, sought, TargetOptions(points.settings.polarity))}
     unseen = "it lies behind the camera"
     absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in points.ids}
-    return tuple((absent | seen | contradicted).values()), notes
+    marks = tuple((absent | seen | contradicted).values())
+    return checked_places(marks, field, named.model, measured), notes
 
 
 def _contradiction(prediction: TargetPrediction, strangers: Mapping[str, Candidate]) -> str:

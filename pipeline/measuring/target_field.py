@@ -1,7 +1,7 @@
 """The single targets of a project: where they are in space, how they should look, and how they are found and fitted."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,18 @@ _LEAST_DIAMETER_PX = 2.5
 
 @dataclass(frozen=True)
 class Field:
-    """The targets that a prediction can name: ids, coordinates (n, 3), normals by id, the radius of the disks or half
-    the length of the crosses."""
+    """The targets that a prediction can name: ids, coordinates (n, 3) and their standard deviations (n, 3), inf where
+    they are free; normals by id, the radius of the disks or half the length of the crosses."""
 
     ids: tuple[str, ...]
     xyz: Array
+    sigmas: Array
     normals: Mapping[str, Array]
     radius: float
+
+    def of(self, rows: Sequence[int]) -> "Field":
+        """Some of them."""
+        return replace(self, ids=tuple(self.ids[row] for row in rows), xyz=self.xyz[rows], sigmas=self.sigmas[rows])
 
     def predictions(self, model: ImageModel, scan: MeasuredScan, search_px: float) -> tuple[TargetPrediction, ...]:
         """Where and how every target before the camera should be seen; crosses upright, their arms along the horizontal
@@ -48,10 +53,14 @@ class Field:
 def target_field(project: Project) -> Field:
     """The targets whose coordinates are known at least roughly."""
     places = {id: (point.X, point.Y, point.Z) for id, point in given_points(project).items()}
-    known = {id: [p.value for p in priors if p is not None] for id, priors in places.items()}
-    complete = {id: xyz for id, xyz in known.items() if len(xyz) == 3}
+    known = {id: [prior for prior in priors if prior is not None] for id, priors in places.items()}
+    complete = {id: priors for id, priors in known.items() if len(priors) == 3}
+    xyz, sigmas = (
+        np.array([[getattr(prior, what) for prior in priors] for priors in complete.values()], float).reshape(-1, 3)
+        for what in ("value", "sigma")
+    )
     normals = dict(project.given_points.normals) if project.given_points else {}
-    return Field(tuple(complete), np.array(list(complete.values())).reshape(-1, 3), normals, project.target_radius)
+    return Field(tuple(complete), xyz, sigmas, normals, project.target_radius)
 
 
 def target_candidates(scan: Scan, settings: TargetSettings, diameters_px: tuple[float, float]) -> list[Candidate]:

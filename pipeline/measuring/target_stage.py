@@ -24,6 +24,7 @@ from pipeline.measuring.comparator_file import comparator_from_pixel
 from pipeline.measuring.identification import PatternOptions, assign, log10_of_chance, recognise
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field, measure_single_targets, target_candidates, target_field
+from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.unoriented import likely_diameters_px, name_field
 
 Array = NDArray[np.float64]
@@ -78,11 +79,13 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
         notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
         return with_targets(measured, board.marks, (*problems, *notes))
     field = target_field(project)
-    predictions, notes = _predictions(project, settings, field, scan, measured)
-    if isinstance(predictions, str):
-        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, predictions) for id in field.ids)
-        return with_targets(measured, marks, (*notes, f"No target has a name: {predictions}."))
-    return with_targets(measured, measure_single_targets(scan, predictions, settings), notes)
+    found, notes = _oriented_by_targets(project, settings, field, scan, measured)
+    if isinstance(found, str):
+        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, found) for id in field.ids)
+        return with_targets(measured, marks, (*notes, f"No target has a name: {found}."))
+    model, predictions = found
+    seen = measure_single_targets(scan, predictions, settings)
+    return with_targets(measured, checked_places(seen, field, model, measured), notes)
 
 
 def with_targets(
@@ -96,11 +99,11 @@ def with_targets(
     )  # fmt: skip
 
 
-def _predictions(
+def _oriented_by_targets(
     project: Project, settings: TargetSettings, field: Field, scan: Scan, measured: MeasuredScan
-) -> tuple[Sequence[TargetPrediction] | str, tuple[str, ...]]:
-    """Where each target should be, by the approximate orientation or, without one that fits, by the pattern alone; or
-    why not. And what is to be said of the image."""
+) -> tuple[tuple[ImageModel, Sequence[TargetPrediction]] | str, tuple[str, ...]]:
+    """The image and where each target should be, by the approximate orientation or, without one that fits, by the
+    pattern alone; or why not. And what is to be said of the image."""
     image = measured.frame.image
     camera = project.camera_of(image)
     model = camera_model(camera, measured)
@@ -112,11 +115,11 @@ def _predictions(
         approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
         oriented, why = _oriented(approximate, field, scan, measured, settings)
         if oriented is not None:
-            return field.predictions(oriented, measured, _SLACK_PX), ()
+            return (oriented, field.predictions(oriented, measured, _SLACK_PX)), ()
         notes = (f"Its orientation in images.csv was not used to name the targets: {why}.",)
     found = target_candidates(scan, settings, likely_diameters_px(field, measured))
     named = name_field(field, model, camera, measured, found)
-    return (named if isinstance(named, str) else named.predictions(field, measured)), notes
+    return (named if isinstance(named, str) else (named.model, named.predictions(field, measured))), notes
 
 
 def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredScan) -> tuple[float, float] | None:

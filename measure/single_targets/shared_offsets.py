@@ -1,0 +1,147 @@
+"""Where the other targets of an image put each of them, and how likely a right one lies as far off as it was seen.
+
+Targets lie off the places that an orientation predicts, together: by what the orientation is wrong, and by what lens
+and film bend, which is a smooth function of the place in the image. Both are told by the targets themselves, in a
+linear regression with priors, in which wrong names count little (Student's t: Lange, Little and Taylor 1989). Each
+target is compared with what the others say (cross-validation), by the scatter that all show.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Standard deviations, as shares of the image's size: of shift, scale and shear; of radial distortion in the corners, of
+# its third, fifth and seventh degree; of the other polynomials of the second to the fifth, of which the targets choose.
+_PLAIN, _RADIAL, _BENDING = 0.1, (0.03, 0.01, 0.003), (1e-5, 1e-4, 1e-3, 1e-2)
+_DEGREES = 5
+_FREEDOM = 4.0  # of Student's t: a fifth of wrong names moves little
+_ROUNDS, _SETTLED = 60, 1e-3
+_MEDIAN = 2.0 * float(np.log(2.0))  # of chi-square (2)
+_EFFICIENCY = 0.37  # of a scale told by a median: as good as by the squares of so many of the observations
+_NEIGHBOURS = 8  # that tell where the image bends more than the regression
+_LEAST_PX2 = 0.01**2  # the variance that no prediction falls short of
+
+
+@dataclass(frozen=True, eq=False)
+class TargetPlaces:
+    """Of n targets: places_px (n, 2) as predicted; by_orientation (n, 2, k): how far each unknown of the orientation
+    moves them by its standard deviation; covariance_px2 (n, 2, 2): of what is known beside it, as of the points'
+    coordinates; is_free (n,): those of whose coordinates nobody says how good they are."""
+
+    places_px: Array
+    by_orientation: Array
+    covariance_px2: Array
+    is_free: Mask
+
+    def at(self, index: NDArray[np.intp]) -> "TargetPlaces":
+        """Some of them."""
+        return TargetPlaces(
+            self.places_px[index], self.by_orientation[index], self.covariance_px2[index], self.is_free[index]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Of n targets, each without itself: off_px (n, 2), how far it was seen from where the others put it; chance (n,):
+    that a right one lies so far off or farther."""
+
+    off_px: Array
+    chance: Array
+
+
+def compared(targets: TargetPlaces, seen_px: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Comparison:
+    """Targets seen at (n, 2) px with covariances (n, 2, 2), in an image of this width and height."""
+    known = targets.covariance_px2 + covariance_px2
+    offsets = seen_px - targets.places_px
+    fits = [_fitted(_design(targets, size_px, bending), offsets, known, targets.is_free) for bending in _BENDING]
+    best = min(fits, key=lambda fit: float(np.median(np.linalg.norm(fit.off_px, axis=1))))
+    return Comparison(best.off_px, _chances(best, targets))
+
+
+def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> Array:
+    """(n, 2, m) how far each unknown moves the targets by its standard deviation, px: the orientation, the lens, and
+    what is smooth."""
+    size = float(np.hypot(*size_px))
+    places = 2.0 * (targets.places_px - (np.array(size_px) - 1.0) / 2.0) / size
+    square = (places**2).sum(axis=1, keepdims=True)
+    radial = [share * size * places * square ** (k + 1) for k, share in enumerate(_RADIAL)]
+    along, across = (np.polynomial.legendre.legvander(one, _DEGREES) for one in places.T)
+    smooth = [
+        (_PLAIN if i + j < 2 else bending) * size * along[:, i] * across[:, j]
+        for i in range(_DEGREES + 1)
+        for j in range(_DEGREES + 1 - i)
+    ]
+    both = np.einsum("kn,ij->nikj", smooth, np.eye(2)).reshape(len(places), 2, -1)
+    return np.concatenate([targets.by_orientation, np.stack(radial, axis=-1), both], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """off_px (n, 2), squares (n,): each target against the others, the latter in its variances; unknowns: how many the
+    n targets tell."""
+
+    off_px: Array
+    squares: Array
+    unknowns: float
+
+
+def _fitted(design: Array, offsets: Array, known: Array, is_free: Mask) -> _Fit:
+    """Student's t by expectation and maximisation, the scatter anew in each round."""
+    off, predicted = offsets - np.median(offsets, axis=0), np.zeros_like(known)
+    weights = np.ones(len(offsets))
+    fit = None
+    for _ in range(_ROUNDS):
+        variances = _variances(off, predicted, known, is_free)
+        spread = variances / weights[:, None, None]
+        by_weight = np.linalg.inv(spread)
+        normal = np.eye(design.shape[2]) + np.einsum("nia,nij,njb->ab", design, by_weight, design, optimize=True)
+        right = np.einsum("nia,nij,nj->a", design, by_weight, offsets, optimize=True)
+        cofactor = np.linalg.inv(normal)
+        hat = np.einsum("nia,ab,njb->nij", design, cofactor, design, optimize=True)
+        without = np.linalg.inv(spread - hat)  # of what the target itself adds to the fit
+        residuals = offsets - np.einsum("nia,a->ni", design, cofactor @ right)
+        off = np.einsum("nij,njk,nk->ni", spread, without, residuals)
+        predicted = hat + hat @ without @ hat
+        squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(variances + predicted), off)
+        before, weights = weights, (_FREEDOM + 2.0) / (_FREEDOM + squares)
+        fit = _Fit(off, squares, float(np.einsum("nij,nji->", hat, by_weight)))
+        if np.abs(weights - before).max() < _SETTLED:
+            break
+    assert fit is not None
+    return fit
+
+
+def _variances(off: Array, predicted: Array, known: Array, is_free: Mask) -> Array:
+    """(n, 2, 2) of the targets about their places: what is known, and beside it what all of them scatter more; where
+    they scatter less, so much less. Points whose coordinates are free have a scatter of their own."""
+    variances = known.copy()
+    for group in (is_free, ~is_free):
+        if not group.any():
+            continue
+        seen = float(np.median((off[group] ** 2).sum(axis=1))) / _MEDIAN
+        claimed = float(np.median(np.einsum("nii->n", known[group]))) / 2.0
+        open_px2 = float(np.median(np.einsum("nii->n", predicted[group]))) / 2.0
+        own = max(seen - open_px2, _LEAST_PX2)
+        variances[group] *= min(own / max(claimed, _LEAST_PX2), 1.0)
+        variances[group] += max(own - claimed, _LEAST_PX2) * np.eye(2)
+    return variances
+
+
+def _chances(fit: _Fit, targets: TargetPlaces) -> Array:
+    """(n,) of lying farther off: the scatter is as good as those that tell it, and as large as that nearby."""
+    count = min(_NEIGHBOURS + 1, len(fit.squares))
+    near = np.asarray(cKDTree(targets.places_px).query(targets.places_px, k=np.arange(2, count + 1))[1])
+    local = np.median(fit.squares[near], axis=1) / _MEDIAN
+    chance = np.ones(len(fit.squares))
+    for group in (targets.is_free, ~targets.is_free):
+        share = group.sum() / len(group)
+        freedom = _EFFICIENCY * share * (2.0 * len(group) - fit.unknowns)
+        if freedom > 1.0:
+            chance[group] = stats.f.sf(fit.squares[group] / np.maximum(local[group], 1.0) / 2.0, 2, freedom)
+    return chance

@@ -1,0 +1,51 @@
+"""Targets against where the others put them: wrong ones are told, right ones as seldom doubted as said."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from measure.single_targets.shared_offsets import TargetPlaces, compared
+
+Array = NDArray[np.float64]
+SIZE_PX, NOISE_PX = (4000, 3000), 0.05
+
+
+def field(rng: np.random.Generator, count: int, sigma_px: Array) -> tuple[TargetPlaces, Array]:
+    """Targets and where they are seen: shifted, turned, by parallax, by 2 % of radial distortion, and by noise."""
+    places = rng.uniform(0.0, SIZE_PX, (count, 2))
+    depth = rng.uniform(-1.0, 1.0, count)
+    about = (places - (2010.0, 1480.0)) / 5000.0
+    parallax = np.stack([100.0 * depth, np.zeros(count)], axis=1)[..., None]
+    bent = 0.08 * 5000.0 * about * (about**2).sum(axis=1, keepdims=True)
+    seen = places + (12.0, -7.0) + 20.0 * about[:, ::-1] * (1.0, -1.0) + 0.3 * parallax[..., 0] + bent
+    seen += rng.normal(0.0, 1.0, seen.shape) * np.hypot(NOISE_PX, sigma_px)[:, None]
+    covariances = sigma_px[:, None, None] ** 2 * np.eye(2)
+    return TargetPlaces(places, parallax, covariances, np.zeros(count, bool)), seen
+
+
+@pytest.mark.parametrize("count", [80, 200])
+def test_wrong_ones_are_told_and_right_ones_as_seldom_as_said(count: int) -> None:
+    rng = np.random.default_rng(count)
+    chances, wrong_chances = [], []
+    for _ in range(480 // count):
+        targets, seen = field(rng, count, np.zeros(count))
+        wrong = rng.choice(count, count // 10, replace=False)
+        angle = rng.uniform(0.0, 2.0 * np.pi, len(wrong))
+        seen[wrong] += rng.uniform(1.0, 4.0, (len(wrong), 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        chance = compared(targets, seen, np.tile(1e-6 * np.eye(2), (count, 1, 1)), SIZE_PX).chance
+        wrong_chances.append(chance[wrong])
+        chances.append(np.delete(chance, wrong))
+    right = np.concatenate(chances)
+    assert np.concatenate(wrong_chances).max() < 1e-3
+    assert right.min() > 1e-4
+    assert 0.01 < (right < 0.1).mean() < 0.12  # neighbours that scatter more make it less than said
+
+
+def test_points_known_less_well_may_lie_farther_off() -> None:
+    rng = np.random.default_rng(5)
+    sigma = np.where(np.arange(200) < 20, 1.0, 0.02)
+    targets, seen = field(rng, 200, sigma)
+    chance = compared(targets, seen, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance
+    assert chance.min() > 1e-4
+    targets.covariance_px2[:20] = 4e-4 * np.eye(2)
+    assert np.median(compared(targets, seen, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance[:20]) < 1e-6
