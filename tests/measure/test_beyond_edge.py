@@ -1,32 +1,26 @@
 """Marks that touch the frame's edge, or dust, which are far stronger than they are: against their drawn places."""
 
 import numpy as np
-from brute_marks import brute_picture
+from brute_marks import brute_picture, placed
 from drawn import scan_of
-from numpy.typing import NDArray
+from drawn_frames import layout_of, paint
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.fitting.beyond_edge import beyond_edge
 from measure.frames.refinement import sight
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, polygon
+from measure.marks.shapes import MarkShape, cross, polygon
 from measure.match_options import MatchOptions
 from measure.search.correlation import CLOSE
 from measure.search.prediction import MarkPrediction
-
-Array = NDArray[np.float64]
 
 PX_PER_MM = 30.0
 GROUND, EDGE, NOISE = 55000.0, 5000.0, 600.0
 WING = MarkShape(polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35))))
 
 
-def placed(center_px: tuple[float, float]) -> Array:
-    return np.column_stack([np.diag([PX_PER_MM, -PX_PER_MM]), center_px])
-
-
 def test_a_wing_is_measured_whose_base_is_the_frames_edge() -> None:
-    place = placed((60.3, 59.7))
+    place = placed(PX_PER_MM, (60.3, 59.7))
     grey = GROUND + 5500.0 * brute_picture(WING, place, 121, 121, 1.0)
     grey[:, 84:] = EDGE
     grey += np.random.default_rng(1).normal(0.0, NOISE, grey.shape)
@@ -36,7 +30,7 @@ def test_a_wing_is_measured_whose_base_is_the_frames_edge() -> None:
 
 
 def test_the_marks_own_ground_is_never_beyond_an_edge() -> None:
-    place = placed((60.3, 59.7))
+    place = placed(PX_PER_MM, (60.3, 59.7))
     mark = brute_picture(WING, place, 121, 121, 1.0)
     for contrast in (30000.0, -30000.0):  # the mark itself is the strongest edge of its window
         grey = 30000.0 + contrast * mark + np.random.default_rng(2).normal(0.0, NOISE, mark.shape)
@@ -46,20 +40,18 @@ def test_the_marks_own_ground_is_never_beyond_an_edge() -> None:
 def test_a_cross_that_dust_touches_is_seen_where_the_others_put_it() -> None:
     mark, size, rng = MarkShape(cross(0.5, 0.1)), 440, np.random.default_rng(5)
     corners = [(x, y) for x in (-4.4, 4.4) for y in (-4.4, 4.4)]
-    layout = FiducialLayout(
-        tuple(LayoutMark(str(k), xy, (0.01, 0.01), mark) for k, xy in enumerate(corners)), (11.0, 11.0)
-    )
-    centers = {str(k): np.array([220.3 + PX_PER_MM * x, 220.3 - PX_PER_MM * y]) for k, (x, y) in enumerate(corners)}
+    layout, matrix = layout_of([mark] * 4, corners, (11.0, 11.0)), placed(PX_PER_MM, (220.3, 220.3))
     grey = np.full((size, size), GROUND)
-    for center in centers.values():
-        grey += 6000.0 * brute_picture(mark, placed((center[0], center[1])), size, size, 1.0)
+    for corner in corners:
+        paint(grey, mark, corner, matrix, 6000.0, blur_px=1.0)
     row, col = np.mgrid[:size, :size]
-    grey[np.hypot(col - centers["3"][0] + 13, row - centers["3"][1]) < 5] = EDGE
+    dusty = matrix @ (*corners[3], 1.0)
+    grey[np.hypot(col - dusty[0] + 13, row - dusty[1]) < 5] = EDGE
     grey += rng.normal(0.0, 1200.0, grey.shape)
     result = measure_fiducials(
         scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
     )
-    for found in result.marks:
+    for found, corner in zip(result.marks, corners, strict=True):
         assert found.center_px is not None
         assert found.status.is_observation, found
-        assert np.hypot(*(found.center_px - centers[found.point])) < 0.3
+        assert np.hypot(*(found.center_px - matrix @ (*corner, 1.0))) < 0.3

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from brute_marks import Array, written_scan
-from test_fiducials import CORNERS, NUMBERED, assert_right, frame_picture, layout_of, pixel_from_camera
+from drawn_frames import CORNERS, NUMBERED, assert_right, frame_picture, layout_of, pixel_from_camera
 
 from measure import fiducials
 from measure.fiducials import measure_fiducials

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from brute_marks import Array, brute_picture
 from drawn import scan_of
+from drawn_frames import layout_of, paint
 from numpy.typing import NDArray
 
 from measure.fiducial_options import FiducialOptions
@@ -13,7 +14,7 @@ from measure.frames.chance import doubt
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.poses import POSES, up_from_camera
-from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, dot
+from measure.marks.shapes import Disk, FiducialLayout, MarkShape, dot
 from measure.pose.pose_decision import decide_pose
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
@@ -24,15 +25,8 @@ PX_PER_MM = 20.0
 CONTRAST_DN = 8000.0
 CORNERS = ((7.0, -7.0), (-7.0, -7.0), (-7.0, 7.0), (7.0, 7.0))
 DOT = MarkShape(dot(0.2), "light")
+DOTS = layout_of([DOT] * 4, CORNERS, (16.0, 16.0))
 OPTIONS = FiducialOptions()
-
-
-def layout_of(*marks: MarkShape) -> FiducialLayout:
-    given = [
-        LayoutMark(str(k + 1), place, (0.01, 0.01), mark)
-        for k, (place, mark) in enumerate(zip(CORNERS, marks, strict=True))
-    ]
-    return FiducialLayout(tuple(given), (16.0, 16.0))
 
 
 def placement(pose: str) -> Placement:
@@ -44,12 +38,9 @@ def placement(pose: str) -> Placement:
 def picture(layout: FiducialLayout, pose: str, hidden: int | None = None) -> Array:
     """Marks on a plain ground, one of them under tape."""
     grey = np.full((380, 380), 20000.0)
-    for index, (mark, center) in enumerate(zip(layout.marks, centers_px(layout, pose), strict=True)):
-        col0, row0 = np.rint(center).astype(int) - 24
+    for index, mark in enumerate(layout.marks):
         if index != hidden:
-            assert isinstance(mark.mark, MarkShape)
-            place = np.column_stack([placement(pose).pixel_from_camera[:, :2], center - (col0, row0)])
-            grey[row0 : row0 + 49, col0 : col0 + 49] += CONTRAST_DN * brute_picture(mark.mark, place, 49, 49, 0.8)
+            paint(grey, mark.mark, mark.xy_mm, placement(pose).pixel_from_camera, CONTRAST_DN, half=24)
     return noisy(grey)
 
 
@@ -77,31 +68,28 @@ def frame_of(scan: Scan, layout: FiducialLayout) -> Frame:
 
 
 def test_three_plain_dots_of_four_are_no_chance() -> None:
-    layout = layout_of(DOT, DOT, DOT, DOT)
-    scan = scan_of(picture(layout, "0", hidden=1))
-    frame = frame_of(scan, layout)
+    scan = scan_of(picture(DOTS, "0", hidden=1))
+    frame = frame_of(scan, DOTS)
     assert frame.belongs.tolist() == [True, False, True, True]
-    assert doubt(FrameSearch(scan, layout, OPTIONS), frame) == ""
+    assert doubt(FrameSearch(scan, DOTS, OPTIONS), frame) == ""
 
 
 def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> None:
-    layout = layout_of(DOT, DOT, DOT, DOT)
-    as_marks = np.rint(centers_px(layout, "0")).astype(int)
+    as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
     free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
     scan = scan_of(strewn(np.concatenate([elsewhere[free], as_marks[1:]])))
-    frame = frame_of(scan, layout)
+    frame = frame_of(scan, DOTS)
     assert frame.belongs.tolist() == [False, True, True, True]
-    sentence = doubt(FrameSearch(scan, layout, OPTIONS), frame)
+    sentence = doubt(FrameSearch(scan, DOTS, OPTIONS), frame)
     assert "of 64 places beside them look as much like marks: chance finds as many with a probability of" in sentence
 
 
 def test_specks_that_lie_as_all_marks_are_doubted_too() -> None:
-    layout = layout_of(DOT, DOT, DOT, DOT)
-    as_marks = np.rint(centers_px(layout, "0")).astype(int)
+    as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
     free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
-    result = measure_fiducials(scan_of(strewn(np.concatenate([elsewhere[free], as_marks]))), layout, (50.0, 50.0))
+    result = measure_fiducials(scan_of(strewn(np.concatenate([elsewhere[free], as_marks]))), DOTS, (50.0, 50.0))
     assert Status.MEASURED not in {mark.status for mark in result.marks}
     assert result.pose is None or not result.pose.decided
 
@@ -109,7 +97,7 @@ def test_specks_that_lie_as_all_marks_are_doubted_too() -> None:
 def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     """Marks that differ by their identification dots are not found under one another's names."""
     ids = [tuple(Disk((0.9, 0.4 * k - 0.4), 0.12) for k in range(count)) for count in range(4)]
-    layout = layout_of(*[MarkShape((*dot(0.2), *dots), "light") for dots in ids])
+    layout = layout_of([MarkShape((*dot(0.2), *dots), "light") for dots in ids], CORNERS, (16.0, 16.0))
     scan = scan_of(picture(layout, "90"))
     frame = replace(frame_of(scan, layout), belongs=np.array([True, False, False, False]))
     pose = decide_pose(scan, layout, [placement(pose) for pose in POSES], frame, OPTIONS)

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from brute_marks import brute_picture
+from brute_marks import placed
 from drawn import scan_of
+from drawn_frames import layout_of, paint
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, polygon, turned_part
+from measure.marks.shapes import MarkShape, polygon, turned_part
 from measure.status import Status
 
 PX_PER_MM = 30.0
@@ -23,31 +24,24 @@ def wing(x: float, y: float) -> MarkShape:
     return MarkShape(tuple(turned_part(part, float(np.degrees(np.arctan2(y, x)))) for part in WING))
 
 
-def layout() -> FiducialLayout:
-    marks = [LayoutMark(str(k), place, (0.01, 0.01), wing(*place)) for k, place in enumerate(PLACES)]
-    return FiducialLayout(tuple(marks), (2 * HALF_MM, 2 * HALF_MM))
-
-
 @pytest.mark.parametrize("contrast", [4500.0, 0.0])
 def test_wings_are_found_beside_an_edge_that_is_nine_times_as_strong(contrast: float) -> None:
     rng = np.random.default_rng(3)
     grey = np.full((440, 440), 55000.0)
     edge = slice(round(MIDDLE_PX - HALF_MM * PX_PER_MM), round(MIDDLE_PX + HALF_MM * PX_PER_MM))
     grey[edge, edge] = 13000.0
-    centers = {str(k): MIDDLE_PX + PX_PER_MM * np.array([x, -y]) for k, (x, y) in enumerate(PLACES)}
-    for mark in layout().marks:
-        assert isinstance(mark.mark, MarkShape)
-        col0, row0 = np.rint(centers[mark.id]).astype(int) - 30
-        place = np.column_stack([np.diag([PX_PER_MM, -PX_PER_MM]), centers[mark.id] - (col0, row0)])
-        grey[row0 : row0 + 61, col0 : col0 + 61] -= contrast * brute_picture(mark.mark, place, 61, 61, 0.9)
+    matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))
+    layout = layout_of([wing(*place) for place in PLACES], PLACES, (2 * HALF_MM, 2 * HALF_MM))
+    for mark in layout.marks:
+        paint(grey, mark.mark, mark.xy_mm, matrix, -contrast, blur_px=0.9)
     grey += rng.normal(0.0, 900.0, grey.shape)
     result = measure_fiducials(
-        scan_of(grey), layout(), (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
+        scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, FiducialOptions(pose="0", pitch_is_right=True)
     )
     if not contrast:
         assert {mark.status for mark in result.marks} == {Status.ABSENT}
         return
-    for found in result.marks:
+    for found, given in zip(result.marks, layout.marks, strict=True):
         assert found.status is Status.WEAK, found
         assert found.center_px is not None
-        assert np.hypot(*(found.center_px - centers[found.point])) < 0.5
+        assert np.hypot(*(found.center_px - matrix @ (*given.xy_mm, 1.0))) < 0.5

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 from brute_marks import Array, written_scan
+from drawn_frames import ALIKE, PITCH_UM, frame_picture, pixel_from_camera
 from scipy.ndimage import gaussian_filter
-from test_fiducials import ALIKE, PITCH_UM, frame_picture, pixel_from_camera
 
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import Side

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from brute_marks import brute_picture
+from brute_marks import placed
 from drawn import drawn, scan_of
+from drawn_frames import layout_of, paint
 from numpy.typing import NDArray
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
+from measure.marks.shapes import MarkShape, dot
 from measure.search.exposed_frame import exposed_frame
 from measure.status import Status
 
@@ -54,22 +55,19 @@ def test_a_picture_without_edges_shows_no_frame() -> None:
 def test_faint_dots_are_found_where_the_edges_put_them(contrast_dn: float) -> None:
     rng = np.random.default_rng(2)
     grey = frame(0.0, 50000.0, 8000.0) + rng.normal(0.0, 2000.0, (440, 470))
-    centers = [CENTER + PX_PER_MM * np.array([x, -y]) for x, y in PLACES]
-    for center in centers:
-        col0, row0 = np.rint(center).astype(int) - 15
-        place = np.column_stack([np.diag([PX_PER_MM, -PX_PER_MM]), center - (col0, row0)])
-        grey[row0 : row0 + 31, col0 : col0 + 31] += contrast_dn * brute_picture(DOT, place, 31, 31, 0.9)
-    marks = tuple(LayoutMark(str(k), place, (0.01, 0.01), DOT) for k, place in enumerate(PLACES))
-    layout = FiducialLayout(marks, (SIZE[0] / PX_PER_MM, SIZE[1] / PX_PER_MM))
+    matrix = placed(PX_PER_MM, (float(CENTER[0]), float(CENTER[1])))
+    for place in PLACES:
+        paint(grey, DOT, place, matrix, contrast_dn, half=15, blur_px=0.9)
+    layout = layout_of([DOT] * 4, PLACES, (SIZE[0] / PX_PER_MM, SIZE[1] / PX_PER_MM))
     options = FiducialOptions(pose="0", pitch_is_right=True)
     result = measure_fiducials(scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, options)
     if not contrast_dn:
         assert {mark.status for mark in result.marks} == {Status.ABSENT}
         return
-    for found, center in zip(result.marks, centers, strict=True):
+    for found, place in zip(result.marks, PLACES, strict=True):
         assert found.status is Status.WEAK, found
         assert found.center_px is not None
-        assert np.hypot(*(found.center_px - center)) < 1.0
+        assert np.hypot(*(found.center_px - matrix @ (*place, 1.0))) < 1.0
 
 
 def test_the_edges_themselves_are_no_marks() -> None:

@@ -41,9 +41,8 @@ def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
         assert np.trace(fit.covariance_px2) < 1.5**2 * np.trace(mark.bound(0.2))
 
 
-def test_a_line_far_thinner_than_a_pixel_is_looked_for_without_complaint() -> None:
+def test_a_line_far_thinner_than_a_pixel_is_not_seen_in_noise_and_warns_of_nothing() -> None:
     mark = MarkShape(cross(1.5, 0.06), "dark")
     noise = np.random.default_rng(3).standard_normal((60, 60))
     place = np.array([[1.5, 0.0, 30.0], [0.0, -1.5, 30.0]])  # 0.67 mm a pixel
-    sighting = sight(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1), FiducialOptions().match)
-    assert sighting.fit is None or sighting.fit.likeness < 1.0
+    assert seen(scan_of(GROUND + 3000 * noise), MarkPrediction(mark, place, 3.0, -1)) is None

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 from brute_marks import Array
+from drawn_frames import ALIKE, FRAME_PX, assert_right, frame_picture, measured, paint, pixel_from_camera
 from scipy.ndimage import gaussian_filter
-from test_fiducials import ALIKE, FRAME_PX, assert_right, frame_picture, measured, paint, pixel_from_camera
 
 from measure.fiducial_options import FiducialOptions
 

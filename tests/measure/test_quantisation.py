@@ -1,3 +1,5 @@
+"""How coarsely files round, against the tables that the standard prints."""
+
 from pathlib import Path
 
 import cv2

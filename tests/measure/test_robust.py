@@ -1,3 +1,5 @@
+"""What residuals show of dust and scratches, on specks whose pixels are known."""
+
 import numpy as np
 
 from measure.noise.robust import damage, damage_where_lossy

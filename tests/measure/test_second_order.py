@@ -1,3 +1,5 @@
+"""The second order of a place's variance, against a mark whose integrals are known."""
+
 import numpy as np
 import pytest
 
