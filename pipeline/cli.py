@@ -7,7 +7,7 @@ from concurrent.futures.process import BrokenProcessPool
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -126,7 +126,7 @@ def choose(project: ProjectFile, as_json: AsJson = False) -> int:
     settings = read_project(project)
     choice = run_choose(settings, Reporter())
     if as_json:
-        typer.echo(json.dumps(without_nan(choice_json(choice)), indent=1, ensure_ascii=False))
+        _echo_json(choice_json(choice))
     else:
         print_choice(choice, Console(), settings.choice_path)
     return DONE if choice.chosen and choice.chosen.model == choice.given else LOOK
@@ -161,7 +161,7 @@ def design(
     """The precision to be expected of a scene's photographs, without any picture, and what would improve it."""
     planned = run_design(scene, out_dir, Reporter())
     if as_json:
-        typer.echo(json.dumps(planned.content, indent=1, ensure_ascii=False))
+        _echo_json(planned.content)
     else:
         planned.print(Console())
     return LOOK if planned.needs_a_look else DONE
@@ -200,13 +200,13 @@ def cameras(
         return DONE
     if scan is None:
         if as_json:
-            typer.echo(json.dumps(library_json(), indent=1, ensure_ascii=False))
+            _echo_json(library_json())
         else:
             print_library(Console())
         return DONE
     identification = identify(scan, read_library(), pitch_um, Reporter())
     if as_json:
-        typer.echo(json.dumps(identification.as_json(), indent=1, ensure_ascii=False))
+        _echo_json(identification.as_json())
     else:
         print_identification(identification, Console())
     return DONE if identification.best else LOOK
@@ -218,10 +218,14 @@ def _with_project(path: Path, stage: Callable[[Project, Reporter], Summary], as_
 
 def _finish(summary: Summary, as_json: bool) -> int:
     if as_json:
-        typer.echo(json.dumps(summary.as_json(), indent=1, ensure_ascii=False))
+        _echo_json(summary.as_json())
     else:
         print_summary(summary, Console())
     return summary.verdict.exit_code
+
+
+def _echo_json(content: Any) -> None:
+    typer.echo(json.dumps(without_nan(content), indent=1, ensure_ascii=False, allow_nan=False))
 
 
 def _message(text: str, code: int) -> int:

@@ -160,7 +160,10 @@ def _expected_at_most(seen: Trial, marks: int) -> float:
 
 
 def _not_measured(names: tuple[str, ...], drawn: int, expected: float) -> Trial:
-    reason = f"not measured: chance makes {expected:.1g} constellations in such a scan that answer as well"
+    if np.isfinite(expected):
+        reason = f"not measured: chance makes {expected:.1g} constellations in such a scan that answer as well"
+    else:
+        reason = "not measured: nowhere in the scan do its marks answer together"
     return Trial(names, 0, drawn, 0.0, 0.0, 0.0, None, None, None, reason, 0.0, expected)
 
 

@@ -1,6 +1,7 @@
 """The camera library: its files, a project that names one, and which camera a scan is of."""
 
 import json
+import math
 import re
 from dataclasses import replace
 from importlib import resources
@@ -188,6 +189,22 @@ def test_a_part_of_a_lattice_is_no_other_camera(
         camera_trials, "_trial", lambda *_: replace(trial(("lattice",), 0.5), found=found, expected=1e-25)
     )
     assert sum(each.cameras == ("lattice",) for each in identify(scan, two, 100.0, Reporter()).trials) == measured
+
+
+def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
+    frame: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nowhere do its marks answer together: that is no number, which neither a sentence nor JSON could hold."""
+    (scan,) = (frame.parent / "scans").glob("*.tif")
+    few = {name: LIBRARY[name] for name in (RENDERED, "hasselblad-reseau-60")}
+    monkeypatch.setattr("pipeline.cli.read_library", lambda: few)
+    monkeypatch.setattr(
+        camera_trials, "expected_alike", lambda _, layout, *__: 1e-9 if len(layout.marks) == 4 else math.inf
+    )
+    assert run(["cameras", "--scan", str(scan), "--json"]) == 0
+    trials = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["trials"]
+    assert [each["expected"] for each in trials] == [1e-9, None]
+    assert trials[1]["reason"] == "not measured: nowhere in the scan do its marks answer together"
 
 
 def test_what_chance_finds_as_well_does_not_stand_out() -> None:
