@@ -67,6 +67,11 @@ class Project:
         return self.output / "report.html"
 
     @property
+    def unit(self) -> str:
+        """The user's unit of object coordinates."""
+        return next(name for name, mm in UNITS_MM.items() if mm == self.unit_mm)
+
+    @property
     def disk_radius(self) -> float:
         """The radius of the disk targets in the unit of the object coordinates; 0 where nothing is said of it."""
         diameter = self.targets.diameter_mm if self.targets else None

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
@@ -59,6 +60,19 @@ def check_targets(project: Project) -> None:
         raise InputError(
             f"{project.path}: [object] points: {known} points with X, Y and Z name no targets; give {_LEAST_PAIRS}, if "
             "only roughly."
+        )
+    _check_size(project, target_field(project))
+
+
+def _check_size(project: Project, field: Field) -> None:
+    """Raises InputError for targets that would cover one another: coordinates in another unit than the project says."""
+    nearest = cKDTree(field.xyz).query(field.xyz, k=[2])[0]
+    spacing, diameter = float(np.quantile(nearest, 0.9)), 2.0 * field.radius
+    if diameter > spacing:
+        raise InputError(
+            f"{project.path}: [targets] of {diameter * project.unit_mm:g} mm would cover one another: nine of ten "
+            f"points of [object] lie within {spacing * project.unit_mm:.3g} mm of the next one if their coordinates "
+            f'are in {project.unit}. Give the unit that they are in, as [object] unit = "m".'
         )
 
 
@@ -117,9 +131,21 @@ def _oriented_by_targets(
         if oriented is not None:
             return (oriented, field.predictions(oriented, measured, _SLACK_PX)), ()
         notes = (f"Its orientation in images.csv was not used to name the targets: {why}.",)
-    found = target_candidates(scan, settings, likely_diameters_px(field, measured))
+    diameters = likely_diameters_px(field, measured)
+    if diameters[1] < _LEAST_DIAMETER_PX:
+        return _too_small(project, field, diameters[1]), notes
+    found = target_candidates(scan, settings, diameters)
     named = name_field(field, model, camera, measured, found)
     return (named if isinstance(named, str) else (named.model, named.predictions(field, measured))), notes
+
+
+def _too_small(project: Project, field: Field, largest_px: float) -> str:
+    extent = float(np.linalg.norm(np.ptp(field.xyz, axis=0)))
+    return (
+        f"targets of {2.0 * field.radius * project.unit_mm:g} mm in a field of {extent:g} {project.unit} would have "
+        f"{largest_px:.2g} px at most, and {_LEAST_DIAMETER_PX} are needed; is [object] unit the one of the "
+        f'coordinates? "{project.unit}" is taken, "m" being the default'
+    )
 
 
 def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredScan) -> tuple[float, float] | None:

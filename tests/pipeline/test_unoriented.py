@@ -14,6 +14,7 @@ from pipeline.files.tables import read_toml
 from pipeline.files.target_table import read_targets
 from pipeline.measuring.measure_stage import measure_scan
 from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.measuring.target_stage import check_targets
 from pipeline.rendered.scene_file import render_project
 
 Array = NDArray[np.float64]
@@ -115,3 +116,18 @@ def test_what_a_cross_cannot_be(tmp_path: Path, targets: str, message: str) -> N
     (tmp_path / "t.toml").write_text(targets, encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_targets(read_toml(tmp_path / "t.toml"))
+
+
+def test_coordinates_in_another_unit_than_the_project_says(tmp_path: Path) -> None:
+    project, _ = rendered(tmp_path, CROSSES)
+    text = project.read_text(encoding="utf-8")
+    project.write_text(text.replace('unit = "m"', 'unit = "mm"'), encoding="utf-8")
+    with pytest.raises(InputError, match=r"nine of ten points .* if their coordinates are in mm"):
+        check_targets(read_project(project))
+    project.write_text(text, encoding="utf-8")
+    points = tmp_path / "points.csv"
+    header, *rows = (row.split(",") for row in points.read_text(encoding="utf-8").splitlines())
+    in_mm = [[row[0], *(f"{1000.0 * float(value):.3f}" for value in row[1:4]), *row[4:]] for row in rows]
+    points.write_text("\n".join(",".join(row) for row in (header, *in_mm)), encoding="utf-8")
+    scan = measure_scan(read_project(project), "a")
+    assert any("unit the one of the coordinates?" in problem for problem in scan.frame.problems)
