@@ -167,16 +167,22 @@ def _global_test(adjustment: Json) -> Iterator[Problem]:
     by_group = ", ".join(f"{name} {fixed(group['sigma0'])}" for name, group in groups.items())
     if sigma0 > high:
         yield Problem(
-            f"σ₀ = {sigma0:.2f} is above {high:.2f}: the residuals are larger than the sigmas given ({by_group}).",
+            f"{_sigma0_and('above', high, sigma0)}: the residuals are larger than the sigmas given ({by_group}).",
             "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
             "film_sigma_um or add distortion parameters. All sigmas of the result are already multiplied by σ₀.",
         )
     elif sigma0 < low:
         yield Problem(
-            f"σ₀ = {sigma0:.2f} is below {low:.2f}: the marks fit better than the sigmas given ({by_group}).",
+            f"{_sigma0_and('below', low, sigma0)}: the marks fit better than the sigmas given ({by_group}).",
             "Lower the sigmas of the group that is below 1 (sigma_target_um, sigma_fiducial_um, film_sigma_um, or "
             "comparator.csv; datum: sigma_mm of the fiducials). All sigmas of the result are already multiplied by σ₀.",
         )
+
+
+def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
+    """Both with as many digits as tell them apart."""
+    digits = next((count for count in (2, 3, 4) if f"{sigma0:.{count}f}" != f"{bound:.{count}f}"), 5)
+    return f"σ₀ = {sigma0:.{digits}f} is {side} {bound:.{digits}f}"
 
 
 def _check_problems(check: Json) -> Iterator[Problem]:

@@ -61,6 +61,7 @@ def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
     assert "film_sigma_um" in told(changed(adjusted, sigma0=1.6))
     assert "(target 1.02, fiducial 0.97)" in told(changed(adjusted, sigma0=1.6)), "no group without a check"
     assert "σ₀ = 0.50 is below 0.89" in told(changed(adjusted, sigma0=0.5))
+    assert "σ₀ = 0.886 is below 0.887" in told(changed(adjusted, sigma0=0.8864)), "0.89 is not below 0.89"
 
 
 def suspect(**values: object) -> Json:
