@@ -7,7 +7,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,8 @@ from measure.marks.rendering import ROUGH_CELLS, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
 from measure.scans.scan import SINGLE_CHANNELS, Scan
 from measure.search.correlation import WIDE, Map, Surroundings
+from measure.search.held import Held
+from measure.search.scan_maps import ScanMaps, Sought
 
 Array = NDArray[np.float64]
 Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])
@@ -35,9 +36,9 @@ class Responses:
     """Correlations with the looks of the marks, over the reduced scan.
 
     maps: by the kind of look and +1 or -1, (rows, columns) of how much the place looks like the mark lighter or darker
-    than its surroundings. reduction: by which the scan was reduced. origins: (kinds, 2) column and row of the reduced
-    scan where the maps of each kind begin; None: they hold all of it. surroundings: what counts
-    about a mark.
+    than its surroundings; those of a whole scan are made when they are asked for. reduction: by which the scan was
+    reduced. origins: (kinds, 2) column and row of the reduced scan where the maps of each kind begin; None: they hold
+    all of it. surroundings: what counts about a mark.
     """
 
     maps: Mapping[tuple[int, int], Map]
@@ -48,6 +49,11 @@ class Responses:
     def origin(self, kind: int) -> NDArray[np.int_]:
         """(2,) pixel of the reduced scan where the maps of a kind begin."""
         return np.zeros(2, dtype=int) if self.origins is None else self.origins[kind]
+
+    def expect(self, kinds: Sequence[int], later: Sequence[int]) -> None:
+        """Kinds whose maps are asked for next, and those later on: made together they take less time."""
+        if isinstance(self.maps, ScanMaps):
+            self.maps.expect(kinds, later)
 
     def reduced_px(self, scan_px: Array) -> Array:
         """Scan pixels (..., 2) in pixels of the reduced scan."""
@@ -63,15 +69,16 @@ class Responses:
         reach = int(np.ceil(reach_px / self.reduction))
         middles = [tuple(place) for place in np.rint(self.reduced_px(places_px)).astype(int).tolist()]
         pairs = list(dict.fromkeys(zip(kinds, middles, strict=True)))
-        size = np.array(next(iter(self.maps.values())).shape[::-1])
+        signs = {sign for _, sign in self.maps}
+        size = np.array(self.maps[next(iter(self.maps))].shape[::-1])
         first = np.clip(np.array([middle for _, middle in pairs]) - reach, 0, size - 1)
         last = np.clip(np.array([middle for _, middle in pairs]) + reach, first, size - 1)
-        maps = {
-            (number, sign): map_[first[number, 1] : last[number, 1] + 1, first[number, 0] : last[number, 0] + 1]
-            for number, (kind, _) in enumerate(pairs)
-            for (own, sign), map_ in self.maps.items()
-            if own == kind
-        }
+        maps: dict[tuple[int, int], Map] = {}
+        for number, (kind, _) in enumerate(pairs):
+            rows, cols = (slice(first[number, axis], last[number, axis] + 1) for axis in (1, 0))
+            self.expect([kind], [later for later, _ in pairs[number:]])
+            # Copies: a part of a map would hold all of it.
+            maps |= {(number, sign): self.maps[kind, sign][rows, cols].copy() for sign in signs}
         index = tuple(pairs.index(pair) for pair in zip(kinds, middles, strict=True))
         return Responses(maps, self.reduction, first, self.surroundings), index
 
@@ -85,25 +92,15 @@ class Look:
 
 
 def respond(
-    scan: Scan, looks: Sequence[Look], signs: Collection[int] = (1, -1), surroundings: Surroundings = WIDE
+    scan: Scan, looks: Sequence[Look], signs: Collection[int], surroundings: Surroundings, held: Held[Map]
 ) -> tuple[Responses, tuple[int, ...]]:
     """The responses to the looks that differ, lighter (+1) and darker (-1) than their surroundings as signs says, and
-    for every look which of the kinds is its own.
-
-    Of a colour scan every channel is tried, and the one that answers best at a place counts there.
-    """
+    for every look which of the kinds is its own. held: what there is of these maps, and of others of the scan."""
     reduction = _reduction(scan, looks)
     kinds, index = _distinct(_templates(looks, reduction))
     details = [_reduced_detail_px(looks[index.index(kind)], reduction) for kind in range(len(kinds))]
-    half = max(template.shape[0] for template in kinds) // 2
-    maps: dict[tuple[int, int], Map] = {}
-    for weights in _channel_weights(scan):
-        grey = scan.reduced(reduction, weights)
-        around = np.asarray(cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE), np.float32)
-        for detail in sorted(set(details)):
-            image = surroundings.flattened(around, detail, scan.full_scale_dn * FAINT)
-            for kind in (kind for kind, own in enumerate(details) if own == detail):
-                _strongest(maps, kind, signs, _within(surroundings.correlated(image, kinds[kind], detail), grey.shape))
+    sought = Sought(kinds, details, signs, surroundings, scan.full_scale_dn * FAINT)
+    maps = ScanMaps(scan, reduction, _channel_weights(scan), sought, held)
     return Responses(maps, reduction, surroundings=surroundings), index
 
 
@@ -114,8 +111,9 @@ def respond_about(
     file only these windows are read. A kind is a look at one place."""
     reduction = _reduction(scan, looks)
     shapes, shape_of = _distinct(_templates(looks, reduction))
-    detail = _reduced_detail_px(looks[0], reduction)
-    reach, half = int(np.ceil(reach_px / reduction)), max(template.shape[0] for template in shapes) // 2
+    details = [_reduced_detail_px(looks[0], reduction)] * len(shapes)
+    sought = Sought(shapes, details, signs, WIDE, scan.full_scale_dn * FAINT)
+    reach, half = int(np.ceil(reach_px / reduction)), sought.half_px
     # Row by row: strips of the file that windows share are still decoded for the next one.
     squares = np.floor(places_px[:, ::-1] / reduction / _SHARED_PX)
     corners, corner_of = np.unique(squares, axis=0, return_inverse=True)
@@ -125,45 +123,21 @@ def respond_about(
 
     def at_corner(corner: int) -> dict[tuple[int, int], Map]:
         col0, row0 = (origins[corner] - half).tolist()
-        maps: dict[tuple[int, int], Map] = {}
-        for weights in _channel_weights(scan):
-            grey = scan.reduced_window(reduction, col0, row0, size + 2 * half, size + 2 * half, weights)
-            image = WIDE.flattened(grey, detail, scan.full_scale_dn * FAINT)
-            for kind, shape in ((kind, shape) for kind, (own, shape) in enumerate(kinds) if own == corner):
-                _strongest(maps, kind, signs, _within(WIDE.correlated(image, shapes[shape], detail), (size, size)))
-        return maps
+        greys = (
+            scan.reduced_window(reduction, col0, row0, size + 2 * half, size + 2 * half, weights)
+            for weights in _channel_weights(scan)
+        )
+        maps = sought.maps([shape for own, shape in kinds if own == corner], greys)
+        return {(kinds.index((corner, shape)), sign): map_ for (shape, sign), map_ in maps.items()}
 
     every = {key: map_ for maps in scan.each(at_corner, range(len(corners))) for key, map_ in maps.items()}
     index = tuple(kinds.index(pair) for pair in zip(corner_of.tolist(), shape_of, strict=True))
     return Responses(every, reduction, origins[[corner for corner, _ in kinds]]), index
 
 
-def _strongest(maps: dict[tuple[int, int], Map], kind: int, signs: Collection[int], response: Map) -> None:
-    """Keep at every place the strongest response of all channels."""
-    for sign in signs:
-        signed = response if sign > 0 else -response
-        known = maps.setdefault((kind, sign), signed)
-        np.maximum(known, signed, out=known)
-
-
-def peaks(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[Array, Array]:
-    """(n, 2) places (col, row) and (n,) heights of the highest local maxima above least, in order of height."""
-    highest = cv2.dilate(response, np.ones((2 * apart_px + 1, 2 * apart_px + 1), np.uint8))
-    rows, cols = np.nonzero((response == highest) & (response > least))
-    order = np.argsort(-response[rows, cols], kind="stable")[:count]
-    places = np.column_stack([cols, rows])[order].astype(float)
-    return places, response[rows, cols][order].astype(float)
-
-
 def detail_px(mark: Mark, linear: Array) -> float:
     """The width of the mark's finest detail in px, and no less than one."""
     return max(float(np.sqrt(abs(np.linalg.det(linear)))) * thinnest_mm(mark), 1.0)
-
-
-def _within(response: Map, shape: tuple[int, ...]) -> Map:
-    """The middle (rows, columns) of a response that reaches as far beyond it on every side."""
-    row0, col0 = ((whole - part) // 2 for whole, part in zip(response.shape, shape, strict=True))
-    return response[row0 : row0 + shape[0], col0 : col0 + shape[1]]
 
 
 def _reduction(scan: Scan, looks: Sequence[Look]) -> int:

@@ -3,7 +3,7 @@
 Places are complex numbers here, x + iy in mm of the scan's own axes (right, up), so that a similarity is `a w + b`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from measure.marks.poses import up_from_camera
 from measure.marks.shapes import LayoutMark, Mark
 from measure.search.candidates import Responses
 from measure.search.correlation import WIDE, Surroundings
-from measure.search.response_layers import LEAST_TOLERANCE_PX, HeldReaches, Layer, Reach, narrowed
+from measure.search.response_layers import LEAST_TOLERANCE_PX, Layer, narrowed
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -113,7 +113,8 @@ def _different(found: Sequence[Placement], marks: Sequence[LayoutMark], toleranc
 
 
 class PlacementSearch:
-    """The search for placements, in one pose after another, of a frame that bounds are known of."""
+    """The search for placements, in one pose after another, of a frame that bounds are known of. layers: of the
+    responses, by kind and sign."""
 
     def __init__(
         self,
@@ -121,14 +122,12 @@ class PlacementSearch:
         responses: Responses,
         pitch_mm: tuple[float, float],
         bounds: Bounds,
-        held: HeldReaches,
+        layers: Mapping[tuple[int, int], Layer],
     ) -> None:
         self.marks, self.responses, self.bounds = marks, responses, bounds
         self.pitch = np.asarray(pitch_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
-        self.layers = {
-            key: Layer(map_, responses.origin(key[0]), self.tolerance_px, held) for key, map_ in responses.maps.items()
-        }
+        self.layers = layers
 
     def of_pose(self, pose: str, look_of_mark: Sequence[int]) -> list[Placement]:
         """The best placements of a pose that differ from one another, best first; none where no two marks respond.
@@ -158,12 +157,12 @@ class _Constellation:
         scale, offset = self._hypotheses()
         if len(scale) == 0:
             return []
-        scores, _ = self._scores([layer.wide for layer in self.layers], scale, offset)
+        scores, _ = self._scores(self.search.tolerance_px, scale, offset)
         kept = np.argsort(-scores, kind="stable")[:_KEPT]
         slid = self._slid(scale[kept[:_SLID]], offset[kept[:_SLID]])
         starts = (np.concatenate(each) for each in zip((scale[kept], offset[kept]), slid, strict=True))
         scale, offset = self._refined(*starts)
-        scores, supported = self._scores([layer.near for layer in self.layers], scale, offset)
+        scores, supported = self._scores(narrowed(self.search.tolerance_px), scale, offset)
         return [
             Placement(
                 self.pose,
@@ -184,11 +183,11 @@ class _Constellation:
         """Of a lattice too large for all its marks to be candidates the best hypothesis may be many steps off: these,
         moved step by step as long as more marks answer. None where the marks are no lattice."""
         steps = np.concatenate([[0.0], self._steps()])
-        wide = [layer.wide for layer in self.layers]
         moving = len(steps) > 1
         while moving:
             tried = offset[:, None] + scale[:, None] * steps
-            scores = self._scores(wide, np.repeat(scale, len(steps)), tried.ravel())[0].reshape(tried.shape)
+            scores = self._scores(self.search.tolerance_px, np.repeat(scale, len(steps)), tried.ravel())[0]
+            scores = scores.reshape(tried.shape)
             best = scores.argmax(axis=1)
             moving = bool(best.any())
             offset = tried[np.arange(len(best)), best]
@@ -214,7 +213,9 @@ class _Constellation:
 
     def _hypotheses(self) -> tuple[Complex, Complex]:
         """Every similarity within bounds that takes two marks to two of their candidates."""
-        candidates = {layer: self._complex(self.responses.scan_px(layer.candidates)) for layer in set(self.layers)}
+        candidates = {
+            layer: self._complex(self.responses.scan_px(layer.candidates)) for layer in dict.fromkeys(self.layers)
+        }
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
         upright = np.cos(self.bounds.rotation_rad)
         for first, second in self._pairs():
@@ -239,11 +240,11 @@ class _Constellation:
         chosen = far[(np.arange(min(len(far), _PAIRS)) * step).astype(int)]
         return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
 
-    def _scores(self, reached: Sequence[Reach], scale: Complex, offset: Complex) -> tuple[Array, Array]:
-        """Scores and numbers of supporting marks of many placements at once."""
+    def _scores(self, radius_px: float, scale: Complex, offset: Complex) -> tuple[Array, Array]:
+        """Scores and numbers of supporting marks, which answer within the radius, of many placements at once."""
         places = self.responses.reduced_px(self._scan_px(scale[:, None] * self.camera + offset[:, None]))
         nearest = np.rint(places).astype(int)
-        answers = [reach.strength(nearest[:, k]) for k, reach in enumerate(reached)]
+        answers = [layer.within(radius_px).strength(nearest[:, k]) for k, layer in enumerate(self.layers)]
         strength, inside = (np.stack(each, axis=1) for each in zip(*answers, strict=True))
         score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
         return score, (strength > 0).sum(axis=1)

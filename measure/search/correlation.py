@@ -51,13 +51,7 @@ class Surroundings:
         OpenCV's own correlation under a mask gives the same for three times the price.
         """
         chip, about = self.pattern(template, detail_px)
-        sums, squares, products = (
-            cv2.matchTemplate(each, part, cv2.TM_CCORR)
-            for each, part in ((image, about), (image**2, about), (image, chip))
-        )
-        spread = (squares - sums**2 / about.sum()) * np.sum(chip**2)
-        least = _EVEN * about.sum() * np.sum(chip**2)  # nothing but even ground is no answer
-        return np.asarray(np.where(spread > least, products / np.sqrt(np.maximum(spread, least)), 0.0), np.float32)
+        return correlation(image, chip, about, variation(image, about))
 
     def pattern(self, template: Array, detail_px: float) -> tuple[Map, Map]:
         """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts."""
@@ -73,6 +67,27 @@ class Surroundings:
         beside = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
         far_px = self.beside * detail_px + 1
         return np.asarray(cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= far_px, np.float32)
+
+
+def variation(image: Map, about: Map) -> Map:
+    """The sum of squared deviations from their mean, wherever the pixels about a drawing lie inside of the picture."""
+    sums, squares = (np.asarray(cv2.matchTemplate(each, about, cv2.TM_CCORR)) for each in (image, image**2))
+    np.divide(np.square(sums, out=sums), about.sum(), out=sums)
+    return np.asarray(np.subtract(squares, sums, out=squares), np.float32)
+
+
+def correlation(image: Map, chip: Map, about: Map, varied: Map) -> Map:
+    """The normalised correlation of a picture with a pattern, the picture's variation about the drawing being known:
+    patterns of which the same pixels count share it."""
+    products = cv2.matchTemplate(image, chip, cv2.TM_CCORR)
+    power = np.sum(chip**2)
+    spread = varied * power
+    least = _EVEN * about.sum() * power  # nothing but even ground is no answer
+    even = spread <= least
+    np.maximum(spread, least, out=spread)
+    np.divide(products, np.sqrt(spread, out=spread), out=products)
+    products[even] = 0.0
+    return np.asarray(products, np.float32)
 
 
 WIDE = Surroundings(coarse=4.0, beside=2.0, robust=False)

@@ -1,7 +1,8 @@
 """The search for a camera's frame in a scan, under hypotheses about its pitch, and how often chance finds one."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,11 @@ from measure.scans.scan import Scan
 from measure.search.candidates import Look, Responses, detail_px, respond, respond_about
 from measure.search.centred_frame import centred_places_px, reach_mm
 from measure.search.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
-from measure.search.correlation import WIDE, Surroundings
+from measure.search.correlation import WIDE, Map, Surroundings
 from measure.search.exposed_frame import ExposedFrame, exposed_frame
+from measure.search.held import Held
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
-from measure.search.response_layers import HeldReaches
+from measure.search.response_layers import Layer, Reach, layers_of
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
@@ -27,19 +29,46 @@ _COMPARED = 8  # best placements: the one that chance makes least is among them
 _TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
 # Of the marks' middle from that of the exposed frame: one body carries both, but a gate is no datum.
 _OFF_MIDDLE_MM = 0.5
+_MAPS_BYTES = 512 << 20  # held: sixteen looks, of four marks that differ, in a large scan
+_REACHES_BYTES = 256 << 20  # the same: two for each of the looks of one pose
 _TURNED_RAD = 0.01  # of the marks against the exposed frame's edges, and what these leave open
 
 
 @dataclass(frozen=True, eq=False)
+class _Answers:
+    """What a scan answers. look_of: the kinds of all marks' looks, in one pose after another; layers: of the responses,
+    by kind and sign."""
+
+    responses: Responses
+    look_of: tuple[int, ...]
+    layers: Mapping[tuple[int, int], Layer]
+
+
+@dataclass(eq=False)
 class _Searched:
-    """One hypothesis searched. looks: by pose, the kind of response of every mark; differ: poses whose marks do not
-    lie within the tolerance of another pose's. whole: the search in the whole scan and its looks, if this one is only
-    about where the frame's edges put the marks."""
+    """One hypothesis searched, in one pose after another. whole: the search in the whole scan, if this one is only
+    about where the frame's edges put the marks. looks: by pose, the kind of response of every mark; found: by pose,
+    the placements; differ: poses whose marks do not lie within the tolerance of another pose's."""
 
     search: PlacementSearch
-    looks: dict[str, tuple[int, ...]]
-    differ: int
     whole: "_Searched | None" = None
+    looks: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    found: dict[str, list[Placement]] = field(default_factory=dict)
+    differ: int = 0
+
+    def try_pose(self, pose: str, own: tuple[int, ...]) -> None:
+        """Search in a pose, own being the kinds of its marks' looks; if it is another one's twin, it has its places."""
+        search, misfit_mm = self.search, self.search.bounds.misfit_mm
+        twin, like = (
+            next((name for name in self.found if self._same_picture(name, pose, own, within_mm)), "")
+            for within_mm in (_TWIN * misfit_mm, misfit_mm)
+        )
+        found = [place.posed(pose) for place in self.found[twin]] if twin else search.of_pose(pose, own)
+        self.looks[pose], self.found[pose] = own, found
+        self.differ += not like
+
+    def _same_picture(self, known: str, pose: str, own: tuple[int, ...], within_mm: float) -> bool:
+        return same_picture(self.search.marks, (known, self.looks[known]), (pose, own), within_mm)
 
     def share(self, pose: str, index: int, sign: int, place: Array, tolerance_px: float) -> float:
         """Of all places, those that look as much like a mark as one does within the tolerance of a place (2,) of the
@@ -73,18 +102,19 @@ class FrameSearch:
         self.scan, self.layout, self.options, self.surroundings = scan, layout, options, surroundings
         self.poses = POSES if options.pose == "auto" else (options.pose,)
         self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
-        self._drawn: tuple[Pair, Responses, tuple[int, ...]] | None = None
+        self._drawn: tuple[Pair, _Answers] | None = None
         self._searched: dict[Pair, _Searched] = {}
-        self._held = HeldReaches()
+        self._maps, self._reaches = Held[Map](_MAPS_BYTES), Held[Reach](_REACHES_BYTES)
 
     def anywhere(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements in the whole scan, of all poses asked for, best first."""
         found: list[Placement] = []
-        for hypothesis in hypotheses:
-            if self._drawn is None or self._drawn[0] != hypothesis.drawn_mm:
-                looks = self._looks(hypothesis, self.poses)
-                self._drawn = (hypothesis.drawn_mm, *respond(self.scan, looks, self._signs, self.surroundings))
-            found += self._everywhere(hypothesis, *self._drawn[1:])
+        for drawn_mm, alike in groupby(hypotheses, key=lambda hypothesis: hypothesis.drawn_mm):
+            if self._drawn is None or self._drawn[0] != drawn_mm:
+                looks = self._looks(drawn_mm, self.poses)
+                answers = respond(self.scan, looks, self._signs, self.surroundings, self._maps)
+                self._drawn = drawn_mm, self._answers(*answers)
+            found += self._everywhere(list(alike), self._drawn[1])
         return _best_first(found)
 
     def in_the_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
@@ -93,10 +123,9 @@ class FrameSearch:
         linear = _flip(hypothesis.mm)
         places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
         reach_px = reach_mm(self.layout) / max(hypothesis.mm)
-        about = respond_about(
-            self.scan, self._looks(hypothesis, self.poses), np.concatenate(places), reach_px, self._signs
-        )
-        return _best_first(self._everywhere(hypothesis, *about))
+        looks = self._looks(hypothesis.drawn_mm, self.poses)
+        about = respond_about(self.scan, looks, np.concatenate(places), reach_px, self._signs)
+        return _best_first(self._everywhere([hypothesis], self._answers(*about)))
 
     def within_its_edges(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements of a frame whose edges are seen, best first: its marks lie about the middle of what is
@@ -112,7 +141,7 @@ class FrameSearch:
             kinds = [kind for pose in poses for kind in whole.looks[pose]]
             reach_px = (_OFF_MIDDLE_MM + self._slack_mm()) / float(np.mean(hypothesis.mm))
             responses, look_of = whole.search.responses.about(kinds, np.concatenate(places), reach_px)
-            looks = self._looks(hypothesis, poses)
+            looks = self._looks(hypothesis.drawn_mm, poses)
             responses = _beside_edges(responses, dict(zip(look_of, looks, strict=True)), frame)
             right, down = frame.center_px * hypothesis.mm
             bounds = replace(
@@ -122,7 +151,7 @@ class FrameSearch:
                 middle_mm=complex(right, -down),
                 off_mm=_OFF_MIDDLE_MM,
             )
-            found += self._placements(hypothesis, responses, look_of, poses, bounds, whole)
+            found += self._placements({hypothesis.mm: bounds}, self._answers(responses, look_of), poses, whole)
         return _best_first(found)
 
     def _edges(self, hypothesis: PitchHypothesis) -> tuple[ExposedFrame, tuple[str, ...]] | None:
@@ -211,43 +240,38 @@ class FrameSearch:
     def _signs(self) -> set[int]:
         return signs_of(self.layout.marks)
 
-    def _looks(self, hypothesis: PitchHypothesis, poses: Sequence[str]) -> list[Look]:
-        linear = _flip(hypothesis.drawn_mm)
+    def _looks(self, drawn_mm: Pair, poses: Sequence[str]) -> list[Look]:
+        linear = _flip(drawn_mm)
         return [Look(mark.mark, linear @ up_from_camera(pose)) for pose in poses for mark in self.layout.marks]
 
-    def _everywhere(
-        self, hypothesis: PitchHypothesis, responses: Responses, look_of: tuple[int, ...]
-    ) -> list[Placement]:
-        """The placements of a frame that may lie anywhere in the scan."""
-        rotation_rad = float(np.deg2rad(self.options.rotation_deg))
-        bounds = Bounds(hypothesis.tolerance, rotation_rad, self.options.search_mm(self.layout))
-        return self._placements(hypothesis, responses, look_of, self.poses, bounds)
+    def _answers(self, responses: Responses, look_of: tuple[int, ...]) -> _Answers:
+        return _Answers(responses, look_of, layers_of(responses, self._reaches))
+
+    def _everywhere(self, hypotheses: Sequence[PitchHypothesis], answers: _Answers) -> list[Placement]:
+        """The placements of a frame that may lie anywhere in the scan, by hypotheses that share a drawing."""
+        rotation_rad, misfit_mm = float(np.deg2rad(self.options.rotation_deg)), self.options.search_mm(self.layout)
+        bounds = {each.mm: Bounds(each.tolerance, rotation_rad, misfit_mm) for each in hypotheses}
+        return self._placements(bounds, answers, self.poses)
 
     def _placements(
         self,
-        hypothesis: PitchHypothesis,
-        responses: Responses,
-        look_of: tuple[int, ...],
+        bounds: dict[Pair, Bounds],
+        answers: _Answers,
         poses: Sequence[str],
-        bounds: Bounds,
         whole: _Searched | None = None,
     ) -> list[Placement]:
-        marks, count = self.layout.marks, len(self.layout.marks)
-        search = PlacementSearch(marks, responses, hypothesis.mm, bounds, self._held)
-        looks: dict[str, tuple[int, ...]] = {}
-        found: dict[str, list[Placement]] = {}
-        differ = 0
+        """The placements under hypotheses about the pitch, each with its bounds. Pose by pose, for the responses of
+        all poses may be more than can be held."""
+        marks, count, responses, look_of = self.layout.marks, len(self.layout.marks), answers.responses, answers.look_of
+        searches = {mm: PlacementSearch(marks, responses, mm, bounds[mm], answers.layers) for mm in bounds}
+        tried = {mm: _Searched(search, whole) for mm, search in searches.items()}
         for number, pose in enumerate(poses):
-            own = look_of[number * count : (number + 1) * count]
-            twin, like = (
-                next((name for name in found if same_picture(marks, (name, looks[name]), (pose, own), within_mm)), "")
-                for within_mm in (_TWIN * bounds.misfit_mm, bounds.misfit_mm)
-            )
-            looks[pose] = own
-            found[pose] = [place.posed(pose) for place in found[twin]] if twin else search.of_pose(pose, own)
-            differ += not like
-        self._searched[hypothesis.mm] = _Searched(search, looks, differ, whole)
-        return [placement for of_pose in found.values() for placement in of_pose]
+            own, later = look_of[number * count : (number + 1) * count], look_of[(number + 1) * count :]
+            responses.expect(own, later)
+            for searched in tried.values():
+                searched.try_pose(pose, own)
+        self._searched |= tried
+        return [placement for searched in tried.values() for found in searched.found.values() for placement in found]
 
 
 def _beside_edges(responses: Responses, looks: dict[int, Look], frame: ExposedFrame) -> Responses:

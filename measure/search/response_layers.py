@@ -1,15 +1,15 @@
 """The responses to one look of a mark, and what a constellation asks of them: their highest places, and how strongly
 they answer about any place."""
 
-from collections import OrderedDict
 from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.search.candidates import peaks
+from measure.search.candidates import Responses
 from measure.search.correlation import Map
+from measure.search.held import Held
 
 Array = NDArray[np.float64]
 
@@ -18,7 +18,6 @@ _CANDIDATES = 100  # of each look
 _NARROWED = 0.7  # of the tolerance, once a placement is refined
 LEAST_TOLERANCE_PX = 1.5  # of the reduced scan: where a response is highest is known no better
 _CHANCE_PERCENT = 95  # of places that stay below what chance is said to answer
-_HELD_BYTES = 512 << 20  # of reaches: two for each of the sixteen looks of four marks that differ, in a large scan
 _SAMPLED = slice(None, None, 3)  # rows and columns from which that is told: neighbours answer alike
 
 
@@ -27,28 +26,36 @@ def narrowed(tolerance_px: float) -> float:
     return max(_NARROWED * tolerance_px, LEAST_TOLERANCE_PX)
 
 
-class Layer:
-    """The responses to one look, and what is asked of them in every pose. held: what is kept of it, and of others."""
+def layers_of(responses: Responses, held: "Held[Reach]") -> "dict[tuple[int, int], Layer]":
+    """The layers of all looks, by kind and sign. held: what there is of their reaches, and of others of the scan."""
+    return {key: Layer(responses, key, held) for key in responses.maps}
 
-    def __init__(self, map_: Map, origin: NDArray[np.int_], tolerance_px: float, held: "HeldReaches") -> None:
-        self.map, self.origin, self.tolerance_px, self._held = map_, origin, tolerance_px, held
+
+class Layer:
+    """The responses to one look, and what is asked of them in every pose and by every hypothesis that shares them."""
+
+    def __init__(self, responses: Responses, key: tuple[int, int], held: "Held[Reach]") -> None:
+        self._responses, self._key, self._held = responses, key, held
+        self._own = object()  # stands for this layer in what is held, which would else hold the layer that holds it
+        self.origin = responses.origin(key[0])
+
+    @property
+    def map(self) -> Map:
+        return self._responses.maps[self._key]
 
     @cached_property
     def candidates(self) -> Array:
         """(n, 2) px of the reduced scan."""
         return peaks(self.map, _CANDIDATES, _LEAST_RESPONSE)[0] + self.origin
 
-    @property
-    def wide(self) -> "Reach":
-        return self.within(self.tolerance_px)
-
-    @property
-    def near(self) -> "Reach":
-        return self.within(narrowed(self.tolerance_px))
-
     def within(self, radius_px: float) -> "Reach":
-        """What is asked of the responses within a radius."""
-        return self._held.of(self, radius_px)
+        """What is asked of the responses within a radius, to whole pixels."""
+        key = self._own, round(radius_px)
+        reach = self._held.find(key)
+        if reach is None:
+            reach = Reach(self.map, self.origin, radius_px)
+            self._held.keep(key, reach, reach.map.nbytes)
+        return reach
 
     def highest(self, places: Array, radius_px: float) -> tuple[Array, Array]:
         """The highest responses about places (n, 2) of the reduced scan, and (n,) how high; 0 outside of the map."""
@@ -93,30 +100,19 @@ class Reach:
         return np.maximum(np.maximum(response, 0.0) ** 2 - self.chance**2, 0.0), inside
 
 
-class HeldReaches:
-    """The reaches asked for last, of the layers of all hypotheses: marks that look otherwise in every pose have dozens,
-    each as large as the reduced scan."""
-
-    def __init__(self, limit_bytes: int = _HELD_BYTES) -> None:
-        self.limit_bytes = limit_bytes
-        self._reaches: OrderedDict[tuple[Layer, float], Reach] = OrderedDict()
-        self._bytes = 0
-
-    def of(self, layer: Layer, radius_px: float) -> Reach:
-        key = (layer, radius_px)
-        if key not in self._reaches:
-            reach = self._reaches[key] = Reach(layer.map, layer.origin, radius_px)
-            self._bytes += reach.map.nbytes
-            while self._bytes > self.limit_bytes and len(self._reaches) > 1:
-                self._bytes -= self._reaches.popitem(last=False)[1].map.nbytes
-        self._reaches.move_to_end(key)
-        return self._reaches[key]
-
-
 def _about(radius_px: float) -> NDArray[np.uint8]:
     """1 within the radius."""
     size = 2 * round(radius_px) + 1
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
+
+
+def peaks(response: Map, count: int, least: float, apart_px: int = 3) -> tuple[Array, Array]:
+    """(n, 2) places (col, row) and (n,) heights of the highest local maxima above least, in order of height."""
+    highest = cv2.dilate(response, np.ones((2 * apart_px + 1, 2 * apart_px + 1), np.uint8))
+    rows, cols = np.nonzero((response == highest) & (response > least))
+    order = np.argsort(-response[rows, cols], kind="stable")[:count]
+    places = np.column_stack([cols, rows])[order].astype(float)
+    return places, response[rows, cols][order].astype(float)
 
 
 def highest(map_: Map, places: Array, radius_px: float) -> tuple[Array, Array]:

@@ -5,9 +5,10 @@ from numpy.typing import NDArray
 
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import LayoutMark, MarkShape, dot
-from measure.search.candidates import Responses, peaks
+from measure.search.candidates import Responses
 from measure.search.constellation import Bounds, Placement, PlacementSearch, same_picture
-from measure.search.response_layers import HeldReaches
+from measure.search.held import Held
+from measure.search.response_layers import layers_of, peaks
 
 DOT = MarkShape(dot(0.3), "light")
 PLACES = ((100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0), (0.0, -103.0), (0.0, 95.0))
@@ -28,7 +29,8 @@ def responses(places_px: NDArray[np.float64], heights: NDArray[np.float64], seed
 
 
 def placements(pose: str, answers: Responses) -> list[Placement]:
-    return PlacementSearch(MARKS, answers, (PITCH_MM, PITCH_MM), BOUNDS, HeldReaches()).of_pose(pose, [0] * 6)
+    layers = layers_of(answers, Held(1 << 30))
+    return PlacementSearch(MARKS, answers, (PITCH_MM, PITCH_MM), BOUNDS, layers).of_pose(pose, [0] * 6)
 
 
 def seen(pose: str, scale: float = 1.015, angle: float = 0.03) -> NDArray[np.float64]:
@@ -67,7 +69,8 @@ def test_a_lattice_of_more_marks_than_candidates_is_not_a_step_off() -> None:
     camera = np.array([mark.xy_mm for mark in lattice])
     true = camera @ np.array([[1.01, 0.02], [0.02, -1.01]]) / PITCH_MM + (268.0, 257.0)
     heights = np.interp(camera.min(axis=1), [-99.0, 99.0], [0.4, 0.7])
-    search = PlacementSearch(lattice, responses(true, heights), (PITCH_MM, PITCH_MM), BOUNDS, HeldReaches())
+    answers = responses(true, heights)
+    search = PlacementSearch(lattice, answers, (PITCH_MM, PITCH_MM), BOUNDS, layers_of(answers, Held(1 << 30)))
     best = search.of_pose("0", [0] * len(lattice))[0]
     found = camera @ best.pixel_from_camera[:, :2].T + best.pixel_from_camera[:, 2]
     assert np.abs(found - true).max() < 1.5
