@@ -26,7 +26,7 @@ from pipeline.measuring.identification import PatternOptions, assign, log10_of_c
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field, measure_single_targets, target_candidates, target_field
 from pipeline.measuring.target_places import checked_places
-from pipeline.measuring.unoriented import likely_diameters_px, name_field
+from pipeline.measuring.unoriented import NamedField, likely_diameters_px, name_field
 
 Array = NDArray[np.float64]
 
@@ -127,10 +127,10 @@ def _oriented_by_targets(
     notes: tuple[str, ...] = ()
     if exterior is not None and camera.principal_distance_mm is not None:
         approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
-        oriented, why = _oriented(approximate, field, scan, measured, settings)
-        if oriented is not None:
-            return (oriented, field.predictions(oriented, measured, _SLACK_PX)), ()
-        notes = (f"Its orientation in images.csv was not used to name the targets: {why}.",)
+        oriented = _oriented(approximate, field, scan, measured, settings)
+        if not isinstance(oriented, str):
+            return (oriented.model, oriented.predictions(field, measured)), ()
+        notes = (f"Its orientation in images.csv was not used to name the targets: {oriented}.",)
     diameters = likely_diameters_px(field, measured)
     if diameters[1] < _LEAST_DIAMETER_PX:
         return _too_small(project, field, diameters[1]), notes
@@ -160,34 +160,39 @@ def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredSca
 
 def _oriented(
     model: ImageModel, field: Field, scan: Scan, measured: MeasuredScan, settings: TargetSettings
-) -> tuple[ImageModel | None, str]:
-    """The image with an orientation good to a pixel or two, from the disks found and the pattern they make."""
+) -> NamedField | str:
+    """The image oriented by the disks found and the pattern they make, and which of them are which targets: what a lens
+    that is not known moves by far more than a pixel has its name, too. Or why there are no names."""
     size = float(np.hypot(measured.width_px, measured.height_px))
     predictions = field.predictions(model, measured, _SLACK_PX)
     predicted = np.array([prediction.center_px for prediction in predictions]).reshape(-1, 2)
     diameters = _diameters_px(predictions, measured)
     if diameters is None:
-        return None, "the approximate orientation puts no target of two pixels or more into the scan"
+        return "the approximate orientation puts no target of two pixels or more into the scan"
     strongest = target_candidates(scan, settings, diameters)[: _STRONGEST * len(predicted)]
     found = np.array([patch.center_px for patch in strongest]).reshape(-1, 2)
     placement = recognise(predicted, found, PatternOptions(shift_px=size / 2.0))
     unlike = f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted"
     if placement is None:
-        return None, unlike
+        return unlike
     gate_px = _GATE_SHARE * size
     places = placement.places(predicted)
-    ids = [prediction.point for prediction in predictions]
     for _ in range(2):
         pairs = assign(places, found, gate_px)
-        resection = _resected(model, field, [(ids[i], found[j]) for i, j in pairs], measured)
+        resection = _resected(model, field, [(predictions[i].point, found[j]) for i, j in pairs], measured)
         if resection is None:
-            return None, unlike
+            return unlike
         model, gate_px = resection
         predictions = field.predictions(model, measured, gate_px)
-        places, ids = np.array([p.center_px for p in predictions]), [p.point for p in predictions]
+        places = np.array([p.center_px for p in predictions])
     shown = ((places >= 0.0) & (places <= (measured.width_px - 1, measured.height_px - 1))).all(axis=1)
-    by_chance = log10_of_chance(places[shown], found, gate_px, placement.tried) > _MOST_LOG10_CHANCE
-    return (None, f"{unlike}, but for what chance explains") if by_chance else (model, "")
+    if log10_of_chance(places[shown], found, gate_px, placement.tried) > _MOST_LOG10_CHANCE:
+        return f"{unlike}, but for what chance explains"
+    named = {
+        predictions[i].point: replace(strongest[j], pixel_from_disk=predictions[i].pixel_from_disk)
+        for i, j in assign(places, found, gate_px)
+    }
+    return NamedField(model, named, _SLACK_PX)
 
 
 def _resected(
