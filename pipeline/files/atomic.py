@@ -14,18 +14,24 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Raises InputError, with the reason, where the folder cannot be made or the file cannot be written.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with _temporary_file(path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}"), path) as temporary:
         yield temporary
         os.replace(temporary, path)
+
+
+@contextmanager
+def _temporary_file(temporary: Path, told: Path) -> Iterator[Path]:
+    """In a folder that is made for it, gone when the block ends. told: what an InputError says cannot be written."""
+    try:
+        temporary.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(
-            f"{path}: cannot be written: {error.filename} is a file, and a folder is needed there. Set another output."
+            f"{told}: cannot be written: {error.filename} is a file, and a folder is needed there. Set another output."
         ) from error
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}). Nothing was changed there. "
+            f"{told}: cannot be written ({error.strerror or error}). Nothing was changed there. "
             "Make room or give write permission, or set another output folder."
         ) from error
     finally:
@@ -44,6 +50,5 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 def check_writable(folder: Path) -> None:
     """Know before long work whether its results can be written. Raises InputError where they cannot."""
-    with atomic_path(folder / "trial") as temporary:
+    with _temporary_file(folder / f".writable.{os.getpid()}.part", folder) as temporary:
         temporary.touch()
-    (folder / "trial").unlink()

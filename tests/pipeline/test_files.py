@@ -14,7 +14,7 @@ from measure.marks.shapes import MarkShape, MarkTemplate, Polygon
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
-from pipeline.files.atomic import atomic_path, write_atomically
+from pipeline.files.atomic import atomic_path, check_writable, write_atomically
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import read_images
@@ -292,3 +292,11 @@ def test_interrupted_write_leaves_nothing_half_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="stop"):
         interrupted()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_trying_whether_a_folder_takes_results_touches_no_file_of_it(tmp_path: Path) -> None:
+    (tmp_path / "trial").write_text("the user's own", encoding="utf-8")
+    check_writable(tmp_path)
+    assert [path.read_text(encoding="utf-8") for path in tmp_path.iterdir()] == ["the user's own"]
+    with pytest.raises(InputError, match="trial: cannot be written"):
+        check_writable(tmp_path / "trial")
