@@ -19,7 +19,7 @@ CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be anot
 _CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak
 _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
 _CHECKED = 4  # marks that agree: an affine transformation through them has a check
-_WRONG_PX, _WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
+WRONG_PX, WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _LEAST_SCATTER_MM = 0.01  # of few marks, which may agree by chance better than film keeps them
 
@@ -113,7 +113,7 @@ class Frame:
         if fit.damaged_fraction > CLEAR_DAMAGE:
             reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
-        if stats.chi2.sf((_WRONG_PX / sigma_px) ** 2, 2) > _WRONG_CHANCE:
+        if stats.chi2.sf((WRONG_PX / sigma_px) ** 2, 2) > WRONG_CHANCE:
             reasons.append(f"its standard deviation is {sigma_px:.2f} px")
         if self.misfit_mm[index] > _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM):
             reasons.append(f"it lies {self.misfit_mm[index]:.2f} mm from where the others put it: the film is deformed")

@@ -9,8 +9,16 @@ from numpy.typing import NDArray
 
 from measure.fitting.generators import is_round
 from measure.fitting.matching import Match
+from measure.frames.frame import WRONG_CHANCE, WRONG_PX
 from measure.frames.frame_sighter import FrameSighter
-from measure.frames.mark_comparison import round_moves_px, shared_blurs, shared_shapes, shared_sizes
+from measure.frames.mark_comparison import (
+    SharedShape,
+    round_moves_beyond,
+    round_moves_px,
+    shared_blurs,
+    shared_shapes,
+    shared_sizes,
+)
 from measure.frames.refinement import leans_on_frame, sight, strained_px
 from measure.marks.rendering import reach_px
 from measure.marks.shapes import Disk, Mark, MarkShape, Ring
@@ -59,7 +67,7 @@ def share_blur(sighter: FrameSighter) -> None:
 
 def compare_sizes(sighter: FrameSighter) -> None:
     """Doubt marks of another size than the others that are drawn alike: dust, say, that covers one. A round mark is
-    known no better than its size says."""
+    known no better than its size says, and doubted where what touches it may well have moved it far."""
     alike: dict[Mark, list[int]] = defaultdict(list)
     fits = _adjusted(sighter)
     for index in fits:
@@ -73,9 +81,19 @@ def compare_sizes(sighter: FrameSighter) -> None:
                 reason = f"it is {size.ratio:.2f} times as large as the other marks: something may cover or touch it"
                 sighter.doubt(index, reason)
             if size is not None and is_round(mark):
-                radius_px = _radius_px(mark, fits[index].pixel_from_mark[:, :2])
-                moved_px = round_moves_px(size, radius_px)
-                sighter.widen(index, size.touched_px2(moved_px, radius_px, fits[index].damaged_fraction > 0))
+                _count_touches(sighter, index, size, _radius_px(mark, fits[index].pixel_from_mark[:, :2]))
+
+
+def _count_touches(sighter: FrameSighter, index: int, size: SharedShape, radius_px: float) -> None:
+    """What may touch a round mark, as its size has it: in its variance, and as a doubt where it may be far off."""
+    sighting = sighter.sightings[index]
+    is_damaged = sighting is not None and sighting.fit is not None and sighting.fit.damaged_fraction > 0
+    touched = size.touched(radius_px, is_damaged)
+    sighter.widen(index, touched * round_moves_px(size, radius_px) ** 2 / 2)
+    chance = touched * round_moves_beyond(WRONG_PX, size, radius_px)
+    if chance > WRONG_CHANCE and not size.differs:
+        reason = f"it is {size.ratio:.2f} times as large as the other marks: something may touch it and have moved it"
+        sighter.doubt(index, f"{reason} by more than {WRONG_PX} px, with a probability of {chance:.1%}")
 
 
 def compare_shapes(sighter: FrameSighter) -> None:
@@ -98,7 +116,8 @@ def compare_shapes(sighter: FrameSighter) -> None:
             sighter.doubt(index, f"{reason} degrees: something may cover or touch it")
         middle_px = reach_px(sighter.layout.marks[index].mark, fits[index].pixel_from_mark[:, :2]) / 2
         moved_px = float(np.hypot(*(shape.on_place @ other.off)))
-        sighter.widen(index, other.touched_px2(moved_px, middle_px, fits[index].damaged_fraction > 0))
+        touched = other.touched(middle_px, fits[index].damaged_fraction > 0)
+        sighter.widen(index, touched * moved_px**2 / 2)
 
 
 def _radius_px(mark: Mark, linear: Array) -> float:

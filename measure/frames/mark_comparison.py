@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 # The standard deviation of a figure from mark to mark, by the variance that so many marks show beyond their own.
 _Spread = Callable[[float, int], float]
 
-_FEWEST = 3  # other marks: of fewer nobody knows by how much they differ
+_FEWEST_BLURS = 3  # other marks: of fewer nobody knows by how much they differ
+_FEWEST_SHAPES = 2  # the same: how much sizes differ is known beforehand, but not which of two marks is off
 _CHANCE = 0.01  # of doubting any good mark of a frame
 _BLUR_SPREAD = 0.05  # of the logarithm: so much blur differs within a field
 _TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no more where its blur is known so well
@@ -53,11 +54,12 @@ def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
     it is as theirs, or where they are too few."""
     own = np.array([np.log(fit.blur_px**2 + PIXEL_VARIANCE_PX2) / 2 for fit in fits])
     sigma = np.array([fit.blur_sigma for fit in fits])
+    told_by_others = _told_by_others(own, sigma, _blur_spread, _FEWEST_BLURS)
     return [
         None
         if told is None or not (told.differs or own_sigma > _TELLING)
         else SharedBlur(_without_pixel(told.value), told.sigma, told.differs)
-        for told, own_sigma in zip(_told_by_others(own, sigma, _blur_spread), sigma.tolist(), strict=True)
+        for told, own_sigma in zip(told_by_others, sigma.tolist(), strict=True)
     ]
 
 
@@ -76,22 +78,27 @@ class SharedShape:
         """How many times the others' size it has."""
         return float(np.exp(self.off[0]))
 
-    def touched_px2(self, moved_px: float, reach_px: float, is_damaged: bool) -> float:
-        """The mean square of how far what may touch one side of the mark has moved it, along a coordinate: of a mark
-        that is touched, times the probability that it is.
-
-        moved_px: how far a mark of such a shape is moved; reach_px: from its middle to its outline. is_damaged: whether
-        something was cut out beside it.
-        """
+    def touched(self, reach_px: float, is_damaged: bool) -> float:
+        """The probability that something touches the mark on one side. reach_px: from its middle to its outline;
+        is_damaged: whether something was cut out beside it."""
         share = _DAMAGED if is_damaged else _WHOLE
         touched = share * np.prod(stats.norm.pdf(self.off, scale=np.hypot(self.sigma, _TOUCHED_PX / reach_px)))
         untouched = (1 - share) * np.prod(stats.norm.pdf(self.off, scale=self.sigma))
-        return moved_px**2 / 2 * float(touched) / max(float(touched + untouched), 1e-300)
+        return float(touched) / max(float(touched + untouched), 1e-300)
 
 
 def round_moves_px(shape: SharedShape, radius_px: float) -> float:
     """How far what touches one side of a round mark moves it, where it gives it such a size."""
     return _AS_MUCH * radius_px * abs(float(shape.off[0]))
+
+
+def round_moves_beyond(px: float, shape: SharedShape, radius_px: float) -> float:
+    """The probability that what touches one side of a round mark moves it farther than px, of marks that are touched
+    and have such a size."""
+    prior, said = (_TOUCHED_PX / radius_px) ** 2, shape.sigma[0] ** 2
+    sigma = _AS_MUCH * radius_px * np.sqrt(prior * said / (prior + said))
+    moved_px = round_moves_px(shape, radius_px) * prior / (prior + said)
+    return float(stats.norm.sf((px - moved_px) / sigma) + stats.norm.sf((px + moved_px) / sigma))
 
 
 def shared_sizes(fits: Sequence[Match], linear: Array) -> list[SharedShape | None]:
@@ -108,7 +115,7 @@ def shared_shapes(shapes: Sequence[OwnShape]) -> list[SharedShape | None]:
 
 def _beside_others(own: Array, sigma: Array) -> list[SharedShape | None]:
     """own, sigma (n, k): each mark's figures."""
-    told = [_told_by_others(*pair, _size_spread) for pair in zip(own.T, sigma.T, strict=True)]
+    told = [_told_by_sound(*pair) for pair in zip(own.T, sigma.T, strict=True)]
     result: list[SharedShape | None] = []
     for figures, sigmas, each in zip(own, sigma, zip(*told, strict=True), strict=True):
         known = [one for one in each if one is not None]
@@ -118,6 +125,15 @@ def _beside_others(own: Array, sigma: Array) -> list[SharedShape | None]:
         off, beside = figures - [one.value for one in known], np.hypot(sigmas, [one.sigma for one in known])
         result.append(SharedShape(off, beside, any(one.differs for one in known)))
     return result
+
+
+def _told_by_sound(own: Array, sigma: Array) -> "list[_Told | None]":
+    """For each mark what the others tell of one figure of its shape: those alone that do not differ themselves, where
+    these are enough."""
+    told = _told_by_others(own, sigma, _size_spread, _FEWEST_SHAPES)
+    odd = np.array([each is not None and each.differs for each in told])
+    without = _told_by_others(own, np.where(odd, np.inf, sigma), _size_spread, _FEWEST_SHAPES)
+    return [first if is_odd else again or first for first, again, is_odd in zip(told, without, odd, strict=True)]
 
 
 def _blur_spread(shown: float, marks: int) -> float:
@@ -142,17 +158,17 @@ class _Told:
     differs: bool
 
 
-def _told_by_others(own: Array, sigma: Array, spread: _Spread) -> list[_Told | None]:
-    """For each mark what the others tell, None where they are too few.
+def _told_by_others(own: Array, sigma: Array, spread: _Spread, fewest: int) -> list[_Told | None]:
+    """For each mark what the others tell, None where they are fewer than so many.
 
     own, sigma (n,): each mark's figure and its standard deviation, infinite where it has none.
     """
-    return [_told(own, sigma, index, spread) for index in range(len(own))]
+    return [_told(own, sigma, index, spread, fewest) for index in range(len(own))]
 
 
-def _told(own: Array, sigma: Array, index: int, spread: _Spread) -> _Told | None:
+def _told(own: Array, sigma: Array, index: int, spread: _Spread, fewest: int) -> _Told | None:
     others = np.isfinite(sigma) & (np.arange(len(own)) != index)
-    if others.sum() < _FEWEST:
+    if others.sum() < fewest:
         return None
     mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
     predicted = float(np.hypot(mean_sigma, apart))

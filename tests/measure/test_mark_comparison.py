@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from measure.fitting.own_shape import OwnShape
-from measure.frames.mark_comparison import SharedShape, round_moves_px, shared_blurs, shared_shapes, shared_sizes
+from measure.frames.mark_comparison import (
+    SharedShape,
+    round_moves_beyond,
+    round_moves_px,
+    shared_blurs,
+    shared_shapes,
+    shared_sizes,
+)
 
 PIXEL = 1 / 12
 
@@ -79,7 +86,27 @@ def test_what_touches_one_side_of_a_dot_widens_its_variance_and_chance_hardly_do
 
 def touched(ratio: float, sigma: float, radius_px: float) -> float:
     shape = SharedShape(np.log([ratio]), np.array([sigma]), differs=False)
-    return shape.touched_px2(round_moves_px(shape, radius_px), radius_px, is_damaged=False)
+    return shape.touched(radius_px, is_damaged=False) * round_moves_px(shape, radius_px) ** 2 / 2
+
+
+def test_how_likely_a_touched_dot_is_far_off_is_what_drawing_at_random_finds() -> None:
+    rng, radius_px, sigma = np.random.default_rng(4), 5.3, 0.022
+    changes = rng.normal(0.0, 0.3 / radius_px, 400_000)
+    alike = np.abs(changes + rng.normal(0.0, sigma, len(changes)) + 0.054) < 0.002  # of those that look so small
+    shape = SharedShape(np.array([-0.054]), np.array([sigma]), differs=False)
+    expected = float(np.mean(np.abs(2 * radius_px * changes[alike]) > 0.5))
+    assert round_moves_beyond(0.5, shape, radius_px) == pytest.approx(expected, abs=0.02)
+
+
+def test_two_other_marks_tell_a_size_and_an_odd_one_does_not_spoil_the_others() -> None:
+    linear = np.diag([19.0, -19.0])
+    small = shared_sizes(sized(np.array([1.0, 1.002, 0.998, 0.9]), np.full(4, 0.01), linear), linear)
+    assert [size is not None and size.differs for size in small] == [False, False, False, True]
+    assert small[0] is not None
+    assert abs(small[0].off[0]) < 0.01
+    assert all(shared_sizes(sized(np.array([1.0, 1.0, 0.95]), np.full(3, 0.01), linear), linear))
+    pair = shared_sizes(sized(np.array([1.0, 0.9]), np.array([0.01, 0.01]), linear), linear)
+    assert pair == [None, None]
 
 
 def sized(sizes: Any, sigmas: Any, linear: Any) -> list[Any]:
