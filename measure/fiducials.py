@@ -12,6 +12,7 @@ from measure.frames.fiducial_rows import absent_frame, present_frame
 from measure.frames.frame import Frame
 from measure.frames.frame_fit import AFFINITY_SIGMA
 from measure.frames.frame_measurement import measure_frame
+from measure.marks.frame_border import at_border
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.pose.pose_decision import decide_pose
@@ -48,6 +49,7 @@ def measure_fiducials(
     picture shows: statuses, reasons and problems say it.
     """
     options = options or FiducialOptions()
+    layout = at_border(layout)
     search = FrameSearch(scan, layout, options)
     hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
     found, frame = _at_first_look(search, hypotheses, pitch_um is not None)

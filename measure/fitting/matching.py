@@ -23,7 +23,7 @@ from measure.fitting.picture_model import GREY, PictureModel, State, background_
 from measure.fitting.scan_window import ScanWindow
 from measure.fitting.second_order import second_order
 from measure.fitting.second_place import SecondPlace, edge_place, sloping_place
-from measure.marks.rendering import extent_px
+from measure.marks.rendering import extent_px, known
 from measure.marks.shapes import Mark, MarkTemplate
 from measure.match_options import MatchOptions
 from measure.noise.blank_film import blank_patches, is_coloured
@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SPARE_PX = 2.0  # beyond the margin: room for the mark to move
+_BORDER_PX = 4.0  # within the frame's border, where a mark grows out of it: so far its edge is blurred
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +126,13 @@ class _Given(NamedTuple):
 
 
 def _given(window: ScanWindow, mark: Mark, pixel_from_mark: Array) -> _Given:
-    usable, sides = window.usable, window.sides
+    start = np.array(pixel_from_mark, dtype=float)
+    start[:, 2] -= window.origin_px
+    rows, cols = window.usable.shape
+    usable, sides = window.usable & known(mark, start, cols, rows, _BORDER_PX), window.sides
     # A chip's picture is smoothed for the fit, and blank film beside it is not.
     has_none = window.is_lossy or isinstance(mark, MarkTemplate)
     blank = np.zeros_like(usable) if has_none else usable & (sides == 0)
-    start = np.array(pixel_from_mark, dtype=float)
-    start[:, 2] -= window.origin_px
     grey = np.where(usable, np.asarray(window.grey, dtype=float), 0.0)
     return _Given(grey, usable, sides, blank, mark, start, window.is_lossy)
 

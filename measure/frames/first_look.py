@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from measure.fitting.matching import window_about
-from measure.marks.rendering import ROUGH_CELLS, extent_px, picture
+from measure.marks.rendering import extent_px, known_picture
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT, detail_px
 from measure.search.prediction import MarkPrediction
@@ -63,7 +63,7 @@ class _Look:
         centred[:, 2] = -low
         size = high - low + 1
         finest_px = max(detail_px(mark, reduced[:, :2]), blur_px)
-        template = picture(mark, centred, int(size[0]), int(size[1]), blur_px, ROUGH_CELLS)
+        template = known_picture(mark, centred, int(size[0]), int(size[1]), blur_px)
         window = scan.reduced_window(reduction, col0, row0, width, tall, expected.weights)
         self._flat = expected.polarity * surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
         self._pattern, self._counts = surroundings.pattern(template, finest_px)

@@ -10,7 +10,8 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from measure.marks.coverage import CELLS, cell_coverage, outline_mm
+from measure.marks.coverage import CELLS, cell_coverage
+from measure.marks.frame_border import drawn_outline_mm, known_outline_mm
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate
 
 Array = NDArray[np.float64]
@@ -19,6 +20,7 @@ Integers = NDArray[np.int_]
 
 _DRAWINGS = 16  # kept: more than a camera has kinds of marks
 ROUGH_CELLS = 2  # along a pixel's side: of pictures that are right to a hundredth
+_BLURRED = 2.0  # times the blur: so far an edge is seen
 _BLOCK = 4  # pixels that are averaged at once: of a matrix for more, too much would be empty
 
 
@@ -72,9 +74,19 @@ def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px
     return _seen(mark, pixel_from_mark, (width, height), blur_px, ((0, 0),), cells)[0].astype(float)
 
 
+def known_picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
+    """(height, width): a rough picture of the mark, nan where its drawing is not known to be true."""
+    drawn = picture(mark, pixel_from_mark, width, height, blur_px, ROUGH_CELLS)
+    return np.where(known(mark, pixel_from_mark, width, height, _BLURRED * blur_px), drawn, np.nan)
+
+
 def extent_px(mark: Mark, pixel_from_mark: Array) -> tuple[Array, Array]:
     """(2,) least and (2,) greatest column and row that the mark reaches."""
-    points = _outline_mm(mark) @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
+    return _extent_px(_outline_mm(mark), pixel_from_mark)
+
+
+def _extent_px(outline: Array, pixel_from_mark: Array) -> tuple[Array, Array]:
+    points = outline @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
     return points.min(axis=0), points.max(axis=0)
 
 
@@ -85,13 +97,25 @@ def reach_px(mark: Mark, linear: Array) -> float:
 
 @lru_cache(maxsize=_DRAWINGS)
 def _outline_mm(mark: Mark) -> Array:
-    """(n, 2) corners of a region that holds the mark."""
+    """(n, 2) corners of a region that holds the mark, as far as it is known."""
     if isinstance(mark, MarkTemplate):
         rows, cols = mark.image.shape
         corners = np.array([(0, 0), (cols - 1, 0), (cols - 1, rows - 1), (0, rows - 1)], dtype=float)
         chip_from_mark = _chip_from_mark(mark)
         return np.asarray((corners - chip_from_mark[:, 2]) @ np.linalg.inv(chip_from_mark[:, :2]).T)
-    return mark.drawn_at(np.concatenate([outline_mm(part) for part in mark.parts]))
+    return known_outline_mm(mark)
+
+
+def known(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+    """(height, width): in which pixels the mark's drawing is true, and in all within margin_px of them."""
+    if isinstance(mark, MarkTemplate) or mark.known_mm is None:
+        return np.ones((height, width), dtype=bool)
+    mark_from_pixel = np.linalg.inv(pixel_from_mark[:, :2])
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - pixel_from_mark[:, 2]
+    margin_mm = margin_px / np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2])))
+    least, greatest = np.add(mark.known_mm, [[margin_mm], [-margin_mm]])
+    places = pixels @ mark_from_pixel.T
+    return np.asarray(np.all((places >= least) & (places <= greatest), axis=-1))
 
 
 def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> NDArray[np.bool_]:
@@ -173,7 +197,7 @@ def _drawn(mark: MarkShape, linear: bytes, origin_px: tuple[float, float], cells
     """The mark's cells, its origin so far right and down of a pixel's centre; and which pixel (col, row) that is. Marks
     of a camera that are drawn alike share them."""
     place = np.column_stack([np.frombuffer(linear).reshape(2, 2), origin_px])
-    least, greatest = extent_px(mark, place)
+    least, greatest = _extent_px(drawn_outline_mm(mark), place)
     low, high = np.floor(least + 0.5).astype(int), np.ceil(greatest + 0.5).astype(int)
     place[:, 2] -= low
     width, height = np.maximum(high - low, 1).tolist()

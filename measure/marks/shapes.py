@@ -60,11 +60,13 @@ class MarkShape:
     """A mark that is drawn. Overlapping parts count once.
 
     perspective: of a plane seen obliquely, per mm: a point u of the parts is drawn at u / (1 + perspective u).
+    known_mm: the least and the greatest corner of the part of the plane that the drawing is true in; None: all of it.
     """
 
     parts: tuple[Part, ...]
     polarity: Polarity = "auto"
     perspective: Point = field(default=(0.0, 0.0), kw_only=True)
+    known_mm: tuple[Point, Point] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not self.parts:

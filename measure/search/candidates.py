@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.marks.rendering import ROUGH_CELLS, extent_px, picture
+from measure.marks.rendering import extent_px, known_picture
 from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
 from measure.scans.scan import SINGLE_CHANNELS, Scan
 from measure.search.correlation import WIDE, Map, Surroundings
@@ -192,7 +192,7 @@ def _template(look: Look, reduction: int) -> Array:
     least, greatest = extent_px(look.mark, linear)
     half = int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + _RIM_PX
     linear[:, 2] = half
-    return picture(look.mark, linear, 2 * half + 1, 2 * half + 1, _BLUR_PX, ROUGH_CELLS)
+    return known_picture(look.mark, linear, 2 * half + 1, 2 * half + 1, _BLUR_PX)
 
 
 def _centred(linear: Array) -> Array:
@@ -217,7 +217,7 @@ def _distinct(templates: Sequence[Array]) -> tuple[list[Array], tuple[int, ...]]
 def _likeness(templates: Sequence[Array]) -> Array:
     """(n, n) correlations of templates about one centre, the smaller of two filled up with nothing."""
     sizes = np.array([template.shape[0] for template in templates])
-    flat = np.stack([np.pad(each, (sizes.max() - len(each)) // 2).ravel() for each in templates])
+    flat = np.stack([np.pad(np.nan_to_num(each), (sizes.max() - len(each)) // 2).ravel() for each in templates])
     sums, count = flat.sum(axis=1), np.maximum(sizes[:, None], sizes) ** 2
     squares = (flat**2).sum(axis=1)
     spread = squares[:, None] - sums[:, None] ** 2 / count

@@ -54,19 +54,22 @@ class Surroundings:
         return correlation(image, chip, about, variation(image, about))
 
     def pattern(self, template: Array, detail_px: float) -> tuple[Map, Map]:
-        """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts."""
+        """What a flattened picture is correlated with, of mean 0, and how much each of its pixels counts: one that is
+        nan in the template does not."""
         about = self._about(template, detail_px)
+        template = np.nan_to_num(template)
         chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), self.coarse * detail_px), np.float32)
         return about * (chip - np.average(chip, weights=about)), about
 
     def _about(self, template: Array, detail_px: float) -> Map:
         """1 on the drawing and beside it, 0 elsewhere."""
         rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
-        drawn = np.abs(template - np.median(rim))
+        drawn = np.nan_to_num(np.abs(template - np.nanmedian(rim)))
         # Of a line far thinner than a pixel hardly anything is left.
         beside = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
         far_px = self.beside * detail_px + 1
-        return np.asarray(cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= far_px, np.float32)
+        near = cv2.distanceTransform(beside, cv2.DIST_L2, 5) <= far_px
+        return np.asarray(near & ~np.isnan(template), np.float32)
 
 
 def variation(image: Map, about: Map) -> Map:

@@ -1,0 +1,77 @@
+"""Wings that grow out of the frame's border and merge into it, and notches cut into it, drawn by half planes."""
+
+import numpy as np
+import pytest
+from drawn import Array, drawn, scan_of
+from drawn_frames import layout_of, pixel_from_camera
+
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.marks.frame_border import at_border, known_outline_mm
+from measure.marks.shapes import FiducialLayout, MarkShape, Point, Polygon, turned_part
+from measure.status import Status
+
+HALF_MM, SIDES = 11.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+WEDGE = ((0.0, 0.0), (1.6, 0.7), (1.6, -0.7))
+WEDGE_TO_EDGE = ((0.0, 0.0), (1.0, 0.4375), (1.0, -0.4375))
+WEDGE_AND_BORDER = ((0.0, 0.0), (1.0, 0.4375), (1.0, 2.5), (2.5, 2.5), (2.5, -2.5), (1.0, -2.5), (1.0, -0.4375))
+NOTCH = ((-0.3, 0.5), (0.8, 0.5), (0.8, -0.5), (-0.3, -0.5))
+
+
+def layout(vertices: tuple[Point, ...], at_mm: float) -> FiducialLayout:
+    """One to each side, drawn as on the right."""
+    turns = [float(np.degrees(np.arctan2(up, right))) for right, up in SIDES]
+    marks = [MarkShape((turned_part(Polygon(vertices), turn),)) for turn in turns]
+    places = [(at_mm * x, at_mm * y) for x, y in SIDES]
+    return layout_of(marks, places, (2 * HALF_MM, 2 * HALF_MM))
+
+
+def scanned(at_mm: float, is_notch: bool, matrix: Array) -> Array:
+    """A light frame with a wedge of its dark border, or a notch in it, on each side."""
+    camera_from_pixel = np.linalg.inv(matrix[:, :2])
+
+    def exposed(col: Array, row: Array) -> Array:
+        x, y = np.tensordot(camera_from_pixel, np.stack([col - matrix[0, 2], row - matrix[1, 2]]), axes=1)
+        frame = np.maximum(np.abs(x), np.abs(y)) < HALF_MM
+        for right, up in SIDES:
+            out, along = x * right + y * up - at_mm, np.abs(y * right - x * up)
+            if is_notch:
+                frame |= (out > -0.3) & (out < 0.8) & (along < 0.5)
+            else:
+                frame &= ~((out > 0) & (along < out * 0.7 / 1.6))
+        return np.asarray(frame)
+
+    light = drawn(exposed, 520, 520, 0.9, fineness=6)
+    return 3000 + 20000 * light + np.random.default_rng(3).normal(0, 400, light.shape)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "at_mm", "is_notch"),
+    [(WEDGE, 10.0, False), (WEDGE_AND_BORDER, 10.0, False), (WEDGE_TO_EDGE, 10.0, False), (NOTCH, 11.0, True)],
+    ids=["beyond", "with its border", "to the edge", "notch"],
+)
+def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
+    vertices: tuple[Point, ...], at_mm: float, is_notch: bool
+) -> None:
+    matrix = pixel_from_camera("90", turn_rad=0.03)
+    camera = layout(vertices, at_mm)
+    result = measure_fiducials(
+        scan_of(scanned(at_mm, is_notch, matrix)), camera, (50.0, 50.0), FiducialOptions(pose="90")
+    )
+    for mark, given in zip(result.marks, camera.marks, strict=True):
+        assert mark.status is Status.MEASURED, mark.reason
+        assert mark.center_px is not None
+        assert mark.covariance_px2 is not None
+        off = mark.center_px - matrix @ (*given.xy_mm, 1.0)
+        assert np.hypot(*off) < 0.1
+        assert off @ np.linalg.solve(mark.covariance_px2, off) < 18  # 1 in 8000
+
+
+def test_what_is_known_of_a_drawing_ends_at_the_frame() -> None:
+    (wedge, *_), (notch, *_) = at_border(layout(WEDGE, 10.0)).marks, at_border(layout(NOTCH, 11.0)).marks
+    inner = layout(((0.0, 0.0), (0.8, 0.3), (0.8, -0.3)), 10.0)
+    assert isinstance(wedge.mark, MarkShape)
+    assert isinstance(notch.mark, MarkShape)
+    assert known_outline_mm(wedge.mark)[:, 0].max() == pytest.approx(0.9)
+    assert known_outline_mm(notch.mark)[:, 0].min() == pytest.approx(0.1)
+    assert at_border(inner) == inner
