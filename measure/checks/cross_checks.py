@@ -90,7 +90,7 @@ def _by_other_method(frames: Sequence[FrameMeasurement], _: FiducialLayout) -> I
             if sigmas is not None and stats.chi2.sf(sigmas**2, 2) * tests < _CHANCE:
                 off = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
                 doubts[mark.point] = Doubt(
-                    f"its edges put it {off:.2f} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
+                    f"its edges put it {off:#.2g} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
                     "it is damaged or unlike its drawing",
                     off,
                 )
