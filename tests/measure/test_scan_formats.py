@@ -1,0 +1,242 @@
+"""Scan files of every kind: each way of storing one picture gives the same grey values, pitch and size."""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import PIL.Image
+import pytest
+import tifffile
+from stored_picture import HEIGHT, WIDTH, picture, whole
+
+from measure.scans.scan import open_scan
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("compression", [None, "lzw", "deflate", "zstd", "packbits"])
+@pytest.mark.parametrize("layout", [{"tile": (64, 48)}, {"rowsperstrip": 7}, {"rowsperstrip": HEIGHT}])
+def test_every_storage_gives_the_same_values(
+    tmp_path: Path, dtype: type[np.unsignedinteger[Any]], compression: str | None, layout: dict[str, Any]
+) -> None:
+    truth = picture(dtype)
+    path = tmp_path / "scan.tif"
+    tifffile.imwrite(path, truth, compression=compression, photometric="minisblack", **layout)
+    with open_scan(path) as scan:
+        assert (scan.width_px, scan.height_px, scan.channels) == (WIDTH, HEIGHT, 1)
+        assert scan.full_scale_dn == np.iinfo(dtype).max
+        assert scan.name == "scan"
+        window = scan.window(40, 50, 61, 73)
+    assert window.dtype == np.float32
+    np.testing.assert_array_equal(window, truth[50:123, 40:101])
+
+
+@pytest.mark.parametrize("options", [{"bigtiff": True}, {"byteorder": ">"}, {"predictor": True, "compression": "lzw"}])
+@pytest.mark.parametrize("tile", [None, (32, 32)])
+def test_byte_order_bigtiff_and_predictor(
+    tmp_path: Path, options: dict[str, Any], tile: tuple[int, int] | None
+) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", tile=tile, **options)
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
+
+
+@pytest.mark.parametrize("compression", ["lzw", "deflate", "zstd"])
+@pytest.mark.parametrize(
+    "options", [{"rowsperstrip": 1624, "byteorder": ">"}, {"rowsperstrip": 900}, {"tile": (1024, 2560)}]
+)
+def test_strips_and_tiles_of_megabytes(tmp_path: Path, compression: str, options: dict[str, Any]) -> None:
+    """In one; in two, the last of them a shorter one; in two of which the last reaches beyond the picture."""
+    truth = np.tile(picture(), (8, 8))
+    tifffile.imwrite(tmp_path / "s.tif", truth, photometric="minisblack", compression=compression, **options)
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), truth)
+
+
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+@pytest.mark.parametrize("tile", [None, (64, 64)])
+def test_planes_kept_apart_or_together(tmp_path: Path, planar: str, tile: tuple[int, int] | None) -> None:
+    truth = picture(channels=3)
+    stored = truth if planar == "contig" else np.moveaxis(truth, -1, 0)
+    tifffile.imwrite(tmp_path / "s.tif", stored, photometric="rgb", planarconfig=planar, tile=tile, compression="lzw")
+    with open_scan(tmp_path / "s.tif") as scan:
+        grey = scan.window(0, 0, WIDTH, HEIGHT)
+        blue = scan.window(0, 0, WIDTH, HEIGHT, weights=(0, 0, 1))
+    np.testing.assert_allclose(grey, truth @ [0.299, 0.587, 0.114], rtol=1e-5)
+    np.testing.assert_array_equal(blue, truth[..., 2])
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("writer", ["tifffile", "libtiff"])
+def test_jpeg_in_tiff(tmp_path: Path, channels: int, writer: str) -> None:
+    smooth = cv2.GaussianBlur(picture(np.uint8, channels), (0, 0), 3)
+    path = tmp_path / "s.tif"
+    if writer == "tifffile":
+        kind = "rgb" if channels == 3 else "minisblack"
+        tifffile.imwrite(
+            path, smooth, photometric=kind, tile=(64, 64), compression="jpeg", compressionargs={"level": 95}
+        )
+    else:
+        PIL.Image.fromarray(smooth).save(path, compression="jpeg", quality=95)
+    truth = smooth @ [0.299, 0.587, 0.114] if channels == 3 else smooth
+    assert np.sqrt(np.mean((whole(path) - truth) ** 2)) < 1.0
+
+
+@pytest.mark.parametrize("ending", [".png", ".tif"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_files_of_another_writer(
+    tmp_path: Path, ending: str, dtype: type[np.unsignedinteger[Any]], channels: int
+) -> None:
+    truth = picture(dtype, channels)
+    cv2.imwrite(str(tmp_path / f"s{ending}"), truth[..., ::-1] if channels == 3 else truth)
+    expected = truth @ [0.299, 0.587, 0.114] if channels == 3 else truth
+    np.testing.assert_allclose(whole(tmp_path / f"s{ending}"), expected, rtol=1e-5)
+
+
+def test_jpeg_file_is_read_whatever_its_name(tmp_path: Path) -> None:
+    smooth = cv2.GaussianBlur(picture(np.uint8), (0, 0), 3)
+    cv2.imwrite(str(tmp_path / "s.jpg"), smooth)
+    (tmp_path / "s.jpg").rename(tmp_path / "s.tif")
+    assert np.abs(whole(tmp_path / "s.tif") - smooth).max() < 8
+
+
+def test_trap_16_bit_squeezed_or_wrapped_to_8(tmp_path: Path) -> None:
+    truth = np.full((40, 50), 256, np.uint16)
+    truth[10, 20] = 40001
+    for name in ("s.tif", "s.png"):
+        cv2.imwrite(str(tmp_path / name), truth)
+        with open_scan(tmp_path / name) as scan:
+            assert scan.full_scale_dn == 65535.0
+            np.testing.assert_array_equal(scan.window(0, 0, 50, 40), truth)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("options", [{}, {"compression": "lzw", "tile": (64, 64)}])
+def test_trap_white_is_zero_ignored(
+    tmp_path: Path, dtype: type[np.unsignedinteger[Any]], options: dict[str, Any]
+) -> None:
+    stored = picture(dtype)
+    tifffile.imwrite(tmp_path / "s.tif", stored, photometric="miniswhite", **options)
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), float(np.iinfo(dtype).max) - stored)
+
+
+def test_trap_palette_read_as_grey(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    colours = rng.integers(0, 65536, (3, 256), dtype=np.uint16)
+    indices = picture(np.uint8)
+    tifffile.imwrite(tmp_path / "s.tif", indices, photometric="palette", colormap=colours)
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert scan.channels == 3
+        assert scan.full_scale_dn == 65535.0
+        green = scan.window(0, 0, WIDTH, HEIGHT, weights=(0, 1, 0))
+    np.testing.assert_array_equal(green, colours[1][indices])
+
+
+def test_trap_palette_of_greys_in_reverse(tmp_path: Path) -> None:
+    colours = np.repeat(np.arange(255, -1, -1, dtype=np.uint16)[None] * 257, 3, axis=0)
+    tifffile.imwrite(tmp_path / "s.tif", picture(np.uint8), photometric="palette", colormap=colours)
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert scan.channels == 1
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), (255 - picture(np.uint8).astype(float)) * 257)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("extra", ["unassalpha", "assocalpha", "unspecified"])
+def test_trap_alpha_taken_for_light(tmp_path: Path, channels: int, extra: str) -> None:
+    truth = picture(np.uint8, channels)
+    stored = np.dstack([truth, np.full((HEIGHT, WIDTH), 255, np.uint8)])
+    kind = "rgb" if channels == 3 else "minisblack"
+    tifffile.imwrite(tmp_path / "s.tif", stored, photometric=kind, planarconfig="contig", extrasamples=[extra])
+    expected = truth @ [0.299, 0.587, 0.114] if channels == 3 else truth
+    np.testing.assert_allclose(whole(tmp_path / "s.tif"), expected, rtol=1e-5)
+
+
+def test_trap_alpha_of_a_png(tmp_path: Path) -> None:
+    truth = picture(np.uint8, 3)
+    cv2.imwrite(str(tmp_path / "s.png"), np.dstack([truth[..., ::-1], np.full((HEIGHT, WIDTH), 9, np.uint8)]))
+    np.testing.assert_allclose(whole(tmp_path / "s.png"), truth @ [0.299, 0.587, 0.114], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("resolution", "unit", "pitch_um"),
+    [
+        ((1270, 1270), "INCH", (20.0, 20.0)),
+        ((1270, 635), "INCH", (20.0, 40.0)),
+        ((500, 500), "CENTIMETER", (20.0, 20.0)),
+        ((50, 50), 4, (20.0, 20.0)),
+        (((1, 20), (1, 20)), 5, (20.0, 20.0)),
+        (((25400, 7), (25400, 7)), "INCH", (7.0, 7.0)),
+    ],
+)
+def test_trap_odd_dpi_units(tmp_path: Path, resolution: Any, unit: Any, pitch_um: tuple[float, float]) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture(), resolution=resolution, resolutionunit=unit)
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert scan.pitch_um == pytest.approx(pitch_um, rel=1e-9)
+        assert scan.pitch_note == ""
+
+
+@pytest.mark.parametrize(
+    ("resolution", "unit", "words"),
+    [
+        ((72, 72), "INCH", "72 dpi"),
+        ((96, 96), "INCH", "96 dpi"),
+        ((28.35, 28.35), "CENTIMETER", "72 dpi"),
+        ((1270, 1270), "NONE", "no unit"),
+        ((0, 0), "INCH", "0 x 0"),
+        ((50800000, 50800000), "INCH", "finer than any scanner"),
+    ],
+)
+def test_trap_default_dpi_believed(tmp_path: Path, resolution: Any, unit: str, words: str) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture(), resolution=resolution, resolutionunit=unit)
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert scan.pitch_um is None
+        assert words in scan.pitch_note
+
+
+def test_pitch_of_png_and_jpeg(tmp_path: Path) -> None:
+    png = cv2.imencode(".png", picture(np.uint8))[1].tobytes()
+    density = struct.pack(">4sIIB", b"pHYs", 50000, 40000, 1)
+    chunk = struct.pack(">I", 9) + density + struct.pack(">I", zlib.crc32(density))
+    (tmp_path / "s.png").write_bytes(png[:33] + chunk + png[33:])
+    jpeg = bytearray(cv2.imencode(".jpg", picture(np.uint8))[1].tobytes())
+    assert jpeg[6:10] == b"JFIF"
+    jpeg[13:18] = struct.pack(">BHH", 2, 500, 400)
+    (tmp_path / "s.jpg").write_bytes(bytes(jpeg))
+    for name in ("s.png", "s.jpg"):
+        with open_scan(tmp_path / name) as scan:
+            assert scan.pitch_um == pytest.approx((20.0, 25.0))
+
+
+def test_the_first_full_picture_of_several_is_taken(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "s.tif") as file:
+        file.write(picture()[::4, ::4], subfiletype=1)
+        file.write(picture(), metadata=None)
+        file.write(np.zeros_like(picture()), metadata=None)
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert scan.notes == ("the file holds 2 pictures: the first was taken",)
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
+
+
+def test_the_orientation_tag_is_said_and_not_applied(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture(), extratags=[(274, 3, 1, 6, True)])
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert "orientation tag (6) is not applied" in scan.notes[0]
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), picture())
+
+
+def test_a_jpeg_says_its_orientation_too(tmp_path: Path) -> None:
+    grey = (picture() >> 8).astype(np.uint8)
+    exif = PIL.Image.Exif()
+    exif[274] = 8
+    PIL.Image.fromarray(grey).save(tmp_path / "s.jpg", exif=exif)
+    with open_scan(tmp_path / "s.jpg") as scan:
+        assert (scan.height_px, scan.width_px) == grey.shape
+        assert "orientation tag (8) is not applied" in scan.notes[0]
+
+
+def test_twelve_bits_have_their_own_full_scale(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", picture() >> 4, bitspersample=12, photometric="miniswhite")
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert scan.full_scale_dn == 4095.0
+    np.testing.assert_array_equal(whole(tmp_path / "s.tif"), 4095.0 - (picture() >> 4))
