@@ -82,7 +82,7 @@ def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
     pitch_mm = np.asarray(scene.scanner.pitch_um) / 1000
     center = np.array([width_px - 1, -(height_px - 1)]) / 2 * pitch_mm
     mirror = np.diag([-1.0, 1.0]) if image.pose.endswith("m") else np.eye(2)
-    bed_from_film = turn(image.turn_rad) @ quarter_turn(image.pose) @ mirror
+    bed_from_film = turn(image.turn_rad) @ _quarter_turn(image.pose) @ mirror
     film_from_camera = turn(film.rotation_rad) @ np.array([[film.scale[0], film.shear_rad], [0.0, film.scale[1]]])
     shift = bed_from_film @ np.asarray(film.shift_mm) + center + np.asarray(image.offset_mm)
     generator = np.random.default_rng([scene.seed, index, 1])
@@ -108,7 +108,7 @@ def turn(angle_rad: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
-def quarter_turn(pose: str) -> Array:
+def _quarter_turn(pose: str) -> Array:
     """The counter-clockwise turn that a pose names, exactly."""
     return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), int(pose.rstrip("m")) // 90)
 

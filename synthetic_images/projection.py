@@ -24,7 +24,7 @@ def camera_from_object(camera: SceneCamera, exterior: tuple[float, ...], points:
     reach = np.hypot(u, v) / depth * camera.principal_distance_mm
     tangents = np.stack([u / depth, v / depth], axis=1)
     tangents[~(reach < np.hypot(*camera.frame_mm))] = np.nan
-    return distorted(camera, tangents)
+    return _distorted(camera, tangents)
 
 
 def object_rotation(omega: float, phi: float, kappa: float) -> Array:
@@ -43,7 +43,7 @@ def object_rotation(omega: float, phi: float, kappa: float) -> Array:
     return np.asarray(r3 @ r2 @ r1)
 
 
-def distorted(camera: SceneCamera, tangents: Array) -> Array:
+def _distorted(camera: SceneCamera, tangents: Array) -> Array:
     """(n, 2) observed camera coordinates in mm of directions (U, V) / -W (n, 2)."""
     c, point = camera.principal_distance_mm, np.asarray(camera.principal_point_mm)
     ideal = c * tangents

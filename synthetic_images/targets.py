@@ -33,14 +33,14 @@ def field_targets(field: DiskField | BoardField) -> tuple[Target, ...]:
     radius = field.diameter / 2 if field.kind == "circle-grid" else 0.0
     up = np.array([0.0, 0.0, 1.0])
     return tuple(
-        Target(f"r{row}c{column}", np.array([*board_point(field, row, column), 0.0]), up, radius)
+        Target(f"r{row}c{column}", np.array([*_board_point(field, row, column), 0.0]), up, radius)
         for row in range(field.rows)
         for column in range(field.columns)
         if not field.asymmetric or (row + column) % 2 == 0
     )
 
 
-def board_point(field: BoardField, row: int, column: int) -> tuple[float, float]:
+def _board_point(field: BoardField, row: int, column: int) -> tuple[float, float]:
     """X and Y of a board's point."""
     return column * field.spacing, (field.rows - 1 - row) * field.spacing
 
@@ -105,7 +105,7 @@ def _own_axes(normal: Array) -> tuple[Array, Array]:
 def board_sheet(field: BoardField) -> Array:
     """(n, 3) the outline of the board's white sheet: one spacing and a half beyond its outer points."""
     edge = 1.5 * field.spacing
-    right, top = board_point(field, 0, field.columns - 1)
+    right, top = _board_point(field, 0, field.columns - 1)
     return _rectangle(-edge, right + edge, -edge, top + edge)
 
 
@@ -114,7 +114,7 @@ def chessboard_squares(field: BoardField) -> tuple[Array, ...]:
     squares = []
     for row in range(field.rows + 1):
         for column in range(row % 2, field.columns + 1, 2):
-            right, bottom = board_point(field, row, column)
+            right, bottom = _board_point(field, row, column)
             squares.append(_rectangle(right - field.spacing, right, bottom, bottom + field.spacing))
     return tuple(squares)
 

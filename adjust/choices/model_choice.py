@@ -146,12 +146,12 @@ def simplest_sufficient(candidates: Sequence[Candidate]) -> Candidate | None:
     """The simplest candidate that no richer one is significantly better than; None where none has a solution."""
     chosen = None
     for candidate in sorted(_solved(candidates), key=lambda each: (each.unknowns, each.vpv)):
-        if chosen is None or is_better(candidate, chosen):
+        if chosen is None or _is_better(candidate, chosen):
             chosen = candidate
     return chosen
 
 
-def is_better(richer: Candidate, simpler: Candidate) -> bool:
+def _is_better(richer: Candidate, simpler: Candidate) -> bool:
     """Whether a model is significantly better than one of no more unknowns, and predicts better too."""
     a, b = richer.cross_validation, simpler.cross_validation
     if a is not None and b is not None and a.sigmas >= b.sigmas:

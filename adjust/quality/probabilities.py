@@ -40,7 +40,7 @@ class Probabilities:
 
         The probability `family` is shared out evenly (Sidak).
         """
-        return np.asarray(special.chdtri(np.maximum(sizes, 1), sidak(self.family, tests)), dtype=np.float64)
+        return np.asarray(special.chdtri(np.maximum(sizes, 1), _sidak(self.family, tests)), dtype=np.float64)
 
     def critical_tau(self, redundancy: int, tests: int = 1) -> float:
         """What Pope's tau, the standardised residual over sigma0 of the same adjustment, may reach; inf: no test.
@@ -50,11 +50,11 @@ class Probabilities:
         """
         if redundancy < 2:
             return np.inf
-        alpha = self.alpha if tests == 1 else sidak(self.family, tests)
+        alpha = self.alpha if tests == 1 else _sidak(self.family, tests)
         t = special.stdtrit(redundancy - 1, 1.0 - 0.5 * alpha)
         return float(t * np.sqrt(redundancy / (redundancy - 1 + t**2)))
 
 
-def sidak(family: float, tests: int) -> float:
+def _sidak(family: float, tests: int) -> float:
     """The probability for each of so many independent tests where that of any one failing is `family`."""
     return float(-np.expm1(np.log1p(-family) / max(tests, 1)))

@@ -107,7 +107,7 @@ def contradictions(search: Search) -> list[Contradiction]:
         limits = scale**2 * search.critical
         chosen = _chosen(search, covariance, limits, most)
         if len(chosen) < most:
-            learnt = significant_scale(*_rest(search, covariance, chosen), search.probabilities)
+            learnt = _significant_scale(*_rest(search, covariance, chosen), search.probabilities)
         else:  # there may be more, which the sum of squares would take for a bad scale
             learnt = _median_scale(search, covariance, chosen)
         if learnt <= RAISED * scale:
@@ -115,7 +115,7 @@ def contradictions(search: Search) -> list[Contradiction]:
         scale = learnt
 
 
-def significant_scale(vpv: float, redundancy: float, probabilities: Probabilities) -> float:
+def _significant_scale(vpv: float, redundancy: float, probabilities: Probabilities) -> float:
     """Root of v'Pv over the redundancy, where that is larger than chance makes it, else 1."""
     chance = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > probabilities.family
     return 1.0 if chance else float(np.sqrt(vpv / redundancy))
@@ -123,7 +123,7 @@ def significant_scale(vpv: float, redundancy: float, probabilities: Probabilitie
 
 def limits(search: Search) -> Array:
     """What the statistics (N,) may reach in an adjustment that does without what contradicts the others."""
-    scale = significant_scale(*_rest(search, _Covariance(search), []), search.probabilities)
+    scale = _significant_scale(*_rest(search, _Covariance(search), []), search.probabilities)
     return np.asarray(scale**2 * search.critical)
 
 

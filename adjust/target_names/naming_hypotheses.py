@@ -205,7 +205,7 @@ def _tested(
     rotations: Array, shifts: Array, points: Array, anchors: Array, marks: Marks, reach: float
 ) -> tuple[Array, Indices, NDArray[np.bool_]]:
     """The evidence (k,) for poses, and for each of the points (k, p, 3) the nearest mark and whether it agrees."""
-    places = projected(rotations, shifts, points)
+    places = _projected(rotations, shifts, points)
     nearest = marks.nearest(places)
     gate = _NOISE * marks.sigma + reach * np.linalg.norm(places - anchors[:, None], axis=2)
     hit = np.linalg.norm(places - marks.places[nearest], axis=2) <= gate
@@ -214,7 +214,7 @@ def _tested(
     return np.where(marks.inside(places), gain, 0.0).sum(axis=1), nearest, hit & marks.inside(places)
 
 
-def projected(rotations: Array, shifts: Array, points: Array) -> Array:
+def _projected(rotations: Array, shifts: Array, points: Array) -> Array:
     """(k, p, 2) images of points (k, p, 3), in principal distances; nan behind the camera."""
     camera = points @ np.swapaxes(rotations, 1, 2) + shifts[:, None]
     depth = np.where(camera[..., 2:] < 0.0, -camera[..., 2:], np.nan)

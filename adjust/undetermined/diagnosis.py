@@ -72,7 +72,7 @@ def weak_directions(
 def _together(directions: Sequence[NullDirection]) -> NullDirection:
     """Many directions that have no name, as one."""
     moved = tuple(dict.fromkeys(name for each in directions for name in each.parameters))
-    return NullDirection(collapsed(list(moved)), *many_sentence(len(directions), following(set(moved))))
+    return NullDirection(_collapsed(list(moved)), *many_sentence(len(directions), following(set(moved))))
 
 
 def _motion(direction: NullDirection) -> str:
@@ -94,7 +94,7 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     names = [unknowns.names[i] for i in np.flatnonzero(np.sqrt(variances) > UNDETERMINED * prior)]
     if not names:
         return ""
-    said = f"The observations say nothing about {', '.join(collapsed(names))}: their standard deviations stay as given"
+    said = f"The observations say nothing about {', '.join(_collapsed(names))}: their standard deviations stay as given"
     cameras = [name for name in unknowns.camera if any(f"IO.{name}.{each}" in names for each in ("c", "x0", "y0"))]
     if not cameras:
         return f"{said}. What is given is all that places them: give it well, or fix what you do not need."
@@ -102,7 +102,7 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     return f"{said}, for {field.because}. To determine them, {field.remedy}."
 
 
-def collapsed(names: list[str]) -> tuple[str, ...]:
+def _collapsed(names: list[str]) -> tuple[str, ...]:
     """Names of unknowns, those of one kind shown as one with a star where they are many."""
     kinds: dict[str, list[str]] = {}
     for name in names:
@@ -163,7 +163,7 @@ def _named(
     sentences += [leads[i].sentence(own) for i, own in zip(chosen, of_leads, strict=True)]
     for vector, own in zip(left.T, moved[len(moved) - left.shape[1] :], strict=True):
         sentences.append(_left_sentence(problem, state, names[int(np.argmax(np.abs(vector)))], own))
-    told = tuple(NullDirection(collapsed(own), *sentence) for own, sentence in zip(moved, sentences, strict=True))
+    told = tuple(NullDirection(_collapsed(own), *sentence) for own, sentence in zip(moved, sentences, strict=True))
     return _Directions(told[: len(told) - left.shape[1]], told[len(told) - left.shape[1] :])
 
 

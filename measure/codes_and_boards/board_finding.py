@@ -36,30 +36,30 @@ class FoundBoard:
 def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> FoundBoard:
     """Search a board at a size that shows it whole, then finer: small boards in large scans need it."""
     reason = ""
-    for factor in search_factors(scan):
-        picture, reason = searchable(scan, factor)
+    for factor in _search_factors(scan):
+        picture, reason = _searchable(scan, factor)
         if reason:
             return FoundBoard({}, reason)
         if isinstance(spec, ChessboardSpec):
-            found = find_chessboard(picture, spec)
+            found = _find_chessboard(picture, spec)
         elif isinstance(spec, CharucoSpec):
-            found = find_charuco(picture, spec)
+            found = _find_charuco(picture, spec)
         else:
-            found = find_aruco(picture, spec)
+            found = _find_aruco(picture, spec)
         if found.corners:
-            return FoundBoard({name: in_scan(corner, factor) for name, corner in found.corners.items()})
+            return FoundBoard({name: _in_scan(corner, factor) for name, corner in found.corners.items()})
         reason = found.reason
     return FoundBoard({}, reason)
 
 
-def search_factors(scan: Scan) -> list[int]:
+def _search_factors(scan: Scan) -> list[int]:
     """Reductions of the scan to search, the coarsest first."""
     longest = max(scan.width_px, scan.height_px)
     coarse, fine = (max(round(longest / size), 1) for size in (FIRST_SIZE_PX, LAST_SIZE_PX))
     return [coarse] if coarse == fine else [coarse, fine]
 
 
-def searchable(scan: Scan, factor: int) -> tuple[Bytes, str]:
+def _searchable(scan: Scan, factor: int) -> tuple[Bytes, str]:
     """The reduced scan stretched to 8 bits, and why there is nothing to search in it, if so."""
     grey = scan.reduced(factor)
     low, high = np.percentile(grey, (1, 99))
@@ -69,12 +69,12 @@ def searchable(scan: Scan, factor: int) -> tuple[Bytes, str]:
     return np.clip((grey - low) * (255 / (high - low)), 0, 255).astype(np.uint8), ""
 
 
-def in_scan(corner: FoundCorner, factor: int) -> FoundCorner:
+def _in_scan(corner: FoundCorner, factor: int) -> FoundCorner:
     """Pixel (i, j) of a reduced picture has its centre at factor j + (factor - 1) / 2."""
     return FoundCorner(corner.center_px * factor + (factor - 1) / 2, corner.steps_px * factor)
 
 
-def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
+def _find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
     """All inner corners of a chessboard that is wholly seen."""
     size = (spec.columns, spec.rows)
     for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE, 0):
@@ -87,23 +87,23 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
         found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
     if not found:
         return FoundBoard({}, f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen")
-    grid = right_handed(np.asarray(corners, float).reshape(spec.rows, spec.columns, 2))
+    grid = _right_handed(np.asarray(corners, float).reshape(spec.rows, spec.columns, 2))
     return FoundBoard(
         {
             f"r{row}c{column}": FoundCorner(grid[row, column], steps)
-            for (row, column), steps in np.ndenumerate(grid_steps(grid))
+            for (row, column), steps in np.ndenumerate(_grid_steps(grid))
         }
     )
 
 
-def right_handed(grid: Array) -> Array:
+def _right_handed(grid: Array) -> Array:
     """A (rows, columns, 2) grid of which the columns' direction, then the rows', turn as column and row of a scan."""
     across, down = grid[:, -1] - grid[:, 0], grid[-1] - grid[0]
     turn = np.linalg.det(np.stack([across.mean(axis=0), down.mean(axis=0)]))
     return grid if turn > 0 else grid[:, ::-1]
 
 
-def grid_steps(grid: Array) -> NDArray[np.object_]:
+def _grid_steps(grid: Array) -> NDArray[np.object_]:
     """(rows, columns) of (2, 2) matrices: the grid's steps to the right and down at each of its points."""
     steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1)
     result = np.empty(grid.shape[:2], object)
@@ -112,7 +112,7 @@ def grid_steps(grid: Array) -> NDArray[np.object_]:
     return result
 
 
-def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
+def _find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     """The inner corners whose neighbouring markers are read."""
     size = (spec.columns, spec.rows)
     board = cv2.aruco.CharucoBoard(size, spec.square_mm, spec.marker_mm, aruco_dictionary(spec.dictionary))
@@ -124,26 +124,26 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     return FoundBoard(
         {
             f"c{number}": FoundCorner(place, steps)
-            for number, place, steps in zip(ids, places, charuco_steps(ids, places, spec), strict=True)
+            for number, place, steps in zip(ids, places, _charuco_steps(ids, places, spec), strict=True)
         }
     )
 
 
-def charuco_steps(ids: NDArray[np.int64], places: Array, spec: CharucoSpec) -> list[Array]:
+def _charuco_steps(ids: NDArray[np.int64], places: Array, spec: CharucoSpec) -> list[Array]:
     """The squares' sides at each corner, from a homography of the board: neighbours may be missing."""
     across = spec.columns - 1
     board = np.stack([ids % across, ids // across], axis=-1).astype(float)
     homography, _ = cv2.findHomography(board, places)
-    return [homography_steps(np.asarray(homography, float), place) for place in board]
+    return [_homography_steps(np.asarray(homography, float), place) for place in board]
 
 
-def homography_steps(homography: Array, place: Array) -> Array:
+def _homography_steps(homography: Array, place: Array) -> Array:
     """(2, 2) derivatives of a homography at a place."""
     x, y, w = homography @ (*place, 1.0)
     return np.asarray((homography[:2, :2] - np.outer((x, y), homography[2, :2]) / w) / w)
 
 
-def find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
+def _find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
     """The corners of the board's markers that are read; steps are the marker's sides that leave the corner."""
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(spec.dictionary))
     outlines, numbers, _ = detector.detectMarkers(picture)

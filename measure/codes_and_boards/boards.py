@@ -49,13 +49,13 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
         marks, reason, notes = measure_circle_grid(scan, spec)
         return BoardMeasurement(marks, reason, notes)
     board = find_board(scan, spec)
-    reach = common_reach_px(board.corners.values()) if board.corners else 0.0
-    fitted = {name: fit_found(scan, found, spec, reach) for name, found in board.corners.items()}
+    reach = _common_reach_px(board.corners.values()) if board.corners else 0.0
+    fitted = {name: _fit_found(scan, found, spec, reach) for name, found in board.corners.items()}
     notes = ()
     if isinstance(spec, ChessboardSpec) and fitted:
-        fitted, notes = named_by_colour(fitted, board.corners, spec)
+        fitted, notes = _named_by_colour(fitted, board.corners, spec)
     missing = board.reason or "not seen: its markers were not read"
-    marks = tuple(as_mark(name, fitted.get(name), missing) for name in spec.object_points())
+    marks = tuple(_as_mark(name, fitted.get(name), missing) for name in spec.object_points())
     return BoardMeasurement(marks, board.reason, notes)
 
 
@@ -67,15 +67,15 @@ class FittedCorner:
     moved_px: float
 
 
-def fit_found(
+def _fit_found(
     scan: Scan, found: FoundCorner, spec: ChessboardSpec | ArucoSpec | CharucoSpec, board_reach_px: float
 ) -> FittedCorner:
     """Least-squares matching about a corner that was found."""
     surface: Surface = quarter if isinstance(spec, ArucoSpec) else crossing
     if isinstance(spec, ArucoSpec):
-        reach = marker_reach_px(found.steps_px, spec)
+        reach = _marker_reach_px(found.steps_px, spec)
     else:
-        reach = reach_px(found.steps_px, board_reach_px, spec)
+        reach = _reach_px(found.steps_px, board_reach_px, spec)
     half = np.ceil(np.abs(found.steps_px / np.hypot(*found.steps_px)) @ reach).astype(int) + 2
     col0, row0 = np.round(found.center_px).astype(int) - half
     width, height = 2 * half + 1
@@ -85,7 +85,7 @@ def fit_found(
     return FittedCorner(corner, float(np.hypot(*(corner.center_px - found.center_px))))
 
 
-def reach_px(steps_px: Array, board_reach_px: float, spec: ChessboardSpec | CharucoSpec) -> Array:
+def _reach_px(steps_px: Array, board_reach_px: float, spec: ChessboardSpec | CharucoSpec) -> Array:
     """(2,) how far along the square's sides grey values are used: not into a marker in one of the squares."""
     farthest = FARTHEST_REACH
     if isinstance(spec, CharucoSpec):
@@ -93,14 +93,14 @@ def reach_px(steps_px: Array, board_reach_px: float, spec: ChessboardSpec | Char
     return np.full(2, min(board_reach_px, farthest * float(np.hypot(*steps_px).min())))
 
 
-def common_reach_px(corners: Iterable[FoundCorner]) -> float:
+def _common_reach_px(corners: Iterable[FoundCorner]) -> float:
     """One reach for a whole board: what a camera's sharpening does to a corner depends on the window, and where all
     windows are alike it moves all corners alike, and not the near ones otherwise than the far ones."""
     sides = [float(np.hypot(*corner.steps_px).min()) for corner in corners]
     return float(np.clip(REACH * np.median(sides), SHORTEST_REACH_PX, LONGEST_REACH_PX))
 
 
-def marker_reach_px(sides_px: Array, spec: ArucoSpec) -> Array:
+def _marker_reach_px(sides_px: Array, spec: ArucoSpec) -> Array:
     """(2,) the same along a marker's sides."""
     modules = aruco_dictionary(spec.dictionary).markerSize + 2
     gap_modules = spec.gap_mm / spec.marker_mm * modules
@@ -109,7 +109,7 @@ def marker_reach_px(sides_px: Array, spec: ArucoSpec) -> Array:
     )
 
 
-def named_by_colour(
+def _named_by_colour(
     fitted: dict[str, FittedCorner], found: dict[str, FoundCorner], spec: ChessboardSpec
 ) -> tuple[dict[str, FittedCorner], tuple[str, ...]]:
     """The corners named so that the square r0c0, r0c1, r1c1, r1c0 is dark; a board that looks the same after a half
@@ -119,9 +119,9 @@ def named_by_colour(
     turned = [np.rot90(names, quarter_turns) for quarter_turns in quarters]
     # Turned by a quarter, the square between a corner's steps is its neighbour of the other colour.
     darkness = np.array(
-        [-((-1) ** turns) * first_square_contrast(fitted, now) for turns, now in zip(quarters, turned, strict=True)]
+        [-((-1) ** turns) * _first_square_contrast(fitted, now) for turns, now in zip(quarters, turned, strict=True)]
     )
-    upright = np.array([steps_right(found, names_now) for names_now in turned])
+    upright = np.array([_steps_right(found, names_now) for names_now in turned])
     best = max(range(len(turned)), key=lambda index: (darkness[index] > 0, upright[index]))
     notes: tuple[str, ...] = ()
     if np.sum(darkness > 0) > 1:
@@ -129,20 +129,20 @@ def named_by_colour(
     return {str(new): fitted[str(old)] for new, old in zip(names.ravel(), turned[best].ravel(), strict=True)}, notes
 
 
-def first_square_contrast(fitted: dict[str, FittedCorner], names: NDArray[np.str_]) -> float:
+def _first_square_contrast(fitted: dict[str, FittedCorner], names: NDArray[np.str_]) -> float:
     """How much lighter than its neighbours the square at the first corner is, over the whole board."""
     sign = np.where(np.indices(names.shape).sum(axis=0) % 2 == 0, 1, -1)
     contrast = np.array([[fitted[str(name)].corner.contrast_dn for name in row] for row in names])
     return float(np.nanmedian(sign * contrast))
 
 
-def steps_right(found: dict[str, FoundCorner], names: NDArray[np.str_]) -> float:
+def _steps_right(found: dict[str, FoundCorner], names: NDArray[np.str_]) -> float:
     """How far to the right in the scan the first row runs."""
     first, last = found[str(names[0, 0])].center_px, found[str(names[0, -1])].center_px
     return float(last[0] - first[0])
 
 
-def as_mark(name: str, fitted: FittedCorner | None, missing: str) -> MarkMeasurement:
+def _as_mark(name: str, fitted: FittedCorner | None, missing: str) -> MarkMeasurement:
     """The row of a point."""
     if fitted is None:
         return MarkMeasurement(name, "target", None, None, Status.ABSENT, missing)

@@ -22,14 +22,14 @@ NEAREST_DOTS = 8  # whose places and shapes predict a missing one's
 def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> tuple[tuple[MarkMeasurement, ...], str, tuple[str, ...]]:
     """One mark for each dot of the grid, why the grid was not found, and what the user should know."""
     names = {place: f"r{place[0]}c{place[1]}" for place in spec.places()}
-    patches = disk_candidates(scan, DiskSearch((SMALLEST_DOT_PX, largest_dot_px(scan, spec))))
+    patches = disk_candidates(scan, DiskSearch((SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
     centers = np.array([patch.center_px for patch in patches]).reshape(-1, 2)
-    assignments = grid_places(centers, looks(patches), spec.places())
+    assignments = grid_places(centers, _looks(patches), spec.places())
     if not assignments:
         reason = f"no grid of {spec.columns} x {spec.rows} dots is wholly seen; {len(patches)} spots look like dots"
         absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, reason) for name in names.values())
         return tuple(absent), reason, ()
-    assignment = max(assignments, key=lambda found: upright(found, centers))
+    assignment = max(assignments, key=lambda found: _upright(found, centers))
     notes = (
         ("the grid looks the same when turned: it was taken as upright in the scan",) if len(assignments) > 1 else ()
     )
@@ -37,34 +37,34 @@ def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> tuple[tuple[MarkMea
     gap = 1 - spec.diameter_mm / spec.shortest_distance_mm
     marks = []
     for place, name in names.items():
-        center, shape = seen[place] if place in seen else predicted(place, seen)
+        center, shape = seen[place] if place in seen else _predicted(place, seen)
         margin = gap / (1 - gap) * 2 * float(np.linalg.svd(shape, compute_uv=False)[1])
-        marks.append(as_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in seen))
+        marks.append(_as_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in seen))
     return tuple(marks), "", notes
 
 
-def looks(patches: list[Candidate]) -> Array:
+def _looks(patches: list[Candidate]) -> Array:
     """(n, 3) logarithms of size and contrast, and which of both, light or dark."""
     return np.array(
         [(np.log(patch.radius_px), np.log(abs(patch.contrast_dn)), np.sign(patch.contrast_dn)) for patch in patches]
     )
 
 
-def largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
+def _largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
     """The largest that a dot can be when the grid fills the scan."""
     places = min(spec.columns, spec.rows)
     share = spec.diameter_mm / spec.spacing_mm
     return max(2 * SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
 
 
-def upright(assignment: dict[Place, int], centers: Array) -> float:
+def _upright(assignment: dict[Place, int], centers: Array) -> float:
     """How far to the right in the scan the grid's columns follow one another."""
     columns = np.array([column for _, column in assignment], float)
     right = np.array([centers[index][0] for index in assignment.values()])
     return float(np.cov(columns, right)[0, 1])
 
 
-def predicted(place: Place, seen: dict[Place, tuple[Array, Array]]) -> tuple[Array, Array]:
+def _predicted(place: Place, seen: dict[Place, tuple[Array, Array]]) -> tuple[Array, Array]:
     """Centre and shape of a dot by a homography of its nearest neighbours; the shape is their mean one."""
     others = sorted(seen, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
     nearest = others[: max(NEAREST_DOTS, len(others) // 3)]
@@ -74,7 +74,7 @@ def predicted(place: Place, seen: dict[Place, tuple[Array, Array]]) -> tuple[Arr
     return np.array([x / w, y / w]), np.linalg.cholesky(np.mean(squares, axis=0))
 
 
-def as_mark(name: str, disk: FittedDisk, was_seen: bool) -> MarkMeasurement:
+def _as_mark(name: str, disk: FittedDisk, was_seen: bool) -> MarkMeasurement:
     """The row of a dot."""
     if disk.reason:
         status = Status.REJECTED if was_seen else Status.PREDICTED

@@ -26,8 +26,8 @@ def grid_places(points_px: Array, looks: Array, places: list[Place]) -> list[dic
     than LIKENESS. The grid's outline must be seen, a fifth of its places may be missing.
     """
     best: list[dict[Place, int]] = []
-    for lattice in lattices(points_px, looks):
-        for assignment in outlines(lattice, places):
+    for lattice in _lattices(points_px, looks):
+        for assignment in _outlines(lattice, places):
             if not best or len(assignment) > len(best[0]):
                 best = [assignment]
             elif len(assignment) == len(best[0]) and assignment not in best:
@@ -37,18 +37,20 @@ def grid_places(points_px: Array, looks: Array, places: list[Place]) -> list[dic
     return best
 
 
-def lattices(points_px: Array, looks: Array) -> list[dict[Place, int]]:
+def _lattices(points_px: Array, looks: Array) -> list[dict[Place, int]]:
     """Lattices that the points form, {(i, j): index}, the largest first; i to j turns as column to row of a scan."""
     if len(points_px) < 4:
         return []
     tree = cKDTree(points_px)
-    found = [grown(points_px, looks, tree, int(seed)) for seed in np.linspace(0, len(points_px) - 1, SEEDS).astype(int)]
+    found = [
+        _grown(points_px, looks, tree, int(seed)) for seed in np.linspace(0, len(points_px) - 1, SEEDS).astype(int)
+    ]
     return sorted(found, key=len, reverse=True)[:3]
 
 
-def grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Place, int]:
+def _grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Place, int]:
     """The lattice about a point, grown from neighbour to neighbour; each step is expected to be like the last."""
-    basis = seed_basis(points_px, tree, seed)
+    basis = _seed_basis(points_px, tree, seed)
     if basis is None:
         return {}
     lattice: dict[Place, int] = {(0, 0): seed}
@@ -75,7 +77,7 @@ def grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Plac
     return lattice
 
 
-def seed_basis(points_px: Array, tree: cKDTree, seed: int) -> Array | None:
+def _seed_basis(points_px: Array, tree: cKDTree, seed: int) -> Array | None:
     """(2, 2) rows: the two shortest steps from a point to neighbours that have a partner on the other side."""
     _, near = tree.query(points_px[seed], k=np.arange(2, min(NEIGHBOURS + 1, len(points_px)) + 1))
     steps = points_px[near] - points_px[seed]
@@ -87,15 +89,15 @@ def seed_basis(points_px: Array, tree: cKDTree, seed: int) -> Array | None:
     return None
 
 
-def outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place, int]]:
+def _outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place, int]]:
     """The ways to lay the grid's outline on a lattice, with as many points as possible."""
     wanted = set(places)
     nodes = np.array(list(lattice)).reshape(-1, 2)
     indices = list(lattice.values())
     found: list[dict[Place, int]] = []
-    for matrix in unit_steps(places):
+    for matrix in _unit_steps(places):
         columns_rows = nodes @ matrix
-        for shift in outline_shifts(columns_rows, places):
+        for shift in _outline_shifts(columns_rows, places):
             moved = columns_rows + shift
             assignment = {
                 (int(row), int(column)): index
@@ -108,7 +110,7 @@ def outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place,
     return [assignment for assignment in found if len(assignment) == most]
 
 
-def unit_steps(places: list[Place]) -> list[Integers]:
+def _unit_steps(places: list[Place]) -> list[Integers]:
     """(2, 2) matrices whose rows are the lattice's two steps in (column, row): all pairs of short steps that reach
     every place of the grid, turning from column to row."""
     staggered = len({(row + column) % 2 for row, column in places}) == 1
@@ -122,7 +124,7 @@ def unit_steps(places: list[Place]) -> list[Integers]:
     return [pair for pair in pairs if round(np.linalg.det(pair)) == area]
 
 
-def outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integers]:
+def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integers]:
     """Shifts that lay the grid's outline about a lattice's nodes. Strangers beside the grid may widen the nodes'
     outline by a line or two."""
     grid = np.array([(column, row) for row, column in places])

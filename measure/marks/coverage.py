@@ -29,7 +29,7 @@ def coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int) 
     pixel_from_mark: (2, 3) affine matrix from (x_mm, y_mm, 1) to (col, row) in this window. A part's share is exact;
     where parts overlap they count once, to about 0.001 of a pixel.
     """
-    return pixel_means(cell_coverage(shape, pixel_from_mark, width, height, CELLS), CELLS)
+    return _pixel_means(cell_coverage(shape, pixel_from_mark, width, height, CELLS), CELLS)
 
 
 def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: int, cells: int) -> Single:
@@ -43,7 +43,7 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     return covered
 
 
-def pixel_means(cell_values: NDArray[np.floating], cells: int) -> Array:
+def _pixel_means(cell_values: NDArray[np.floating], cells: int) -> Array:
     """Means over the cells of each pixel of an image (rows, columns)."""
     rows, cols = cell_values.shape
     size = (cols // cells, rows // cells)

@@ -25,11 +25,11 @@ def open_picture(path: Path, start: bytes) -> tuple[Segments, Pitch, tuple[str, 
     """
     if start.startswith(JPEG_START):
         data = path.read_bytes()
-        samples, pitch, step_dn = jpeg_samples(path, data), jpeg_pitch(data), rounding_step_dn(data)
-        notes = jpeg_notes(data)
+        samples, pitch, step_dn = _jpeg_samples(path, data), _jpeg_pitch(data), rounding_step_dn(data)
+        notes = _jpeg_notes(data)
     elif start.startswith(PNG_START):
         data = path.read_bytes()
-        samples, pitch, step_dn = png_samples(path, data), png_pitch(data), 0.0
+        samples, pitch, step_dn = _png_samples(path, data), _png_pitch(data), 0.0
         notes = ()
     else:
         raise MeasurementError(
@@ -57,33 +57,33 @@ class WholePicture:
         """Nothing is open."""
 
 
-def jpeg_samples(path: Path, data: bytes) -> Samples:
+def _jpeg_samples(path: Path, data: bytes) -> Samples:
     """Grey or RGB; a decoder that fills a truncated file with grey is not asked."""
     picture = 2 + sum(4 + len(body) for _, body in jpeg_headers(data))
     if b"\xff\xd9" not in data[picture:]:
         raise broken(path, "its end marker is missing")
     try:
-        return as_channels(path, imagecodecs.jpeg_decode(data))
+        return _as_channels(path, imagecodecs.jpeg_decode(data))
     except DECODING_ERRORS as error:
         raise broken(path, str(error)) from error
 
 
-def png_samples(path: Path, data: bytes) -> Samples:
+def _png_samples(path: Path, data: bytes) -> Samples:
     """Grey or RGB, 8 or 16 bits."""
     try:
-        return as_channels(path, imagecodecs.png_decode(data))
+        return _as_channels(path, imagecodecs.png_decode(data))
     except DECODING_ERRORS as error:
         raise broken(path, str(error)) from error
 
 
-def as_channels(path: Path, decoded: np.ndarray) -> Samples:
+def _as_channels(path: Path, decoded: np.ndarray) -> Samples:
     """One or three channels of a decoded picture; transparency is left out."""
     stored = decoded[..., None] if decoded.ndim == 2 else decoded
     channels = {1: 1, 2: 1, 3: 3, 4: 3}[stored.shape[2]]
     return Radiometry(channels, float(np.iinfo(stored.dtype).max)).apply(stored)
 
 
-def jpeg_pitch(data: bytes) -> Pitch:
+def _jpeg_pitch(data: bytes) -> Pitch:
     """The JFIF density, or the Exif resolution where that has no unit."""
     pitch = NO_TAGS
     for marker, body in jpeg_headers(data):
@@ -91,11 +91,11 @@ def jpeg_pitch(data: bytes) -> Pitch:
             unit, x, y = struct.unpack(">BHH", body[7:12])
             pitch = pitch_from_density(x, y, JFIF_UNIT.get(unit))
         elif marker == 0xE1 and body.startswith(b"Exif\0\0") and pitch.um is None:
-            pitch = exif_pitch(body[6:], pitch)
+            pitch = _exif_pitch(body[6:], pitch)
     return pitch
 
 
-def jpeg_notes(data: bytes) -> tuple[str, ...]:
+def _jpeg_notes(data: bytes) -> tuple[str, ...]:
     """On the orientation that an Exif block gives."""
     for marker, body in jpeg_headers(data):
         if marker == 0xE1 and body.startswith(b"Exif\0\0"):
@@ -107,7 +107,7 @@ def jpeg_notes(data: bytes) -> tuple[str, ...]:
     return ()
 
 
-def exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:
+def _exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:
     """The resolution tags of an Exif block, which is a small TIFF file without a picture."""
     try:
         with TiffFile(BytesIO(exif)) as file:
@@ -117,7 +117,7 @@ def exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:
     return pitch if pitch.um is not None or otherwise is NO_TAGS else otherwise
 
 
-def png_pitch(data: bytes) -> Pitch:
+def _png_pitch(data: bytes) -> Pitch:
     """The pHYs chunk, which stands before the picture's data (PNG specification, 11.3.5.3)."""
     position = len(PNG_START)
     while position + 8 <= len(data):

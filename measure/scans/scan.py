@@ -168,8 +168,8 @@ class Scan:
         """(height, width, channels): every segment is decoded once."""
         result = np.empty((height, width, self.channels), np.float32)
         tall, wide = self.segment_px
-        cols = width if wide >= self.width_px else reduced_side(wide, factor, PART_PX)
-        rows = reduced_side(tall, factor, max(PART_PX**2 // (cols * factor), 1))
+        cols = width if wide >= self.width_px else _reduced_side(wide, factor, PART_PX)
+        rows = _reduced_side(tall, factor, max(PART_PX**2 // (cols * factor), 1))
 
         def fill(part: tuple[int, int]) -> None:
             row0, col0 = part
@@ -188,7 +188,7 @@ class Scan:
         return weights
 
 
-def reduced_side(fine_px: int, factor: int, most_px: int) -> int:
+def _reduced_side(fine_px: int, factor: int, most_px: int) -> int:
     """The side of a part of a reduced scan: about most_px of the scan, in whole segments if these are not much
     larger."""
     unit = lcm(fine_px, factor)
@@ -203,17 +203,17 @@ def means(samples: Samples | Array, factor: int) -> Array:
     rows = max(BAND_PIXELS // (width * factor), 1)
     for row in range(0, len(result), rows):
         band = samples[row * factor : (row + rows) * factor].astype(np.float32)
-        for step in steps_of(factor):
+        for step in _steps_of(factor):
             size = band.shape[1] // step, band.shape[0] // step
             band = np.asarray(cv2.resize(band, size, interpolation=cv2.INTER_AREA), np.float32)
         result[row : row + rows] = band.reshape(-1, width // factor, channels)
     return result
 
 
-def steps_of(factor: int) -> tuple[int, ...]:
+def _steps_of(factor: int) -> tuple[int, ...]:
     """Twos, which OpenCV averages fastest, and what is left."""
     if factor % 2 == 0:
-        return 2, *steps_of(factor // 2)
+        return 2, *_steps_of(factor // 2)
     return (factor,) if factor > 1 else ()
 
 
@@ -223,7 +223,7 @@ def open_scan(path: Path) -> Scan:
     Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture.
     """
     path = Path(path)
-    start = first_bytes(path)
+    start = _first_bytes(path)
     if start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         segments, pitch, notes = open_tiff(path)
     else:
@@ -231,7 +231,7 @@ def open_scan(path: Path) -> Scan:
     return Scan(path, segments, pitch, notes)
 
 
-def first_bytes(path: Path) -> bytes:
+def _first_bytes(path: Path) -> bytes:
     """The file's first 16 bytes, or why there are none."""
     try:
         with path.open("rb") as file:

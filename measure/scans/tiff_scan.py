@@ -39,9 +39,9 @@ def open_tiff(path: Path) -> tuple[Segments, Pitch, tuple[str, ...]]:
     except DECODING_ERRORS as error:
         raise broken(path, str(error)) from error
     try:
-        page, notes = main_page(file, path)
-        check_extent(page, path)
-        segments: Segments = (RawRows if is_raw(page) else TiffSegments)(file, page, path)
+        page, notes = _main_page(file, path)
+        _check_extent(page, path)
+        segments: Segments = (RawRows if _is_raw(page) else TiffSegments)(file, page, path)
         return segments, tag_pitch(page), notes
     except BaseException:
         file.close()
@@ -54,7 +54,7 @@ def broken(path: Path, what: str) -> MeasurementError:
     )
 
 
-def main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
+def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     """The first page that is neither a thumbnail nor a mask."""
     try:
         pages = [page.aspage() for page in file.pages]
@@ -78,7 +78,7 @@ def orientation_notes(page: TiffPage) -> tuple[str, ...]:
     return (f"the file's orientation tag ({orientation}) is not applied: columns and rows are as stored",)
 
 
-def check_extent(page: TiffPage, path: Path) -> None:
+def _check_extent(page: TiffPage, path: Path) -> None:
     """A file whose tiles or strips lie beyond its end is truncated: better said now than at the last window."""
     size = path.stat().st_size
     ends = [
@@ -92,7 +92,7 @@ def check_extent(page: TiffPage, path: Path) -> None:
         raise broken(path, f"{missing} of {len(ends)} {part} lie beyond its end of {size} bytes")
 
 
-def is_raw(page: TiffPage) -> bool:
+def _is_raw(page: TiffPage) -> bool:
     """Rows stand one after the other, uncompressed."""
     return (
         page.is_contiguous
@@ -113,24 +113,24 @@ def tag_pitch(page: TiffPage) -> Pitch:
     return pitch_from_density(x, y, TIFF_UNIT.get(int(page.tags.valueof("ResolutionUnit", default=2))))
 
 
-def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
+def _page_radiometry(page: TiffPage, path: Path) -> Radiometry:
     """How the page's samples become grey or colour values."""
     bits, kind, samples = page.bitspersample, int(page.photometric), page.samplesperpixel
     if page.sampleformat != 1 or not 1 < bits <= 16:
         number = {1: "integers", 2: "signed integers", 3: "floating-point numbers"}.get(page.sampleformat, "numbers")
-        raise unsupported(path, f"samples are {number} of {bits} bits")
+        raise _unsupported(path, f"samples are {number} of {bits} bits")
     if page.imagedepth != 1:
-        raise unsupported(path, f"it is a volume of {page.imagedepth} slices")
+        raise _unsupported(path, f"it is a volume of {page.imagedepth} slices")
     if kind == PALETTE and page.colormap is not None:
         return Radiometry.of_palette(page.colormap)
     is_colour = kind == RGB or (kind == YCBCR and page.compression in JPEG_COMPRESSIONS)  # its decoder gives RGB
     if not (kind in (WHITE_IS_ZERO, BLACK_IS_ZERO) or (is_colour and samples >= 3)):
         name = getattr(page.photometric, "name", str(page.photometric))
-        raise unsupported(path, f"its colours are {name} with {samples} samples a pixel")
+        raise _unsupported(path, f"its colours are {name} with {samples} samples a pixel")
     return Radiometry(3 if is_colour else 1, float(2**bits - 1), inverted=kind == WHITE_IS_ZERO)
 
 
-def page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
+def _page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
     """Of a page compressed as JPEG: its tables stand in a tag, or else at the beginning of every tile or strip."""
     if page.compression not in JPEG_COMPRESSIONS:
         return 0.0
@@ -142,7 +142,7 @@ def page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
     return rounding_step_dn(start)
 
 
-def unsupported(path: Path, what: str) -> MeasurementError:
+def _unsupported(path: Path, what: str) -> MeasurementError:
     return MeasurementError(
         f"{path} is a TIFF of a kind that is not read ({what}): save it as grey or RGB with 8 or 16 bits a sample"
     )
@@ -154,8 +154,8 @@ class TiffSegments:
     def __init__(self, file: TiffFile, page: TiffPage, path: Path) -> None:
         self._file, self._page, self._path = file, page, path
         self._reading = Lock()
-        self._radiometry = page_radiometry(page, path)
-        self.rounding_step_dn = page_rounding_step_dn(file, page)
+        self._radiometry = _page_radiometry(page, path)
+        self.rounding_step_dn = _page_rounding_step_dn(file, page)
         self.channels, self.full_scale_dn = self._radiometry.channels, self._radiometry.full_scale_dn
         self.sample_bytes = self._radiometry.sample_bytes
         self.height_px, self.width_px = page.imagelength, page.imagewidth
@@ -202,7 +202,7 @@ class TiffSegments:
         except DECODING_ERRORS as error:
             raise broken(self._path, f"tile or strip {index}: {error}") from error
         except NotImplementedError as error:
-            raise unsupported(self._path, str(error)) from error
+            raise _unsupported(self._path, str(error)) from error
         if decoded is None:
             return np.zeros(shape[1:], page.dtype)
         return np.asarray(np.asarray(decoded)[0])

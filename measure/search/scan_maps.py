@@ -42,7 +42,7 @@ class Sought:
         for picture in pictures:
             image = self.surroundings.flattened(picture, detail_px, self.faint_dn)
             inner = tuple(side - 2 * self.half_px for side in image.shape)
-            for own in grouped(kinds, {kind: patterns[kind][1].tobytes() for kind in kinds}):
+            for own in _grouped(kinds, {kind: patterns[kind][1].tobytes() for kind in kinds}):
                 varied = variation(image, patterns[own[0]][1])
                 for kind in own:
                     _strongest(maps, kind, self.signs, _within(correlation(image, *patterns[kind], varied), inner))
@@ -78,7 +78,7 @@ class ScanMaps(Mapping[Key, Map]):
             return
         every = list(dict.fromkeys([*kinds, *later]))[: max(self._held.limit_bytes // self._kind_bytes, 1)]
         missing = [kind for kind in every if not self._is_held(kind)]
-        for own in grouped(missing, dict(enumerate(self._sought.details_px))):
+        for own in _grouped(missing, dict(enumerate(self._sought.details_px))):
             self._made(own)
 
     @property
@@ -104,7 +104,7 @@ class ScanMaps(Mapping[Key, Map]):
             yield np.asarray(cv2.copyMakeBorder(grey, half, half, half, half, cv2.BORDER_REPLICATE), np.float32)
 
 
-def grouped(kinds: Iterable[int], key: Mapping[int, object]) -> list[list[int]]:
+def _grouped(kinds: Iterable[int], key: Mapping[int, object]) -> list[list[int]]:
     """The kinds whose keys are equal, together."""
     groups: dict[object, list[int]] = {}
     for kind in kinds:

@@ -50,7 +50,7 @@ def assign(links: Links, gate_sigmas: float, least_gate_px: float) -> Assignment
     place, disk = links.pairs()
     if not len(place):
         return Assignment(chosen, nearest, why_not)
-    residuals, gate = shared_shift_residuals(links, place, disk, gate_sigmas, least_gate_px)
+    residuals, gate = _shared_shift_residuals(links, place, disk, gate_sigmas, least_gate_px)
     cost = np.full((count, len(links.centers)), _FORBIDDEN)
     cost[place, disk] = residuals
     gated = np.where(cost <= gate, cost, _FORBIDDEN)
@@ -75,21 +75,21 @@ def assign(links: Links, gate_sigmas: float, least_gate_px: float) -> Assignment
     return Assignment(chosen, nearest, why_not)
 
 
-def shared_shift_residuals(
+def _shared_shift_residuals(
     links: Links, place: NDArray[np.int64], disk: NDArray[np.int64], gate_sigmas: float, least_gate_px: float
 ) -> tuple[Array, float]:
     """Lengths of all links less the shift that most of them share, and the gate: a few robust standard deviations of
     the links that share it."""
     shifts = links.centers[disk] - links.places[place]
     tolerance = max(least_gate_px, _VOTE_SHARE * float(np.hypot(*shifts.T).max()))
-    common = most_voted(shifts, place, tolerance)
+    common = _most_voted(shifts, place, tolerance)
     residuals = np.hypot(*(shifts - common).T)
     gate = tolerance
     for _ in range(_ROUNDS):
-        agreeing = best_of_each_place(place, residuals) & (residuals <= gate)
+        agreeing = _best_of_each_place(place, residuals) & (residuals <= gate)
         if agreeing.sum() < 3:
             break
-        model = shift_model(links.places[place], shifts, agreeing)
+        model = _shift_model(links.places[place], shifts, agreeing)
         left = shifts - model
         residuals = np.hypot(*left.T)
         sigma = robust_scale(left[agreeing].ravel())
@@ -97,7 +97,7 @@ def shared_shift_residuals(
     return residuals, gate
 
 
-def most_voted(shifts: Array, place: NDArray[np.int64], tolerance: float) -> Array:
+def _most_voted(shifts: Array, place: NDArray[np.int64], tolerance: float) -> Array:
     """(2,) the shift that the links of most places agree with, each place counted once; of equals the shortest."""
     best, best_votes = shifts[0], (-1, 0.0)
     for shift in shifts:
@@ -108,7 +108,7 @@ def most_voted(shifts: Array, place: NDArray[np.int64], tolerance: float) -> Arr
     return np.asarray(best)
 
 
-def best_of_each_place(place: NDArray[np.int64], residuals: Array) -> NDArray[np.bool_]:
+def _best_of_each_place(place: NDArray[np.int64], residuals: Array) -> NDArray[np.bool_]:
     """Which links are the shortest of their place."""
     order = np.lexsort((residuals, place))
     first = np.zeros(len(place), bool)
@@ -116,7 +116,7 @@ def best_of_each_place(place: NDArray[np.int64], residuals: Array) -> NDArray[np
     return first
 
 
-def shift_model(places: Array, shifts: Array, agreeing: NDArray[np.bool_]) -> Array:
+def _shift_model(places: Array, shifts: Array, agreeing: NDArray[np.bool_]) -> Array:
     """(n, 2) the shared shift at all places: their median, or an affine function where there are enough."""
     if agreeing.sum() < _AFFINE_FROM:
         return np.broadcast_to(np.median(shifts[agreeing], axis=0), shifts.shape)

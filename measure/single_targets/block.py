@@ -57,11 +57,11 @@ class Block:
             if finer:
                 known[factor] = means(known[finer[-1]][..., None], factor // finer[-1])[..., 0]
             else:
-                known[factor] = weighted(nearly_means(self.samples, factor), self.scan.weights)
+                known[factor] = weighted(_nearly_means(self.samples, factor), self.scan.weights)
         return known
 
 
-def nearly_means(samples: Samples, factor: int) -> Samples | Image:
+def _nearly_means(samples: Samples, factor: int) -> Samples | Image:
     """(height / factor, width / factor, channels) means over squares, by an even factor from means of four rounded to
     whole grey values, again and again: in a quarter of the time, and a grey value is no matter in a search."""
     while factor % 2 == 0:

@@ -44,8 +44,8 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
     confirmed: which of them are right, and where exactly, asked while the block about them is still decoded.
     """
     unit = lcm(*(octave.factor for octave in octaves))
-    margin = whole(max(octave.margin_px for octave in octaves), unit)
-    width, height = block_px(scan, unit, margin)
+    margin = _whole(max(octave.margin_px for octave in octaves), unit)
+    width, height = _block_px(scan, unit, margin)
 
     rows, cols = height + 2 * margin, width + 2 * margin
     spare: list[Samples] = []  # new memory for every block would take longer than what is done in it
@@ -54,38 +54,38 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
         row0, col0 = (place - margin for place in corner)
         memory = spare.pop() if spare else np.empty((rows, cols, scan.channels), scan.samples_dtype)
         block = Block(scan, col0, row0, margin, scan.samples(col0, row0, cols, rows, memory))
-        found = separate(joined(Patches.of(()), *patches_in(block, octaves)))
+        found = _separate(joined(Patches.of(()), *_patches_in(block, octaves)))
         found = confirmed(block, found) if confirmed else found
         spare.append(memory)
         return found
 
     corners = product(range(0, scan.height_px, height), range(0, scan.width_px, width))
-    return separate(joined(*scan.each(in_block, corners))).candidates()
+    return _separate(joined(*scan.each(in_block, corners))).candidates()
 
 
-def block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:
+def _block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:
     """Width and height of blocks, in whole units. What all threads have in work stays decoded, so that neighbours
     decode no more than their share; strips are taken whole."""
     tall, wide = scan.segment_px
     pixel = scan.channels * np.dtype(scan.samples_dtype).itemsize
-    width = scan.width_px if wide >= scan.width_px else even_part(scan.width_px, ROW_BYTES // pixel, unit)
+    width = scan.width_px if wide >= scan.width_px else _even_part(scan.width_px, ROW_BYTES // pixel, unit)
     tallest = max(BLOCK_BYTES // (width * pixel), 1)
     if tall < scan.height_px:  # else all is decoded at once, and held
         kept = (scan.rows_kept * scan.width_px // width - tall) // max(cv2.getNumThreads(), 1) - 2 * margin
         tallest = min(max(kept, 2 * margin), tallest)
-    return width, even_part(scan.height_px, tallest, unit)
+    return width, _even_part(scan.height_px, tallest, unit)
 
 
-def even_part(size: int, most: int, unit: int) -> int:
+def _even_part(size: int, most: int, unit: int) -> int:
     """Of parts of one size, in whole units, that are hardly longer than most."""
-    return whole(-(-size // -(-size // most)), unit)
+    return _whole(-(-size // -(-size // most)), unit)
 
 
-def whole(size: int, unit: int) -> int:
+def _whole(size: int, unit: int) -> int:
     return -(-size // unit) * unit
 
 
-def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
+def _patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
     """Those that lie in the block, in pixels of the scan."""
     reductions = block.reductions({octave.factor for octave in octaves})
     width, height = (size - 2 * block.margin_px for size in block.size_px)
@@ -93,7 +93,7 @@ def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
         factor, small = octave.factor, reductions[octave.factor]
         margin, spare = octave.margin_px // factor, (block.margin_px - octave.margin_px) // factor
         rows = slice(spare, spare + height // factor + 2 * margin)
-        part = even_part(width, octave.widest_px, factor) // factor
+        part = _even_part(width, octave.widest_px, factor) // factor
         for col0 in range(0, width // factor, part):
             first, last = spare + col0, spare + min(col0 + part, width // factor) + 2 * margin
             place = np.array([block.col0, block.row0]) + factor * np.array([first, spare]) + (factor - 1) / 2
@@ -103,7 +103,7 @@ def patches_in(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
             yield found.part(np.all(found.centers < edge, axis=1))
 
 
-def separate(found: Patches) -> Patches:
+def _separate(found: Patches) -> Patches:
     """The strongest of candidates that lie within one another, the strongest first."""
     found = found.by_strength()
     kept: set[int] = set()

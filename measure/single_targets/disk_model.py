@@ -34,7 +34,7 @@ class DiskStates:
 
     @property
     def radius(self) -> Array:
-        return radius_px(self.shapes)
+        return _radius_px(self.shapes)
 
     def moved(self, by: NDArray[np.intp]) -> "DiskStates":
         """By (n, 2) columns and rows."""
@@ -55,7 +55,7 @@ class DiskStates:
         )
 
 
-def radius_px(shapes: Array) -> Array:
+def _radius_px(shapes: Array) -> Array:
     """(n,) of the circles of the same area."""
     return np.asarray(np.sqrt(np.abs(shapes[:, 0, 0] * shapes[:, 1, 1] - shapes[:, 0, 1] * shapes[:, 1, 0])))
 
@@ -106,7 +106,7 @@ class DiskModel:
         distance = (1 - radius) * radius / length
         place = distance / each(state.blur)
         density = np.exp(np.float32(-0.5) * place * place)
-        return _Edges(col, row, along_col, along_row, length, distance, place, density, normal_share(place, density))
+        return _Edges(col, row, along_col, along_row, length, distance, place, density, _normal_share(place, density))
 
     def grey(self) -> Image:
         """(n, pixels) as modelled."""
@@ -141,7 +141,7 @@ class DiskModel:
         return design
 
 
-def normal_share(place: Image, density: Image) -> Image:
+def _normal_share(place: Image, density: Image) -> Image:
     """Of a normal distribution below a place in its sigmas, to some 1e-7, for its density there over the largest
     (Abramowitz and Stegun, 1964, 26.2.17): in single precision ten times as fast as the error function."""
     falling, (first, *others) = _TAIL

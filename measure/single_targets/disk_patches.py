@@ -109,11 +109,11 @@ def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn:
     small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
     cells = Cells.of(small.shape[1], round(scan_px2 / CELL_PX**2))
     is_textured = scan_px2 >= TEXTURE_PX**2
-    noise = cells.scales(fine_structure(small)) if is_textured else np.zeros(len(cells.ends))
+    noise = cells.scales(_fine_structure(small)) if is_textured else np.zeros(len(cells.ends))
     found = []
-    for sign, own in blobs(small, radii, search, full_scale_dn, cells, is_textured):
+    for sign, own in _blobs(small, radii, search, full_scale_dn, cells, is_textured):
         outlines = outlines_about(small if sign > 0 else -small, own)
-        found.append(round_ones(outlines, noise[cells.at(outlines.centers[:, 0])], factor, sign))
+        found.append(_round_ones(outlines, noise[cells.at(outlines.centers[:, 0])], factor, sign))
     return joined(Patches.of(()), *found)
 
 
@@ -148,7 +148,7 @@ class Cells:
         return picture
 
 
-def blobs(
+def _blobs(
     small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, cells: Cells, is_textured: bool
 ) -> Iterator[tuple[int, Blobs]]:
     """1 with the light ones and -1 with the dark ones, within the picture's margin. is_textured: whether they have to
@@ -183,7 +183,7 @@ def blobs(
             yield sign, Blobs(np.stack([cols, rows], axis=1), radius, contrast)
 
 
-def fine_structure(small: Image) -> Image:
+def _fine_structure(small: Image) -> Image:
     """Samples of what is no smooth picture, with the noise's standard deviation (Immerkaer, 1996, Fast noise variance
     estimation)."""
     above, row, below = (small[first : len(small) - 2 + first : EVERY] for first in range(3))
@@ -192,7 +192,7 @@ def fine_structure(small: Image) -> Image:
     return np.asarray((left - 2 * column + right) / 6)
 
 
-def round_ones(found: Outlines, noise: Array, factor: int, sign: int) -> Patches:
+def _round_ones(found: Outlines, noise: Array, factor: int, sign: int) -> Patches:
     """Those that are ellipses but for noise (n,), light ones if the sign is 1, dark ones if it is -1.
 
     A disk that stands out of the noise of the scan's own pixels stands out of their means so much the more.

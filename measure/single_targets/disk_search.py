@@ -26,12 +26,12 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
 
     def disks(block: Block, patches: Patches) -> Patches:
         found = disks_among(block, patches)
-        return found.part(are_between(smallest, largest, found))
+        return found.part(_are_between(smallest, largest, found))
 
     return search_blocks(scan, octaves_of(search, scan.full_scale_dn), disks)
 
 
-def are_between(smallest_px: float, largest_px: float, disks: Patches) -> NDArray[np.bool_]:
+def _are_between(smallest_px: float, largest_px: float, disks: Patches) -> NDArray[np.bool_]:
     """(n,) whether the diameters of ellipses can be those of disks seen obliquely."""
     longer, shorter = 2 * np.linalg.svd(disks.shapes, compute_uv=False).T
     return np.asarray((longer >= smallest_px) & (shorter <= largest_px))

@@ -166,11 +166,11 @@ def _fit_by_margin(
             noise_dn=fit.noise_dn,
             blur_px=fit.blur_px,
             damaged_fraction=fit.damaged_fraction,
-            appearance_covariance=appearance_covariance(fit),
+            appearance_covariance=_appearance_covariance(fit),
             sloping=fit.sloping,
             reason="" if fit.converged else fit.reason,
         )
-        return judged(disk, fit)
+        return _judged(disk, fit)
 
     return fitted
 
@@ -180,7 +180,7 @@ def _mean_radius_px(pixel_from_disk: Array) -> float:
     return float(np.sqrt(abs(np.linalg.det(pixel_from_disk))))
 
 
-def appearance_covariance(fit: Match) -> Array:
+def _appearance_covariance(fit: Match) -> Array:
     """(5, 5) as a fitted disk has it."""
     assert fit.covariance is not None
     gain = len(fit.covariance) - GREY
@@ -189,7 +189,7 @@ def appearance_covariance(fit: Match) -> Array:
     return np.asarray(fit.covariance[np.ix_(figures, figures)] / np.outer(per, per))
 
 
-def judged(disk: FittedDisk, fit: Match) -> FittedDisk:
+def _judged(disk: FittedDisk, fit: Match) -> FittedDisk:
     """The disk with its reason or weakness, where the fit's figures give one; residuals of a picture of something else
     are alike in neighbouring pixels."""
     if disk.reason:

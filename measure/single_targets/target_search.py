@@ -55,8 +55,8 @@ def search_targets(
     result = SearchResult()
     for prediction in predictions:
         near, why = [], ""
-        for spot in spots(scan, prediction, polarity, shape):
-            index, reason = fitted_at(scan, spot, prediction, size_tolerance, shape, result)
+        for spot in _spots(scan, prediction, polarity, shape):
+            index, reason = _fitted_at(scan, spot, prediction, size_tolerance, shape, result)
             if index is None:
                 why = why or reason
             elif index not in near:
@@ -65,15 +65,15 @@ def search_targets(
         why = f"nothing like it within {prediction.search_px:.0f} px of its place" + (f"; {why}" if why else "")
         result.why_none.append("" if near else why)
     if polarity == "auto":
-        keep_common_polarity(result)
+        _keep_common_polarity(result)
     return result
 
 
-def spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -> list[Array]:
+def _spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -> list[Array]:
     """(2,) places within the search distance where the predicted picture correlates best, the best first."""
     shorter = float(np.linalg.svd(prediction.pixel_from_disk, compute_uv=False)[1])
     factor = max(1, int(shorter * min(1.0 / _SEARCHED_RADIUS_PX, thinnest_mm(shape) / _THINNEST_PX)))
-    template = predicted_picture(prediction.pixel_from_disk / factor, shape)
+    template = _predicted_picture(prediction.pixel_from_disk / factor, shape)
     half = np.array(template.shape[::-1]) // 2
     reach = int(np.ceil(prediction.search_px / factor)) + 1
     corner = np.round(prediction.center_px).astype(int) - (reach + half) * factor - factor // 2
@@ -83,7 +83,7 @@ def spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -
     if float(small.max() - small.min()) <= 0.0:
         return []
     small = small - small.mean()  # the correlation's sums are of single precision
-    compared = compared_part(prediction.pixel_from_disk / factor, half, shape)
+    compared = _compared_part(prediction.pixel_from_disk / factor, half, shape)
     score = cv2.matchTemplate(small, template, cv2.TM_CCOEFF_NORMED, mask=compared)
     score = np.nan_to_num(score, posinf=0.0, neginf=0.0)
     signed = {"light": score, "dark": -score}.get(polarity, np.abs(score))
@@ -94,7 +94,7 @@ def spots(scan: Scan, prediction: Prediction, polarity: str, shape: MarkShape) -
     return list(places[within][:_MOST_SPOTS])
 
 
-def predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> NDArray[np.float32]:
+def _predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> NDArray[np.float32]:
     """The target as it should look, with some of its surroundings; its centre is that of the middle pixel."""
     _, greatest = extent_px(shape, np.column_stack([pixel_from_disk, (0.0, 0.0)]))
     half = np.ceil(greatest * (1 + _GROUND) + _GROUND_PX).astype(int)
@@ -103,7 +103,7 @@ def predicted_picture(pixel_from_disk: Array, shape: MarkShape) -> NDArray[np.fl
     return picture(shape, placed, int(width), int(height), _EXPECTED_BLUR_PX).astype(np.float32)
 
 
-def compared_part(pixel_from_disk: Array, half: NDArray[np.intp], shape: MarkShape) -> NDArray[np.float32]:
+def _compared_part(pixel_from_disk: Array, half: NDArray[np.intp], shape: MarkShape) -> NDArray[np.float32]:
     """1 where the predicted picture, of half (2,) px about its middle, is to be found, 0 elsewhere: a disk with what is
     next to it, for a ring may begin where the picture's corners are."""
     width, height = 2 * half + 1
@@ -115,11 +115,11 @@ def compared_part(pixel_from_disk: Array, half: NDArray[np.intp], shape: MarkSha
     return np.asarray(np.linalg.norm(places @ np.linalg.inv(grown).T, axis=-1) <= 1, np.float32)
 
 
-def fitted_at(
+def _fitted_at(
     scan: Scan, spot: Array, prediction: Prediction, size_tolerance: float, shape: MarkShape, result: SearchResult
 ) -> tuple[int | None, str]:
     """The index of the disk at a spot, fitted now or before; None, and why, if there is none of the right size."""
-    index = known_disk(result.disks, spot)
+    index = _known_disk(result.disks, spot)
     if index is not None:
         disk = result.disks[index]
     else:
@@ -144,7 +144,7 @@ def _in_perspective(shape: MarkShape, prediction: Prediction) -> MarkShape:
     return replace(shape, perspective=(x, y))
 
 
-def known_disk(disks: list[FittedDisk], spot: Array) -> int | None:
+def _known_disk(disks: list[FittedDisk], spot: Array) -> int | None:
     """The disk that was already fitted at a spot."""
     for index, disk in enumerate(disks):
         if np.hypot(*(disk.center_px - spot)) < _SAME_DISK * disk.half_axes_px[1]:
@@ -152,7 +152,7 @@ def known_disk(disks: list[FittedDisk], spot: Array) -> int | None:
     return None
 
 
-def keep_common_polarity(result: SearchResult) -> None:
+def _keep_common_polarity(result: SearchResult) -> None:
     """Leave out the disks, light or dark, of which there are fewer among the predictions that found one disk only."""
     lone = [near[0] for near in result.near if len(near) == 1] or [index for near in result.near for index in near]
     sign = np.sign(sum(np.sign(result.disks[index].contrast_dn) for index in lone)) or 1.0

@@ -21,7 +21,7 @@ from pipeline.measuring.measurement_file import MeasuredScan
 
 Array = NDArray[np.float64]
 
-_LEAST_DIAMETER_PX = 2.5
+LEAST_DIAMETER_PX = 2.5  # of a target in the scan: of a smaller one, size and blur cannot be told apart
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def target_field(project: Project) -> Field:
 
 def target_candidates(scan: Scan, settings: TargetSettings, diameters_px: tuple[float, float]) -> list[Candidate]:
     """What looks like the targets anywhere in the scan, the strongest first."""
-    smallest = max(diameters_px[0], _LEAST_DIAMETER_PX)
+    smallest = max(diameters_px[0], LEAST_DIAMETER_PX)
     sizes = (smallest, max(diameters_px[1], smallest))
     if settings.cross_line is None:
         return disk_candidates(scan, DiskSearch(sizes, settings.polarity))

@@ -24,7 +24,13 @@ from pipeline.measuring.coded_sheet import CodedSheet, measure_sheet
 from pipeline.measuring.comparator_file import comparator_from_pixel
 from pipeline.measuring.identification import PatternOptions, assign, log10_of_chance, recognise
 from pipeline.measuring.measurement_file import MeasuredScan
-from pipeline.measuring.target_field import Field, measure_single_targets, target_candidates, target_field
+from pipeline.measuring.target_field import (
+    LEAST_DIAMETER_PX,
+    Field,
+    measure_single_targets,
+    target_candidates,
+    target_field,
+)
 from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.unoriented import NamedField, likely_diameters_px, name_field
 
@@ -38,7 +44,6 @@ _LEAST_PAIRS = 4
 _MOST_LOG10_CHANCE = -1.0  # of agreements as good by chance: the project says that the pattern is in the scan
 _STRONGEST = 3  # patches a target, by contrast: dust and texture are weaker than what was painted to be seen
 _NEAR = 0.65  # of the scan's size from its middle: targets there may be in it
-_LEAST_DIAMETER_PX = 2.5
 _SIZE_SLACK = 1.5  # how wrong the approximate distance may make a target's size
 
 
@@ -132,7 +137,7 @@ def _oriented_by_targets(
             return (oriented.model, oriented.predictions(field, measured)), ()
         notes = (f"Its orientation in images.csv was not used to name the targets: {oriented}.",)
     diameters = likely_diameters_px(field, measured)
-    if diameters[1] < _LEAST_DIAMETER_PX:
+    if diameters[1] < LEAST_DIAMETER_PX:
         return _too_small(project, field, diameters[1]), notes
     found = target_candidates(scan, settings, diameters)
     named = name_field(field, model, camera, measured, found)
@@ -143,7 +148,7 @@ def _too_small(project: Project, field: Field, largest_px: float) -> str:
     extent = float(np.linalg.norm(np.ptp(field.xyz, axis=0)))
     return (
         f"targets of {2.0 * field.radius * project.unit_mm:g} mm in a field of {extent:g} {project.unit} would have "
-        f"{largest_px:.2g} px at most, and {_LEAST_DIAMETER_PX} are needed; is [object] unit the one of the "
+        f"{largest_px:.2g} px at most, and {LEAST_DIAMETER_PX} are needed; is [object] unit the one of the "
         f'coordinates? "{project.unit}" is taken, "m" being the default'
     )
 
@@ -153,7 +158,7 @@ def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredSca
     size = np.array([measured.width_px, measured.height_px])
     near = [p for p in predictions if np.all(np.abs(p.center_px - size / 2.0) < _NEAR * size)]
     axes = np.array([p.half_axes_px for p in near]).reshape(-1, 2)
-    if not len(axes) or 2.0 * float(axes.max()) < _LEAST_DIAMETER_PX:
+    if not len(axes) or 2.0 * float(axes.max()) < LEAST_DIAMETER_PX:
         return None
     return 2.0 * float(axes.min()) / _SIZE_SLACK, 2.0 * float(axes.max()) * _SIZE_SLACK
 
@@ -168,7 +173,7 @@ def _oriented(
     predicted = np.array([prediction.center_px for prediction in predictions]).reshape(-1, 2)
     diameters = _diameters_px(predictions, measured)
     if diameters is None:
-        return "the approximate orientation puts no target of two pixels or more into the scan"
+        return f"the approximate orientation puts no target of {LEAST_DIAMETER_PX} px or more into the scan"
     strongest = target_candidates(scan, settings, diameters)[: _STRONGEST * len(predicted)]
     found = np.array([patch.center_px for patch in strongest]).reshape(-1, 2)
     placement = recognise(predicted, found, PatternOptions(shift_px=size / 2.0))

@@ -87,11 +87,11 @@ class Axes:
                 *(line((x, x), (y_bottom, y_bottom + 4.0), "axis") for x in self.x(x_ticks)),
                 line((x_left, x_right), (y_bottom, y_bottom), "axis"),
                 *(
-                    words(x, y_bottom + 17.0, tick_text(t), "tick", "middle")
+                    words(x, y_bottom + 17.0, _tick_text(t), "tick", "middle")
                     for t, x in zip(x_ticks, self.x(x_ticks), strict=True)
                 ),
                 *(
-                    words(x_left - 7.0, y + 4.0, tick_text(t), "tick", "end")
+                    words(x_left - 7.0, y + 4.0, _tick_text(t), "tick", "end")
                     for t, y in zip(y_ticks, self.y(y_ticks), strict=True)
                 ),
                 words(0.5 * (x_left + x_right), self.height - 6.0, x_label, "label", "middle"),
@@ -119,7 +119,7 @@ def round_step(size: float) -> float:
     return float(power * max((m for m in (1.0, 2.0, 5.0) if m <= size / power * (1.0 + 1e-9)), default=1.0))
 
 
-def tick_text(value: float) -> str:
+def _tick_text(value: float) -> str:
     return f"{value:.6g}".replace("-", "−")
 
 

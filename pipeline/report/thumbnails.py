@@ -59,7 +59,7 @@ def drawn(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) ->
     rows, cols = thumbnail.pixels.shape
     zoom = SIZE_PX / (max(rows, cols) * thumbnail.step_px)  # page pixels to a pixel of the scan
     width, height = cols * thumbnail.step_px * zoom, rows * thumbnail.step_px * zoom
-    image = svg.tag("image", href=png_uri(thumbnail.pixels, most_px), width=width, height=height, class_="chip")
+    image = svg.tag("image", href=_png_uri(thumbnail.pixels, most_px), width=width, height=height, class_="chip")
     overlay = Markup("")
     if mark.center_px is not None:
         # The centre of the top-left thumbnail pixel lies half a thumbnail pixel inside of the picture's edge.
@@ -68,7 +68,7 @@ def drawn(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) ->
     return svg.picture(SIZE_PX, SIZE_PX, _description(mark), image, overlay, class_="thumb")
 
 
-def png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
+def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
     """Grey values as a PNG of 8 bit in a data URI, stretched from their darkest to their lightest per mille."""
     grey = pixels.astype(np.float64)
     low, high = np.percentile(grey, [0.1, 99.9])

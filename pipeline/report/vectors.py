@@ -58,21 +58,21 @@ def places_mm(residuals: list[Json]) -> Array:
     return np.array([(row["camera_x_mm"], row["camera_y_mm"]) for row in residuals], dtype=float)
 
 
-def vectors_um(residuals: list[Json]) -> Array:
+def _vectors_um(residuals: list[Json]) -> Array:
     """(n, 2) the residuals along the camera's axes."""
     return np.array([(row["camera_vx_um"], row["camera_vy_um"]) for row in residuals], dtype=float)
 
 
 def vector_scale(residuals: list[Json], longest_px: float) -> float:
     """Page pixels to 1 um, a round number: all but the largest per cent are shorter than `longest_px`."""
-    length = float(np.percentile(np.hypot(*vectors_um(residuals).T), 99.0))
+    length = float(np.percentile(np.hypot(*_vectors_um(residuals).T), 99.0))
     return svg.round_step(longest_px / length) if length > 0.0 else 1.0
 
 
 def image_plot(image: str, residuals: list[Json], on: Plane, px_per_um: float, suspect: list[Json]) -> Markup:
     """The residuals of one image, each with its name and numbers to point at."""
     starts = on.page(places_mm(residuals))
-    ends = starts + px_per_um * vectors_um(residuals) * (1.0, -1.0)
+    ends = starts + px_per_um * _vectors_um(residuals) * (1.0, -1.0)
     marks = [
         svg.tag("g", svg.tag("title", _hint(row)), _stroke(start, end, row, suspect))
         for start, end, row in zip(starts, ends, residuals, strict=True)
@@ -90,7 +90,7 @@ def image_plot(image: str, residuals: list[Json], on: Plane, px_per_um: float, s
 def all_images_plot(residuals: list[Json], on: Plane, px_per_um: float) -> Markup:
     """The residuals of all images in one frame: what they have in common is the camera's, not the film's."""
     starts = on.page(places_mm(residuals))
-    ends = starts + px_per_um * vectors_um(residuals) * (1.0, -1.0)
+    ends = starts + px_per_um * _vectors_um(residuals) * (1.0, -1.0)
     is_fiducial = np.array([row["kind"] == "fiducial" for row in residuals])
     return svg.picture(
         on.width_px,
