@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.least_squares.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.least_squares.kept_memory import keep_freed_memory
-from adjust.least_squares.runs import Run, again, run
 from adjust.network import STRAIGHT, Approximations, Network
 from adjust.options import Datum, Method, Options
 from adjust.problem import Problem, number
 from adjust.quality.assessment import RunAssessment
+from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.result import Adjustment, Cofactor
+from adjust.runs import Run, again, run
 from adjust.undetermined.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.undetermined.datum_choice import chosen_coordinates, chosen_points, with_held
 from adjust.validation import validate

@@ -22,9 +22,9 @@ import synthetic_images
 from pipeline.design.alone import alone
 from pipeline.design.alternatives import gains
 from pipeline.design.expected import INTERIOR, UM_PER_MM, expect, rms
-from pipeline.design.settings import Sweep
 from pipeline.design.sweeps import Swept, over_layouts, sweep
 from pipeline.design.variations import Variations
+from pipeline.rendered.design_table import Sweep
 
 Row = Sequence[str | float]
 

@@ -9,10 +9,10 @@ from typing import Any
 from adjust.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.adjustment_file import write_adjustment
-from pipeline.adjusting.adjustment_reader import covariance_path, read_adjustment, read_covariance
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.adjusting.second_visit import measure_again
 from pipeline.errors import InputError
+from pipeline.files.adjustment_reader import covariance_path, read_adjustment, read_covariance
 from pipeline.files.atomic import check_writable, write_atomically
 from pipeline.files.project_file import Project
 from pipeline.measuring.comparator_file import ComparatorPoint, read_comparator, write_comparator

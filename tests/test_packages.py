@@ -36,20 +36,26 @@ def test_package_imports_only_what_the_architecture_allows(package: str) -> None
         assert not pictures, f"{file.relative_to(ROOT)} imports {sorted(pictures)}"
 
 
-def test_the_folders_of_measure_use_one_another_in_no_circle() -> None:
-    used = {
-        folder.name: folders_used(folder) - {folder.name} for folder in (ROOT / "measure").iterdir() if folder.is_dir()
+@pytest.mark.parametrize(
+    ("package", "user", "used"),
+    [("measure", "pose", "frames"), ("adjust", "quality", "least_squares"), ("pipeline", "adjusting", "measuring")],
+)
+def test_the_folders_of_a_package_use_one_another_in_no_circle(package: str, user: str, used: str) -> None:
+    folders = {
+        folder.name: folders_used(folder) - {folder.name} for folder in (ROOT / package).iterdir() if folder.is_dir()
     }
-    assert "frames" in used["pose"]
-    TopologicalSorter(used).prepare()
+    assert used in folders[user]
+    TopologicalSorter(folders).prepare()
 
 
 def folders_used(folder: Path) -> set[str]:
-    """The folders of measure from which the files of one import."""
+    """The folders of its package from which the files of one import."""
     modules = {
         node.module or ""
         for file in folder.glob("*.py")
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.ImportFrom)
     }
-    return {name.split(".")[1] for name in modules if name.count(".") == 2 and name.startswith("measure.")}
+    return {
+        name.split(".")[1] for name in modules if name.count(".") == 2 and name.startswith(f"{folder.parent.name}.")
+    }

@@ -11,10 +11,10 @@ from adjust.adjustment import Options, with_datum
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel, approximate_image
 from adjust.initial_values.intersection import intersect
-from adjust.least_squares.runs import run
 from adjust.network import Approximations, Network
 from adjust.problem import number
 from adjust.result import Adjustment
+from adjust.runs import run
 from adjust.validation import validate
 
 Array = NDArray[np.float64]

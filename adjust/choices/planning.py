@@ -11,12 +11,12 @@ from adjust.adjustment import Options, adjust_problem, with_datum
 from adjust.errors import AdjustmentError
 from adjust.functional_model.functions import blind_mark, computed_observations
 from adjust.functional_model.further_observations import at_computed
-from adjust.least_squares.cofactor import free_cofactor
 from adjust.least_squares.factor import Factor
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.network import Approximations, Network
 from adjust.numbering import Numbering
 from adjust.problem import Problem, number
+from adjust.quality.cofactor import free_cofactor
 from adjust.result import Adjustment, NullDirection
 from adjust.undetermined.null_space import null_vectors
 from adjust.validation import validate

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.correction import Correction, Imaged
 from adjust.functional_model.families import family
-from adjust.least_squares.small_matrices import columns, zeros
 from adjust.network import Distortion
+from adjust.small_matrices import columns, zeros
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.line_of_sight import sight_vectors
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.least_squares.small_matrices import applied, determinant, solved
 from adjust.network import EXTERIOR_NAMES, STRAIGHT, Approximations, Distortion, Image, LineOfSight, Network
 from adjust.result import Adjustment
+from adjust.small_matrices import applied, determinant, solved
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

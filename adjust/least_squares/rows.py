@@ -10,9 +10,9 @@ from adjust.functional_model.functions import Derivatives
 from adjust.functional_model.further_observations import FurtherObservation
 from adjust.least_squares.elimination import Sums
 from adjust.least_squares.factor import Blocks
-from adjust.least_squares.small_matrices import applied, inverse, lower_root, product
 from adjust.numbering import Numbering, Touched
 from adjust.problem import ABSENT, Problem, State
+from adjust.small_matrices import applied, inverse, lower_root, product
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -8,7 +8,6 @@ import numpy as np
 
 from adjust.functional_model.transformation import marks_needed
 from adjust.least_squares.iteration import factorise
-from adjust.least_squares.runs import ROUNDS, Run
 from adjust.problem import Problem
 from adjust.quality.probabilities import Probabilities
 from adjust.quality.reliability import Misfits, reliability
@@ -18,6 +17,7 @@ from adjust.quality.suspicions import suspicions
 from adjust.quality.tested import TestedUnits
 from adjust.quality.variance_components import factor_sigmas
 from adjust.result import Cofactor, FurtherResidual, Group, Reliability, Residuals, Suspect
+from adjust.runs import ROUNDS, Run
 from adjust.undetermined.diagnosis import undetermined, weak_directions
 
 

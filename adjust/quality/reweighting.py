@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.least_squares.small_matrices import laid_out
 from adjust.problem import Problem
 from adjust.quality.tested import TestedUnits
+from adjust.small_matrices import laid_out
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -18,9 +18,9 @@ from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
 from adjust.quality.correlation import correlations
 from adjust.quality.significance import group_tests, parameter_tests
 from adjust.result import Adjustment, FurtherResidual
-from pipeline.adjusting.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.adjusting.covariance_arrays import covariance_arrays, covariance_note
 from pipeline.adjusting.reliability_json import point_tests, reliability_json, suspect_json
+from pipeline.files.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.files.atomic import atomic_path
 
 Array = NDArray[np.float64]

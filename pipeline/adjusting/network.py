@@ -1,7 +1,7 @@
 """From the user's files and the comparator coordinates to the network that is adjusted."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from adjust.network import (
     Network,
     ObjectPoint,
     Observations,
-    Prior,
     Transformation,
 )
 from pipeline.adjusting.fiducial_check import check_fiducials
@@ -89,7 +88,7 @@ def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
 
 def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
     """The marks of the points that can be located: of which something is given, or which two images show."""
-    given = {id for id, point in given_points(project).items() if any((point.X, point.Y, point.Z))}
+    given = {id for id, point in project.object_points.items() if any((point.X, point.Y, point.Z))}
     images = Counter(mark.point for mark in marks if mark.kind != "fiducial")
     lonely = {point for point, count in images.items() if count < 2 and point not in given}
     sentence = (
@@ -175,7 +174,7 @@ def _transformation(project: Project, camera: CameraFile) -> Transformation:
 
 def _check_points(project: Project, marks: Sequence[ComparatorPoint]) -> None:
     """A target is one of the given points, where any are given; a tie point need not be."""
-    given = given_points(project)
+    given = project.object_points
     for mark in marks:
         if mark.kind == "target" and given and mark.point not in given:
             raise InputError(
@@ -205,7 +204,7 @@ def _cameras(
 
 def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectPoint, ...]:
     """Every object point that an image shows: as given, of the board, or unknown where nothing gives it."""
-    given = given_points(project)
+    given = project.object_points
     points = {}
     for mark in marks:
         if mark.kind == "fiducial" or mark.point in points:
@@ -221,21 +220,10 @@ def _unnamed(project: Project, mark: ComparatorPoint) -> ObjectPoint:
     return ObjectPoint(mark.point, None, None, None)
 
 
-def given_points(project: Project) -> Mapping[str, ObjectPoint]:
-    """The points of points.csv, or else those of the board, by id."""
-    if project.given_points is not None:
-        return {point.id: point for point in project.given_points.points}
-    if project.targets is None or project.targets.board is None:
-        return {}
-    scale = 1.0 / project.unit_mm
-    board = project.targets.board.object_points()
-    return {id: ObjectPoint(id, *(Prior(scale * value) for value in xyz)) for id, xyz in board.items()}
-
-
 def _distances(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[tuple[Distance, ...], tuple[str, ...]]:
     """The distances between points and stations that take part, and a sentence on the others."""
     taking_part = {mark.point for mark in marks if mark.kind != "fiducial"} | {mark.image for mark in marks}
-    known = taking_part | set(given_points(project)) | set(project.given_images.camera if project.given_images else ())
+    known = taking_part | set(project.object_points) | set(project.given_images.camera if project.given_images else ())
     known |= set(project.scans)
     lost = []
     for given in project.given_distances:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from adjust import network
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.network import Approximations, Network, Prior, Transformation
-from pipeline.design.settings import DesignSettings
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
+from pipeline.rendered.design_table import DesignSettings
 from pipeline.rendered.scene_project import SceneFile, film_transformation
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import SceneCamera, SceneImage

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.design.expected import Expected, expect
-from pipeline.design.settings import Sweep
 from pipeline.design.variations import Variations
+from pipeline.rendered.design_table import Sweep
 
 Progress = Callable[[str, int, int], None]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.network import Calibration, Camera, Distortion, Fiducial, Prior
-from pipeline.adjusting.adjustment_reader import Covariance, read_adjustment, read_covariance
+from pipeline.files.adjustment_reader import Covariance, read_adjustment, read_covariance
 from pipeline.files.tables import Table
 
 Array = NDArray[np.float64]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from adjust.network import ObjectPoint, Prior
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera
@@ -82,6 +83,17 @@ class Project:
         """That of the disks, or half the length of the crosses, in the unit of the object coordinates."""
         arm = self.targets.arm_mm if self.targets else None
         return self.disk_radius if arm is None else arm / self.unit_mm
+
+    @cached_property
+    def object_points(self) -> Mapping[str, ObjectPoint]:
+        """The points of points.csv, or else those of the board, by id."""
+        if self.given_points is not None:
+            return {point.id: point for point in self.given_points.points}
+        if self.targets is None or self.targets.board is None:
+            return {}
+        scale = 1.0 / self.unit_mm
+        board = self.targets.board.object_points()
+        return {id: ObjectPoint(id, *(Prior(scale * value) for value in xyz)) for id, xyz in board.items()}
 
     @cached_property
     def default_camera(self) -> CameraFile:

@@ -15,7 +15,6 @@ from measure.single_targets.disk_patches import Candidate, DiskSearch
 from measure.single_targets.disk_search import disk_candidates
 from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_disks
 from measure.status import Status
-from pipeline.adjusting.network import given_points
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
@@ -49,7 +48,7 @@ class CodedSheet:
                 f'{project.path}: [targets] kind "coded-ring" names the dots by the sheet, and there is no [object] '
                 'points = "...". Give the file of the sheet\'s points.'
             )
-        known = {id: [p.value for p in (q.X, q.Y, q.Z) if p] for id, q in given_points(project).items()}
+        known = {id: [p.value for p in (q.X, q.Y, q.Z) if p] for id, q in project.object_points.items()}
         xyz = {id: values for id, values in known.items() if len(values) == 3}
         for point in settings.numbers.values():
             if point not in xyz:

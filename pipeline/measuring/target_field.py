@@ -13,7 +13,6 @@ from measure.single_targets.cross_search import CrossSearch, cross_candidates
 from measure.single_targets.disk_patches import Candidate, DiskSearch
 from measure.single_targets.disk_search import disk_candidates
 from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
-from pipeline.adjusting.network import given_points
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.disks import disk_images, disk_normals, plane_normal
@@ -52,7 +51,7 @@ class Field:
 
 def target_field(project: Project) -> Field:
     """The targets whose coordinates are known at least roughly."""
-    places = {id: (point.X, point.Y, point.Z) for id, point in given_points(project).items()}
+    places = {id: (point.X, point.Y, point.Z) for id, point in project.object_points.items()}
     known = {id: [prior for prior in priors if prior is not None] for id, priors in places.items()}
     complete = {id: priors for id, priors in known.items() if len(priors) == 3}
     xyz, sigmas = (

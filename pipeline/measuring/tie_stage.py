@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.ties import measure_ties
-from pipeline.adjusting.network import given_points
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.tie_table import TieSettings
@@ -25,7 +24,7 @@ _LEAST_MARK_PX = 20.0  # about a mark whose size nobody has noted
 
 def check_tie_names(project: Project) -> None:
     """Raises InputError where a given point has a name that a natural point would take."""
-    strangers = sorted(id for id in given_points(project) if _TIE_NAME.fullmatch(id)) if project.ties else []
+    strangers = sorted(id for id in project.object_points if _TIE_NAME.fullmatch(id)) if project.ties else []
     if strangers:
         raise InputError(
             f"{project.path}: the given points hold {strangers[0]!r}, a name that [ties] gives to natural points. "

@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
-from pipeline.adjusting.adjustment_reader import Covariance
+from pipeline.files.adjustment_reader import Covariance
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.adjusting.adjustment_reader import Covariance
+from pipeline.files.adjustment_reader import Covariance
 from pipeline.measuring.comparator_file import ComparatorPoint
 
 Json = dict[str, Any]

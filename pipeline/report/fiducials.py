@@ -8,7 +8,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.adjusting.adjustment_reader import Covariance
+from pipeline.files.adjustment_reader import Covariance
 from pipeline.report import svg
 from pipeline.report.data import Json
 

@@ -10,7 +10,7 @@ from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import ideal_from_observed
 from adjust.network import Distortion
-from pipeline.adjusting.adjustment_reader import Covariance
+from pipeline.files.adjustment_reader import Covariance
 from pipeline.report import svg
 from pipeline.report.data import Json
 

@@ -7,7 +7,7 @@ import numpy as np
 from adjust.functional_model.families import family as family_of
 from adjust.functional_model.families import parameter_names
 from adjust.quality.significance import LEVEL
-from pipeline.adjusting.adjustment_reader import Covariance
+from pipeline.files.adjustment_reader import Covariance
 from pipeline.report.data import Json
 from pipeline.report.lens import largest_effects_um, lens
 from pipeline.report.numbers import fixed, significant, value_and_sigma

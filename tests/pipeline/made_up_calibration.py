@@ -34,7 +34,7 @@ from adjust.result import (
 )
 from measure.status import Status
 from pipeline.adjusting.adjustment_file import write_adjustment
-from pipeline.adjusting.adjustment_reader import read_adjustment, read_covariance
+from pipeline.files.adjustment_reader import read_adjustment, read_covariance
 from pipeline.measuring.comparator_file import ComparatorPoint
 from pipeline.report import ReportData, Thumbnail
 

@@ -15,8 +15,8 @@ from adjust.network import ObjectPoint, Prior
 from adjust.result import Adjustment, Residuals
 from pipeline.adjusting import covariance_arrays
 from pipeline.adjusting.adjustment_file import write_adjustment
-from pipeline.adjusting.adjustment_reader import covariance_path, read_adjustment, read_covariance
 from pipeline.errors import InputError
+from pipeline.files.adjustment_reader import covariance_path, read_adjustment, read_covariance
 
 
 @pytest.fixture

@@ -12,11 +12,11 @@ from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.design.alone import alone
 from pipeline.design.alternatives import alternatives, gains
 from pipeline.design.expected import expect, rms
-from pipeline.design.settings import Sweep
 from pipeline.design.setup import planned_network, setup_of
 from pipeline.design.sweeps import Swept, over_layouts, sweep
 from pipeline.design.variations import Variations
 from pipeline.errors import InputError
+from pipeline.rendered.design_table import Sweep
 from pipeline.rendered.scene_file import read_scene
 
 SCENES = Path(str(resources.files("synthetic_images").joinpath("scenes")))

@@ -17,8 +17,8 @@ from adjust.network import EXTERIOR_NAMES
 from adjust.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.adjustment_file import write_adjustment
-from pipeline.adjusting.adjustment_reader import read_adjustment
 from pipeline.errors import InputError
+from pipeline.files.adjustment_reader import read_adjustment
 from pipeline.files.project_file import read_project
 from pipeline.measuring.comparator_file import read_comparator
 from pipeline.opencv_check.check import check_against_opencv

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.adjusting.adjustment_reader import Covariance
+from pipeline.files.adjustment_reader import Covariance
 from pipeline.report.fiducials import Figure, figure, figure_plot
 from pipeline.report.lens import curves, curves_plot, displacement, largest_effects_um, lens
 from pipeline.report.lens_map import lens_map
