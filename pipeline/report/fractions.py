@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.spatial import cKDTree
 
 from pipeline.report.marks import Frame
 
@@ -13,9 +12,9 @@ Array = NDArray[np.float64]
 
 BINS = 10
 LEAST_MARKS = 50  # five a bin, below which the chi-square test means nothing
-LEAST_PROBABILITY = 1e-4  # grids of targets that lie along the pixels are a little uneven by themselves
+LEAST_PROBABILITY = 1e-4  # grids of targets that lie nearly along the pixels are a little uneven by themselves
 LEAST_BIAS_PX = 0.01  # with very many marks even a bias that harms nobody is beyond chance
-SAME_PLACE_PX = 0.5  # scans that lie at random do not put a mark so near to where another one has it
+SAME_PLACE_PX = 0.5  # marks that lie at random are seldom so near to another one's column or row
 
 
 @dataclass(frozen=True)
@@ -37,23 +36,26 @@ class FractionTest:
         return self.probability is not None and self.probability < LEAST_PROBABILITY and self.bias_px > LEAST_BIAS_PX
 
 
-def places_px(shots: list[Frame]) -> Array:
-    """(n, 2) px, column and row of all marks observed, each place of a mark once: one that recurs there in frame after
-    frame has one fractional part, however often it was measured."""
-    by_mark: dict[tuple[bool, str], list[Array]] = {}
-    for mark in (mark for frame in shots for mark in frame.marks):
-        if mark.status.is_observation and mark.center_px is not None:
-            by_mark.setdefault((mark.is_fiducial, mark.point), []).append(np.asarray(mark.center_px, dtype=np.float64))
-    return np.array([place for places in by_mark.values() for place in _apart(np.array(places))]).reshape(-1, 2)
+def places_px(shots: list[Frame]) -> dict[str, Array]:
+    """Columns and rows (n,) of all marks observed, each place along its axis once: a mark that recurs there in frame
+    after frame, and the line of a lattice that lies along the pixels, share one fractional part."""
+    centers = [
+        mark.center_px
+        for frame in shots
+        for mark in frame.marks
+        if mark.status.is_observation and mark.center_px is not None
+    ]
+    columns, rows = np.array(centers, dtype=np.float64).reshape(-1, 2).T
+    return {"column": _apart(columns), "row": _apart(rows)}
 
 
-def _apart(places: Array) -> Array:
-    """Of places (n, 2) px those that lie apart from all that were kept before."""
-    kept: set[int] = set()
-    for index, near in enumerate(cKDTree(places).query_ball_point(places, np.full(len(places), SAME_PLACE_PX))):
-        if kept.isdisjoint(near):
-            kept.add(index)
-    return places[sorted(kept)]
+def _apart(positions_px: Array) -> Array:
+    """Of positions (n,) those that lie apart from all that were kept before."""
+    kept: list[float] = []
+    for position in np.sort(positions_px).tolist():
+        if not kept or position - kept[-1] > SAME_PLACE_PX:
+            kept.append(position)
+    return np.array(kept)
 
 
 def fraction_test(position_px: Array) -> FractionTest:

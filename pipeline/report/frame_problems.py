@@ -61,7 +61,7 @@ def _reasons(lost: list[Mark]) -> str:
 
 
 def pixel_locking(shots: list[Frame]) -> Iterator[Problem]:
-    for axis, positions in zip(("column", "row"), places_px(shots).T, strict=True):
+    for axis, positions in places_px(shots).items():
         test = fraction_test(positions)
         if test.is_locked:
             yield Problem(

@@ -65,9 +65,8 @@ def _context(data: ReportData) -> dict[str, Any]:
 
 def _fractions(shots: list[Frame]) -> Iterator[tuple[str, FractionTest, Markup]]:
     """By axis: the test of the fractional parts and its drawing; nothing where no pixel positions are known."""
-    places = places_px(shots)
-    if len(places):
-        for axis, positions in zip(("column", "row"), places.T, strict=True):
+    for axis, positions in places_px(shots).items():
+        if len(positions):
             test = fraction_test(positions)
             yield axis, test, fraction_plot(axis, test)
 
