@@ -4,14 +4,18 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 
-.PHONY: demo test lint types clean
+.PHONY: demo test lint types suite clean
 
 demo: $(READY)
 	$(BIN)/reseau demo demo
 
+# The types are checked beside the tests: without its cache, mypy keeps one core busy for a minute.
+test: lint
+	$(MAKE) --no-print-directory --jobs=2 types suite
+
 # One BLAS thread a worker: two on two cores make the small factorisations ten times slower.
-test: export OPENBLAS_NUM_THREADS = 1
-test: lint types
+suite: export OPENBLAS_NUM_THREADS = 1
+suite: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 lint: $(READY)

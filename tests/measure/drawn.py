@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from measure.scans.picture_scan import WholePicture
 from measure.scans.radiometry import Samples
@@ -24,10 +25,10 @@ def scan_of(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0)
 def drawn(
     inside: Callable[[Array, Array], Array], width: int, height: int, blur_px: float, fineness: int = 16
 ) -> Array:
-    """(height, width) means over the pixels of a function of column and row, after a Gaussian blur."""
+    """(height, width) means over the pixels of a function of columns (1, n) and rows (m, 1), after a Gaussian blur."""
     pad = int(np.ceil(5 * blur_px)) + 1
     fine = [(np.arange((size + 2 * pad) * fineness) + 0.5) / fineness - 0.5 - pad for size in (width, height)]
-    sharp = inside(*np.meshgrid(*fine)).astype(float)
+    sharp = inside(*np.meshgrid(*fine, sparse=True)).astype(float)
     return pixel_means(sharp, blur_px, fineness, pad)
 
 
@@ -35,19 +36,24 @@ def pixel_means(sharp: Array, blur_px: float, fineness: int, pad: int) -> Array:
     """Means over the pixels after a Gaussian blur cut off at five sigmas; of samples `fineness` to a pixel along each
     axis, with a border of `pad` pixels, of more than five sigmas, that the result has not."""
     rows, columns = (_means_of_samples(size, blur_px * fineness, fineness, pad) for size in sharp.shape)
-    return np.asarray(rows @ sharp @ columns.T)
+    return np.asarray(rows @ (columns @ sharp.T).T)
 
 
-def _means_of_samples(samples: int, sigma: float, fineness: int, pad: int) -> Array:
+def _means_of_samples(samples: int, sigma: float, fineness: int, pad: int) -> csr_array:
     """(pixels, samples) what each sample counts in a pixel's mean: all blurred samples of the pixel, summed up."""
     reach = int(5 * sigma + 0.5)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2) if sigma > 0 else np.ones(1)
     of_pixel = np.convolve(np.ones(fineness), kernel / kernel.sum()) / fineness
-    means = np.zeros((samples // fineness - 2 * pad, samples))
-    for pixel, row in enumerate(means):
-        first = (pixel + pad) * fineness - reach
-        row[first : first + len(of_pixel)] = of_pixel
-    return means
+    pixels, each = samples // fineness - 2 * pad, len(of_pixel)
+    first = (np.arange(pixels) + pad) * fineness - reach
+    entries = np.tile(of_pixel, pixels), (first[:, None] + np.arange(each)).ravel(), each * np.arange(pixels + 1)
+    return csr_array(entries, shape=(pixels, samples))
+
+
+def transformed(matrix: NDArray[np.floating], col: Array, row: Array) -> tuple[Array, Array]:
+    """The x and the y of a matrix (2, 2) by (column, row), for columns (1, n) and rows (m, 1)."""
+    x, y = (line[0] * col + line[1] * row for line in matrix)
+    return x, y
 
 
 def ellipse(center_px: Array, pixel_from_disk: Array) -> Callable[[Array, Array], Array]:
@@ -55,8 +61,7 @@ def ellipse(center_px: Array, pixel_from_disk: Array) -> Callable[[Array, Array]
     disk_from_pixel = np.linalg.inv(pixel_from_disk)
 
     def inside(col: Array, row: Array) -> Array:
-        offset = np.stack([col - center_px[0], row - center_px[1]])
-        x, y = np.tensordot(disk_from_pixel, offset, axes=1)
+        x, y = transformed(disk_from_pixel, col - center_px[0], row - center_px[1])
         return np.asarray(x**2 + y**2 < 1)
 
     return inside

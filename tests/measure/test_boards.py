@@ -52,8 +52,8 @@ def picture_of(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1) 
     middle = np.mean([point[:2] for point in spec.object_points().values()], axis=0)
 
     def light(col: Array, row: Array) -> Array:
-        x, y = mapped(homography, np.stack([col.ravel(), row.ravel()], -1)).T + np.asarray(middle)[:, None]
-        return np.asarray(1.0 - is_dark(x, y).reshape(col.shape))
+        x, y, w = (line[0] * col + line[1] * row + line[2] for line in homography)
+        return np.asarray(1.0 - is_dark(x / w + middle[0], y / w + middle[1]))
 
     rng = np.random.default_rng(seed)
     clean = drawn(light, WIDTH, HEIGHT, 0.8, fineness=6)

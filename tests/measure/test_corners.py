@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drawn import drawn, whitened
+from drawn import drawn, transformed, whitened
 from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
@@ -42,7 +42,7 @@ def square_picture(center: Array, steps: Array, blur_px: float, alone: bool) -> 
     inverse = np.linalg.inv(steps)
 
     def light(col: Array, row: Array) -> Array:
-        s, t = np.tensordot(inverse, np.stack([col - center[0], row - center[1]]), axes=1)
+        s, t = transformed(inverse, col - center[0], row - center[1])
         return np.asarray((s > 0) & (t > 0) if alone else (np.floor(s) + np.floor(t)) % 2 == 0)
 
     return 50 + CONTRAST * drawn(light, SIZE, SIZE, blur_px)

@@ -1,8 +1,10 @@
 """Wings that grow out of the frame's border and merge into it, and notches cut into it, drawn by half planes."""
 
+from functools import cache
+
 import numpy as np
 import pytest
-from drawn import Array, drawn, scan_of
+from drawn import Array, drawn, scan_of, transformed
 from drawn_frames import layout_of, pixel_from_camera
 
 from measure.fiducial_options import FiducialOptions
@@ -12,6 +14,7 @@ from measure.marks.shapes import FiducialLayout, MarkShape, Point, Polygon, turn
 from measure.status import Status
 
 HALF_MM, SIDES = 11.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+PIXEL_FROM_CAMERA = pixel_from_camera("90", turn_rad=0.03)
 WEDGE = ((0.0, 0.0), (1.6, 0.7), (1.6, -0.7))
 WEDGE_TO_EDGE = ((0.0, 0.0), (1.0, 0.4375), (1.0, -0.4375))
 WEDGE_AND_BORDER = ((0.0, 0.0), (1.0, 0.4375), (1.0, 2.5), (2.5, 2.5), (2.5, -2.5), (1.0, -2.5), (1.0, -0.4375))
@@ -26,12 +29,13 @@ def layout(vertices: tuple[Point, ...], at_mm: float) -> FiducialLayout:
     return layout_of(marks, places, (2 * HALF_MM, 2 * HALF_MM))
 
 
-def scanned(at_mm: float, is_notch: bool, matrix: Array) -> Array:
+@cache
+def scanned(at_mm: float, is_notch: bool) -> Array:
     """A light frame with a wedge of its dark border, or a notch in it, on each side."""
-    camera_from_pixel = np.linalg.inv(matrix[:, :2])
+    camera_from_pixel = np.linalg.inv(PIXEL_FROM_CAMERA[:, :2])
 
     def exposed(col: Array, row: Array) -> Array:
-        x, y = np.tensordot(camera_from_pixel, np.stack([col - matrix[0, 2], row - matrix[1, 2]]), axes=1)
+        x, y = transformed(camera_from_pixel, col - PIXEL_FROM_CAMERA[0, 2], row - PIXEL_FROM_CAMERA[1, 2])
         frame = np.maximum(np.abs(x), np.abs(y)) < HALF_MM
         for right, up in SIDES:
             out, along = x * right + y * up - at_mm, np.abs(y * right - x * up)
@@ -53,16 +57,13 @@ def scanned(at_mm: float, is_notch: bool, matrix: Array) -> Array:
 def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
     vertices: tuple[Point, ...], at_mm: float, is_notch: bool
 ) -> None:
-    matrix = pixel_from_camera("90", turn_rad=0.03)
-    camera = layout(vertices, at_mm)
-    result = measure_fiducials(
-        scan_of(scanned(at_mm, is_notch, matrix)), camera, (50.0, 50.0), FiducialOptions(pose="90")
-    )
+    camera, scan = layout(vertices, at_mm), scan_of(scanned(at_mm, is_notch))
+    result = measure_fiducials(scan, camera, (50.0, 50.0), FiducialOptions(pose="90"))
     for mark, given in zip(result.marks, camera.marks, strict=True):
         assert mark.status is Status.MEASURED, mark.reason
         assert mark.center_px is not None
         assert mark.covariance_px2 is not None
-        off = mark.center_px - matrix @ (*given.xy_mm, 1.0)
+        off = mark.center_px - PIXEL_FROM_CAMERA @ (*given.xy_mm, 1.0)
         assert np.hypot(*off) < 0.1
         assert off @ np.linalg.solve(mark.covariance_px2, off) < 18  # 1 in 8000
 

@@ -2,7 +2,7 @@
 the wedge is another."""
 
 import numpy as np
-from drawn import Array, drawn
+from drawn import Array, drawn, transformed
 
 from measure.fitting.matching import Match, match
 from measure.fitting.scan_window import ScanWindow
@@ -22,7 +22,7 @@ def fits(scale: float, turn: float, sigma: float, count: int) -> list[Match]:
     mark_from_pixel = np.linalg.inv(change @ START[:, :2])
 
     def inside(col: Array, row: Array) -> Array:
-        x, y = np.tensordot(mark_from_pixel, np.stack([col - PLACE[0], row - PLACE[1]]), axes=1)
+        x, y = transformed(mark_from_pixel, col - PLACE[0], row - PLACE[1])
         return np.asarray((x < 0.8) & (np.abs(y) < x * 0.35 / 0.8))
 
     grey, rng = 1000 + CONTRAST * drawn(inside, SIZE, SIZE, 1.0), np.random.default_rng(6)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn import drawn, scan_of
+from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.ring_codes import RingCode, read_code
@@ -28,9 +28,9 @@ def ringed(number: int, code: RingCode, turn: float, light: bool = False, tilt: 
     bits = np.array([number >> bit & 1 for bit in range(code.bits)[::-1]], bool)
 
     def inside(col: Array, row: Array) -> Array:
-        offset = np.stack([col - CENTER[0], row - CENTER[1]])
-        nearer = 1.0 if tilt is None else 1.0 + np.tensordot(tilt, offset, axes=1)
-        x, y = np.tensordot(inverse, offset / nearer, axes=1)
+        right, down = col - CENTER[0], row - CENTER[1]
+        nearer = 1.0 if tilt is None else 1.0 + tilt[0] * right + tilt[1] * down
+        x, y = transformed(inverse, right / nearer, down / nearer)
         radius, angle = np.hypot(x, y), np.arctan2(y, x)
         segment = (np.floor((angle - turn) / (2 * np.pi) * code.bits)).astype(int) % code.bits
         ring = (radius > code.ring[0]) & (radius < code.ring[1]) & bits[segment]

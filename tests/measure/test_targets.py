@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from drawn import drawn, ellipse, scan_of, whitened
+from drawn import drawn, ellipse, scan_of, transformed, whitened
 from numpy.typing import NDArray
 
 from measure.results import MarkMeasurement
@@ -181,7 +181,7 @@ def test_a_cross_seen_obliquely() -> None:
     place = np.array([24.3, 23.8])
 
     def inside(col: Array, row: Array) -> Array:
-        flat = np.tensordot(np.linalg.inv(upright), np.stack([col - place[0], row - place[1]]), axes=1)
+        flat = np.array(transformed(np.linalg.inv(upright), col - place[0], row - place[1]))
         x, y = np.abs(flat / (1 - np.tensordot(nearer, flat, axes=1)))
         return np.asarray(((x < 1) & (y < 0.125)) | ((y < 1) & (x < 0.125)))
 
