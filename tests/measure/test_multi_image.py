@@ -33,8 +33,10 @@ def picture(spots: tuple[Array, Array, Array], scan_from_patch: Array, bending: 
     if bending is not None:
         u, v = patch.T / RADIUS_PX
         patch = patch + np.stack([u * u, u * v, v * v], axis=1) @ bending.reshape(2, 3).T
-    distance = ((patch[:, None, :] - centers) ** 2).sum(axis=2)
-    grey = 500.0 + np.exp(-distance / (2 * widths**2)) @ tones
+    # Squared distances over twice the squared widths, as one product of matrices: spot by spot takes far longer.
+    spots_by = np.vstack([-2.0 * centers.T, np.ones(len(centers)), (centers**2).sum(axis=1)]) / (2 * widths**2)
+    distance = np.column_stack([patch, (patch**2).sum(axis=1), np.ones(len(patch))]) @ spots_by
+    grey = 500.0 + np.exp(-distance) @ tones
     return np.asarray(grey.reshape(len(edge), len(edge)))
 
 
