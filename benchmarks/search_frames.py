@@ -28,7 +28,7 @@ from measure.scans.scan import Scan
 from pipeline.rendered.scene_file import scene_mark
 from synthetic_images.background import scene_background
 from synthetic_images.film import FrameGeometry
-from synthetic_images.frame import make_frame
+from synthetic_images.frame import frame_truth, make_frame
 from synthetic_images.paint import AreaPaint, ChipPaint, Paint
 from synthetic_images.render import grey_strips
 from synthetic_images.scene import (
@@ -86,7 +86,7 @@ def draw_case(seed: int, index: int) -> Case:
     layout = _layout(rng, kind, symmetry)
     tones, picture = _tones(rng)
     scene = _scene(rng, layout, tones)
-    truth = make_frame(scene, 0).truth
+    truth = frame_truth(scene, 0)
     clutter = _clutter(rng, layout, truth.geometry, tones)
     uncovered = tuple(replace(image, covered=()) for image in scene.images)
     bare = replace(scene, camera=replace(scene.camera, fiducials=()), images=uncovered)

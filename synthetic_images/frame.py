@@ -1,6 +1,6 @@
 """One frame as it is painted: exposed parts, field, fiducials, damage; and the truth of where its marks lie."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,15 +40,21 @@ class Frame:
 
 def make_frame(scene: Scene, index: int) -> Frame:
     """Everything of one frame, ready to be painted."""
-    geometry = frame_geometry(scene, index)
+    truth = frame_truth(scene, index)
+    geometry = truth.geometry
     exposed = tuple(AreaPaint((geometry.pixel_area(area),), 1.0) for area in _exposed_areas(geometry))
-    fiducials = {fiducial.id: _fiducial_position(fiducial, geometry) for fiducial in scene.camera.fiducials}
-    targets = _target_positions(geometry)
     generator = np.random.default_rng([scene.seed, index, 2])
     defects = damage(scene.film, geometry.width_px, geometry.height_px, generator)
-    paints = [*_field_paints(geometry, targets), *_fiducial_paints(geometry)]
+    paints = [*_field_paints(geometry, truth.targets), *_fiducial_paints(geometry)]
     paints += [AreaPaint((area,), tone) for area, tone in defects]
-    return Frame(FrameTruth(geometry, fiducials, targets), exposed, tuple(paints))
+    return Frame(truth, exposed, tuple(paints))
+
+
+def frame_truth(scene: Scene, index: int) -> FrameTruth:
+    """Where the marks of one frame lie, and why some of them cannot be seen."""
+    geometry = frame_geometry(scene, index)
+    fiducials = {fiducial.id: _fiducial_position(fiducial, geometry) for fiducial in scene.camera.fiducials}
+    return FrameTruth(geometry, fiducials, _target_positions(geometry))
 
 
 def _exposed_areas(geometry: FrameGeometry) -> list[Area]:
@@ -164,7 +170,7 @@ def _reach_mm(fiducial: SceneFiducial, geometry: FrameGeometry) -> float:
     return reach
 
 
-def _field_paints(geometry: FrameGeometry, positions: dict[str, Position]) -> Iterator[Paint]:
+def _field_paints(geometry: FrameGeometry, positions: Mapping[str, Position]) -> Iterator[Paint]:
     """The field, the far before the near."""
     field, tones = geometry.scene.field, geometry.scene.tones
     if isinstance(field, BoardField):

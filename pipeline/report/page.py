@@ -1,6 +1,7 @@
 """report.html: one file, no network, readable without scripts and on paper."""
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,12 @@ def write_report(data: ReportData, path: Path) -> None:
 
 def render_report(data: ReportData) -> str:
     """The report as HTML."""
+    return _environment().get_template("report.html.j2").render(_context(data))
+
+
+@cache
+def _environment() -> Environment:
+    """What compiles the templates, once for all reports of a process."""
     environment = Environment(
         loader=PackageLoader("pipeline.report"),
         autoescape=True,
@@ -38,7 +45,7 @@ def render_report(data: ReportData) -> str:
     )
     environment.globals["quantity"] = lambda entry: value_and_sigma(entry["value"], entry["sigma"])
     environment.filters |= {"fixed": fixed, "significant": significant}
-    return environment.get_template("report.html.j2").render(_context(data))
+    return environment
 
 
 def _context(data: ReportData) -> dict[str, Any]:

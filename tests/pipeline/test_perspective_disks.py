@@ -14,7 +14,7 @@ from adjust.network import Distortion
 from pipeline.measuring.comparator_file import pixel_from_comparator
 from pipeline.measuring.disks import across, disk_images, disk_normals, eccentricity_mm, plane_normal
 from pipeline.rendered.scene_file import read_scene
-from synthetic_images.frame import make_frame
+from synthetic_images.frame import frame_truth
 from synthetic_images.truth import Truth, truth_json
 
 
@@ -78,7 +78,7 @@ def test_large_disks_at_close_range_under_strong_distortion(tmp_path: Path) -> N
     """125 px wide and up to 1.2 px off, 0.1 px of which comes from the lens, of 2 % in the corner."""
     (tmp_path / "scene.toml").write_text(CLOSE, encoding="utf-8")
     scene = read_scene(tmp_path / "scene.toml").scene
-    truth = Truth(scene, (make_frame(scene, 0).truth,))
+    truth = Truth(scene, (frame_truth(scene, 0),))
     document = json.loads(truth_json(truth))
     (camera,), (frame,) = document["cameras"].values(), document["images"].values()
     shown = {id: place for id, place in frame["targets"].items() if place["visible"]}

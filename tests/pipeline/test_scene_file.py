@@ -22,7 +22,7 @@ from pipeline.files.project_file import read_project
 from pipeline.measuring.comparator_file import read_comparator
 from pipeline.rendered.scene_file import read_scene, render_project
 from pipeline.rendered.scene_project import SceneFile, write_project
-from synthetic_images.frame import make_frame
+from synthetic_images.frame import frame_truth
 from synthetic_images.scene import BoardField, ChipMark, DrawnMark
 from synthetic_images.targets import field_targets
 from synthetic_images.truth import FrameTruth
@@ -70,7 +70,7 @@ def test_the_ready_scenes_are_those_that_are_documented() -> None:
 def true_frames(name: str) -> tuple[FrameTruth, ...]:
     """Where everything lies in the frames of a ready scene."""
     scene = read_scene(scene_path(name)).scene
-    return tuple(make_frame(scene, index).truth for index in range(len(scene.images)))
+    return tuple(frame_truth(scene, index) for index in range(len(scene.images)))
 
 
 def in_its_group(name: str) -> object:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import synthetic_images
 from synthetic_images.areas import bar, disk, ring
-from synthetic_images.frame import make_frame
+from synthetic_images.frame import frame_truth
 from synthetic_images.projection import object_rotation
 from synthetic_images.render import render_scene
 from synthetic_images.scene import (
@@ -355,7 +355,7 @@ def test_eccentricity_follows_the_closed_form() -> None:
     """The ellipse's centre less the projected centre, from the dual conic, with centre c and normal n in the camera's
     frame, z forwards, y down: f r^2 [n_xy n_z + c_xy / c_z (1 - n_z^2)] / (c_z^2 - r^2 (1 - n_z^2))."""
     camera = replace(CAMERA, distortion=Distortion(), principal_point_mm=(0.0, 0.0))
-    frame = make_frame(scene(camera=camera), 0).truth
+    frame = frame_truth(scene(camera=camera), 0)
     into_camera = np.diag([1.0, -1.0, -1.0]) @ object_rotation(*OBLIQUE.exterior[3:])
     radius = FIELD.diameter / 2
     for target in FIELD.targets:
