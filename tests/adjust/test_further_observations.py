@@ -1,6 +1,5 @@
-"""Distances, observed orientations and earlier calibrations beside image points."""
+"""Distances and observed orientations beside image points."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,16 +13,11 @@ from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
 from adjust.network import (
-    Approximations,
-    Calibration,
     Distance,
     Exterior,
-    Fiducial,
     Network,
     ObjectPoint,
-    Observations,
     Prior,
-    Transformation,
 )
 from adjust.numbering import Numbering
 from adjust.problem import number
@@ -234,145 +228,5 @@ def test_a_distance_that_cannot_be_is_refused(distance: Distance, words: list[st
     network = replace(network, points=(*network.points, lonely), distances=(distance,))
     with pytest.raises(AdjustmentError) as error:
         adjust(network, start)
-    for word in words:
-        assert word in str(error.value)
-
-
-def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, Approximations], ...]:
-    """Two data sets of one camera, their names with an A and a B, and both together; errors as small as one likes."""
-    networks = []
-    for prefix, seed in (("A", 1), ("B", 2)):
-        rng = np.random.default_rng(seed)
-        free = {"k3": np.inf, "p1": np.inf}
-        network, start = simulated(rng, None, kind, field_points(rng, 14), 0.0, free, False, 0.002 * noise)
-        rows = network.observations
-        rows = replace(
-            rows,
-            image=tuple(prefix + name for name in rows.image),
-            point=tuple(p if k == "fiducial" else prefix + p for p, k in zip(rows.point, rows.kind, strict=True)),
-            xy_mm=rows.xy_mm + noise * rng.normal(0.0, 0.004, rows.xy_mm.shape),
-            covariance_mm2=noise**2 * rows.covariance_mm2,
-        )
-        images = tuple(replace(image, name=prefix + image.name) for image in network.images)
-        points = tuple(replace(point, id=prefix + point.id) for point in network.points)
-        network = replace(network, images=images, points=points, observations=rows)
-        exterior, films, known = (
-            {prefix + k: v for k, v in each.items()} for each in (start.exterior, start.transformation, start.points)
-        )
-        networks.append((network, replace(start, exterior=exterior, transformation=films, points=known)))
-    (a, start_a), (b, start_b) = networks
-    rows_a, rows_b = a.observations, b.observations
-    rows = Observations(
-        rows_a.image + rows_b.image,
-        rows_a.point + rows_b.point,
-        rows_a.kind + rows_b.kind,
-        np.vstack([rows_a.xy_mm, rows_b.xy_mm]),
-        np.vstack([rows_a.covariance_mm2, rows_b.covariance_mm2]),
-    )
-    joint = replace(a, images=a.images + b.images, points=a.points + b.points, observations=rows)
-    exterior = {**start_a.exterior, **start_b.exterior}
-    films = {**start_a.transformation, **start_b.transformation}
-    known = {**start_a.points, **start_b.points}
-    start_joint = replace(start_a, exterior=exterior, transformation=films, points=known)
-    return (a, start_a), (b, start_b), (joint, start_joint)
-
-
-def calibration_of(result: Adjustment, fiducials: bool) -> Calibration:
-    kinds = ("IO.", "FID.") if fiducials else ("IO.",)
-    names = [name for name in result.names if name.startswith(kinds) and result.cofactor_of([name])[0, 0] > 0.0]
-    return Calibration(tuple(names), np.array([result.value(n) for n in names]), result.cofactor_of(names))
-
-
-def with_calibration(network: Network, calibration: Calibration) -> Network:
-    """The network with that calibration in the place of the camera's priors."""
-    value = dict(zip(calibration.names, calibration.values.tolist(), strict=True))
-
-    def freed(name: str, prior: Prior) -> Prior:
-        return Prior(value[name], np.inf) if name in value else prior
-
-    (camera,) = network.cameras
-    assert camera.principal_distance_mm is not None
-    assert camera.x0_mm is not None
-    assert camera.y0_mm is not None
-    parameters = camera.distortion.parameters
-    free = replace(
-        camera,
-        principal_distance_mm=freed("IO.K.c", camera.principal_distance_mm),
-        x0_mm=freed("IO.K.x0", camera.x0_mm),
-        y0_mm=freed("IO.K.y0", camera.y0_mm),
-        distortion=replace(camera.distortion, parameters={n: freed(f"IO.K.{n}", p) for n, p in parameters.items()}),
-        fiducials={
-            id_: Fiducial(freed(f"FID.K.{id_}.x", mark.x_mm), freed(f"FID.K.{id_}.y", mark.y_mm))
-            for id_, mark in camera.fiducials.items()
-        },
-    )
-    return replace(network, cameras=(free,), calibrations=(calibration,))
-
-
-@pytest.mark.parametrize("kind", ["none", "affine"])
-def test_an_earlier_calibration_stands_for_its_observations(kind: Transformation) -> None:
-    """A, then B with A's calibration, is A and B together: values, sigmas, v'Pv and redundancy.
-
-    The calibration is A made linear, so that with real errors the difference is of second order, some 5e-4 of the
-    standard deviations; with errors of a thousandth it must be a thousand times less.
-    """
-    differences = []
-    for noise in (1.0, 1e-3):
-        (a, start_a), (b, start_b), (joint, start_joint) = two_networks(kind, noise)
-        first, both = adjust(a, start_a), adjust(joint, start_joint)
-        second = adjust(with_calibration(b, calibration_of(first, kind != "none")), start_b)
-        assert second.converged
-        names = [name for name in second.names if both.cofactor_of([name])[0, 0] > 0.0]
-        sigmas = np.sqrt([both.cofactor_of([name])[0, 0] for name in names])
-        change = np.array([second.value(name) - both.value(name) for name in names]) / sigmas
-        differences.append(float(np.abs(change).max()))
-        np.testing.assert_allclose(np.sqrt([second.cofactor_of([n])[0, 0] for n in names]), sigmas, rtol=1e-4 * noise)
-        assert first.vpv + second.vpv == pytest.approx(both.vpv, abs=1e-3 * noise)
-        assert first.redundancy + second.redundancy == both.redundancy
-        assert sum(group.redundancy for group in second.groups.values()) == pytest.approx(second.redundancy)
-        assert second.warnings == ()
-    assert differences[0] < 1e-3
-    assert differences[1] < 1e-6
-
-
-def test_a_fiducial_that_no_image_shows_has_no_part_in_a_calibration() -> None:
-    """It is not tied to its calibrated place, which would hold the others as well."""
-    (a, start_a), (b, start_b), _ = two_networks("affine", 1.0)
-    calibration = calibration_of(adjust(a, start_a), fiducials=True)
-    rows = b.observations
-    keep = [i for i, (p, k) in enumerate(zip(rows.point, rows.kind, strict=True)) if (p, k) != ("5", "fiducial")]
-    rows = Observations(
-        tuple(rows.image[i] for i in keep),
-        tuple(rows.point[i] for i in keep),
-        tuple(rows.kind[i] for i in keep),
-        rows.xy_mm[keep],
-        rows.covariance_mm2[keep],
-    )
-    result = adjust(with_calibration(replace(b, observations=rows), calibration), start_b)
-    assert not any(".5." in row.name for row in result.further)
-    assert len(result.further) == len(calibration.names) - 2
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda n, c: replace(n, calibrations=(replace(c, names=("IO.K.q", *c.names[1:])),)), ["IO.K.q", "no camera"]),
-        (lambda n, c: replace(n, calibrations=(c,)), ["IO.K.c", "standard deviation of its own (1)", "twice"]),
-        (lambda n, c: replace(with_calibration(n, c), calibrations=(c, c)), ["IO.K.c", "another calibration"]),
-        (
-            lambda n, c: with_calibration(n, replace(c, covariance=np.ones_like(c.covariance))),
-            ["not positive definite", "IO.K.c"],
-        ),
-        (lambda n, c: with_calibration(n, replace(c, covariance=c.covariance[:2])), ["shape (2, 5)"]),
-    ],
-)
-def test_a_calibration_that_cannot_be_is_refused(
-    change: Callable[[Network, Calibration], Network], words: list[str]
-) -> None:
-    network, start = simulated(np.random.default_rng(5), kind="none", free={"k3": np.inf, "p1": np.inf})
-    names = tuple(f"IO.K.{name}" for name in ("c", "x0", "y0", "k3", "p1"))
-    calibration = Calibration(names, np.array([153.0, 0.0, 0.0, 1.5e-7, 0.0]), np.diag([1.0, 1.0, 1.0, 1e-18, 1e-16]))
-    with pytest.raises(AdjustmentError) as error:
-        adjust(change(network, calibration), start)
     for word in words:
         assert word in str(error.value)

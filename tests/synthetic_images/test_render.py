@@ -1,81 +1,32 @@
 """Rendered scans against their truth, by means that know nothing of the renderer: centroids and symmetry."""
 
 import json
-import subprocess
-import sys
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import skimage.measure
-import tifffile
-from numpy.typing import NDArray
+from small_scene import CAMERA, CROSS, FIELD, OBLIQUE, PLACES, SCANNER, Array, hidden_field, rendered, scene
 
-import synthetic_images
-from synthetic_images.areas import bar, disk, ring
+from synthetic_images.areas import disk
 from synthetic_images.frame import frame_truth
 from synthetic_images.projection import object_rotation
-from synthetic_images.render import render_scene
 from synthetic_images.scene import (
     POSES,
     BoardField,
     ChipMark,
-    Compression,
     DiskField,
     DiskTarget,
     Distortion,
-    DrawnMark,
     Film,
     FilmTransformation,
-    Scanner,
-    Scene,
-    SceneCamera,
     SceneFiducial,
     SceneImage,
     Tones,
 )
-from synthetic_images.truth import Truth
-
-Array = NDArray[np.float64]
 
 CENTER_PX = 0.002  # what a rendered centre must keep to
-
-CROSS = DrawnMark((ring((0.0, 0.0), 0.5, 0.1), bar((-0.4, 0.0), (0.4, 0.0), 0.1), bar((0.0, -0.4), (0.0, 0.4), 0.1)))
-PLACES = {"a": (4.0, -4.1), "b": (-4.2, -4.0), "c": (-4.0, 4.3), "d": (3.9, 3.8)}
-CAMERA = SceneCamera(
-    "small",
-    (12.0, 12.0),
-    14.0,
-    (0.05, -0.04),
-    Distortion("torlegard", {"k3": -2.0e-4, "p1": 3.0e-5}),
-    tuple(SceneFiducial(id, xy, CROSS) for id, xy in PLACES.items()),
-)
-FIELD = DiskField(
-    tuple(
-        DiskTarget(f"{10 * i + j}", (0.55 * i, 0.55 * j, 0.1 * ((i + j) % 3)), (0.1, 0.05, 1.0))
-        for i in (-1, 0, 1)
-        for j in (-1, 0, 1)
-    ),
-    0.12,
-    surround=0.0,
-)
-OBLIQUE = SceneImage("f", (1.2, -0.5, 3.2, 0.16, 0.34, 0.4))
-SCANNER = Scanner((40.0, 40.0), margin_mm=1.0)
-
-
-def scene(**changes: Any) -> Scene:
-    plain = Scene("test", 4, CAMERA, FIELD, (OBLIQUE,), SCANNER, Film(), Tones(contrast=0.0), pad_mm=1.2)
-    return replace(plain, **changes)
-
-
-def rendered(folder: Path, made: Scene) -> tuple[Array, Truth]:
-    """The first scan's grey values as shares of full scale, and the truth."""
-    truth = render_scene(made, folder)
-    grey = tifffile.imread(folder / "scans" / f"{made.images[0].name}.tif")
-    return np.asarray(grey, np.float64) / np.iinfo(grey.dtype).max, truth
 
 
 def centroid(picture: Array, near_px: Array, half: int) -> Array:
@@ -131,10 +82,6 @@ def test_a_symmetric_mark_is_rendered_symmetrically(tmp_path: Path) -> None:
     assert np.abs(picture - picture.T).max() < 2e-5
 
 
-def hidden_field() -> DiskField:
-    return DiskField((DiskTarget("1", (0.0, 0.0, 50.0)),), 0.1)
-
-
 def test_a_chip_lies_with_its_origin_on_the_mark(tmp_path: Path) -> None:
     chip = np.zeros((41, 51))
     rows, columns = np.indices(chip.shape)
@@ -144,94 +91,6 @@ def test_a_chip_lies_with_its_origin_on_the_mark(tmp_path: Path) -> None:
     picture, truth = rendered(tmp_path, scene(camera=camera, field=hidden_field()))
     for position in truth.frames[0].fiducials.values():
         assert np.abs(centroid(picture, position.center_px, 14) - position.center_px).max() < 0.01
-
-
-@pytest.fixture(scope="module")
-def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Array]:
-    """The same scene in grey and in colour, uncompressed in strips."""
-    folder = tmp_path_factory.mktemp("plain")
-    return {
-        colour: rendered(folder / str(colour), scene(scanner=replace(SCANNER, colour=colour, noise=0.01)))[0]
-        for colour in (False, True)
-    }
-
-
-@pytest.mark.parametrize("compression", ["none", "lzw", "deflate", "zstd"])
-@pytest.mark.parametrize("tile_px", [0, 64, 384])
-@pytest.mark.parametrize("colour", [False, True])
-def test_files_hold_the_same_picture(
-    tmp_path: Path, stored_plainly: dict[bool, Array], compression: Compression, tile_px: int, colour: bool
-) -> None:
-    scanner = replace(SCANNER, colour=colour, noise=0.01, compression=compression, tile_px=tile_px)
-    picture, _ = rendered(tmp_path, scene(scanner=scanner))
-    assert picture.shape == ((350, 350, 3) if colour else (350, 350))
-    assert np.array_equal(picture, stored_plainly[colour])
-    with tifffile.TiffFile(tmp_path / "scans" / "f.tif") as file:
-        tags = file.pages.first.tags
-        assert tags["XResolution"].value[0] / tags["XResolution"].value[1] == pytest.approx(250.0)  # a cm over 40 um
-        assert ("TileWidth" in tags) == (tile_px > 0)
-
-
-@pytest.mark.parametrize("tile_px", [0, 64])
-@pytest.mark.parametrize("colour", [False, True])
-def test_jpeg_is_near(tmp_path: Path, tile_px: int, colour: bool) -> None:
-    scanner = replace(SCANNER, bit_depth=8, colour=colour, tile_px=tile_px)
-    expected, _ = rendered(tmp_path / "a", scene(scanner=scanner))
-    picture, _ = rendered(tmp_path / "b", scene(scanner=replace(scanner, compression="jpeg")))
-    assert 0.0 < np.abs(picture - expected).max() < 0.06
-
-
-def test_eight_bits_are_the_sixteen_rounded(tmp_path: Path) -> None:
-    fine, _ = rendered(tmp_path / "16", scene())
-    coarse, _ = rendered(tmp_path / "8", scene(scanner=replace(SCANNER, bit_depth=8)))
-    assert np.abs(coarse - fine).max() < 0.51 / 255
-
-
-def test_a_negative_is_the_positive_reversed(tmp_path: Path) -> None:
-    positive, truth = rendered(tmp_path / "p", scene())
-    negative, _ = rendered(tmp_path / "n", scene(scanner=replace(SCANNER, negative=True)))
-    assert np.abs(negative - (1 - positive)).max() < 2e-5
-    assert positive[tuple(np.rint(truth.frames[0].fiducials["a"].center_px[::-1]).astype(int))] > 0.5
-
-
-def test_white_is_zero_changes_the_file_and_not_the_picture(tmp_path: Path) -> None:
-    usual, _ = rendered(tmp_path / "b", scene())
-    stored, _ = rendered(tmp_path / "w", scene(scanner=replace(SCANNER, white_is_zero=True)))
-    assert np.abs(stored - (1 - usual)).max() < 2e-5
-    with tifffile.TiffFile(tmp_path / "w" / "scans" / "f.tif") as file:
-        assert file.pages.first.tags["PhotometricInterpretation"].value == 0
-
-
-def test_grain_and_noise_have_the_strength_and_the_correlation_asked_for(tmp_path: Path) -> None:
-    sigma = 1.2
-    made = scene(
-        film=Film(grain=0.03, grain_px=sigma),
-        scanner=replace(SCANNER, noise=0.01, margin_mm=5.0, blur_px=0.0),
-        field=hidden_field(),
-        camera=replace(CAMERA, fiducials=()),
-        tones=Tones(border=0.4, background=0.4, contrast=0.0),
-    )
-    picture, _ = rendered(tmp_path, made)
-    noise = picture - picture.mean()
-    assert noise.std() == pytest.approx(np.hypot(0.03, 0.01), rel=0.02)
-    beside = float((noise[:, 1:] * noise[:, :-1]).mean())
-    below = float((noise[2:] * noise[:-2]).mean())
-    # White noise after a Gaussian is correlated by exp(-d^2 / (4 sigma^2)); across the seams of the strips too.
-    assert beside == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.05)
-    assert below == pytest.approx(0.03**2 * np.exp(-4 / (4 * sigma**2)), rel=0.07)
-    seam = float((noise[255] * noise[256]).mean())
-    assert seam == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.35)
-
-
-def test_the_same_scene_gives_the_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
-    film = Film(grain=0.02, dust=5, scratches=1, hairs=1)
-    made = scene(film=film, background="terrain", tones=Tones())
-    for name, one in (("a", made), ("b", made), ("c", replace(made, seed=5))):
-        render_scene(one, tmp_path / name)
-    scans = [(tmp_path / name / "scans" / "f.tif").read_bytes() for name in "abc"]
-    assert scans[0] == scans[1]
-    assert scans[0] != scans[2]
-    assert (tmp_path / "a" / "truth.json").read_bytes() == (tmp_path / "b" / "truth.json").read_bytes()
 
 
 def test_what_cannot_be_seen_is_said(tmp_path: Path) -> None:
@@ -307,18 +166,6 @@ def test_circle_grids_hold_their_dots(tmp_path: Path, asymmetric: bool, dots: in
     assert np.abs(misses).max() < CENTER_PX
 
 
-def test_memory_does_not_grow_with_the_scans_length(tmp_path: Path) -> None:
-    peaks = []
-    for height_mm in (40.0, 160.0):
-        camera = replace(CAMERA, frame_mm=(40.0, height_mm), fiducials=())
-        made = scene(camera=camera, film=Film(grain=0.02), field=hidden_field())
-        tracemalloc.start()
-        render_scene(made, tmp_path)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < 1.1 * peaks[0]
-
-
 def test_a_disk_is_no_smaller_than_it_should_be(tmp_path: Path) -> None:
     """Seen upright from 3 m with c = 14 mm, a disk of 0.12 m has pi (0.06 / 3 * 14 / 0.04)^2 px."""
     camera = replace(CAMERA, distortion=Distortion(), fiducials=())
@@ -329,19 +176,6 @@ def test_a_disk_is_no_smaller_than_it_should_be(tmp_path: Path) -> None:
     col, row = np.rint(truth.frames[0].targets["1"].center_px).astype(int)
     window = picture[row - 14 : row + 15, col - 14 : col + 15]
     assert (window - 0.2).sum() / 0.6 == pytest.approx(np.pi * 7.0**2, rel=5e-4)
-
-
-def test_a_failed_rendering_leaves_the_earlier_scan(tmp_path: Path) -> None:
-    render_scene(scene(), tmp_path)
-    before = (tmp_path / "scans" / "f.tif").read_bytes()
-
-    def stop(image: str, done: int, total: int) -> None:
-        raise OSError(f"{image} {done} {total}")
-
-    with pytest.raises(OSError, match="f 1 2"):
-        render_scene(scene(seed=9), tmp_path, stop)
-    assert (tmp_path / "scans" / "f.tif").read_bytes() == before
-    assert sorted(path.name for path in (tmp_path / "scans").iterdir()) == ["f.tif"]
 
 
 def test_a_polygonised_disk_is_a_disk() -> None:
@@ -365,25 +199,3 @@ def test_eccentricity_follows_the_closed_form() -> None:
         e_mm = 14.0 * radius**2 * (n[:2] * n[2] + c[:2] / c[2] * tilt) / (c[2] ** 2 - radius**2 * tilt)
         position = frame.targets[target.id]
         assert position.figure_px - position.center_px == pytest.approx(e_mm / 0.04, abs=1e-5)
-
-
-@pytest.mark.slow
-def test_a_frame_of_real_size_needs_little_memory(tmp_path: Path) -> None:
-    """23 x 23 cm at 20 um, 16 bit, grain, dust, in a process of its own."""
-    program = """
-import resource, sys
-from dataclasses import replace
-from pathlib import Path
-from pipeline.rendered.scene_file import read_scene
-from synthetic_images.render import render_scene
-made = read_scene(Path(sys.argv[1])).scene
-made = replace(made, images=made.images[:1], scanner=replace(made.scanner, pitch_um=(20.0, 20.0)))
-render_scene(made, Path(sys.argv[2]))
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-"""
-    aerial = Path(synthetic_images.__file__).parent / "scenes" / "aerial_five.toml"
-    command = [sys.executable, "-c", program, str(aerial), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    with tifffile.TiffFile(next((tmp_path / "scans").glob("*.tif"))) as file:
-        assert file.pages.first.shape == (12000, 12000)
-    assert int(done.stdout) < 600 * 1024  # KiB

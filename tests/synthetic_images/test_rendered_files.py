@@ -1,0 +1,151 @@
+"""Files of rendered scans: every way to store one picture holds it, in little memory, the same in every run."""
+
+import subprocess
+import sys
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from small_scene import CAMERA, SCANNER, Array, hidden_field, rendered, scene
+
+import synthetic_images
+from synthetic_images.render import render_scene
+from synthetic_images.scene import Compression, Film, Tones
+
+
+@pytest.fixture(scope="module")
+def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Array]:
+    """The same scene in grey and in colour, uncompressed in strips."""
+    folder = tmp_path_factory.mktemp("plain")
+    return {
+        colour: rendered(folder / str(colour), scene(scanner=replace(SCANNER, colour=colour, noise=0.01)))[0]
+        for colour in (False, True)
+    }
+
+
+@pytest.mark.parametrize("compression", ["none", "lzw", "deflate", "zstd"])
+@pytest.mark.parametrize("tile_px", [0, 64, 384])
+@pytest.mark.parametrize("colour", [False, True])
+def test_files_hold_the_same_picture(
+    tmp_path: Path, stored_plainly: dict[bool, Array], compression: Compression, tile_px: int, colour: bool
+) -> None:
+    scanner = replace(SCANNER, colour=colour, noise=0.01, compression=compression, tile_px=tile_px)
+    picture, _ = rendered(tmp_path, scene(scanner=scanner))
+    assert picture.shape == ((350, 350, 3) if colour else (350, 350))
+    assert np.array_equal(picture, stored_plainly[colour])
+    with tifffile.TiffFile(tmp_path / "scans" / "f.tif") as file:
+        tags = file.pages.first.tags
+        assert tags["XResolution"].value[0] / tags["XResolution"].value[1] == pytest.approx(250.0)  # a cm over 40 um
+        assert ("TileWidth" in tags) == (tile_px > 0)
+
+
+@pytest.mark.parametrize("tile_px", [0, 64])
+@pytest.mark.parametrize("colour", [False, True])
+def test_jpeg_is_near(tmp_path: Path, tile_px: int, colour: bool) -> None:
+    scanner = replace(SCANNER, bit_depth=8, colour=colour, tile_px=tile_px)
+    expected, _ = rendered(tmp_path / "a", scene(scanner=scanner))
+    picture, _ = rendered(tmp_path / "b", scene(scanner=replace(scanner, compression="jpeg")))
+    assert 0.0 < np.abs(picture - expected).max() < 0.06
+
+
+def test_eight_bits_are_the_sixteen_rounded(tmp_path: Path) -> None:
+    fine, _ = rendered(tmp_path / "16", scene())
+    coarse, _ = rendered(tmp_path / "8", scene(scanner=replace(SCANNER, bit_depth=8)))
+    assert np.abs(coarse - fine).max() < 0.51 / 255
+
+
+def test_a_negative_is_the_positive_reversed(tmp_path: Path) -> None:
+    positive, truth = rendered(tmp_path / "p", scene())
+    negative, _ = rendered(tmp_path / "n", scene(scanner=replace(SCANNER, negative=True)))
+    assert np.abs(negative - (1 - positive)).max() < 2e-5
+    assert positive[tuple(np.rint(truth.frames[0].fiducials["a"].center_px[::-1]).astype(int))] > 0.5
+
+
+def test_white_is_zero_changes_the_file_and_not_the_picture(tmp_path: Path) -> None:
+    usual, _ = rendered(tmp_path / "b", scene())
+    stored, _ = rendered(tmp_path / "w", scene(scanner=replace(SCANNER, white_is_zero=True)))
+    assert np.abs(stored - (1 - usual)).max() < 2e-5
+    with tifffile.TiffFile(tmp_path / "w" / "scans" / "f.tif") as file:
+        assert file.pages.first.tags["PhotometricInterpretation"].value == 0
+
+
+def test_grain_and_noise_have_the_strength_and_the_correlation_asked_for(tmp_path: Path) -> None:
+    sigma = 1.2
+    made = scene(
+        film=Film(grain=0.03, grain_px=sigma),
+        scanner=replace(SCANNER, noise=0.01, margin_mm=5.0, blur_px=0.0),
+        field=hidden_field(),
+        camera=replace(CAMERA, fiducials=()),
+        tones=Tones(border=0.4, background=0.4, contrast=0.0),
+    )
+    picture, _ = rendered(tmp_path, made)
+    noise = picture - picture.mean()
+    assert noise.std() == pytest.approx(np.hypot(0.03, 0.01), rel=0.02)
+    beside = float((noise[:, 1:] * noise[:, :-1]).mean())
+    below = float((noise[2:] * noise[:-2]).mean())
+    # White noise after a Gaussian is correlated by exp(-d^2 / (4 sigma^2)); across the seams of the strips too.
+    assert beside == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.05)
+    assert below == pytest.approx(0.03**2 * np.exp(-4 / (4 * sigma**2)), rel=0.07)
+    seam = float((noise[255] * noise[256]).mean())
+    assert seam == pytest.approx(0.03**2 * np.exp(-1 / (4 * sigma**2)), rel=0.35)
+
+
+def test_the_same_scene_gives_the_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
+    film = Film(grain=0.02, dust=5, scratches=1, hairs=1)
+    made = scene(film=film, background="terrain", tones=Tones())
+    for name, one in (("a", made), ("b", made), ("c", replace(made, seed=5))):
+        render_scene(one, tmp_path / name)
+    scans = [(tmp_path / name / "scans" / "f.tif").read_bytes() for name in "abc"]
+    assert scans[0] == scans[1]
+    assert scans[0] != scans[2]
+    assert (tmp_path / "a" / "truth.json").read_bytes() == (tmp_path / "b" / "truth.json").read_bytes()
+
+
+def test_memory_does_not_grow_with_the_scans_length(tmp_path: Path) -> None:
+    peaks = []
+    for height_mm in (40.0, 160.0):
+        camera = replace(CAMERA, frame_mm=(40.0, height_mm), fiducials=())
+        made = scene(camera=camera, film=Film(grain=0.02), field=hidden_field())
+        tracemalloc.start()
+        render_scene(made, tmp_path)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
+
+
+def test_a_failed_rendering_leaves_the_earlier_scan(tmp_path: Path) -> None:
+    render_scene(scene(), tmp_path)
+    before = (tmp_path / "scans" / "f.tif").read_bytes()
+
+    def stop(image: str, done: int, total: int) -> None:
+        raise OSError(f"{image} {done} {total}")
+
+    with pytest.raises(OSError, match="f 1 2"):
+        render_scene(scene(seed=9), tmp_path, stop)
+    assert (tmp_path / "scans" / "f.tif").read_bytes() == before
+    assert sorted(path.name for path in (tmp_path / "scans").iterdir()) == ["f.tif"]
+
+
+@pytest.mark.slow
+def test_a_frame_of_real_size_needs_little_memory(tmp_path: Path) -> None:
+    """23 x 23 cm at 20 um, 16 bit, grain, dust, in a process of its own."""
+    program = """
+import resource, sys
+from dataclasses import replace
+from pathlib import Path
+from pipeline.rendered.scene_file import read_scene
+from synthetic_images.render import render_scene
+made = read_scene(Path(sys.argv[1])).scene
+made = replace(made, images=made.images[:1], scanner=replace(made.scanner, pitch_um=(20.0, 20.0)))
+render_scene(made, Path(sys.argv[2]))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+    aerial = Path(synthetic_images.__file__).parent / "scenes" / "aerial_five.toml"
+    command = [sys.executable, "-c", program, str(aerial), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    with tifffile.TiffFile(next((tmp_path / "scans").glob("*.tif"))) as file:
+        assert file.pages.first.shape == (12000, 12000)
+    assert int(done.stdout) < 600 * 1024  # KiB
