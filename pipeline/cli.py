@@ -22,7 +22,8 @@ from pipeline.design.run import run_design
 from pipeline.errors import InputError
 from pipeline.files.library import PREFIX, library_json, library_path, print_library, read_library
 from pipeline.files.project_file import FINEST_PITCH_UM, Project, read_project
-from pipeline.measuring.camera_trials import identify, print_identification
+from pipeline.measuring.camera_answer import print_identification
+from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 from pipeline.summary import Summary, print_summary

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from measure.marks.shapes import FiducialLayout
+from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 
@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 
 _CHANCE = 0.01  # of doubting any good mark, of each check
 _FILM_MM = 0.005  # scatter of marks by film and scanner, where one frame has to be judged alone
-_GIVEN_MM = 0.1  # a datum's standard deviation may be a millimetre: the given places are better than that
 _OPPOSITE_MM = 0.3  # how far from being opposite about the centre two given marks may be: an affinity keeps midpoints
 _TOLD = np.log(100.0)  # log-odds at which one mark rather than another is taken for the one that is off
 _ROUNDS = 10  # of fitting the frames to the median of all, which comes to rest after a few
@@ -255,7 +254,7 @@ def _off_midpoint(
 ) -> dict[str, Doubt]:
     """The marks of the pair whose midpoint is farthest, in standard deviations, from that of the others."""
     given = np.array([mark.xy_mm for mark in layout.marks])
-    sigma = np.array([min(max(mark.sigma_mm), _GIVEN_MM) for mark in layout.marks])
+    sigma = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
     off = np.zeros((len(layout.marks), 2))
     variance = np.full(len(layout.marks), np.inf)
     off[seen.index] = seen.camera_mm - given[seen.index]

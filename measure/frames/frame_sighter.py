@@ -14,7 +14,7 @@ from measure.frames.frame import CLEAR_LIKENESS, Frame
 from measure.frames.frame_fit import fit_frame, strangers
 from measure.frames.refinement import Sighting, sight
 from measure.marks.poses import up_from_camera
-from measure.marks.shapes import FiducialLayout
+from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 from measure.search.constellation import NARROW, Placement, sign_of
 from measure.search.correlation import CLOSE
@@ -28,7 +28,6 @@ _LEAST_SIGNIFICANCE = 4.5  # of the contrast: what texture feigns stays below it
 _FAINT_SIGNIFICANCE = 2.0  # the same where noise hardly makes what is seen: contrast there is, at 95 %
 MANY = 6  # marks that agree and tell where a faint one must be
 _CLEAR_RESPONSE = 0.25  # correlation of marks before they are fitted, where likenesses are CLEAR_LIKENESS
-_GIVEN_SIGMA_MM = 0.1  # a datum's sigma may be a millimetre: the given places are better than that
 _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
 _REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
 CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
@@ -237,7 +236,7 @@ class FrameSighter:
     def _sigma_mm(self, index: NDArray[np.intp]) -> Array:
         covariances = [fit.covariance_px2 for fit in self._fits(index)]
         measured = np.sqrt(np.trace(np.array(covariances), axis1=1, axis2=2) / 2) * self.pitch.mean()
-        given = np.array([min(*self.layout.marks[i].sigma_mm, _GIVEN_SIGMA_MM) for i in index])
+        given = np.array([min(*self.layout.marks[i].sigma_mm, MOST_GIVEN_SIGMA_MM) for i in index])
         return np.asarray(np.sqrt(measured**2 + given**2 + self.options.film_sigma_mm**2))
 
 

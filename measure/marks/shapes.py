@@ -16,6 +16,7 @@ Side = Literal["left", "right", "top", "bottom"]
 Array = NDArray[np.float64]
 
 LEARNED_ORIGIN = 0.25  # of a learned mark's size: standard deviation of its template's origin about the mark
+MOST_GIVEN_SIGMA_MM = 0.1  # of a given place: a datum's sigma may be a millimetre, and its place is better than that
 _SEARCHED = 0.3  # of a frame corner's reach: the square that it is searched by
 
 

@@ -15,7 +15,7 @@ from adjust.undetermined.datum_choice import with_held
 from pipeline.adjusting.network import build_network, unmeasured_points
 from pipeline.files.project_file import Project
 from pipeline.measuring.comparator_file import ComparatorPoint
-from pipeline.measuring.disks import across, disk_normals, eccentricity_mm, plane_normal
+from pipeline.measuring.perspective_disks import across, disk_normals, eccentricity_mm, plane_normal
 from pipeline.wording import listed
 
 Array = NDArray[np.float64]

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
+from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.design.expected import Expected, expect
-from pipeline.design.setup import FEWEST_TARGETS, PlannedPoint, Setup
+from pipeline.design.setup import PlannedPoint, Setup
 from synthetic_images.scene import SceneImage
 
 Array = NDArray[np.float64]

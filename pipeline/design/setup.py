@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from adjust import network
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.network import Approximations, Network, Prior, Transformation
+from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.rendered.design_table import DesignSettings
@@ -19,8 +20,6 @@ from synthetic_images.scene import SceneCamera, SceneImage
 from synthetic_images.targets import field_targets
 
 Array = NDArray[np.float64]
-
-FEWEST_TARGETS = 3  # that an image must show to be oriented
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from adjust.network import ObjectPoint, Prior
+from measure.marks.poses import POSES
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera
@@ -19,7 +20,6 @@ from pipeline.files.tables import Table, read_toml
 from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 
-POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 

@@ -2,14 +2,11 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.padding import Padding
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
@@ -20,93 +17,17 @@ from measure.results import FrameMeasurement
 from measure.scans.scan import Scan, open_scan
 from measure.search.frame_search import expected_alike
 from pipeline.files.camera_file import CameraFile
+from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.progress import Count, Reporter
 
 Array = NDArray[np.float64]
-Json = dict[str, Any]
 
 _ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
 _STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is so deformed
-_OUTSTANDING = 2.0  # times what chance finds
 _CERTAIN = 0.01  # constellations expected by chance: no mark need be matched in wrong places to know better
 _BY_CHANCE = 1.0  # constellation expected: chance may have made it
 _ODDS = 1000.0  # times what chance makes of another camera's marks: that one is seen, and not this
-_CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
 _AFFINE = 6  # parameters
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What became of the cameras that share a layout of marks.
-
-    found: marks that are observations, of drawn ones. likeness: their mean correlation with the drawing; snr: the
-    median of contrast over noise. score: 0 to 1, as `_score` has it. chance: the score of the same marks in wrong
-    places, the layout stretched; None where no such comparison is needed. residual_sigmas, residual_mm: what an affine
-    transformation leaves, per axis, in standard deviations of marks and given places; None where it leaves nothing
-    over. expected: how many constellations that answer as well at reduced size chance makes in such a scan.
-    """
-
-    cameras: tuple[str, ...]
-    found: int
-    drawn: int
-    likeness: float
-    snr: float
-    score: float
-    chance: float | None
-    residual_sigmas: float | None
-    residual_mm: float | None
-    reason: str
-    seconds: float
-    expected: float
-
-    @property
-    def against_chance(self) -> str:
-        if self.chance is None:
-            return f"chance makes {self.expected:.1g} constellations that answer as well in such a scan"
-        return f"the same marks in wrong places score {self.chance:.2f}"
-
-    @property
-    def stands_out(self) -> bool:
-        return self.score > 0.0 and (self.chance is None or self.score >= _OUTSTANDING * self.chance)
-
-
-@dataclass(frozen=True)
-class Identification:
-    """The trials, best first, and what follows from them. unreported: by name, what cameras without any calibration
-    report rest on."""
-
-    scan: Path
-    trials: tuple[Trial, ...]
-    unreported: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def best(self) -> tuple[Trial, ...]:
-        """The trial that stands out, and those that come too near to be told from it."""
-        standing = [trial for trial in self.trials if trial.stands_out]
-        return tuple(trial for trial in standing if trial.score >= _CLOSE * standing[0].score)
-
-    def sentence(self) -> str:
-        if not self.best:
-            return (
-                f"{self.scan.name}: no camera of the library stands out. Its marks may be none of those drawn, or too "
-                "faint; --pitch helps where the scan's file does not say it."
-            )
-        first = self.best[0]
-        told = (
-            f"{self.scan.name}: {' or '.join(first.cameras)}, score {first.score:.2f}: {first.found} of {first.drawn} "
-            f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; {first.against_chance}."
-        )
-        if len(self.best) > 1:
-            told += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
-        elif len(first.cameras) > 1:
-            told += " Their marks are alike; the data strip or the focal length must decide."
-        named = [name for trial in self.best for name in trial.cameras if name in self.unreported]
-        return told + "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
-
-    def as_json(self) -> Json:
-        trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
-        best = [name for trial in self.best for name in trial.cameras]
-        return {"scan": str(self.scan), "best": best, "sentence": self.sentence(), "trials": trials}
 
 
 def identify(
@@ -165,26 +86,6 @@ def _not_measured(names: tuple[str, ...], drawn: int, expected: float) -> Trial:
     else:
         reason = "not measured: nowhere in the scan do its marks answer together"
     return Trial(names, 0, drawn, 0.0, 0.0, 0.0, None, None, None, reason, 0.0, expected)
-
-
-def print_identification(identification: Identification, console: Console) -> None:
-    for trial in identification.trials:
-        console.print(", ".join(trial.cameras), style="bold", highlight=False)
-        console.print(Padding(_figures(trial), (0, 0, 0, 4)), highlight=False)
-    console.print(identification.sentence(), highlight=False, soft_wrap=True)
-
-
-def _figures(trial: Trial) -> str:
-    if not trial.found:
-        return f"{trial.score:.2f}: {trial.reason}"
-    words = [f"{trial.score:.2f}: {trial.found} of {trial.drawn} marks, likeness {trial.likeness:.2f}"]
-    words.append(f"signal-to-noise {trial.snr:.1f}")
-    if trial.residual_mm is not None:
-        words.append(f"affine residual {trial.residual_mm:.3f} mm ({trial.residual_sigmas:.0f} sigma)")
-    words.append(f"by chance {trial.expected:.1g}")
-    if trial.chance is not None:
-        words.append(f"in wrong places {trial.chance:.2f}")
-    return f"{', '.join(words)}; {trial.seconds:.0f} s"
 
 
 def _alike(cameras: Mapping[str, CameraFile]) -> list[tuple[str, ...]]:

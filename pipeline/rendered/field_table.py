@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.ring_codes import RingCode
+from pipeline.files.project_file import UNITS_MM
 from pipeline.files.tables import Table
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarget, RingFigure
 
 Array = NDArray[np.float64]
 
-UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 KINDS = ("disks", "crosses", "coded-rings", "chessboard", "circle-grid", "natural")
 
 

@@ -16,9 +16,9 @@ from measure.marks import shapes
 from pipeline.files.atomic import write_atomically
 from pipeline.files.camera_file import CameraFile, GivenFiducial
 from pipeline.files.camera_text import camera_text
+from pipeline.files.project_file import UNITS_MM
 from pipeline.files.template_table import saved_in
 from pipeline.rendered.design_table import DesignSettings
-from pipeline.rendered.field_table import UNITS_MM
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, FilmKind, RingFigure, Scene, SceneImage
 from synthetic_images.targets import Target, field_targets
 

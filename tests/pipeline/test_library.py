@@ -17,7 +17,8 @@ from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path, read_library
 from pipeline.files.project_file import read_project
 from pipeline.measuring import camera_trials
-from pipeline.measuring.camera_trials import Identification, Trial, identify
+from pipeline.measuring.camera_answer import Identification, Trial
+from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Reporter
 from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.rendered.scene_file import render_project
