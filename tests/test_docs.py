@@ -92,3 +92,18 @@ def test_every_module_stands_on_the_map_of_the_code_with_its_own_words() -> None
     for name, path in modules.items():
         own = " ".join((ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split())
         assert own.startswith(told[name]), name
+
+
+def test_what_the_map_of_the_code_says_to_enter_by_exists() -> None:
+    """Above the list of a folder's modules: a name with a dot is one of theirs, or a file."""
+    named, folder = set(), ""
+    for line in (DOCS / "code.md").read_text(encoding="utf-8").splitlines():
+        if line.startswith("#"):
+            heading = re.match(r"### .*`([\w/]+)/`$", line)
+            folder = heading[1].replace("/", ".") if heading else ""
+        elif folder and not line.startswith("- "):
+            named |= {f"{folder}.{name}" for name in re.findall(r"`(\w+\.\w+)`", line)}
+    named = {name for name in named if not name.endswith((".csv", ".json"))}
+    assert len(named) > 40
+    missing = [name for name in sorted(named) if not _exists(name)]
+    assert not missing

@@ -1,7 +1,6 @@
 """Where near its predicted place a mark looks most like itself, at full or half resolution, and whether noise would
 look so."""
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -42,12 +41,8 @@ def strongest(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
     return look.center_px, look.height
 
 
-@dataclass(init=False, eq=False)
 class _Look:
     """center_px (2,): where the mark, drawn with that blur, correlates best; height: how well."""
-
-    center_px: Array
-    height: float
 
     def __init__(self, scan: Scan, expected: MarkPrediction, blur_px: float) -> None:
         mark, surroundings = expected.mark, expected.surroundings
@@ -75,7 +70,7 @@ class _Look:
         self._places = int(near.sum())
         # A fit that begins within a part of a pixel takes a step less.
         top = highest(response, np.array([self._best[::-1]]), 0.0)[0][0]
-        self.center_px = (top + np.array([col0, row0]) - low) * reduction + shift_px
+        self.center_px: Array = (top + np.array([col0, row0]) - low) * reduction + shift_px
         self.height = float(response[self._best])
 
     @cached_property

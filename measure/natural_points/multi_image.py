@@ -191,7 +191,6 @@ class _Fit:
     def result(self) -> tuple[Matched, ...]:
         """The pieces with covariances from the noise that is left between them."""
         count = len(self.pieces)
-
         residuals = (self.values - self.values.mean(axis=0)) * self.used
         # Of a piece's own noise the mean has taken its share.
         residuals *= np.sqrt(count / (count - 1))

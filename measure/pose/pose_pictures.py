@@ -195,7 +195,7 @@ class Site:
 
     def _placed(self, window: Array, view: View, spare: int) -> View:
         """A chip moved to where the window is most like it."""
-        if view.reached.all() or not view.told.any():
+        if not view.is_chip or not view.told.any():
             return view
         core = slice(spare, len(window) - spare)
         grey, told = (np.asarray(each[core, core], np.float32) for each in (view.grey, view.told))
