@@ -77,7 +77,7 @@ class FrameSighter:
 
     def choose_channels(self) -> None:
         """Of a colour scan: the channel in which some marks are most like their drawings, then from these the best
-        combination."""
+        combination. Where no mark is drawn light or dark, the polarity is that of the combination."""
         if self.scan.channels == 1:
             return
         step = max(1, len(self.layout.marks) // _CHANNEL_TRIALS)
@@ -89,8 +89,12 @@ class FrameSighter:
             ]
             place, height = max(answers, key=lambda answer: answer[1])
             if height > _CLEAR_RESPONSE:
-                places.append((expected.mark, expected.moved(place).pixel_from_mark))
-        self.weights = best_weights(self.scan, places)
+                places.append((expected.mark, expected.moved(place).pixel_from_mark, expected.polarity))
+        unsaid = all(mark.mark.polarity == "auto" for mark in self.layout.marks)
+        best = best_weights(self.scan, places, (1, -1) if unsaid else (1,))
+        if best is not None:
+            self.weights, sign = best
+            self.placement = replace(self.placement, polarity=sign * self.placement.polarity)
 
     def look(self, indices: Sequence[int], search_px: float) -> None:
         """Sight marks anew, within search_px of where they are predicted now."""
