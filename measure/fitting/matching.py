@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from measure.fitting.changed_tone import covariance_of_changed_tone
 from measure.fitting.clipping import Sides
 from measure.fitting.generators import is_round
+from measure.fitting.landscape import covariance_of_landscape
 from measure.fitting.linear_fit import LinearFit
 from measure.fitting.own_shape import OwnShape, own_shape
-from measure.fitting.picture_fit import PictureFit
+from measure.fitting.picture_fit import EDGE_BLURS, PictureFit
 from measure.fitting.picture_model import GREY, PictureModel, State, background_px
 from measure.fitting.scan_window import ScanWindow
 from measure.fitting.second_order import second_order
 from measure.fitting.second_place import SecondPlace, edge_place, sloping_place
-from measure.marks.rendering import extent_px, known
+from measure.marks.rendering import extent_px, frame_beside, known
 from measure.marks.shapes import Mark, MarkTemplate
 from measure.match_options import MatchOptions
 from measure.noise.blank_film import blank_patches, is_coloured
@@ -37,7 +38,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SPARE_PX = 2.0  # beyond the margin: room for the mark to move
-_BORDER_PX = 4.0  # within the frame's border, where a mark grows out of it: so far its edge is blurred
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +104,7 @@ def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: Match
         if not detail.reason:
             whole = _with_ground(given, detail_part, detail) if fit.reason else fit
             part, fit = detail_part, whole if _is_right(whole) else detail
-    free = given.blank.copy()
-    free[part.rows, part.cols] &= ~fit.area
-    result = _result(fit, given.grey, free)
+    result = _result(fit, _surroundings(given, part, fit))
     moved = np.array(result.pixel_from_mark)
     moved[:, 2] += part.corner_px + window.origin_px
     return replace(result, center_px=moved[:, 2], pixel_from_mark=moved)
@@ -128,8 +126,7 @@ class _Given(NamedTuple):
 def _given(window: ScanWindow, mark: Mark, pixel_from_mark: Array) -> _Given:
     start = np.array(pixel_from_mark, dtype=float)
     start[:, 2] -= window.origin_px
-    rows, cols = window.usable.shape
-    usable, sides = window.usable & known(mark, start, cols, rows, _BORDER_PX), window.sides
+    usable, sides = window.usable, window.sides
     # A chip's picture is smoothed for the fit, and blank film beside it is not.
     has_none = window.is_lossy or isinstance(mark, MarkTemplate)
     blank = np.zeros_like(usable) if has_none else usable & (sides == 0)
@@ -179,6 +176,23 @@ def _with_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
     return fit
 
 
+class _Surroundings(NamedTuple):
+    """The whole window (height, width) about a mark: its grey values; free: what may be blank film as that under the
+    mark; frame: where it shows the exposed frame that the mark is cut into."""
+
+    grey: Array
+    free: Mask
+    frame: Mask
+
+
+def _surroundings(given: _Given, part: _Part, fit: PictureFit) -> _Surroundings:
+    place, (height, width) = fit.model.state.moved(part.corner_px).pixel_from_mark, given.grey.shape
+    where = given.mark, place, width, height, EDGE_BLURS * fit.model.seen_blur_px
+    free = given.blank & known(*where)
+    free[part.rows, part.cols] &= ~fit.area
+    return _Surroundings(given.grey, free, given.usable & frame_beside(*where))
+
+
 def _begun(
     given: _Given, part: _Part, options: MatchOptions, coarse_px: float | None, state: State | None = None
 ) -> PictureFit:
@@ -211,16 +225,16 @@ def window_about(mark: Mark, pixel_from_mark: Array, margin_px: float) -> tuple[
     return int(col0), int(row0), int(col1 - col0 + 1), int(row1 - row0 + 1)
 
 
-def _result(fit: PictureFit, window: Array, free: Mask) -> Match:
-    """The match in the pixels of the fit's own window; free: which pixels of the whole window may be blank film."""
+def _result(fit: PictureFit, about: _Surroundings) -> Match:
+    """The match in the pixels of the fit's own window."""
     model, used = fit.model, fit.telling
     noise = noise_model(model.scores, fit.used, len(model.design), float(model.information[fit.used].sum()))
     precision = _Precision(np.full((len(model.design),) * 2, np.inf), np.inf)
     if not fit.reason:
-        patches = blank_patches(window, free, noise.variance_dn2)
+        patches = blank_patches(about.grey, about.free, noise.variance_dn2)
         if not noise.is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
-        precision = _weighed(fit, used, noise)
+        precision = _weighed(fit, used, noise, about)
     state, covariance = model.state, precision.covariance
     return Match(
         converged=not fit.reason,
@@ -257,7 +271,7 @@ class _Precision(NamedTuple):
     own_shape: OwnShape | None = None
 
 
-def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel) -> _Precision:
+def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surroundings) -> _Precision:
     """The fit ended with the weights of its noise. used: the pixels that said how large this is."""
     model = fit.model
     covariance, by_grey = fit.weigh(noise)
@@ -266,6 +280,8 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel) -> _Precision:
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))
         covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
+    if about.frame.any():
+        covariance[:2, :2] += covariance_of_landscape(about.grey, about.frame, by_grey[:2] * model.design[-GREY])
     linear = LinearFit(model.residuals, used, model.design, by_grey, noise)
     freedom = model.options.freedom
     tells_shape = freedom == "similarity" and not is_round(model.mark)

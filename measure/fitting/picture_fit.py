@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from measure.fitting.clipping import noise_scale
 from measure.fitting.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.fitting.sandwich_covariance import sandwich_covariance
-from measure.marks.rendering import chip_mask, picture
+from measure.marks.rendering import chip_mask, known, picture
 from measure.marks.shapes import MarkTemplate
 from measure.noise.noise import NoiseModel, correlated, may_be_noise, robust_scale
 from measure.noise.pixel_sums import combined, products
@@ -29,6 +29,7 @@ _WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
 _UNSETTLED = "the adjustment did not converge"
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
+EDGE_BLURS = 3.0  # from the frame's border, in which a mark ends: a thousandth of its step is seen farther off
 
 
 class PictureFit:
@@ -187,6 +188,7 @@ class PictureFit:
             near, self.far = distance <= self.options.margin_px, distance > self.options.plain_px
             if outside.all():
                 self.reason = "the mark lies outside of its window"
+        near &= known(mark, place, width, height, EDGE_BLURS * self.model.seen_blur_px)
         self.area = self.used = self.usable & near
         if self.area.sum() < 0.5 * near.sum() or self.area.sum() < 40:
             self.reason = self.reason or "most of the mark lies outside of the scan"

@@ -81,14 +81,13 @@ def compare_sizes(sighter: FrameSighter) -> None:
                 reason = f"it is {size.ratio:.2f} times as large as the other marks: something may cover or touch it"
                 sighter.doubt(index, reason)
             if size is not None and is_round(mark):
-                _count_touches(sighter, index, size, _radius_px(mark, fits[index].pixel_from_mark[:, :2]))
+                _count_touches(sighter, index, size, fits[index])
 
 
-def _count_touches(sighter: FrameSighter, index: int, size: SharedShape, radius_px: float) -> None:
+def _count_touches(sighter: FrameSighter, index: int, size: SharedShape, fit: Match) -> None:
     """What may touch a round mark, as its size has it: in its variance, and as a doubt where it may be far off."""
-    sighting = sighter.sightings[index]
-    is_damaged = sighting is not None and sighting.fit is not None and sighting.fit.damaged_fraction > 0
-    touched = size.touched(radius_px, is_damaged)
+    radius_px = _radius_px(sighter.layout.marks[index].mark, fit.pixel_from_mark[:, :2])
+    touched = size.touched(radius_px, fit.damaged_fraction > 0)
     sighter.widen(index, touched * round_moves_px(size, radius_px) ** 2 / 2)
     chance = touched * round_moves_beyond(WRONG_PX, size, radius_px)
     if chance > WRONG_CHANCE and not size.differs:

@@ -27,7 +27,7 @@ def at_border(layout: FiducialLayout) -> FiducialLayout:
 
 def _at_border(mark: LayoutMark, half_mm: Array) -> LayoutMark:
     shape, at = mark.mark, np.array(mark.xy_mm)
-    if not _is_solid(shape):
+    if not _is_of_polygons(shape):
         return mark
     drawn = at + drawn_outline_mm(shape)
     beyond = np.abs(at) >= half_mm - _EDGE_MM
@@ -45,7 +45,7 @@ def _at_border(mark: LayoutMark, half_mm: Array) -> LayoutMark:
     return replace(mark, mark=replace(shape, known_mm=((left, bottom), (right, top))))
 
 
-def _is_solid(mark: Mark) -> TypeGuard[MarkShape]:
+def _is_of_polygons(mark: Mark) -> TypeGuard[MarkShape]:
     if not isinstance(mark, MarkShape) or isinstance(mark, FrameCorner):
         return False
     return all(isinstance(part, Polygon) for part in mark.parts)

@@ -110,12 +110,30 @@ def known(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px
     """(height, width): in which pixels the mark's drawing is true, and in all within margin_px of them."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None:
         return np.ones((height, width), dtype=bool)
-    mark_from_pixel = np.linalg.inv(pixel_from_mark[:, :2])
-    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - pixel_from_mark[:, 2]
-    margin_mm = margin_px / np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2])))
+    places, margin_mm = _places_mm(pixel_from_mark, width, height), margin_px / _px_per_mm(pixel_from_mark)
     least, greatest = np.add(mark.known_mm, [[margin_mm], [-margin_mm]])
-    places = pixels @ mark_from_pixel.T
     return np.asarray(np.all((places >= least) & (places <= greatest), axis=-1))
+
+
+def frame_beside(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+    """(height, width): which pixels show the exposed frame beside a mark that is cut into its border, farther than
+    margin_px from the frame's edge; none beside other marks."""
+    if isinstance(mark, MarkTemplate) or mark.known_mm is None or np.isfinite(mark.known_mm).all():
+        return np.zeros((height, width), dtype=bool)
+    places, margin_mm = _places_mm(pixel_from_mark, width, height), margin_px / _px_per_mm(pixel_from_mark)
+    least, greatest = np.add(mark.known_mm, [[-margin_mm], [margin_mm]])
+    inner = (np.isinf(least) | (places < least)) & (np.isinf(greatest) | (places > greatest))
+    return np.asarray(np.all(inner, axis=-1))
+
+
+def _places_mm(pixel_from_mark: Array, width: int, height: int) -> Array:
+    """(height, width, 2) where in the mark's plane the pixels lie."""
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - pixel_from_mark[:, 2]
+    return np.asarray(pixels @ np.linalg.inv(pixel_from_mark[:, :2]).T)
+
+
+def _px_per_mm(pixel_from_mark: Array) -> float:
+    return float(np.sqrt(abs(np.linalg.det(pixel_from_mark[:, :2]))))
 
 
 def chip_mask(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int) -> NDArray[np.bool_]:

@@ -47,7 +47,7 @@ def noise_model(residuals: Array, used: Mask, unknowns: int, told: float | None 
     correlation = _covariance_along(kept, used, 1) / by_residuals
     if abs(correlation) < 3 / np.sqrt(2 * count):
         return NoiseModel(variance, np.array([[variance]]), correlation)
-    lags = _autocovariance(kept, used, REACH_PX) * (variance / by_residuals)
+    lags = autocovariance(kept, used, REACH_PX) * (variance / by_residuals)
     return NoiseModel(variance, lags * _taper(REACH_PX), correlation)
 
 
@@ -96,6 +96,17 @@ def correlated(columns: Array, noise: NoiseModel) -> Array:
     return np.asarray(smeared[:, :height, :width])
 
 
+def autocovariance(kept: Array, used: Mask, reach: int) -> Array:
+    """Mean products at all lags up to reach, averaged over opposite and mirrored lags: grain has no direction."""
+    shape = padded(kept.shape, reach)
+    spectra = np.abs(fft.rfft2(np.stack([kept, used]), s=shape)) ** 2
+    products, pairs = fft.irfft2(spectra, s=shape)
+    index = np.arange(-reach, reach + 1)
+    lags = (products / np.maximum(pairs, 1.0))[np.ix_(index, index)]
+    lags = (lags + lags[:, ::-1]) / 2
+    return np.asarray((lags + lags.T) / 2)
+
+
 def padded(shape: tuple[int, ...], reach: int) -> list[int]:
     """The size of a transform in which lags up to the reach do not run into one another."""
     return [fft.next_fast_len(size + reach, real=True) for size in shape]
@@ -106,17 +117,6 @@ def _covariance_along(kept: Array, used: Mask, lag: int) -> float:
     products = (kept[:, lag:] * kept[:, :-lag]).sum(), (kept[lag:] * kept[:-lag]).sum()
     pairs = (used[:, lag:] & used[:, :-lag]).sum(), (used[lag:] & used[:-lag]).sum()
     return float(sum(product / max(count, 1) for product, count in zip(products, pairs, strict=True)) / 2)
-
-
-def _autocovariance(kept: Array, used: Mask, reach: int) -> Array:
-    """Mean products at all lags up to reach, averaged over opposite and mirrored lags: grain has no direction."""
-    shape = padded(kept.shape, reach)
-    spectra = np.abs(fft.rfft2(np.stack([kept, used]), s=shape)) ** 2
-    products, pairs = fft.irfft2(spectra, s=shape)
-    index = np.arange(-reach, reach + 1)
-    lags = (products / np.maximum(pairs, 1.0))[np.ix_(index, index)]
-    lags = (lags + lags[:, ::-1]) / 2
-    return np.asarray((lags + lags.T) / 2)
 
 
 def _taper(reach: int) -> Array:

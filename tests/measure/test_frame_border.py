@@ -1,11 +1,13 @@
 """Wings that grow out of the frame's border and merge into it, and notches cut into it, drawn by half planes."""
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from drawn import Array, drawn, scan_of, transformed
 from drawn_frames import layout_of, pixel_from_camera
+from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
@@ -15,10 +17,19 @@ from measure.status import Status
 
 HALF_MM, SIDES = 11.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 PIXEL_FROM_CAMERA = pixel_from_camera("90", turn_rad=0.03)
+ONE_IN_8000 = 18.0  # of chi-square, two coordinates
 WEDGE = ((0.0, 0.0), (1.6, 0.7), (1.6, -0.7))
 WEDGE_TO_EDGE = ((0.0, 0.0), (1.0, 0.4375), (1.0, -0.4375))
 WEDGE_AND_BORDER = ((0.0, 0.0), (1.0, 0.4375), (1.0, 2.5), (2.5, 2.5), (2.5, -2.5), (1.0, -2.5), (1.0, -0.4375))
 NOTCH = ((-0.3, 0.5), (0.8, 0.5), (0.8, -0.5), (-0.3, -0.5))
+
+
+class Measured(NamedTuple):
+    """A mark's error, the standard deviation claimed of a coordinate, and the squared error in such ones."""
+
+    off_px: float
+    sigma_px: float
+    chi2: float
 
 
 def layout(vertices: tuple[Point, ...], at_mm: float) -> FiducialLayout:
@@ -30,8 +41,9 @@ def layout(vertices: tuple[Point, ...], at_mm: float) -> FiducialLayout:
 
 
 @cache
-def scanned(at_mm: float, is_notch: bool) -> Array:
-    """A light frame with a wedge of its dark border, or a notch in it, on each side."""
+def scanned(at_mm: float, is_notch: bool, blur_px: float = 0.9, landscape: float = 0.0) -> Array:
+    """A light frame with a wedge of its dark border, or a notch in it, on each side. landscape: by what share of itself
+    its light varies, over some 6 px."""
     camera_from_pixel = np.linalg.inv(PIXEL_FROM_CAMERA[:, :2])
 
     def exposed(col: Array, row: Array) -> Array:
@@ -45,8 +57,25 @@ def scanned(at_mm: float, is_notch: bool) -> Array:
                 frame &= ~((out > 0) & (along < out * 0.7 / 1.6))
         return np.asarray(frame)
 
-    light = drawn(exposed, 520, 520, 0.9, fineness=6)
-    return 3000 + 20000 * light + np.random.default_rng(3).normal(0, 400, light.shape)
+    generator = np.random.default_rng(3)
+    light = drawn(exposed, 520, 520, blur_px, fineness=6)
+    noise = generator.normal(0, 400, light.shape)
+    terrain = gaussian_filter(generator.normal(0, 1, light.shape), 6)
+    return np.asarray(3000 + 20000 * light * (1 + landscape * terrain / terrain.std()) + noise)
+
+
+def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
+    """What is measured of the marks in it, none of them damaged or in doubt."""
+    result = measure_fiducials(scan_of(picture), camera, (50.0, 50.0), FiducialOptions(pose="90"))
+    found = []
+    for mark, given in zip(result.marks, camera.marks, strict=True):
+        assert mark.status is Status.MEASURED, mark.reason
+        assert mark.center_px is not None
+        assert mark.covariance_px2 is not None
+        off = mark.center_px - PIXEL_FROM_CAMERA @ (*given.xy_mm, 1.0)
+        chi2 = float(off @ np.linalg.solve(mark.covariance_px2, off))
+        found.append(Measured(float(np.hypot(*off)), float(np.sqrt(np.trace(mark.covariance_px2) / 2)), chi2))
+    return found
 
 
 @pytest.mark.parametrize(
@@ -57,15 +86,23 @@ def scanned(at_mm: float, is_notch: bool) -> Array:
 def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
     vertices: tuple[Point, ...], at_mm: float, is_notch: bool
 ) -> None:
-    camera, scan = layout(vertices, at_mm), scan_of(scanned(at_mm, is_notch))
-    result = measure_fiducials(scan, camera, (50.0, 50.0), FiducialOptions(pose="90"))
-    for mark, given in zip(result.marks, camera.marks, strict=True):
-        assert mark.status is Status.MEASURED, mark.reason
-        assert mark.center_px is not None
-        assert mark.covariance_px2 is not None
-        off = mark.center_px - PIXEL_FROM_CAMERA @ (*given.xy_mm, 1.0)
-        assert np.hypot(*off) < 0.1
-        assert off @ np.linalg.solve(mark.covariance_px2, off) < 18  # 1 in 8000
+    for mark in measured(layout(vertices, at_mm), scanned(at_mm, is_notch)):
+        assert mark.off_px < 0.1
+        assert mark.chi2 < ONE_IN_8000
+
+
+def test_the_border_of_a_soft_scan_reaches_farther_into_the_frame() -> None:
+    for mark in measured(layout(WEDGE_TO_EDGE, 10.0), scanned(10.0, False, blur_px=1.8)):
+        assert mark.off_px < 0.2
+        assert mark.chi2 < ONE_IN_8000
+
+
+def test_a_notch_claims_no_more_than_the_landscape_in_it_allows() -> None:
+    camera = layout(NOTCH, 11.0)
+    even, uneven = (measured(camera, scanned(11.0, True, 2.0, landscape)) for landscape in (0.0, 0.05))
+    assert max(mark.off_px for mark in uneven) > 3 * max(mark.sigma_px for mark in even)
+    for mark in (*even, *uneven):
+        assert mark.chi2 < ONE_IN_8000
 
 
 def test_what_is_known_of_a_drawing_ends_at_the_frame() -> None:
