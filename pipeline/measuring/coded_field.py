@@ -12,7 +12,7 @@ from measure.single_targets.targets import TargetOptions, TargetPrediction, meas
 from measure.status import Status
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_model import camera_model
-from pipeline.measuring.coded_sheet import CodedSheet, coded_candidates, coded_points, none_coded, read_numbers
+from pipeline.measuring.coded_points import CodedPoints, coded_candidates, named_by_code, none_coded, read_numbers
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field, target_field
 from pipeline.measuring.target_places import checked_places
@@ -21,13 +21,13 @@ from pipeline.wording import listed
 
 
 def measure_coded_field(
-    scan: Scan, points: CodedSheet, project: Project, measured: MeasuredScan
+    scan: Scan, points: CodedPoints, project: Project, measured: MeasuredScan
 ) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """A mark for every point of the field, and what is to be said of the whole."""
     scan, camera = scan.green(), project.camera_of(measured.frame.image)
     found = coded_candidates(scan, points)
     numbers = read_numbers(scan, found, points, _is_mirrored(measured))
-    coded, notes = coded_points(numbers, points)
+    coded, notes = named_by_code(numbers, points)
     model = camera_model(camera, measured)
     field = target_field(project)
     if isinstance(model, str):

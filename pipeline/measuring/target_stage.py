@@ -20,7 +20,8 @@ from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.camera_model import camera_model
 from pipeline.measuring.coded_field import measure_coded_field
-from pipeline.measuring.coded_sheet import CodedSheet, measure_sheet
+from pipeline.measuring.coded_points import CodedPoints
+from pipeline.measuring.coded_sheet import measure_sheet
 from pipeline.measuring.comparator_file import comparator_from_pixel
 from pipeline.measuring.identification import PatternOptions, assign, log10_of_chance, recognise
 from pipeline.measuring.measurement_file import MeasuredScan
@@ -53,7 +54,7 @@ def check_targets(project: Project) -> None:
     if settings is None or settings.board is not None:
         return
     if settings.code is not None:
-        CodedSheet.of(project, settings)
+        CodedPoints.of(project, settings)
         return
     if project.given_points is None:
         raise InputError(
@@ -87,7 +88,7 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
     if settings is None:
         return measured
     if settings.code is not None:
-        coded = CodedSheet.of(project, settings)
+        coded = CodedPoints.of(project, settings)
         if coded.is_flat:
             return with_targets(measured, *measure_sheet(scan, coded))
         return with_targets(measured, *measure_coded_field(scan, coded, project, measured))
