@@ -10,8 +10,8 @@ from measure.results import FrameMeasurement
 
 Array = NDArray[np.float64]
 
-CHANCE = 0.01  # of calling a right pitch wrong
-LEAST_MARKS = 3  # with two, a false one makes a pitch of its own
+_CHANCE = 0.01  # of calling a right pitch wrong
+_LEAST_MARKS = 3  # with two, a false one makes a pitch of its own
 
 
 def pitch_problem(
@@ -24,7 +24,7 @@ def pitch_problem(
     """
     found = {mark.point for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation}
     marks = [mark for mark in layout.marks if mark.id in found]
-    if frame.pixel_from_camera is None or len(marks) < LEAST_MARKS:
+    if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS:
         return None
     seen_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film mm for each pixel, across and down
     places = np.array([mark.xy_mm for mark in marks])
@@ -33,7 +33,7 @@ def pitch_problem(
     if not lever_mm > given:
         return None
     sigma = float(np.hypot(AFFINITY_SIGMA, given / lever_mm))
-    limit = float(stats.norm.isf(CHANCE / 2 / 2)) * sigma
+    limit = float(stats.norm.isf(_CHANCE / 2 / 2)) * sigma
     excess = seen_um / np.asarray(pitch_um) - 1
     if np.abs(excess).max() <= limit:
         return None

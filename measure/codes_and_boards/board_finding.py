@@ -12,8 +12,8 @@ from measure.scans.scan import Scan
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-FIRST_SIZE_PX, LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
-LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
+_FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
+_LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> Fo
 def _search_factors(scan: Scan) -> list[int]:
     """Reductions of the scan to search, the coarsest first."""
     longest = max(scan.width_px, scan.height_px)
-    coarse, fine = (max(round(longest / size), 1) for size in (FIRST_SIZE_PX, LAST_SIZE_PX))
+    coarse, fine = (max(round(longest / size), 1) for size in (_FIRST_SIZE_PX, _LAST_SIZE_PX))
     return [coarse] if coarse == fine else [coarse, fine]
 
 
@@ -63,7 +63,7 @@ def _searchable(scan: Scan, factor: int) -> tuple[Bytes, str]:
     """The reduced scan stretched to 8 bits, and why there is nothing to search in it, if so."""
     grey = scan.reduced(factor)
     low, high = np.percentile(grey, (1, 99))
-    if high - low < LEAST_CONTRAST * scan.full_scale_dn:
+    if high - low < _LEAST_CONTRAST * scan.full_scale_dn:
         share = 100 * (high - low) / scan.full_scale_dn
         return np.zeros((1, 1), np.uint8), f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
     return np.clip((grey - low) * (255 / (high - low)), 0, 255).astype(np.uint8), ""

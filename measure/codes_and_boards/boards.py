@@ -25,12 +25,12 @@ from measure.status import Status
 Array = NDArray[np.float64]
 
 # Along the edges, in shares of a square's side:
-REACH = 0.3  # light, lens and paper change little over it
-SHORTEST_REACH_PX = 5.0  # less shows too little of the edges...
-FARTHEST_REACH = 0.6  # ...but beyond this share the neighbouring crossing begins to show
-LONGEST_REACH_PX = 15.0  # enough for a few thousandths of a pixel, whatever the square
-MARKER_REACH = 0.8  # of a marker's module: its black border is one module wide
-WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out it is weak
+_REACH = 0.3  # light, lens and paper change little over it
+_SHORTEST_REACH_PX = 5.0  # less shows too little of the edges...
+_FARTHEST_REACH = 0.6  # ...but beyond this share the neighbouring crossing begins to show
+_LONGEST_REACH_PX = 15.0  # enough for a few thousandths of a pixel, whatever the square
+_MARKER_REACH = 0.8  # of a marker's module: its black border is one module wide
+_WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out it is weak
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _fit_found(
 
 def _reach_px(steps_px: Array, board_reach_px: float, spec: ChessboardSpec | CharucoSpec) -> Array:
     """(2,) how far along the square's sides grey values are used: not into a marker in one of the squares."""
-    farthest = FARTHEST_REACH
+    farthest = _FARTHEST_REACH
     if isinstance(spec, CharucoSpec):
         farthest = (spec.square_mm - spec.marker_mm) / (2 * spec.square_mm)
     return np.full(2, min(board_reach_px, farthest * float(np.hypot(*steps_px).min())))
@@ -97,7 +97,7 @@ def _common_reach_px(corners: Iterable[FoundCorner]) -> float:
     """One reach for a whole board: what a camera's sharpening does to a corner depends on the window, and where all
     windows are alike it moves all corners alike, and not the near ones otherwise than the far ones."""
     sides = [float(np.hypot(*corner.steps_px).min()) for corner in corners]
-    return float(np.clip(REACH * np.median(sides), SHORTEST_REACH_PX, LONGEST_REACH_PX))
+    return float(np.clip(_REACH * np.median(sides), _SHORTEST_REACH_PX, _LONGEST_REACH_PX))
 
 
 def _marker_reach_px(sides_px: Array, spec: ArucoSpec) -> Array:
@@ -105,7 +105,7 @@ def _marker_reach_px(sides_px: Array, spec: ArucoSpec) -> Array:
     modules = aruco_dictionary(spec.dictionary).markerSize + 2
     gap_modules = spec.gap_mm / spec.marker_mm * modules
     return np.asarray(
-        np.minimum(MARKER_REACH * min(1.0, gap_modules) * np.hypot(*sides_px) / modules, LONGEST_REACH_PX)
+        np.minimum(_MARKER_REACH * min(1.0, gap_modules) * np.hypot(*sides_px) / modules, _LONGEST_REACH_PX)
     )
 
 
@@ -159,7 +159,7 @@ def _as_mark(name: str, fitted: FittedCorner | None, missing: str) -> MarkMeasur
     }
     if corner.junction_px is not None:
         quality |= {"junction_col_px": corner.junction_px[0], "junction_row_px": corner.junction_px[1]}
-    weak = corner.damaged_fraction > WEAK_DAMAGE
+    weak = corner.damaged_fraction > _WEAK_DAMAGE
     reason = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit" if weak else ""
     status = Status.WEAK if weak else Status.MEASURED
     return MarkMeasurement(name, "target", corner.center_px, corner.covariance_px2, status, reason, quality)

@@ -15,14 +15,14 @@ from measure.status import Status
 
 Array = NDArray[np.float64]
 
-SMALLEST_DOT_PX = 5.0  # its diameter
-NEAREST_DOTS = 8  # whose places and shapes predict a missing one's
+_SMALLEST_DOT_PX = 5.0  # its diameter
+_NEAREST_DOTS = 8  # whose places and shapes predict a missing one's
 
 
 def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> tuple[tuple[MarkMeasurement, ...], str, tuple[str, ...]]:
     """One mark for each dot of the grid, why the grid was not found, and what the user should know."""
     names = {place: f"r{place[0]}c{place[1]}" for place in spec.places()}
-    patches = disk_candidates(scan, DiskSearch((SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
+    patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
     centers = np.array([patch.center_px for patch in patches]).reshape(-1, 2)
     assignments = grid_places(centers, _looks(patches), spec.places())
     if not assignments:
@@ -54,7 +54,7 @@ def _largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
     """The largest that a dot can be when the grid fills the scan."""
     places = min(spec.columns, spec.rows)
     share = spec.diameter_mm / spec.spacing_mm
-    return max(2 * SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
+    return max(2 * _SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
 
 
 def _upright(assignment: dict[Place, int], centers: Array) -> float:
@@ -67,10 +67,10 @@ def _upright(assignment: dict[Place, int], centers: Array) -> float:
 def _predicted(place: Place, seen: dict[Place, tuple[Array, Array]]) -> tuple[Array, Array]:
     """Centre and shape of a dot by a homography of its nearest neighbours; the shape is their mean one."""
     others = sorted(seen, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
-    nearest = others[: max(NEAREST_DOTS, len(others) // 3)]
+    nearest = others[: max(_NEAREST_DOTS, len(others) // 3)]
     homography, _ = cv2.findHomography(np.array(nearest, float), np.array([seen[other][0] for other in nearest]))
     x, y, w = np.asarray(homography, float) @ (*place, 1.0)
-    squares = [seen[other][1] @ seen[other][1].T for other in nearest[:NEAREST_DOTS]]
+    squares = [seen[other][1] @ seen[other][1].T for other in nearest[:_NEAREST_DOTS]]
     return np.array([x / w, y / w]), np.linalg.cholesky(np.mean(squares, axis=0))
 
 

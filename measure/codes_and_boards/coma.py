@@ -15,8 +15,8 @@ from measure.results import MarkMeasurement
 
 Array = NDArray[np.float64]
 
-NEIGHBOURS = 4  # crossings: the next ones along the rows and columns
-FEWEST_CROSSINGS = 30  # with fewer nobody can tell coma from noise
+_NEIGHBOURS = 4  # crossings: the next ones along the rows and columns
+_FEWEST_CROSSINGS = 30  # with fewer nobody can tell coma from noise
 
 
 def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple[MarkMeasurement, ...], ...]:
@@ -32,13 +32,13 @@ def one_definition(pictures: Sequence[Sequence[MarkMeasurement]]) -> tuple[tuple
     apart, alike = [], []
     for marks in pictures:
         crossings = [mark for mark in marks if _has_junction(mark)]
-        if len(crossings) > NEIGHBOURS:
+        if len(crossings) > _NEIGHBOURS:
             centers = np.array([mark.center_px for mark in crossings])
             differences = np.array([_junction(mark) for mark in crossings]) - centers
-            near = np.asarray(KDTree(centers).query(centers, NEIGHBOURS + 1)[1])[:, 1:]
+            near = np.asarray(KDTree(centers).query(centers, _NEIGHBOURS + 1)[1])[:, 1:]
             apart.append(differences)
             alike.append((differences[:, None, :] * differences[near]).mean(axis=1))
-    if sum(map(len, apart)) < FEWEST_CROSSINGS:
+    if sum(map(len, apart)) < _FEWEST_CROSSINGS:
         return tuple(tuple(marks) for marks in pictures)
     variance = float((np.concatenate(apart) ** 2).mean())
     if float(np.concatenate(alike).mean()) <= variance / 2:

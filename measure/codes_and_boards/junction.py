@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-GRADIENT_PX = 1.0  # the Gaussian under the derivatives: pixel noise has gone, the edges are still apart
-REACH_SIGMAS = 4.0  # of that Gaussian's filter
-MAX_ITERATIONS = 30
-TOLERANCE_PX = 1e-4  # of the last step
-WORST_CONDITION = 1e6  # of the normal matrix: beyond it the gradients have one direction only
+_GRADIENT_PX = 1.0  # the Gaussian under the derivatives: pixel noise has gone, the edges are still apart
+_REACH_SIGMAS = 4.0  # of that Gaussian's filter
+_MAX_ITERATIONS = 30
+_TOLERANCE_PX = 1e-4  # of the last step
+_WORST_CONDITION = 1e6  # of the normal matrix: beyond it the gradients have one direction only
 
 
 def junction(grey: Array, start_px: Array, window_px: float, area: Array) -> Array:
@@ -27,16 +27,16 @@ def junction(grey: Array, start_px: Array, window_px: float, area: Array) -> Arr
     along_x, along_y = _derivative(grey, 0), _derivative(grey, 1)
     row, col = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(float)
     center = np.array(start_px, float)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         dx, dy = col - center[0], row - center[1]
         weights = area * np.exp(-(dx**2 + dy**2) / (2 * window_px**2))
         normal = _normal(along_x, along_y, weights)
-        if np.linalg.cond(normal) > WORST_CONDITION:
+        if np.linalg.cond(normal) > _WORST_CONDITION:
             return np.full(2, np.nan)
         distance = along_x * dx + along_y * dy
         step = np.linalg.solve(normal, [(weights * along * distance).sum() for along in (along_x, along_y)])
         center += step
-        if np.hypot(*step) < TOLERANCE_PX:
+        if np.hypot(*step) < _TOLERANCE_PX:
             break
     return center
 
@@ -48,9 +48,9 @@ def _normal(along_x: Array, along_y: Array, weights: Array) -> Array:
 
 def _derivative(image: Array, axis: int) -> Array:
     """The derivative of the image smoothed by a Gaussian, along columns (0) or rows (1)."""
-    reach = int(np.ceil(REACH_SIGMAS * GRADIENT_PX))
+    reach = int(np.ceil(_REACH_SIGMAS * _GRADIENT_PX))
     place = np.arange(-reach, reach + 1.0)
-    smooth = np.exp(-(place**2) / (2 * GRADIENT_PX**2))
+    smooth = np.exp(-(place**2) / (2 * _GRADIENT_PX**2))
     smooth /= smooth.sum()
     slope = place * smooth / (place**2 * smooth).sum()
     along, down = (slope, smooth) if axis == 0 else (smooth, slope)

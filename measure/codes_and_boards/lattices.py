@@ -11,19 +11,19 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Place = tuple[int, int]
 
-NEIGHBOURS = 8  # of a point: those that touch its square
-STEP_TOLERANCE = 0.3  # of a step, between where a neighbour is expected and where it is
-SEEDS = 12  # points to begin at, spread over all
-LIKENESS = 0.4  # of the logarithms of size and contrast
-LEAST_SHARE = 0.8  # of the grid's places that must be seen
+_NEIGHBOURS = 8  # of a point: those that touch its square
+_STEP_TOLERANCE = 0.3  # of a step, between where a neighbour is expected and where it is
+_SEEDS = 12  # points to begin at, spread over all
+_LIKENESS = 0.4  # of the logarithms of size and contrast
+_LEAST_SHARE = 0.8  # of the grid's places that must be seen
 
 
 def grid_places(points_px: Array, looks: Array, places: list[Place]) -> list[dict[Place, int]]:
     """Assignments of points to the places (row, column) of a grid, one for each way to turn the grid so that it fits as
     well as the best one: {place: index of the point}. Empty where no outline fits; the grid is never mirrored.
 
-    points_px (n, 2) may hold strangers; looks (n, k): figures of a point's looks in which neighbours differ by less
-    than LIKENESS. The grid's outline must be seen, a fifth of its places may be missing.
+    points_px (n, 2) may hold strangers; looks (n, k): figures of a point's looks, in which neighbours differ little,
+    logarithms of size and contrast. The grid's outline must be seen, a fifth of its places may be missing.
     """
     best: list[dict[Place, int]] = []
     for lattice in _lattices(points_px, looks):
@@ -43,7 +43,7 @@ def _lattices(points_px: Array, looks: Array) -> list[dict[Place, int]]:
         return []
     tree = cKDTree(points_px)
     found = [
-        _grown(points_px, looks, tree, int(seed)) for seed in np.linspace(0, len(points_px) - 1, SEEDS).astype(int)
+        _grown(points_px, looks, tree, int(seed)) for seed in np.linspace(0, len(points_px) - 1, _SEEDS).astype(int)
     ]
     return sorted(found, key=len, reverse=True)[:3]
 
@@ -65,8 +65,8 @@ def _grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Pla
             if place in lattice:
                 continue
             distance, index = tree.query(here + sign * step[along])
-            unlike = np.abs(looks[index] - looks[lattice[i, j]]).max() > LIKENESS
-            if unlike or distance > STEP_TOLERANCE * np.hypot(*step[along]) or int(index) in taken:
+            unlike = np.abs(looks[index] - looks[lattice[i, j]]).max() > _LIKENESS
+            if unlike or distance > _STEP_TOLERANCE * np.hypot(*step[along]) or int(index) in taken:
                 continue
             lattice[place] = int(index)
             taken.add(int(index))
@@ -79,9 +79,9 @@ def _grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Pla
 
 def _seed_basis(points_px: Array, tree: cKDTree, seed: int) -> Array | None:
     """(2, 2) rows: the two shortest steps from a point to neighbours that have a partner on the other side."""
-    _, near = tree.query(points_px[seed], k=np.arange(2, min(NEIGHBOURS + 1, len(points_px)) + 1))
+    _, near = tree.query(points_px[seed], k=np.arange(2, min(_NEIGHBOURS + 1, len(points_px)) + 1))
     steps = points_px[near] - points_px[seed]
-    paired = [step for step in steps if tree.query(points_px[seed] - step)[0] < STEP_TOLERANCE * np.hypot(*step)]
+    paired = [step for step in steps if tree.query(points_px[seed] - step)[0] < _STEP_TOLERANCE * np.hypot(*step)]
     for second in paired[1:]:
         turn = np.linalg.det(np.stack([paired[0], second]))
         if abs(turn) > 0.3 * np.hypot(*paired[0]) * np.hypot(*second):
@@ -104,7 +104,7 @@ def _outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place
                 for (column, row), index in zip(moved, indices, strict=True)
                 if (int(row), int(column)) in wanted
             }
-            if len(assignment) >= LEAST_SHARE * len(places) and assignment not in found:
+            if len(assignment) >= _LEAST_SHARE * len(places) and assignment not in found:
                 found.append(assignment)
     most = max((len(assignment) for assignment in found), default=0)
     return [assignment for assignment in found if len(assignment) == most]

@@ -11,13 +11,13 @@ from measure.single_targets.disk_patches import Candidate
 
 Array = NDArray[np.float64]
 
-SAMPLES = 16  # along each segment
-RING_SHARES = (0.35, 0.5, 0.65)  # where across the ring it is sampled: its edges are blurred
-CORE = 0.4  # of the dot's radius: the middle of the dot
-GAP_LEVEL = 0.35  # of the dot's contrast: the gap between dot and ring is plain ground
-LEAST_PLAIN = 0.97  # of the gap
-EDGE_SAMPLES = 4  # at either end of a segment, which blur and perspective may give to its neighbour
-SURE = 0.3  # how near to ground or dot a bit must be, in units of the dot's contrast
+_SAMPLES = 16  # along each segment
+_RING_SHARES = (0.35, 0.5, 0.65)  # where across the ring it is sampled: its edges are blurred
+_CORE = 0.4  # of the dot's radius: the middle of the dot
+_GAP_LEVEL = 0.35  # of the dot's contrast: the gap between dot and ring is plain ground
+_LEAST_PLAIN = 0.97  # of the gap
+_EDGE_SAMPLES = 4  # at either end of a segment, which blur and perspective may give to its neighbour
+_SURE = 0.3  # how near to ground or dot a bit must be, in units of the dot's contrast
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ def read_code(scan: Scan, dot: Candidate, code: RingCode) -> int | None:
     percent. Set bits are those that look like the dot.
     """
     inner, outer = code.ring
-    angles = 2.0 * np.pi * np.arange(code.bits * SAMPLES) / (code.bits * SAMPLES)
+    angles = 2.0 * np.pi * np.arange(code.bits * _SAMPLES) / (code.bits * _SAMPLES)
     gap_radius = (1.0 + inner) / 2.0
-    radii = np.array([CORE, gap_radius, *(inner + share * (outer - inner) for share in RING_SHARES)])
+    radii = np.array([_CORE, gap_radius, *(inner + share * (outer - inner) for share in _RING_SHARES)])
     core, gap, *ring = _sampled(scan, dot, radii, angles)
     ground, contrast = float(np.median(gap)), float(np.median(core) - np.median(gap))
-    if contrast * dot.contrast_dn <= 0.0 or np.mean(np.abs(gap - ground) < GAP_LEVEL * abs(contrast)) < LEAST_PLAIN:
+    if contrast * dot.contrast_dn <= 0.0 or np.mean(np.abs(gap - ground) < _GAP_LEVEL * abs(contrast)) < _LEAST_PLAIN:
         return None
     return _decoded(((np.mean(ring, axis=0) - ground) / contrast), code)
 
@@ -97,14 +97,14 @@ def _sampled(scan: Scan, dot: Candidate, radii: Array, angles: Array) -> Array:
 
 
 def _decoded(levels: Array, code: RingCode) -> int | None:
-    """The number of a ring's levels (bits * SAMPLES,), 0 the ground and 1 the dot; None where no start of the segments
+    """The number of a ring's levels (bits * _SAMPLES,), 0 the ground and 1 the dot; None where no start of the segments
     makes all of them plain, or where they are all alike."""
-    turned = np.stack([np.roll(levels, -phase).reshape(code.bits, SAMPLES) for phase in range(SAMPLES)])
+    turned = np.stack([np.roll(levels, -phase).reshape(code.bits, _SAMPLES) for phase in range(_SAMPLES)])
     strays = np.minimum((turned > 0.5).sum(axis=2), (turned <= 0.5).sum(axis=2)).sum(axis=1)
     segments = turned[int(np.argmin(strays))]
-    middles = segments[:, EDGE_SAMPLES:-EDGE_SAMPLES]
+    middles = segments[:, _EDGE_SAMPLES:-_EDGE_SAMPLES]
     set_bits = np.median(middles, axis=1) > 0.5
-    sure = np.where(set_bits[:, None], middles > 1.0 - 1.5 * SURE, middles < SURE)
-    if np.mean(sure) < LEAST_PLAIN or set_bits.all() or not set_bits.any():
+    sure = np.where(set_bits[:, None], middles > 1.0 - 1.5 * _SURE, middles < _SURE)
+    if np.mean(sure) < _LEAST_PLAIN or set_bits.all() or not set_bits.any():
         return None
     return code.number(set_bits)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from measure.frames.faint_marks import FaintMark
 
-SHOWS = 1 / 3  # of the others' contrast: ground that leaves less to a mark hides it
+_SHOWS = 1 / 3  # of the others' contrast: ground that leaves less to a mark hides it
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ def reason_unseen(ground: Ground, usual_dn: float, reach_px: float, seen: FaintM
     usual_dn: by which the other marks change their ground. seen: the strongest answer within reach_px, and certain
     whether chance would not make it.
     """
-    if ground.room_dn < SHOWS * usual_dn:
+    if ground.room_dn < _SHOWS * usual_dn:
         shade = "light" if ground.is_light else "dark"
         return (
             f"the ground at its place is so {shade} that the mark could change it by {_grey(ground.room_dn)} only, the "
@@ -36,7 +36,7 @@ def reason_unseen(ground: Ground, usual_dn: float, reach_px: float, seen: FaintM
         )
     within = f"within {reach_px:.0f} px of its place"
     could = min(ground.room_dn, usual_dn)
-    if seen is not None and abs(seen.fit.contrast_dn) < SHOWS * could:
+    if seen is not None and abs(seen.fit.contrast_dn) < _SHOWS * could:
         return (
             f"nothing {within} looks like it: what does so most changes the ground by "
             f"{_grey(abs(seen.fit.contrast_dn))}, where the mark could by {could:.0f}"

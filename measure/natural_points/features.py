@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-LONGEST_PX = 3000  # side of the reduced scan in which features are sought
+_LONGEST_PX = 3000  # side of the reduced scan in which features are sought
 _TILE_PX, _OVERLAP_PX = 1024, 96  # SIFT takes some 130 bytes a pixel: a tile at a time
 _CONTRAST = 0.02  # half of OpenCV's default: fields and water have weak texture
 _RATIO = 0.8  # Lowe's: nine false matches in ten have a second neighbour nearer than that, one right in twenty
@@ -39,7 +39,7 @@ class Features:
 
 def reduction(scan: Scan) -> int:
     """The factor by which a scan is reduced before features are sought in it."""
-    return -(-max(scan.width_px, scan.height_px) // LONGEST_PX)
+    return -(-max(scan.width_px, scan.height_px) // _LONGEST_PX)
 
 
 def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, count: int) -> Features:

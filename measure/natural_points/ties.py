@@ -17,7 +17,7 @@ from measure.status import Status
 
 Progress = Callable[[str, int, int], None]
 
-FEWEST_IMAGES = 3  # two frames cannot contradict each other along the line of sight
+_FEWEST_IMAGES = 3  # two frames cannot contradict each other along the line of sight
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class TieOptions:
     """wanted: how many points. images: the fewest that must show a point."""
 
     wanted: int = 300
-    images: int = FEWEST_IMAGES
+    images: int = _FEWEST_IMAGES
 
     def __post_init__(self) -> None:
         if self.wanted < 1:
             raise ValueError(f"wanted is {self.wanted}; at least 1 is right")
-        if self.images < FEWEST_IMAGES:
-            raise ValueError(f"images is {self.images}; at least {FEWEST_IMAGES} is right: two prove nothing")
+        if self.images < _FEWEST_IMAGES:
+            raise ValueError(f"images is {self.images}; at least {_FEWEST_IMAGES} is right: two prove nothing")
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,11 @@ from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
 
-LOST_PX = 0.25  # times the square of step over contrast: rms of what residuals do not show (benchmarks/marks.py)
-MOST_LOST_PX = 1.0  # where the contrast is hardly two steps, there is nothing left to measure
+_LOST_PX = 0.25  # times the square of step over contrast: rms of what residuals do not show (benchmarks/marks.py)
+_MOST_LOST_PX = 1.0  # where the contrast is hardly two steps, there is nothing left to measure
 
 
 def with_loss(covariance_px2: Array, scan: Scan, contrast_dn: float) -> Array:
     """The covariance (2, 2) of a mark of that contrast and what the scan's compression adds to it."""
-    lost = min(LOST_PX * (scan.rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, MOST_LOST_PX)
+    lost = min(_LOST_PX * (scan.rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, _MOST_LOST_PX)
     return covariance_px2 + lost**2 * np.eye(2)

@@ -15,7 +15,7 @@ from measure.scans.resolution import JFIF_UNIT, NO_TAGS, PNG_UNIT, Pitch, pitch_
 from measure.scans.segments import Segments
 from measure.scans.tiff_scan import DECODING_ERRORS, broken, orientation_notes, tag_pitch
 
-JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_JPEG_START, _PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
 
 def open_picture(path: Path, start: bytes) -> tuple[Segments, Pitch, tuple[str, ...]]:
@@ -23,11 +23,11 @@ def open_picture(path: Path, start: bytes) -> tuple[Segments, Pitch, tuple[str, 
 
     Raises MeasurementError for a truncated file and for one that is no picture.
     """
-    if start.startswith(JPEG_START):
+    if start.startswith(_JPEG_START):
         data = path.read_bytes()
         samples, pitch, step_dn = _jpeg_samples(path, data), _jpeg_pitch(data), rounding_step_dn(data)
         notes = _jpeg_notes(data)
-    elif start.startswith(PNG_START):
+    elif start.startswith(_PNG_START):
         data = path.read_bytes()
         samples, pitch, step_dn = _png_samples(path, data), _png_pitch(data), 0.0
         notes = ()
@@ -119,7 +119,7 @@ def _exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:
 
 def _png_pitch(data: bytes) -> Pitch:
     """The pHYs chunk, which stands before the picture's data (PNG specification, 11.3.5.3)."""
-    position = len(PNG_START)
+    position = len(_PNG_START)
     while position + 8 <= len(data):
         length, kind = struct.unpack(">I4s", data[position : position + 8])
         if kind == b"pHYs" and length == 9:

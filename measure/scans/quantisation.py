@@ -1,6 +1,6 @@
 """How coarsely a JPEG file rounds: its quantisation tables (ITU-T T.81, B.2.4.1)."""
 
-DQT = 0xDB
+_DQT = 0xDB
 UNKNOWN_DN = 15.0  # where a file does not say it: as at quality 50, which no scan should be below
 _COARSE = 15  # coefficients in the order of the table: up to two periods in a block of 8 px, as blurred edges have them
 
@@ -19,7 +19,7 @@ def rounding_step_dn(data: bytes) -> float:
     """The mean step to which the coarser detail of the luminance is rounded, in grey values: from a JPEG file, or its
     beginning up to the picture's data."""
     for marker, body in jpeg_headers(data):
-        if marker == DQT:
+        if marker == _DQT:
             table = _table(body, 0)
             if table:
                 return sum(table[:_COARSE]) / _COARSE

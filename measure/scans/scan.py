@@ -24,10 +24,11 @@ from measure.scans.tiff_scan import RawRows, open_tiff
 Array = NDArray[np.float32]
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601: red, green, blue
-SINGLE_CHANNELS = RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
-PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, about
-LARGEST_PART_PX = 2048  # the side of a part in whole segments: beyond it segments are divided
+_GREEN = (0.0, 1.0, 0.0)
+SINGLE_CHANNELS = (1.0, 0.0, 0.0), _GREEN, (0.0, 0.0, 1.0)
+_BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
+_PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, about
+_LARGEST_PART_PX = 2048  # the side of a part in whole segments: beyond it segments are divided
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -90,8 +91,8 @@ class Scan:
         """The same scan with its green for grey value, if it has colours. A lens draws red and blue at scales of their
         own, some 1e-4 off; a mark in a mixture of all has no one place."""
         scan = copy(self)
-        if self.channels == len(GREEN):
-            scan._grey_weights = GREEN
+        if self.channels == len(_GREEN):
+            scan._grey_weights = _GREEN
         return scan
 
     def window(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
@@ -168,8 +169,8 @@ class Scan:
         """(height, width, channels): every segment is decoded once."""
         result = np.empty((height, width, self.channels), np.float32)
         tall, wide = self.segment_px
-        cols = width if wide >= self.width_px else _reduced_side(wide, factor, PART_PX)
-        rows = _reduced_side(tall, factor, max(PART_PX**2 // (cols * factor), 1))
+        cols = width if wide >= self.width_px else _reduced_side(wide, factor, _PART_PX)
+        rows = _reduced_side(tall, factor, max(_PART_PX**2 // (cols * factor), 1))
 
         def fill(part: tuple[int, int]) -> None:
             row0, col0 = part
@@ -192,7 +193,7 @@ def _reduced_side(fine_px: int, factor: int, most_px: int) -> int:
     """The side of a part of a reduced scan: about most_px of the scan, in whole segments if these are not much
     larger."""
     unit = lcm(fine_px, factor)
-    return max((unit * max(most_px // unit, 1) if unit <= LARGEST_PART_PX else most_px) // factor, 1)
+    return max((unit * max(most_px // unit, 1) if unit <= _LARGEST_PART_PX else most_px) // factor, 1)
 
 
 def means(samples: Samples | Array, factor: int) -> Array:
@@ -200,7 +201,7 @@ def means(samples: Samples | Array, factor: int) -> Array:
     x factor of them."""
     height, width, channels = samples.shape
     result = np.empty((height // factor, width // factor, channels), np.float32)
-    rows = max(BAND_PIXELS // (width * factor), 1)
+    rows = max(_BAND_PIXELS // (width * factor), 1)
     for row in range(0, len(result), rows):
         band = samples[row * factor : (row + rows) * factor].astype(np.float32)
         for step in _steps_of(factor):

@@ -18,13 +18,13 @@ from measure.scans.segments import Segments
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
 
-WHITE_IS_ZERO, BLACK_IS_ZERO, RGB, PALETTE, YCBCR = 0, 1, 2, 3, 6
-JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
-JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
-INTO_MEMORY = (5, 8, 32946, 34926, 50000)  # LZW, deflate, zstd: their decoders write into memory that they are given
-LARGE_BYTES = 4 << 20  # decoded; from here on numpy asks the system for memory in large pages
-MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time; larger tiles and strips are not copied
-REDUCED_IMAGE, TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
+_JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
+_JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
+_INTO_MEMORY = (5, 8, 32946, 34926, 50000)  # LZW, deflate, zstd: their decoders write into memory that they are given
+_LARGE_BYTES = 4 << 20  # decoded; from here on numpy asks the system for memory in large pages
+_MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time; larger tiles and strips are not copied
+_REDUCED_IMAGE, _TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
 DECODING_ERRORS = (RuntimeError, ValueError, OSError, IndexError, TypeError, struct.error, TiffFileError)
 
 
@@ -60,7 +60,7 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
         pages = [page.aspage() for page in file.pages]
     except DECODING_ERRORS as error:
         raise broken(path, str(error)) from error
-    full = [page for page in pages if not int(page.subfiletype) & (REDUCED_IMAGE | TRANSPARENCY_MASK)]
+    full = [page for page in pages if not int(page.subfiletype) & (_REDUCED_IMAGE | _TRANSPARENCY_MASK)]
     full = [page for page in full if page.imagewidth > 0 and page.imagelength > 0]
     if not full:
         raise broken(path, "it holds no picture")
@@ -121,24 +121,24 @@ def _page_radiometry(page: TiffPage, path: Path) -> Radiometry:
         raise _unsupported(path, f"samples are {number} of {bits} bits")
     if page.imagedepth != 1:
         raise _unsupported(path, f"it is a volume of {page.imagedepth} slices")
-    if kind == PALETTE and page.colormap is not None:
+    if kind == _PALETTE and page.colormap is not None:
         return Radiometry.of_palette(page.colormap)
-    is_colour = kind == RGB or (kind == YCBCR and page.compression in JPEG_COMPRESSIONS)  # its decoder gives RGB
-    if not (kind in (WHITE_IS_ZERO, BLACK_IS_ZERO) or (is_colour and samples >= 3)):
+    is_colour = kind == _RGB or (kind == _YCBCR and page.compression in _JPEG_COMPRESSIONS)  # its decoder gives RGB
+    if not (kind in (_WHITE_IS_ZERO, _BLACK_IS_ZERO) or (is_colour and samples >= 3)):
         name = getattr(page.photometric, "name", str(page.photometric))
         raise _unsupported(path, f"its colours are {name} with {samples} samples a pixel")
-    return Radiometry(3 if is_colour else 1, float(2**bits - 1), inverted=kind == WHITE_IS_ZERO)
+    return Radiometry(3 if is_colour else 1, float(2**bits - 1), inverted=kind == _WHITE_IS_ZERO)
 
 
 def _page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
     """Of a page compressed as JPEG: its tables stand in a tag, or else at the beginning of every tile or strip."""
-    if page.compression not in JPEG_COMPRESSIONS:
+    if page.compression not in _JPEG_COMPRESSIONS:
         return 0.0
     start = page.jpegtables or page.jpegheader
     if start is None:
         first = next(index for index, count in enumerate(page.databytecounts) if count)
         file.filehandle.seek(page.dataoffsets[first])
-        start = file.filehandle.read(min(page.databytecounts[first], JPEG_HEADERS_BYTES))
+        start = file.filehandle.read(min(page.databytecounts[first], _JPEG_HEADERS_BYTES))
     return rounding_step_dn(start)
 
 
@@ -167,8 +167,8 @@ class TiffSegments:
         self._samples = page.samplesperpixel if page.planarconfig == 1 else 1
         decoded_bytes = self.segment_height_px * self.segment_width_px * self._samples * self._stored_dtype.itemsize
         self._is_large_and_plain = (
-            decoded_bytes >= LARGE_BYTES
-            and page.compression in INTO_MEMORY
+            decoded_bytes >= _LARGE_BYTES
+            and page.compression in _INTO_MEMORY
             and page.predictor == 1
             and page.fillorder == 1
             and page.bitspersample in (8, 16)
@@ -221,7 +221,7 @@ class TiffSegments:
         """A tile or strip as the file has it: mapped where it is so large that a copy would take long, for a mapping
         takes longer than the copy of a small one."""
         offset, size = self._page.dataoffsets[index], self._page.databytecounts[index]
-        if size > MAPPED_BYTES:
+        if size > _MAPPED_BYTES:
             before = offset % ALLOCATIONGRANULARITY
             length = before + size
             mapped = mmap(self._file.filehandle.fileno(), length, access=ACCESS_READ, offset=offset - before)
@@ -250,7 +250,7 @@ class RawRows(TiffSegments):
 
     def fill(self, samples: Samples, row0: int, col0: int) -> None:
         """Samples (height, width, channels) of the picture from a row and column on."""
-        rows = max(MAPPED_BYTES // self._row_bytes, 1)
+        rows = max(_MAPPED_BYTES // self._row_bytes, 1)
         for first in range(0, len(samples), rows):
             self._fill(samples[first : first + rows], row0 + first, col0)
 

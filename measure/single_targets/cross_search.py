@@ -16,15 +16,15 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SEARCHED_ARM_PX = 12.0  # scans are reduced until half a cross has about this length, if its lines stay...
-THINNEST_PX = 1.5  # ...so wide
-WIDEST_PX = 1536  # of what is compared with its own noise
-OCTAVE = 2.0  # longest over shortest half cross that one reduction finds
-NOISE_SIGMAS = 5.0
-STEPS_DEG = 5.0  # of the directions that bars may have
-LEAST_ANGLE_DEG = 35.0  # between the bars, right-angled ones seen obliquely
-BLURRED_PX = 0.75  # by which blur widens a bar on either side
-LEAST_FILLED, LEAST_EXPLAINED = 0.85, 0.8  # of the bars by the patch, of the patch by the bars
+_SEARCHED_ARM_PX = 12.0  # scans are reduced until half a cross has about this length, if its lines stay...
+_THINNEST_PX = 1.5  # ...so wide
+_WIDEST_PX = 1536  # of what is compared with its own noise
+_OCTAVE = 2.0  # longest over shortest half cross that one reduction finds
+_NOISE_SIGMAS = 5.0
+_STEPS_DEG = 5.0  # of the directions that bars may have
+_LEAST_ANGLE_DEG = 35.0  # between the bars, right-angled ones seen obliquely
+_BLURRED_PX = 0.75  # by which blur widens a bar on either side
+_LEAST_FILLED, _LEAST_EXPLAINED = 0.85, 0.8  # of the bars by the patch, of the patch by the bars
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def _octaves(search: CrossSearch, full_scale_dn: float) -> list["CrossOctave"]:
     octaves = []
     shortest, longest = search.half_px
     while True:
-        upper = min(shortest * OCTAVE, longest)
+        upper = min(shortest * _OCTAVE, longest)
         factor = _reduction(shortest, search.line)
         octaves.append(CrossOctave(factor, (shortest / factor, upper / factor), search, full_scale_dn))
         if upper >= longest:
@@ -64,7 +64,7 @@ def _octaves(search: CrossSearch, full_scale_dn: float) -> list["CrossOctave"]:
 
 def _reduction(half_px: float, line: float) -> int:
     """A power of two: blocks are whole numbers of every octave's pixels."""
-    most = max(min(half_px / SEARCHED_ARM_PX, line * half_px / THINNEST_PX), 1.0)
+    most = max(min(half_px / _SEARCHED_ARM_PX, line * half_px / _THINNEST_PX), 1.0)
     return int(2 ** np.floor(np.log2(most)))
 
 
@@ -76,7 +76,7 @@ class CrossOctave:
     half: tuple[float, float]
     search: CrossSearch
     full_scale_dn: float
-    widest_px = WIDEST_PX
+    widest_px = _WIDEST_PX
 
     @property
     def margin_px(self) -> int:
@@ -104,7 +104,7 @@ def _patches(small: Image, half: tuple[float, float], search: CrossSearch, full_
         thin = np.asarray(cv2.morphologyEx(small, operation, kernel), np.float32)
         middle = float(np.median(thin[::3, ::3]))
         noise = robust_scale(thin[::3, ::3].astype(np.float64) - middle)
-        level = max(0.5 * search.least_contrast * full_scale_dn, middle + NOISE_SIGMAS * noise)
+        level = max(0.5 * search.least_contrast * full_scale_dn, middle + _NOISE_SIGMAS * noise)
         found += _crosses(thin, level, half, search, sign)
     return found
 
@@ -139,21 +139,21 @@ def _cross_of(patch: NDArray[np.floating], line: float) -> tuple[Array, Array] |
     place = np.stack([cols, rows], axis=1).astype(float)
     center = np.average(place, axis=0, weights=weight)
     off = place - center
-    directions = np.deg2rad(np.arange(0.0, 180.0, STEPS_DEG))
+    directions = np.deg2rad(np.arange(0.0, 180.0, _STEPS_DEG))
     units = np.stack([np.cos(directions), np.sin(directions)])
     across = off @ np.stack([-units[1], units[0]])
     reach = float(np.abs(off).max())
-    on_bar = np.abs(across) <= line * reach / 2.0 + BLURRED_PX
+    on_bar = np.abs(across) <= line * reach / 2.0 + _BLURRED_PX
     first = int(np.argmax(on_bar.sum(axis=0)))
     apart = np.abs((np.arange(len(directions)) - first + len(directions) / 2) % len(directions) - len(directions) / 2)
-    others = np.where(apart * STEPS_DEG >= LEAST_ANGLE_DEG, (on_bar & ~on_bar[:, [first]]).sum(axis=0), -1)
+    others = np.where(apart * _STEPS_DEG >= _LEAST_ANGLE_DEG, (on_bar & ~on_bar[:, [first]]).sum(axis=0), -1)
     second = int(np.argmax(others))
     explained = (on_bar[:, first] | on_bar[:, second]).mean()
-    if explained < LEAST_EXPLAINED or others[second] == 0:
+    if explained < _LEAST_EXPLAINED or others[second] == 0:
         return None
     bars = np.stack([_bar(off[on_bar[:, k]], units[:, k]) for k in (first, second)], axis=1)
     filled = min(_filled(patch, center, bar) for bar in (*bars.T, *-bars.T))
-    return (center, bars) if filled >= LEAST_FILLED and abs(np.linalg.det(bars)) >= 1.0 else None
+    return (center, bars) if filled >= _LEAST_FILLED and abs(np.linalg.det(bars)) >= 1.0 else None
 
 
 def _bar(off: Array, unit: Array) -> Array:

@@ -24,12 +24,12 @@ Mask = NDArray[np.bool_]
 WORST_MISFIT, WORST_SMOOTH_MISFIT = 0.23, 0.08  # residuals over contrast: texture and stains are no disks
 SMOOTH = 0.5  # correlation of neighbouring residuals, from which on they are no noise
 MARGIN, LEAST_MARGIN_PX = 0.3, 2.5  # of its radius: the ground is not plain for long, where a target's pad ends, say
-COARSE_PX = 3.0  # radius in pixels that are enough for a first look and its steps
-EDGE_SAMPLES = 8  # likewise, of a disk's edge, two blurs wide
-COARSE_STEPS = 2  # before one that is robust
-SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale
-FIRST_BLUR_PX = 1.0
-HOPELESS = 1.5  # times the misfit that is allowed, before all steps: an outline is right to a few percent
+_COARSE_PX = 3.0  # radius in pixels that are enough for a first look and its steps
+_EDGE_SAMPLES = 8  # likewise, of a disk's edge, two blurs wide
+_COARSE_STEPS = 2  # before one that is robust
+_SCALE_FLOOR = 0.015  # of the contrast, under Tukey's scale
+_FIRST_BLUR_PX = 1.0
+_HOPELESS = 1.5  # times the misfit that is allowed, before all steps: an outline is right to a few percent
 
 
 def disks_among(block: Block, patches: Patches) -> Patches:
@@ -44,13 +44,13 @@ def disks_among(block: Block, patches: Patches) -> Patches:
 def _states(patches: Patches) -> DiskStates:
     greys = np.zeros((len(patches.contrasts), GREYS))
     greys[:, 0] = patches.contrasts
-    return DiskStates(patches.centers, patches.shapes, np.full(len(greys), FIRST_BLUR_PX), greys)
+    return DiskStates(patches.centers, patches.shapes, np.full(len(greys), _FIRST_BLUR_PX), greys)
 
 
 def _every(radius: Array) -> NDArray[np.intp]:
     """(n,) how many pixels apart those are that tell enough of disks (n,): of their area, and of their edge."""
-    of_edge = np.sqrt(4 * np.pi * FIRST_BLUR_PX * radius / EDGE_SAMPLES)
-    return np.maximum(np.minimum(radius / COARSE_PX, of_edge), 1.0).astype(np.intp)
+    of_edge = np.sqrt(4 * np.pi * _FIRST_BLUR_PX * radius / _EDGE_SAMPLES)
+    return np.maximum(np.minimum(radius / _COARSE_PX, of_edge), 1.0).astype(np.intp)
 
 
 def _groups(block: Block, disks: DiskStates, every: NDArray[np.intp]) -> Iterator["_Group"]:
@@ -64,12 +64,12 @@ def _groups(block: Block, disks: DiskStates, every: NDArray[np.intp]) -> Iterato
 
 def _hopeful(group: "_Group") -> DiskStates:
     """Those that look like disks, as their outlines have them and still after some steps."""
-    group = group.part(group.misfit() < HOPELESS)
+    group = group.part(group.misfit() < _HOPELESS)
     if not len(group.grey):
         return group.disks
-    for step in range(COARSE_STEPS + 1):
-        group = group.stepped(is_robust=step == COARSE_STEPS)
-    return group.part((group.misfit() < HOPELESS) & group.is_sane()).disks_now()
+    for step in range(_COARSE_STEPS + 1):
+        group = group.stepped(is_robust=step == _COARSE_STEPS)
+    return group.part((group.misfit() < _HOPELESS) & group.is_sane()).disks_now()
 
 
 def _fitted(group: "_Group") -> DiskStates:
@@ -121,7 +121,7 @@ class _Group:
         """After one step of the adjustment, a robust one being little moved by dust and neighbours."""
         weights = self.pixels.used.astype(np.float32)
         if is_robust:
-            scale = np.maximum(self.scale, SCALE_FLOOR * np.abs(self.state.greys[:, 0]) + 1e-6)
+            scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.state.greys[:, 0]) + 1e-6)
             weights *= tukey_weights(self.residuals / each(scale), 1.0)
         step = solved(self.model.design(), self.residuals, weights)
         return replace(self, model=self.model.at(self.state.stepped(step)))

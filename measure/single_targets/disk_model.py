@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-BLUR_PX = (0.5, 8.0)  # pixels' own width included
-LONGEST_STEP = 0.3  # of the radius
-DAMPING = 1e-4
+_BLUR_PX = (0.5, 8.0)  # pixels' own width included
+_LONGEST_STEP = 0.3  # of the radius
+_DAMPING = 1e-4
 GREYS, UNKNOWNS = 4, 10
 _TAIL = 0.2316419, np.array([1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.319381530]) / np.sqrt(2 * np.pi)
 _GENERATORS = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
@@ -46,11 +46,11 @@ class DiskStates:
     def stepped(self, step: Array) -> "DiskStates":
         """After a step (n, unknowns); one beyond what the linearisation tells is shortened."""
         relative = step[:, :5] / self.radius[:, None]
-        relative /= np.maximum(np.abs(relative).max(axis=1, keepdims=True) / LONGEST_STEP, 1.0)
+        relative /= np.maximum(np.abs(relative).max(axis=1, keepdims=True) / _LONGEST_STEP, 1.0)
         return DiskStates(
             self.centers + relative[:, :2] * self.radius[:, None],
             self.shapes + np.tensordot(relative[:, 2:], _GENERATORS, axes=1) @ self.shapes,
-            np.clip(self.blur + np.clip(step[:, 5], -0.5 * self.blur, self.blur), *BLUR_PX),
+            np.clip(self.blur + np.clip(step[:, 5], -0.5 * self.blur, self.blur), *_BLUR_PX),
             self.greys + step[:, -GREYS:],
         )
 
@@ -165,5 +165,5 @@ def solved(design: Image, residuals: Image, weights: Image) -> Array:
     normal = (weighted @ design.swapaxes(1, 2)).astype(float)
     right = (weighted @ residuals[..., None]).astype(float)
     size = np.sqrt(np.maximum(np.einsum("nuu->nu", normal), 1e-12))
-    scaled = normal / (size[:, :, None] * size[:, None]) + DAMPING * np.eye(normal.shape[1])
+    scaled = normal / (size[:, :, None] * size[:, None]) + _DAMPING * np.eye(normal.shape[1])
     return np.asarray(np.linalg.solve(scaled, right / size[..., None])[..., 0] / size)

@@ -19,11 +19,11 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Sampled = Callable[[NDArray[np.intp], Array], Image]
 
-RAYS, FEW_RAYS = 32, (8, 16)  # of an outline, and of the looks before: half of the blobs do not outlast the first
+_RAYS, _FEW_RAYS = 32, (8, 16)  # of an outline, and of the looks before: half of the blobs do not outlast the first
 REACH = 3.0  # radii of a blob: where its patch must have ended
-CORE, AROUND = 0.5, (1.5, 2.5)  # radii of a blob: within, that it is as high as; between, that there is ground
-GROUND_SHARE = 1 / 3  # of the rays, that are lower there: other things may stand about
-LEAST_HEIGHT = 0.5  # of the blob's contrast
+_CORE, _AROUND = 0.5, (1.5, 2.5)  # radii of a blob: within, that it is as high as; between, that there is ground
+_GROUND_SHARE = 1 / 3  # of the rays, that are lower there: other things may stand about
+_LEAST_HEIGHT = 0.5  # of the blob's contrast
 _CHUNK = 1 << 18  # samples taken at a time: they take a few MiB
 
 
@@ -68,11 +68,11 @@ def outlines_about(image: Image, blobs: Blobs) -> Outlines:
     found = []
     for radius in np.unique(blobs.radius).tolist():
         alike = blobs.part(blobs.radius == radius)
-        for rays in FEW_RAYS:
+        for rays in _FEW_RAYS:
             ends = [_Profiles(near, some, radius, rays, 1.0).ends for some in _chunks(alike, rays * REACH * radius)]
             alike = alike.part(np.concatenate([np.zeros(0, bool), *ends]))
-        for some in _chunks(alike, RAYS * REACH * radius / 0.5):
-            profiles = _Profiles(between, some, radius, RAYS, 0.5)
+        for some in _chunks(alike, _RAYS * REACH * radius / 0.5):
+            profiles = _Profiles(between, some, radius, _RAYS, 0.5)
             found.append(_outlines(some.places[profiles.ends], profiles))
     return joined(_NONE, *found)
 
@@ -93,13 +93,13 @@ class _Profiles:
         angle = 2 * np.pi * np.arange(rays) / rays
         self.directions = np.stack([np.cos(angle), np.sin(angle)])
         self.values = sampled(blobs.places, along[:, None] * self.directions[:, None])
-        core, around = (along <= CORE * radius), (along >= AROUND[0] * radius) & (along <= AROUND[1] * radius)
+        core, around = (along <= _CORE * radius), (along >= _AROUND[0] * radius) & (along <= _AROUND[1] * radius)
         top, outer = self.values[core].mean(axis=(0, 1)), self.values[around].mean(axis=0)
-        self.ground = np.partition(outer, int(GROUND_SHARE * rays), axis=0)[int(GROUND_SHARE * rays)]
+        self.ground = np.partition(outer, int(_GROUND_SHARE * rays), axis=0)[int(_GROUND_SHARE * rays)]
         self.height = top - self.ground
         self.level = (top + self.ground) / 2
         is_below = (self.values[1:].min(axis=0) < self.level).all(axis=0)
-        self.ends = (self.values[0, 0] >= self.level) & is_below & (self.height >= LEAST_HEIGHT * blobs.contrast)
+        self.ends = (self.values[0, 0] >= self.level) & is_below & (self.height >= _LEAST_HEIGHT * blobs.contrast)
 
     def radii(self) -> Image:
         """(rays, those that end) px to where the rays fall below half of the height."""

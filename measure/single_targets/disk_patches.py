@@ -18,16 +18,18 @@ from measure.single_targets.joined import joined
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-PEAK_OF_DISK = 2 / np.e  # of the scale-normalised Laplacian of a disk, in units of its contrast, at sigma = r / sqrt(2)
-RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale
-TEXTURE_PX = 1024  # side, px of the scan: a smaller picture may be full of disks, which are no texture or noise
-CELL_PX = 1536  # of the scan, side of what has one texture and one noise, about
-EVERY = 8  # column and row are enough to tell these
-WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, beside what noise makes of it
-NOISE_SIGMAS = 1.5  # by which that may exceed its expectation: it is that of many rays
-EDGE_PX = 2.5  # of an edge with a blur of a pixel: its whole height over its steepest slope
+_PEAK_OF_DISK = (
+    2 / np.e
+)  # of the scale-normalised Laplacian of a disk, in units of its contrast, at sigma = r / sqrt(2)
+_RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale
+_TEXTURE_PX = 1024  # side, px of the scan: a smaller picture may be full of disks, which are no texture or noise
+_CELL_PX = 1536  # of the scan, side of what has one texture and one noise, about
+_EVERY = 8  # column and row are enough to tell these
+_WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, beside what noise makes of it
+_NOISE_SIGMAS = 1.5  # by which that may exceed its expectation: it is that of many rays
+_EDGE_PX = 2.5  # of an edge with a blur of a pixel: its whole height over its steepest slope
 LEAST_SNR = 4.0  # of a disk that is measured
-LEAST_FLAT = 0.05  # the shorter half axis over the longer, squared
+_LEAST_FLAT = 0.05  # the shorter half axis over the longer, squared
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,8 @@ def margin_px(radii: list[float]) -> int:
 def patches(small: Image, radii: list[float], search: DiskSearch, full_scale_dn: float, factor: int) -> Patches:
     """Patches of a disk's shape in a picture reduced by a factor that lie within its margin."""
     small, scan_px2 = np.ascontiguousarray(small), small.size * factor**2
-    cells = Cells.of(small.shape[1], round(scan_px2 / CELL_PX**2))
-    is_textured = scan_px2 >= TEXTURE_PX**2
+    cells = Cells.of(small.shape[1], round(scan_px2 / _CELL_PX**2))
+    is_textured = scan_px2 >= _TEXTURE_PX**2
     noise = cells.scales(_fine_structure(small)) if is_textured else np.zeros(len(cells.ends))
     found = []
     for sign, own in _blobs(small, radii, search, full_scale_dn, cells, is_textured):
@@ -127,7 +129,7 @@ class Cells:
     @classmethod
     def of(cls, width: int, count: int) -> "Cells":
         """Some count of them, as far as they hold samples."""
-        count = max(min(count, width // (2 * EVERY)), 1)
+        count = max(min(count, width // (2 * _EVERY)), 1)
         return cls(np.linspace(0, width, count + 1).astype(np.intp)[1:])
 
     def scales(self, samples: Image) -> Array:
@@ -161,10 +163,10 @@ def _blobs(
         further = np.sqrt(sigma**2 - blurred**2)
         smooth = np.asarray(cv2.GaussianBlur(smooth, 2 * (2 * int(3 * further + 0.5) + 1,), further), np.float32)
         blurred = sigma
-        contrast = cv2.Laplacian(smooth, cv2.CV_32F, ksize=1, scale=-(sigma**2) / PEAK_OF_DISK)
+        contrast = cv2.Laplacian(smooth, cv2.CV_32F, ksize=1, scale=-(sigma**2) / _PEAK_OF_DISK)
         contrasts.append(np.asarray(contrast, np.float32))
-        textures = cells.scales(contrasts[-1][::EVERY, ::EVERY]) if is_textured else np.zeros(len(cells.ends))
-        levels.append(np.maximum(RESPONSE_SIGMAS * textures, search.least_contrast * full_scale_dn))
+        textures = cells.scales(contrasts[-1][::_EVERY, ::_EVERY]) if is_textured else np.zeros(len(cells.ends))
+        levels.append(np.maximum(_RESPONSE_SIGMAS * textures, search.least_contrast * full_scale_dn))
     neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * max(int(radii[0]), 1) + 1,))
     margin, width = margin_px(radii), small.shape[1] - 2 * margin_px(radii)
     for sign, polarity in ((-1, "dark"), (1, "light")):  # which may use the contrasts up
@@ -186,9 +188,9 @@ def _blobs(
 def _fine_structure(small: Image) -> Image:
     """Samples of what is no smooth picture, with the noise's standard deviation (Immerkaer, 1996, Fast noise variance
     estimation)."""
-    above, row, below = (small[first : len(small) - 2 + first : EVERY] for first in range(3))
+    above, row, below = (small[first : len(small) - 2 + first : _EVERY] for first in range(3))
     rows = above - 2 * row + below
-    left, column, right = (rows[:, first : rows.shape[1] - 2 + first : EVERY] for first in range(3))
+    left, column, right = (rows[:, first : rows.shape[1] - 2 + first : _EVERY] for first in range(3))
     return np.asarray((left - 2 * column + right) / 6)
 
 
@@ -198,8 +200,8 @@ def _round_ones(found: Outlines, noise: Array, factor: int, sign: int) -> Patche
     A disk that stands out of the noise of the scan's own pixels stands out of their means so much the more.
     """
     share = np.minimum(noise / np.maximum(found.height, 1e-9), 1 / (LEAST_SNR * factor))
-    kept = found.part(found.misfit < np.hypot(WORST_MISFIT, NOISE_SIGMAS * EDGE_PX * share / found.radius))
+    kept = found.part(found.misfit < np.hypot(_WORST_MISFIT, _NOISE_SIGMAS * _EDGE_PX * share / found.radius))
     axes, directions = np.linalg.eigh(kept.moments)
     shapes = directions * (2 * np.sqrt(np.maximum(axes, 0.0)))[:, None]
-    is_wide = axes[:, 0] >= LEAST_FLAT * axes[:, 1]
+    is_wide = axes[:, 0] >= _LEAST_FLAT * axes[:, 1]
     return Patches(kept.centers, shapes, sign * kept.height).part(is_wide)

@@ -14,9 +14,9 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-TOGETHER_PIXELS = 1 << 16  # of all disks: with their derivatives they take some 10 MiB
-TOGETHER_CELLS = 1 << 18  # of the windows in which these lie
-LENGTHS_STEP = 2.0  # longest over shortest list among them
+_TOGETHER_PIXELS = 1 << 16  # of all disks: with their derivatives they take some 10 MiB
+_TOGETHER_CELLS = 1 << 18  # of the windows in which these lie
+_LENGTHS_STEP = 2.0  # longest over shortest list among them
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +82,9 @@ class Areas:
         rest = np.argsort(-pixels, kind="stable")
         while len(rest):
             most = pixels[rest[0]]
-            first = rest[: max(int(TOGETHER_PIXELS / most), 1)]
+            first = rest[: max(int(_TOGETHER_PIXELS / most), 1)]
             cells = np.arange(len(first)) * (2 * np.maximum.accumulate(self._half[first]) + 2) ** 2
-            chosen = first[(cells < TOGETHER_CELLS) & (pixels[first] * LENGTHS_STEP >= most)]
+            chosen = first[(cells < _TOGETHER_CELLS) & (pixels[first] * _LENGTHS_STEP >= most)]
             yield chosen
             rest = rest[len(chosen) :]
 

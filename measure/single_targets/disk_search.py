@@ -14,15 +14,15 @@ from measure.single_targets.disk_patches import Candidate, DiskSearch, Patches, 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk stands out by a tenth less
-SIZE_TOLERANCE = 1.4  # of what is found, to the sizes that are looked for
-WIDEST_PX = 12288  # of what is looked at in one piece
-SEARCH_RADIUS_PX = 2.0  # reduced so far that the smallest disk of an octave has at least this radius
+_SCALE_STEP = 1.5  # from one radius to the next at most: between them a disk stands out by a tenth less
+_SIZE_TOLERANCE = 1.4  # of what is found, to the sizes that are looked for
+_WIDEST_PX = 12288  # of what is looked at in one piece
+_SEARCH_RADIUS_PX = 2.0  # reduced so far that the smallest disk of an octave has at least this radius
 
 
 def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
     """What a disk explains, to a tenth of a pixel or so, the strongest first, none within another."""
-    smallest, largest = search.diameter_px[0] / SIZE_TOLERANCE, search.diameter_px[1] * SIZE_TOLERANCE
+    smallest, largest = search.diameter_px[0] / _SIZE_TOLERANCE, search.diameter_px[1] * _SIZE_TOLERANCE
 
     def disks(block: Block, patches: Patches) -> Patches:
         found = disks_among(block, patches)
@@ -46,7 +46,7 @@ class DiskOctave:
     search: DiskSearch
     full_scale_dn: float
 
-    widest_px = WIDEST_PX
+    widest_px = _WIDEST_PX
 
     @property
     def margin_px(self) -> int:
@@ -59,9 +59,9 @@ class DiskOctave:
 def octaves_of(search: DiskSearch, full_scale_dn: float) -> list[DiskOctave]:
     """Radii from the smallest to the largest, each in the reduction that leaves it a few pixels."""
     smallest, largest = search.diameter_px[0] / 2, search.diameter_px[1] / 2
-    count = int(np.ceil(np.log(largest / smallest) / np.log(SCALE_STEP))) + 1
+    count = int(np.ceil(np.log(largest / smallest) / np.log(_SCALE_STEP))) + 1
     by_factor: dict[int, list[float]] = {}
     for radius in np.geomspace(smallest, largest, count).tolist():
-        factor = max(1, int(2 ** np.floor(np.log2(max(radius / SEARCH_RADIUS_PX, 1.0)))))
+        factor = max(1, int(2 ** np.floor(np.log2(max(radius / _SEARCH_RADIUS_PX, 1.0)))))
         by_factor.setdefault(factor, []).append(radius / factor)
     return [DiskOctave(factor, radii, search, full_scale_dn) for factor, radii in by_factor.items()]

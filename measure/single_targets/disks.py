@@ -21,18 +21,18 @@ from measure.single_targets.disk_patches import LEAST_SNR
 Array = NDArray[np.float64]
 
 UNIT_DISK = MarkShape((Disk((0.0, 0.0), 1.0),))
-LONGEST_MARGIN_PX = 10.0
-NARROWEST_MARGIN_PX = 1.5  # however near a neighbour is: with less, no pixel is ground
-LEAST_SHIFT_PX = 2.0  # from the start: a small disk may have been found so far off
-FORM_SIGMA = 0.2  # of size and shear: as well as the start is known
+_LONGEST_MARGIN_PX = 10.0
+_NARROWEST_MARGIN_PX = 1.5  # however near a neighbour is: with less, no pixel is ground
+_LEAST_SHIFT_PX = 2.0  # from the start: a small disk may have been found so far off
+_FORM_SIGMA = 0.2  # of size and shear: as well as the start is known
 PLAIN_MARGIN_PX = 7.0  # where it is plain, for a tenth less noise than with the shortest margin
-MARGIN_BLURS = 4.0  # in a soft scan so many standard deviations of its blur, as other marks get
-LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
+_MARGIN_BLURS = 4.0  # in a soft scan so many standard deviations of its blur, as other marks get
+_LEAST_REACH_PX = 5.5  # from the centre: in less, the size of a small disk and the blur are one
 SMALLEST_RADIUS_PX = 1.2  # of the shorter half axis: below it blur and size cannot be told apart
-SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
-WEAK_DAMAGE, MOST_DAMAGE = 0.2, 0.35
-MOST_BLUR = 0.7  # of the shorter half axis
-SURE, MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may be greater, and what that may add to it
+_SMALL_RADIUS_PX = 2.0  # below it dust cannot be told from a lone disk
+_WEAK_DAMAGE, _MOST_DAMAGE = 0.2, 0.35
+_MOST_BLUR = 0.7  # of the shorter half axis
+_SURE, _MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may be greater, and what that may add to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +68,12 @@ class FittedDisk:
     @property
     def is_soft(self) -> bool:
         """Whether it was fitted, and its edge is as soft as that of a spot, which has none."""
-        return bool(self.is_fitted and self.blur_px > MOST_BLUR * self.half_axes_px[1])
+        return bool(self.is_fitted and self.blur_px > _MOST_BLUR * self.half_axes_px[1])
 
     @property
     def is_spoilt(self) -> bool:
         """Whether it was fitted, and too little about it fits a disk."""
-        return bool(self.is_fitted and self.damaged_fraction > MOST_DAMAGE)
+        return bool(self.is_fitted and self.damaged_fraction > _MOST_DAMAGE)
 
     @property
     def contrast_sigma(self) -> float:
@@ -84,7 +84,7 @@ class FittedDisk:
     def lone_doubt(self) -> str:
         """Why a disk that cannot be compared with others is doubtful: dust and spots look like it; empty otherwise."""
         shorter = self.half_axes_px[1]
-        if shorter < SMALL_RADIUS_PX:
+        if shorter < _SMALL_RADIUS_PX:
             return f"small: half axis {shorter:.1f} px, dust of its size would look the same"
         return f"its edge is as soft as a spot's: blur {self.blur_px:.1f} px, half axis {shorter:.1f} px" * self.is_soft
 
@@ -107,7 +107,7 @@ def fit_disk(
     scan: Scan,
     center_px: Array,
     pixel_from_disk: Array,
-    longest_margin_px: float = LONGEST_MARGIN_PX,
+    longest_margin_px: float = _LONGEST_MARGIN_PX,
     shape: MarkShape = UNIT_DISK,
 ) -> FittedDisk:
     """Fit an ellipse near center_px (2,), which pixel_from_disk (2, 2) describes to some 20 %.
@@ -118,12 +118,12 @@ def fit_disk(
     """
     start = np.column_stack([pixel_from_disk, center_px])
     radius = _mean_radius_px(pixel_from_disk)
-    sure = max(MARGIN * radius, LEAST_MARGIN_PX, LEAST_REACH_PX - radius)
-    sure = max(min(sure, longest_margin_px, LONGEST_MARGIN_PX), NARROWEST_MARGIN_PX)
+    sure = max(MARGIN * radius, LEAST_MARGIN_PX, _LEAST_REACH_PX - radius)
+    sure = max(min(sure, longest_margin_px, _LONGEST_MARGIN_PX), _NARROWEST_MARGIN_PX)
     wide = max(sure, min(PLAIN_MARGIN_PX, longest_margin_px))
     fitted = _fit_by_margin(scan, start, shape, sure, wide)
     disk = fitted(wide)
-    soft = min(MARGIN_BLURS * disk.blur_px, longest_margin_px)
+    soft = min(_MARGIN_BLURS * disk.blur_px, longest_margin_px)
     # In less ground than its blur reaches, a disk's blur, size and contrast may run away together.
     if soft > wide and not (disk.reason and disk.is_fitted):
         softer = fitted(soft)
@@ -151,8 +151,8 @@ def _fit_by_margin(
         margin_px=wide_px,
         margin_blurs=0.0,
         plain_px=sure_px,
-        max_shift_px=max(_mean_radius_px(start[:, :2]), LEAST_SHIFT_PX),
-        linear_sigma=FORM_SIGMA,
+        max_shift_px=max(_mean_radius_px(start[:, :2]), _LEAST_SHIFT_PX),
+        linear_sigma=_FORM_SIGMA,
     )
     window = read_window(scan, window_about(shape, start, wide_px + BESIDE_PX))
 
@@ -197,7 +197,7 @@ def _judged(disk: FittedDisk, fit: Match) -> FittedDisk:
     reason = weakness = ""
     contrast, (_, shorter) = abs(disk.contrast_dn), disk.half_axes_px
     # White residuals are noise, which also moves a contrast: as strong as it may be, the disk counts.
-    most = contrast * (1 + min(SURE * disk.contrast_sigma, MOST_FAINTER)) if fit.covariance_is_white else contrast
+    most = contrast * (1 + min(_SURE * disk.contrast_sigma, _MOST_FAINTER)) if fit.covariance_is_white else contrast
     worst = WORST_SMOOTH_MISFIT if fit.neighbour_correlation > SMOOTH else WORST_MISFIT
     if not disk.is_fitted or most < LEAST_SNR * disk.noise_dn:
         reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
@@ -207,6 +207,6 @@ def _judged(disk: FittedDisk, fit: Match) -> FittedDisk:
         reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
     elif shorter < SMALLEST_RADIUS_PX:
         reason = f"too small: half axis {shorter:.1f} px"
-    elif disk.damaged_fraction > WEAK_DAMAGE:
+    elif disk.damaged_fraction > _WEAK_DAMAGE:
         weakness = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
     return replace(disk, reason=reason, weakness=weakness)
