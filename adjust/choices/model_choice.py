@@ -4,83 +4,29 @@ Every candidate is adjusted with the same weights. Of two of which one contains 
 squares says whether the richer one is needed; any two are compared by Akaike's criterion; and all by how well they
 predict points that had no part in their fit (`adjust.choices.cross_validation`). Chosen is the simplest model that no
 richer one is significantly better than.
-
-    F = ((v'Pv_s - v'Pv_r) / (u_r - u_s)) / (v'Pv_r / r_r)  ~  F(u_r - u_s, r_r)
-    AIC = v'Pv + 2 u                                            where the given variances are taken as known
-    AICc = n ln(v'Pv / n) + 2 K + 2 K (K + 1) / (n - K - 1)     K = u + 1, where their common factor is estimated too
-
-n counts the observations with the priors, u the unknowns. Sources: K. R. Koch, Parameter estimation and hypothesis
-testing in linear models, 1999, chapter 4.2; K. P. Burnham and D. R. Anderson, Model selection and multimodel inference,
-2002, chapter 2.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import stats
 
 from adjust.adjustment import Options, adjust
-from adjust.choices.cross_validation import CrossValidation, approximations_of, cross_validate, folds
+from adjust.choices.candidates import Candidate, Nested, nested_tests, simplest_sufficient
+from adjust.choices.choice_reasons import reasons, verdict
+from adjust.choices.cross_validation import approximations_of, cross_validate, folds
 from adjust.choices.models import Model, given_model, lenses, transformations
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
 from adjust.network import Network, Transformation
 from adjust.quality.reweighting import NO_WEIGHT
-from adjust.quality.significance import LEVEL
 from adjust.result import Adjustment
 from adjust.undetermined.datum_choice import with_held
 
-Array = NDArray[np.float64]
-
-DECISIVE = 10.0  # difference of AICc from which on the worse model has essentially no support (Burnham and Anderson)
 HIGH_CORRELATION = 0.95
 ROUNDS = 3  # of choosing distortion and transformation in turns
 
 Progress = Callable[[str, int], None]
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A model as it was adjusted. problem: why it has no solution, empty where it has one.
-
-    correlated: pairs of interior parameters that the data hardly tell apart, with their correlation.
-    """
-
-    model: Model
-    problem: str = ""
-    observations: int = 0
-    unknowns: int = 0
-    redundancy: int = 0
-    vpv: float = 0.0
-    sigma0: float = 0.0
-    cross_validation: CrossValidation | None = None
-    correlated: tuple[tuple[str, str, float], ...] = ()
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def aic(self) -> float:
-        return self.vpv + 2.0 * self.unknowns
-
-    @property
-    def aicc(self) -> float:
-        """inf where there are too few observations for it."""
-        k, n = self.unknowns + 1, self.observations
-        if n - k - 1 <= 0:
-            return np.inf
-        return float(n * np.log(max(self.vpv, np.finfo(float).tiny) / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
-
-
-@dataclass(frozen=True)
-class Nested:
-    """The F-test of a model against a richer one that contains it."""
-
-    simpler: Model
-    richer: Model
-    f: float
-    degrees: tuple[int, int]
-    p: float
 
 
 @dataclass(frozen=True)
@@ -122,8 +68,8 @@ def choose(
         candidates=candidates,
         tests=nested_tests(candidates),
         chosen=chosen,
-        verdict=_verdict(given, chosen),
-        reasons=_reasons(candidates, chosen),
+        verdict=verdict(given, chosen),
+        reasons=reasons(candidates, chosen),
     )
 
 
@@ -140,54 +86,6 @@ def _chosen(fits: "_Fits", film: Transformation, with_sets: bool) -> Candidate |
             break
         film = chosen.model.transformation
     return chosen
-
-
-def simplest_sufficient(candidates: Sequence[Candidate]) -> Candidate | None:
-    """The simplest candidate that no richer one is significantly better than; None where none has a solution."""
-    chosen = None
-    for candidate in sorted(_solved(candidates), key=lambda each: (each.unknowns, each.vpv)):
-        if chosen is None or _is_better(candidate, chosen):
-            chosen = candidate
-    return chosen
-
-
-def _is_better(richer: Candidate, simpler: Candidate) -> bool:
-    """Whether a model is significantly better than one of no more unknowns, and predicts better too."""
-    a, b = richer.cross_validation, simpler.cross_validation
-    if a is not None and b is not None and a.sigmas >= b.sigmas:
-        return False
-    if a is None and b is not None:
-        return False
-    if richer.model.contains(simpler.model):
-        return f_test(simpler, richer).p < LEVEL
-    return simpler.aicc - richer.aicc > DECISIVE
-
-
-def f_test(simpler: Candidate, richer: Candidate) -> Nested:
-    """Whether the richer of two nested models leaves less than chance would."""
-    more, redundancy = richer.unknowns - simpler.unknowns, richer.redundancy
-    variance = richer.vpv / redundancy if redundancy > 0 else 1.0
-    f = max(simpler.vpv - richer.vpv, 0.0) / more / variance
-    p = stats.f.sf(f, more, redundancy) if redundancy > 0 else stats.chi2.sf(f * more, more)
-    return Nested(simpler.model, richer.model, float(f), (more, redundancy), float(p))
-
-
-def nested_tests(candidates: Sequence[Candidate]) -> tuple[Nested, ...]:
-    """Of all neighbours: pairs of which one contains the other with no candidate between them."""
-    solved = _solved(candidates)
-    models = [each.model for each in solved]
-    return tuple(
-        f_test(simpler, richer)
-        for richer in solved
-        for simpler in solved
-        if richer.model.contains(simpler.model)
-        and richer.unknowns > simpler.unknowns
-        and not any(richer.model.contains(each) and each.contains(simpler.model) for each in models)
-    )
-
-
-def _solved(candidates: Sequence[Candidate]) -> list[Candidate]:
-    return [each for each in candidates if not each.problem]
 
 
 def weighed(own: Adjustment) -> Network:
@@ -278,63 +176,3 @@ def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:
             if abs(correlation[i, j]) > HIGH_CORRELATION
         ]
     return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
-
-
-def _verdict(given: Model, chosen: Candidate | None) -> str:
-    if chosen is None:
-        return "No model has a solution."
-    text = f"The data ask for {chosen.model.name}."
-    if chosen.model == given:
-        text += " That is the model as it is given."
-    low, high = (float(np.sqrt(stats.chi2.ppf(p, chosen.redundancy) / chosen.redundancy)) for p in (0.005, 0.995))
-    if chosen.redundancy > 0 and not low <= chosen.sigma0 <= high:
-        text += (
-            f" Its sigma0 of {chosen.sigma0:.2f} is not what the given standard deviations allow, {low:.2f} to "
-            f"{high:.2f}: they are not right, or no candidate is."
-        )
-    return text
-
-
-def _reasons(candidates: Sequence[Candidate], chosen: Candidate | None) -> tuple[str, ...]:
-    """A sentence on every other candidate that differs from the chosen one in distortion or in transformation alone."""
-    if chosen is None:
-        return tuple(f"{each.model.name}: {each.problem}" for each in candidates)
-    near = [
-        each
-        for each in candidates
-        if each is not chosen
-        and (
-            each.model.transformation == chosen.model.transformation
-            or (each.model.family, each.model.parameters) == (chosen.model.family, chosen.model.parameters)
-        )
-    ]
-    return tuple(_reason(each, chosen) for each in near)
-
-
-def _reason(other: Candidate, chosen: Candidate) -> str:
-    name = other.model.name
-    if other.problem:
-        return f"{name} cannot be had: {other.problem}"
-    predicts = _prediction(other, chosen)
-    if chosen.model.contains(other.model):
-        test = f_test(other, chosen)
-        return f"{name} is too simple: {_f_words(test)}; {predicts}."
-    if other.model.contains(chosen.model) and other.unknowns > chosen.unknowns:
-        test = f_test(chosen, other)
-        needless = "adds nothing that is significant" if test.p >= LEVEL else "fits significantly better"
-        return f"{name} {needless}: {_f_words(test)}; {predicts}."
-    better = "higher" if other.aicc >= chosen.aicc else "lower"
-    size = "richer" if other.unknowns > chosen.unknowns else "no richer"
-    return f"{name}, {size}, has an AICc {abs(other.aicc - chosen.aicc):.1f} {better}; {predicts}."
-
-
-def _f_words(test: Nested) -> str:
-    chance = f"p = {test.p:.3f}" if test.p >= 0.001 else "p < 0.001"
-    return f"F({test.degrees[0]}, {test.degrees[1]}) = {test.f:.3g}, {chance}"
-
-
-def _prediction(other: Candidate, chosen: Candidate) -> str:
-    a, b = other.cross_validation, chosen.cross_validation
-    if a is None or b is None:
-        return "it was not cross-validated" if a is None else "the chosen one was not cross-validated"
-    return f"it predicts points left out to {a.rms_um:.2f} um, the chosen one to {b.rms_um:.2f} um"

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from adjust.choices.model_choice import Candidate, Choice, choose
+from adjust.choices.candidates import Candidate
+from adjust.choices.model_choice import Choice, choose
 from adjust.choices.models import Model
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjusting.adjustment_file import without_nan

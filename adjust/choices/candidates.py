@@ -1,0 +1,112 @@
+"""Models as they were adjusted, compared with one another: nested ones by the F-test, any two by Akaike's criterion.
+
+    F = ((v'Pv_s - v'Pv_r) / (u_r - u_s)) / (v'Pv_r / r_r)  ~  F(u_r - u_s, r_r)
+    AIC = v'Pv + 2 u                                            where the given variances are taken as known
+    AICc = n ln(v'Pv / n) + 2 K + 2 K (K + 1) / (n - K - 1)     K = u + 1, where their common factor is estimated too
+
+n counts the observations with the priors, u the unknowns. Sources: K. R. Koch, Parameter estimation and hypothesis
+testing in linear models, 1999, chapter 4.2; K. P. Burnham and D. R. Anderson, Model selection and multimodel inference,
+2002, chapter 2.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from adjust.choices.cross_validation import CrossValidation
+from adjust.choices.models import Model
+from adjust.quality.significance import LEVEL
+
+DECISIVE = 10.0  # difference of AICc from which on the worse model has essentially no support (Burnham and Anderson)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model as it was adjusted. problem: why it has no solution, empty where it has one.
+
+    correlated: pairs of interior parameters that the data hardly tell apart, with their correlation.
+    """
+
+    model: Model
+    problem: str = ""
+    observations: int = 0
+    unknowns: int = 0
+    redundancy: int = 0
+    vpv: float = 0.0
+    sigma0: float = 0.0
+    cross_validation: CrossValidation | None = None
+    correlated: tuple[tuple[str, str, float], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def aic(self) -> float:
+        return self.vpv + 2.0 * self.unknowns
+
+    @property
+    def aicc(self) -> float:
+        """inf where there are too few observations for it."""
+        k, n = self.unknowns + 1, self.observations
+        if n - k - 1 <= 0:
+            return np.inf
+        return float(n * np.log(max(self.vpv, np.finfo(float).tiny) / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
+
+
+@dataclass(frozen=True)
+class Nested:
+    """The F-test of a model against a richer one that contains it."""
+
+    simpler: Model
+    richer: Model
+    f: float
+    degrees: tuple[int, int]
+    p: float
+
+
+def simplest_sufficient(candidates: Sequence[Candidate]) -> Candidate | None:
+    """The simplest candidate that no richer one is significantly better than; None where none has a solution."""
+    chosen = None
+    for candidate in sorted(_solved(candidates), key=lambda each: (each.unknowns, each.vpv)):
+        if chosen is None or _is_better(candidate, chosen):
+            chosen = candidate
+    return chosen
+
+
+def _is_better(richer: Candidate, simpler: Candidate) -> bool:
+    """Whether a model is significantly better than one of no more unknowns, and predicts better too."""
+    a, b = richer.cross_validation, simpler.cross_validation
+    if a is not None and b is not None and a.sigmas >= b.sigmas:
+        return False
+    if a is None and b is not None:
+        return False
+    if richer.model.contains(simpler.model):
+        return f_test(simpler, richer).p < LEVEL
+    return simpler.aicc - richer.aicc > DECISIVE
+
+
+def f_test(simpler: Candidate, richer: Candidate) -> Nested:
+    """Whether the richer of two nested models leaves less than chance would."""
+    more, redundancy = richer.unknowns - simpler.unknowns, richer.redundancy
+    variance = richer.vpv / redundancy if redundancy > 0 else 1.0
+    f = max(simpler.vpv - richer.vpv, 0.0) / more / variance
+    p = stats.f.sf(f, more, redundancy) if redundancy > 0 else stats.chi2.sf(f * more, more)
+    return Nested(simpler.model, richer.model, float(f), (more, redundancy), float(p))
+
+
+def nested_tests(candidates: Sequence[Candidate]) -> tuple[Nested, ...]:
+    """Of all neighbours: pairs of which one contains the other with no candidate between them."""
+    solved = _solved(candidates)
+    models = [each.model for each in solved]
+    return tuple(
+        f_test(simpler, richer)
+        for richer in solved
+        for simpler in solved
+        if richer.model.contains(simpler.model)
+        and richer.unknowns > simpler.unknowns
+        and not any(richer.model.contains(each) and each.contains(simpler.model) for each in models)
+    )
+
+
+def _solved(candidates: Sequence[Candidate]) -> list[Candidate]:
+    return [each for each in candidates if not each.problem]
