@@ -4,7 +4,7 @@ python benchmarks/real_marks.py MARKS_FOLDER [SCANS_FOLDER]
 
 Every picture below MARKS_FOLDER is a mark at full resolution. Means over FOLD x FOLD of its pixels, begun at each of
 them in turn, are pictures of the same mark shifted by known parts of a pixel; the first is the template of the others.
-Besides, the pixels are dealt out to four pictures that share none, so that the scanner's noise of one is not the
+So they are again under a Gaussian blur, as soft as the sharpest scanners show film. Besides, the pixels are dealt out to four pictures that share none, so that the scanner's noise of one is not the
 other's. The ring-crosses of three frames in SCANS_FOLDER are matched in red, green and blue alone: for each pair of
 channels the shift that the frame's marks have in common is the scanner's, what is left is the measurement's.
 """
@@ -27,6 +27,7 @@ from measure.scans.scan import Scan, open_scan
 Array = NDArray[np.float64]
 
 FOLD = 4
+BLUR_PX = 0.5  # of the softer pictures
 SPARE_PX = 8  # of a chip's edge that the template leaves out: room to be shifted
 OPTIONS = MatchOptions(freedom="shift", estimate_blur=False)
 PX_FROM_MM = np.diag([1.0, -1.0])  # of a template whose pixel is a millimetre
@@ -41,7 +42,7 @@ def main() -> None:
     """Print both tables."""
     marks = Path(sys.argv[1])
     print(f"{'chip':24} {'pictures':>9} {'rms error px':>13} {'claimed px':>11} {'ratio':>6}")
-    for way, resampled in (("phases", phases), ("shared pixels: none", dealt)):
+    for way, resampled in (("phases", phases), ("phases, softer", soft_phases), ("shared pixels: none", dealt)):
         everything: list[Array] = []
         for path in sorted(marks.rglob("*.*")):
             fine = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -76,6 +77,11 @@ def phases(fine: Array) -> Iterator[tuple[Array, tuple[float, float]]]:
         for col in range(FOLD):
             part = fine[row : row + rows * FOLD, col : col + cols * FOLD]
             yield part.reshape(rows, FOLD, cols, FOLD).mean(axis=(1, 3)), (-col / FOLD, -row / FOLD)
+
+
+def soft_phases(fine: Array) -> Iterator[tuple[Array, tuple[float, float]]]:
+    """The same of a mark that is blurred before."""
+    return phases(np.asarray(cv2.GaussianBlur(fine, (0, 0), FOLD * BLUR_PX), float))
 
 
 def dealt(fine: Array) -> Iterator[tuple[Array, tuple[float, float]]]:
