@@ -4,9 +4,10 @@ python benchmarks/real_marks.py MARKS_FOLDER [SCANS_FOLDER]
 
 Every picture below MARKS_FOLDER is a mark at full resolution. Means over FOLD x FOLD of its pixels, begun at each of
 them in turn, are pictures of the same mark shifted by known parts of a pixel; the first is the template of the others.
-So they are again under a Gaussian blur, as soft as the sharpest scanners show film. Besides, the pixels are dealt out to four pictures that share none, so that the scanner's noise of one is not the
-other's. The ring-crosses of three frames in SCANS_FOLDER are matched in red, green and blue alone: for each pair of
-channels the shift that the frame's marks have in common is the scanner's, what is left is the measurement's.
+So they are again under a Gaussian blur, as soft as the sharpest scans of film. Besides, the pixels are dealt out to
+four pictures that share none, so that the scanner's noise of one is not the other's. The ring-crosses of three frames
+in SCANS_FOLDER are matched in red, green and blue alone: for each pair of channels the shift that the frame's marks
+have in common is the scanner's, what is left is the measurement's.
 """
 
 import sys
