@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.optimize import brentq
 
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement
@@ -25,6 +26,7 @@ _FILM_MM = 0.005  # scatter of marks by film and scanner, where one frame has to
 _OPPOSITE_MM = 0.3  # how far from being opposite about the centre two given marks may be: an affinity keeps midpoints
 _TOLD = np.log(100.0)  # log-odds at which one mark rather than another is taken for the one that is off
 _ROUNDS = 10  # of fitting the frames to the median of all, which comes to rest after a few
+_LEAST_MM = 1e-6  # of a standard deviation
 _MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
 
 
@@ -49,6 +51,15 @@ class _Seen:
     def without(self, places: Sequence[int]) -> "_Seen":
         kept = np.setdiff1d(np.arange(len(self.index)), places)
         return replace(self, index=self.index[kept], camera_mm=self.camera_mm[kept], sigma_mm=self.sigma_mm[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class _Reference:
+    """A frame's marks as the median of the other frames has them: mm (n, 2), and the median's variance (n,) in units of
+    one mark's."""
+
+    mm: Array
+    variance: Array
 
 
 def cross_checked(frames: Sequence[FrameMeasurement], layout: FiducialLayout) -> tuple[FrameMeasurement, ...]:
@@ -102,21 +113,21 @@ def _by_other_frames(frames: Sequence[FrameMeasurement], layout: FiducialLayout)
     seen = [_seen(frame, layout) for frame in frames]
     doubts: list[dict[str, Doubt]] = [{} for _ in frames]
     while True:
-        others = _others_mm(seen, layout)
-        fits = {
-            place: _Fit(each, reference)
+        others = _others(seen, layout)
+        apart = {
+            place: _Apart.of(each, reference)
             for place, (each, reference) in enumerate(zip(seen, others, strict=True))
             if reference is not None and len(each.index) > 3
         }
-        if len(fits) < 2:
+        if len(apart) < 2:
             break
-        scatter = _Scatter.of(list(fits.values()))
-        chances = {place: scatter.chance(fit) for place, fit in fits.items()}
+        scatter = _Scatter.of(list(apart.values()))
+        chances = {place: scatter.chance(each) for place, each in apart.items()}
         worst = min(chances, key=lambda place: chances[place])
-        if chances[worst] * len(fits) >= _CHANCE:
+        if chances[worst] * len(apart) >= _CHANCE:
             break
         # Of two frames nobody knows which one is off.
-        for place in fits if len(fits) == 2 else (worst,):
+        for place in apart if len(apart) == 2 else (worst,):
             alike, off_mm = _strangers(seen[place], others[place], scatter)
             names = [layout.marks[seen[place].index[number]].id for number in alike]
             for name, off in zip(names, off_mm, strict=True):
@@ -136,8 +147,8 @@ def _seen(frame: FrameMeasurement, layout: FiducialLayout) -> _Seen:
     return _Seen(np.array([number[mark.point] for mark in marks], dtype=np.intp), camera, mm * np.array(sigma), mm)
 
 
-def _others_mm(seen: Sequence[_Seen], layout: FiducialLayout) -> list[Array | None]:
-    """For each frame its marks (n, 2) as the median of all other frames has them; None where one is in no other.
+def _others(seen: Sequence[_Seen], layout: FiducialLayout) -> list[_Reference | None]:
+    """For each frame its marks as the median of all other frames has them; None where one is in no other.
 
     The median is found in turns: frames fitted to it by affinities, then together anew; the given places hold the
     datum.
@@ -152,11 +163,14 @@ def _others_mm(seen: Sequence[_Seen], layout: FiducialLayout) -> list[Array | No
                 places[each.index] = design @ np.linalg.lstsq(design, common[each.index], rcond=None)[0]
         found = np.isfinite(fitted[..., 0]).any(axis=0)
         common[found] = np.nanmedian(fitted[:, found], axis=0)
-    result: list[Array | None] = []
+    result: list[_Reference | None] = []
     for place, each in enumerate(seen):
         rest = np.delete(fitted, place, axis=0)[:, each.index]
-        known = len(each.index) > 0 and bool(np.isfinite(rest[..., 0]).any(axis=0).all())
-        result.append(np.nanmedian(rest, axis=0) if known else None)
+        frames = np.isfinite(rest[..., 0]).sum(axis=0)
+        if len(each.index) == 0 or not frames.all():
+            result.append(None)
+        else:
+            result.append(_Reference(np.nanmedian(rest, axis=0), np.minimum(np.pi / 2, frames / 2 + 0.5) / frames))
     return result
 
 
@@ -165,20 +179,38 @@ def _affine(places: Array) -> Array:
 
 
 class _Fit:
-    """A frame fitted by an affinity to a reference, in mm of the camera, on the marks kept (n,), all unless said: off
-    (all, 2), of every mark, residuals (n, 2) and leverage (n,) of those kept, degrees of freedom."""
+    """A frame fitted by an affinity to a reference, in mm of the camera, on the marks kept (n,): off (all, 2), of every
+    mark, residuals (n, 2) and sigma (n,) of those kept."""
 
-    def __init__(self, seen: _Seen, reference: Array | None, kept: NDArray[np.bool_] | None = None) -> None:
-        assert reference is not None
-        kept = np.ones(len(seen.index), dtype=bool) if kept is None else kept
+    def __init__(self, seen: _Seen, reference: Array, kept: NDArray[np.bool_]) -> None:
         design = _affine(seen.camera_mm)
-        q = np.linalg.qr(design[kept])[0]
         solution = np.linalg.lstsq(design[kept], reference[kept], rcond=None)[0]
         self.off = reference - design @ solution  # of those left out, too
         self.residuals = self.off[kept]
-        self.leverage: Array = np.asarray((q**2).sum(axis=1))
         self.sigma = seen.sigma_mm[kept]
-        self.degrees = 2 * (int(kept.sum()) - 3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Apart:
+    """How far each mark of a frame (n,) lies from where an affinity through the frame's others puts it: squares_mm2 of
+    the distance. The variance of a coordinate of it is measured_mm2, and what film scatters a mark by times film."""
+
+    squares_mm2: Array
+    film: Array
+    measured_mm2: Array
+
+    @classmethod
+    def of(cls, seen: _Seen, reference: _Reference) -> "_Apart":
+        q = np.linalg.qr(_affine(seen.camera_mm))[0]
+        own = np.maximum(1 - (q**2).sum(axis=1), 1e-6)  # of a mark's error what its residual shows
+        from_marks = (np.eye(len(q)) - q @ q.T) / own[:, None]
+        shares = from_marks**2 * (1 + reference.variance)
+        squares = ((from_marks @ reference.mm) ** 2).sum(axis=1)
+        return cls(squares, shares.sum(axis=1), shares @ np.maximum(seen.sigma_mm, _LEAST_MM) ** 2)
+
+    @property
+    def degrees(self) -> int:
+        return 2 * (len(self.film) - 3)
 
 
 @dataclass(frozen=True)
@@ -189,34 +221,42 @@ class _Scatter:
     degrees: float
 
     @classmethod
-    def of(cls, fits: Sequence[_Fit]) -> "_Scatter":
-        """From the median of the squared residuals, freed of what the fits take up: marks that are off do not widen it.
-        Half of Rayleigh's squares are below 2 ln 2."""
-        squares = np.concatenate([(fit.residuals**2).sum(axis=1) / np.maximum(1 - fit.leverage, 1e-6) for fit in fits])
-        variance = float(np.median(squares)) / (2 * np.log(2))
-        return cls(max(variance, 1e-12), _MEDIAN_EFFICIENCY * sum(fit.degrees for fit in fits))
+    def of(cls, frames: Sequence[_Apart]) -> "_Scatter":
+        """What there is more than the marks' own standard deviations, from the median of the squared distances: marks
+        that are off do not widen it. Half of Rayleigh's squares are below 2 ln 2."""
+        squares = np.concatenate([each.squares_mm2 for each in frames])
+        film, measured = (
+            np.concatenate(parts) for parts in zip(*((f.film, f.measured_mm2) for f in frames), strict=True)
+        )
+
+        def too_far(variance: float) -> float:
+            return float(np.median(squares / (variance * film + measured)) - 2 * np.log(2))
+
+        variance = 0.0 if too_far(0.0) <= 0 else float(brentq(too_far, 0.0, float((squares / film).max())))
+        return cls(variance, _MEDIAN_EFFICIENCY * sum(each.degrees for each in frames))
 
     def chi_square(self, fit: _Fit) -> float:
-        return float(((fit.residuals**2).sum(axis=1) / (self.variance_mm2 + fit.sigma**2)).sum())
+        variance = self.variance_mm2 + np.maximum(fit.sigma, _LEAST_MM) ** 2
+        return float(((fit.residuals**2).sum(axis=1) / variance).sum())
 
-    def chance(self, fit: _Fit) -> float:
-        """The probability that a frame of good marks leaves as much."""
-        if fit.degrees <= 0:
-            return 1.0
-        return float(stats.f.sf(self.chi_square(fit) / fit.degrees, fit.degrees, max(self.degrees, 1.0)))
+    def chance(self, frame: _Apart) -> float:
+        """The probability that a frame of good marks has one as far off."""
+        squares = frame.squares_mm2 / (self.variance_mm2 * frame.film + frame.measured_mm2)
+        return len(squares) * float(stats.f.sf(squares.max() / 2, 2, max(self.degrees, 1.0)))
 
 
-def _strangers(seen: _Seen, reference: Array | None, scatter: _Scatter) -> tuple[list[int], list[float]]:
+def _strangers(seen: _Seen, reference: _Reference | None, scatter: _Scatter) -> tuple[list[int], list[float]]:
     """The mark of a frame that is off, or those that it cannot be told from, and how far, mm, each is."""
+    assert reference is not None
     everything = np.ones(len(seen.index), dtype=bool)
     without = []
     for place in range(len(everything)):
         rest = everything.copy()
         rest[place] = False
-        without.append(_Fit(seen, reference, rest))
+        without.append(_Fit(seen, reference.mm, rest))
     misfits = np.array([scatter.chi_square(fit) for fit in without])
     alike = np.flatnonzero(misfits - misfits.min() < 2 * _TOLD).tolist()
-    fit = without[alike[0]] if len(alike) == 1 else _Fit(seen, reference)
+    fit = without[alike[0]] if len(alike) == 1 else _Fit(seen, reference.mm, everything)
     return alike, [float(np.hypot(*fit.off[place])) for place in alike]
 
 

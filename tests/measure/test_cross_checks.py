@@ -74,6 +74,18 @@ def test_a_mark_that_only_one_frame_has_elsewhere_is_weak() -> None:
     np.testing.assert_allclose(np.sqrt(mark.covariance_px2[0, 0]), 1.5, rtol=0.3)
 
 
+def test_a_mark_ten_standard_deviations_off_is_mostly_found_in_six_frames() -> None:
+    """A distance of ten standard deviations of a coordinate, film included."""
+    rng = np.random.default_rng(3)
+    layout, found = layout_of(EIGHT, sigma_mm=1.0), 0
+    for camera in range(20):
+        frames, mark, angle = frames_of(layout, 6, rng, camera_mm=0.01), camera % 8, rng.uniform(0.0, 2 * np.pi)
+        off = 10 * np.hypot(SIGMA_PX, FILM_MM * PX_PER_MM)
+        frames[4] = moved(frames[4], mark, (off * np.cos(angle), off * np.sin(angle)))
+        found += weak(cross_checked(frames, layout)) == {("4", str(mark))}
+    assert found >= 14
+
+
 def test_four_marks_do_not_tell_which_of_them_is_off() -> None:
     rng = np.random.default_rng(3)
     layout = layout_of(FOUR, sigma_mm=1.0)
