@@ -60,6 +60,7 @@ class FrameMeasurement:
 
     pixel_from_camera: (2, 3) affine matrix, camera mm (x', y', 1) to (column, row), from the fiducials found; None
     where there are too few.
+    weights: what each channel of a colour scan counts in what its fiducials were measured in; None for its grey value.
     problems: what the user should look at, one sentence each.
     """
 
@@ -68,6 +69,7 @@ class FrameMeasurement:
     pose: Pose | None = None
     pixel_from_camera: Array | None = None
     problems: tuple[str, ...] = ()
+    weights: tuple[float, ...] | None = None
 
     @property
     def px_per_mm(self) -> float | None:

@@ -42,7 +42,8 @@ def present_frame(
         marks = tuple(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
         )
-    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, (*problems, *_problems(frame)))
+    problems = (*problems, *_problems(frame))
+    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights)
 
 
 def _problems(frame: Frame) -> list[str]:

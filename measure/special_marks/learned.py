@@ -50,12 +50,13 @@ class Chip:
         return 1000.0 / float(np.sqrt(abs(np.linalg.det(self.pixel_from_mark[:, :2]))))
 
 
-def cut(scan: Scan, pixel_from_mark: Array, size_mm: float) -> Chip:
-    """The window of a scan that holds a square of size_mm about the mark however it is turned, and room to move."""
+def cut(scan: Scan, pixel_from_mark: Array, size_mm: float, weights: Sequence[float] | None = None) -> Chip:
+    """The window of a scan that holds a square of size_mm about the mark however it is turned, and room to move.
+    weights: of a colour scan's channels, those in which the mark is measured."""
     matrix = np.array(pixel_from_mark, dtype=float)
     reach = int(np.ceil(np.abs(matrix[:, :2]).sum(axis=1).max() * size_mm / 2)) + _ROOM_PX
     col0, row0 = (int(value) - reach for value in np.rint(matrix[:, 2]))
-    grey = scan.window(col0, row0, 2 * reach + 1, 2 * reach + 1).astype(np.float64)
+    grey = scan.window(col0, row0, 2 * reach + 1, 2 * reach + 1, weights).astype(np.float64)
     return Chip(scan.name, grey, (col0, row0), matrix)
 
 

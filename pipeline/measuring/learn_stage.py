@@ -95,7 +95,7 @@ def _chips_of(project: Project, camera: CameraFile, learned: Sequence[GivenFiduc
         if matrix is None or not _is_named(frame, camera):
             return {}
         return {
-            one.id: cut(scan, np.column_stack([matrix[:, :2], center]), one.learned_mm)
+            one.id: cut(scan, np.column_stack([matrix[:, :2], center]), one.learned_mm, frame.weights)
             for one in learned
             if (center := found.get(one.id)) is not None
         }

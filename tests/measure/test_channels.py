@@ -7,6 +7,7 @@ from brute_marks import Array, written_scan
 from drawn_frames import FRAME_PX, NUMBERED, assert_right, measured, paint, pixel_from_camera
 
 from measure.frames.channels import best_weights
+from measure.special_marks.learned import cut
 
 RED, GREEN, BLUE = np.eye(3)
 AS_LIGHT = 0.299 / 0.587  # of green that is lost for a mark of more red to be as light as its ground
@@ -28,6 +29,8 @@ def test_red_marks_as_light_as_their_grey_ground_are_found_and_right(tmp_path: P
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == ("90", True)
     assert_right(result, NUMBERED, MATRIX)
+    assert result.weights is not None
+    np.testing.assert_allclose(result.weights, RED, atol=0.02)
 
 
 def test_channels_are_those_of_the_polarity_or_of_the_better_one(tmp_path: Path) -> None:
@@ -45,3 +48,12 @@ def test_channels_are_those_of_the_polarity_or_of_the_better_one(tmp_path: Path)
             np.testing.assert_allclose(best[0], weights, atol=0.02)
             assert best[1] == sign
         assert best_weights(scan, [], (1, -1)) is None
+
+
+def test_learned_marks_are_cut_in_the_channels_they_are_measured_in(tmp_path: Path) -> None:
+    """Else the same mark has another contrast there, which counts as changed light."""
+    place = np.column_stack([MATRIX[:, :2], MATRIX @ (*NUMBERED.marks[0].xy_mm, 1.0)])
+    with written_scan(red_on_grey(), tmp_path) as scan:
+        red, grey = (cut(scan, place, 2.0, weights).grey for weights in (RED.tolist(), None))
+    assert np.ptp(red) > 14000.0
+    assert np.ptp(grey) < 2000.0
