@@ -3,7 +3,8 @@
 Hypothesis and test. Three object points that lie close together are taken to be three marks that do; the poses from
 which they would be are tested on the points about them, the best ones grow over the whole image, and what has grown is
 believed only if chance would hardly do as well (a contrario: Desolneux, Moisan and Morel 2008). Then it is tried
-whether the same marks could bear other names: a field that looks the same from another side has none, and that is said.
+whether the same marks could bear other names. Of two namings the one counts whose points come far closer to the marks;
+a field that looks the same from another side has none, and that is said.
 
 Where the principal distance is not known, either, some far apart are tried: what lies about three points looks nearly
 the same with any, and the growing finds the right one.
@@ -26,7 +27,8 @@ Array = NDArray[np.float64]
 LEAST_POINTS = 5
 MOST_LOG10_CHANCE = -6.0
 LEAST_SHARE = 0.4  # of the points that the image should show
-ALIKE_SHARE = 0.7  # of the named marks, from which on other names explain the image as well
+ALIKE_SHARE = 0.7  # of the named marks, from which on other names may explain the image as well
+TOLD_LOG10 = 6.0  # of the likelihood, by which marks must lie closer to their points in one naming than in another
 MOST_POSES = 1_000_000  # that are tried: they bound the time
 MOST_LOG10_CHANCE_OF_CODES = -3.0  # of codes that agree: they were not chosen among many
 LEAST_CODES = 4  # three always give a pose
@@ -76,11 +78,11 @@ def name_marks(
     search, found = _first([_Search(own, normals, marks, tried) for marks in assumed])
     if found is None:
         return f"the {m} marks found do not make the pattern that the {n} points would from any side"
-    other = search.other(found)
-    if other is not None:
+    found, alike = search.likeliest(found)
+    if alike is not None:
         return (
             f"the points look the same from another side, or moved on, as a regular grid does: {len(found.mark)} marks "
-            f"agree with one naming, {len(other.mark)} with another one"
+            f"agree with one naming, {len(alike.mark)} with another one, and about as closely"
         )
     return unit.names(found, search.marks.c)
 
@@ -181,18 +183,27 @@ class _Search:
         poses = promising(self.xyz, self.normals, self.marks, cluster.triple[None], triples)
         return next(iter(self._grown(poses)), None), poses.tried
 
-    def other(self, found: Grown) -> Grown | None:
-        """Another naming that explains the image as well, if there is one: named clusters taken for other points."""
+    def likeliest(self, found: Grown) -> tuple[Grown, Grown | None]:
+        """Of a naming and the others that the image may have the one that chance makes least likely; and another one
+        that explains the image as well, if there is one."""
+        others = self._others(found)
+        best = min([found, *others], key=_log10_chance)
+        rivals = others if best is found else [found, *self._others(best)]
+        return best, next((one for one in rivals if _is_alike(one, best)), None)
+
+    def _others(self, found: Grown) -> list[Grown]:
+        """Other namings of the image: named clusters taken for other points."""
         named = [cluster for cluster in self.clusters if all(int(point) in found.mark for point in cluster.triple)]
+        others = []
         for cluster in named[:OTHER_CLUSTERS]:
             seen = np.array([[found.mark[int(point)] for point in cluster.triple]])
             points = point_triples(cluster, self.xyz)
             poses = promising(self.xyz, self.normals, self.marks, points, seen)
             for grown in self._grown(poses):
                 same = sum(found.mark.get(point) == mark for point, mark in grown.mark.items())
-                if same < 0.5 * len(grown.mark) and len(grown.mark) >= ALIKE_SHARE * len(found.mark):
-                    return grown
-        return None
+                if same < 0.5 * len(grown.mark):
+                    others.append(grown)
+        return others
 
     def _grown(self, poses: Poses) -> list[Grown]:
         grown = [
@@ -200,7 +211,18 @@ class _Search:
             for rotation, shift, named in zip(poses.rotations, poses.shifts, poses.named, strict=True)
         ]
         enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
-        return sorted(enough, key=lambda one: one.log10_chance)
+        return sorted(enough, key=_log10_chance)
+
+
+def _is_alike(other: Grown, best: Grown) -> bool:
+    """Whether another naming explains about as many marks about as closely. How many it explains does not decide: of a
+    grid moved on by a step, what chance left out at one end is as many as what it left out anywhere."""
+    closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
+    return len(other.mark) >= ALIKE_SHARE * len(best.mark) and bool(closer < TOLD_LOG10)
+
+
+def _log10_chance(grown: Grown) -> float:
+    return grown.log10_chance
 
 
 def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
@@ -216,7 +238,7 @@ def _first(searches: Sequence[_Search]) -> tuple[_Search, Grown | None]:
             if found is not None and found.log10_chance < most:
                 believed.append((search, found))
         if believed:
-            return min(believed, key=lambda one: one[1].log10_chance)
+            return min(believed, key=lambda one: _log10_chance(one[1]))
         if tried > MOST_POSES * len(searches):
             break
     return searches[0], None

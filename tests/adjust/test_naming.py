@@ -81,6 +81,25 @@ def test_a_regular_grid_has_no_names_of_its_own() -> None:
     assert "as a regular grid does" in refused
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_grid_off_by_a_twentieth_of_its_step_is_told_by_how_closely_its_marks_agree(seed: int) -> None:
+    """Moved on or turned, it agrees with most of the marks as well, but not as closely."""
+    rng = np.random.default_rng([9, seed])
+    xyz = lattice(6, 6, 0.05, rng) * 0.9
+    marks, point = photographed(xyz, rng)
+    names = named(xyz, marks)
+    assert isinstance(names, Names), names
+    assert all(point[mark] == own for own, mark in names.mark.items())
+
+
+def test_marks_left_out_do_not_tell_where_a_regular_grid_begins() -> None:
+    rng = np.random.default_rng(8)
+    xyz = lattice(6, 6, 0.0, rng)[3:]
+    refused = named(xyz, photographed(xyz, rng)[0])
+    assert isinstance(refused, str)
+    assert "about as closely" in refused
+
+
 def test_a_field_seen_from_behind_is_no_other_naming() -> None:
     """A lattice that is its own mirror image may be seen from either side, unless it is known where its points face."""
     rng = np.random.default_rng(6)
