@@ -106,15 +106,19 @@ def _in_the_middle(search: FrameSearch, given: PitchHypothesis) -> tuple[list[Pl
 
 def _anywhere(search: FrameSearch, hypotheses: Sequence[PitchHypothesis]) -> tuple[list[Placement], Frame | None]:
     """The placements, best first, in the whole scan, and the frame in the first of the best ones that is sure, or else
-    accepted, or else that of most marks; None where nothing looks like the marks."""
+    accepted, or else that of most marks; None where nothing looks like the marks. A frame is no other one where all
+    its marks are among those of an accepted one that was tried before it."""
     found = search.anywhere(hypotheses)
     if not found:
         return [], None
     frames: list[Frame] = []
     for placement in (found[0], *_others(found)):
-        frames.append(_as_its_pictures_say(search, found, placement))
-        if frames[-1].is_sure:
-            return found, frames[-1]
+        frame = _as_its_pictures_say(search, found, placement)
+        if any(before.accepted and before.has_all_of(frame) for before in frames):
+            continue
+        if frame.is_sure:
+            return found, frame
+        frames.append(frame)
     accepted = [frame for frame in frames if frame.accepted]
     return found, accepted[0] if accepted else max(frames, key=lambda frame: int(frame.belongs.sum()))
 

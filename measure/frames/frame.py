@@ -22,6 +22,7 @@ _CHECKED = 4  # marks that agree: an affine transformation through them has a ch
 WRONG_PX, WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _LEAST_SCATTER_MM = 0.01  # of few marks, which may agree by chance better than film keeps them
+_SAME_MARK_PX = 5.0  # two fits of one mark lie nearer to one another, two marks do not: each is some 14 px large
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +92,15 @@ class Frame:
     @property
     def _least(self) -> int:
         return max(min(_AGREEING, len(self.sightings)), 2)
+
+    def has_all_of(self, other: "Frame") -> bool:
+        """Whether the marks of the other frame are some of this one's, under other names: a frame moved on by the
+        distance of two marks has its marks where this one has others."""
+        own, others = ([fit.center_px for fit in frame.fits if fit] for frame in (self, other))
+        if not others or len(others) >= len(own):
+            return False
+        nearest = [min(float(np.hypot(*(place - known))) for known in own) for place in others]
+        return max(nearest) < _SAME_MARK_PX
 
     def misfit(self) -> str:
         """A sentence for a frame that is not accepted."""

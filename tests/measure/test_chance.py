@@ -74,6 +74,19 @@ def test_three_plain_dots_of_four_are_no_chance() -> None:
     assert doubt(FrameSearch(scan, DOTS, OPTIONS), frame) == ""
 
 
+def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -> None:
+    """It has the left and the middle ones under the names of the middle and the right ones; the rest is outside."""
+    layout = layout_of([DOT] * 8, (*CORNERS, (0.0, -7.0), (-7.0, 0.0), (0.0, 7.0), (7.0, 0.0)), (16.0, 16.0))
+    scan = scan_of(picture(layout, "0", hidden=7))
+    frame = frame_of(scan, layout)
+    moved_on = placement("0").pixel_from_camera - np.array([[0.0, 0.0, 7.0 * PX_PER_MM], [0.0, 0.0, 0.0]])
+    other = measure_frame(scan, layout, replace(placement("0"), pixel_from_camera=moved_on), OPTIONS)
+    assert (int(frame.belongs.sum()), int(other.belongs.sum())) == (7, 4)
+    assert frame.has_all_of(other)
+    assert not other.has_all_of(frame)
+    assert not frame.has_all_of(frame)
+
+
 def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> None:
     as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
