@@ -158,6 +158,7 @@ def _fitted(given: _Given, options: MatchOptions, coarse_px: float | None = None
         fit = _begun(given, part, wide, coarse_px, fit.model.state.moved(narrow.corner_px - part.corner_px))
         fit.choose_area()
     fit.refine()
+    fit.unround()
     return part, fit
 
 
@@ -229,6 +230,9 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
     """The match in the pixels of the fit's own window."""
     model, used = fit.model, fit.telling
     noise = noise_model(model.scores, fit.used, len(model.design), float(model.information[fit.used].sum()))
+    if fit.least_variance_dn2:  # nor does blank film show more than its rounding
+        noise = noise.at_least(fit.least_variance_dn2)
+        about = about._replace(free=np.zeros_like(about.free))
     precision = _Precision(np.full((len(model.design),) * 2, np.inf), np.inf)
     if not fit.reason:
         patches = blank_patches(about.grey, about.free, noise.variance_dn2)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from measure.fitting.clipping import noise_scale
 from measure.fitting.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
+from measure.fitting.rounding import COARSEST_VARIANCE, likely_sigma, rounding_step, unrounded, unrounded_variance
 from measure.fitting.sandwich_covariance import sandwich_covariance
 from measure.marks.rendering import chip_mask, known, picture
 from measure.marks.shapes import MarkTemplate
@@ -25,6 +26,7 @@ _ITERATIONS, _HALVINGS = 15, 4  # more steps, or shorter ones, settle no fit tha
 _DAMAGE_SIGMAS = 3.2  # of smoothed residuals: one pixel in seven hundred of a window without damage goes beyond
 _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # times the variance, that grain may feign; and how much of it may be damaged
 _LEAST_VARIANCE_DN2 = 1e-12
+_UNROUNDED_PX, _MOST_UNROUNDED = 0.0001, 30  # a move by other grey values that needs no further ones; how often
 _WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
 _UNSETTLED = "the adjustment did not converge"
@@ -34,14 +36,15 @@ EDGE_BLURS = 3.0  # from the frame's border, in which a mark ends: a thousandth 
 
 class PictureFit:
     """The fit in progress. area: the pixels about the mark that are there; used: those of them that are undamaged;
-    reason: why it failed. is_lossy: whether the picture was compressed with loss."""
+    least_variance_dn2: what a grey value's noise is at least, by its rounding; reason: why it failed. is_lossy: whether
+    the picture was compressed with loss."""
 
     def __init__(self, model: PictureModel, usable: Mask, is_lossy: bool) -> None:
         self.model, self.usable, self.is_lossy = model, usable, is_lossy
         self.options = model.options
         self.area = self.used = usable
         self.far = np.zeros_like(usable)
-        self.variance_dn2 = 1.0
+        self.variance_dn2, self.least_variance_dn2 = 1.0, 0.0
         self.reason = ""
 
     def approach(self) -> None:
@@ -80,6 +83,24 @@ class PictureFit:
                 self.reason = "the ground about the mark is not plain"
                 return
             self._adjust(robust=False, tolerance_px=0.002)
+
+    def unround(self) -> None:
+        """Where grey values were rounded more coarsely than they are noisy: adjust to what their intervals say."""
+        model, rounded = self.model, self.model.grey
+        ordinary = self.used & (model.clipped == 0)
+        is_whole = not self.is_lossy and model.background_px is None and not isinstance(model.mark, MarkTemplate)
+        step = 0.0 if self.reason or not is_whole else rounding_step(rounded[ordinary])
+        if not step or np.mean(model.residuals[ordinary] ** 2) > COARSEST_VARIANCE * step**2:
+            return
+        for _ in range(_MOST_UNROUNDED):
+            drawn, before = model.grey - model.residuals, model.state.pixel_from_mark[:, 2]
+            off = (rounded - drawn) / step
+            sigma = likely_sigma(off[ordinary])
+            self.least_variance_dn2 = unrounded_variance(sigma) * step**2
+            model.take_grey(np.where(ordinary, drawn + step * unrounded(off, sigma), rounded))
+            self._adjust(robust=False, tolerance_px=_UNROUNDED_PX)
+            if self.reason or np.hypot(*(model.state.pixel_from_mark[:, 2] - before)) < _UNROUNDED_PX:
+                break
 
     def _is_plain(self) -> bool:
         """Whether undamaged pixels far from the mark vary as the nearer ones do."""

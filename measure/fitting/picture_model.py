@@ -133,6 +133,14 @@ class PictureModel:
                 each *= self.steadiness
         self._linearised = self.state, self.residuals
 
+    def take_grey(self, grey: Array) -> None:
+        """Other grey values (height, width) for the same light."""
+        change, self.grey = grey - self.grey, grey
+        self.residuals = self.residuals + change
+        if self._linearised is not None:
+            at, residuals = self._linearised
+            self._linearised = at, residuals + change
+
     def take_noise(self, noise_dn: float) -> None:
         """Judge clipped grey values by noise of that standard deviation, unless it changes nothing of their part."""
         if abs(noise_dn / self.noise_dn - 1) > _AS_NOISY:

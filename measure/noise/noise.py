@@ -1,6 +1,6 @@
 """What the residuals of a fit say about the noise of the film: its scale, and how far grain reaches."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,13 @@ class NoiseModel:
     @property
     def is_white(self) -> bool:
         return self.autocovariance_dn2.size == 1
+
+    def at_least(self, variance_dn2: float) -> "NoiseModel":
+        """The same, of a variance that is not smaller."""
+        larger = max(variance_dn2 / max(self.variance_dn2, 1e-300), 1.0)
+        return replace(
+            self, variance_dn2=self.variance_dn2 * larger, autocovariance_dn2=self.autocovariance_dn2 * larger
+        )
 
 
 def noise_model(residuals: Array, used: Mask, unknowns: int, told: float | None = None) -> NoiseModel:
