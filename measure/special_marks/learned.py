@@ -1,8 +1,9 @@
-"""Marks that nobody has drawn: pictures of the same mark in all frames of a camera, aligned and averaged.
+"""Marks that nobody has drawn: pictures of the same mark in all frames of a camera, aligned, and what they share.
 
-Every frame's picture is matched with the mean of the others (shift, gain and offset), the mean is made anew of the
-aligned pictures, and so on until nothing moves. The noise of the mean falls with the square root of their number. Where
-its origin lies on the mark is a convention, the same one in every frame: a shift of the fiducial's coordinates.
+All pictures are adjusted to the one that they share (shift, blur, gain and offset), this is made anew of them, and so
+on until nothing moves. It is as sharp as the sharpest of them, and the noise of its coarser detail falls with the
+square root of their number. Where its origin lies on the mark is a convention, the same one in every frame: a shift of
+the fiducial's coordinates.
 """
 
 from collections.abc import Sequence
@@ -17,19 +18,15 @@ from measure.fitting.matching import Match
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
 from measure.noise.noise import robust_scale
-from measure.noise.robust import tukey_weights
 from measure.scans.scan import Scan
+from measure.special_marks.shared_picture import NOISE_FLOOR, SharedPicture, adjusted, first_picture
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _PHASES = 2  # of rounds: what differs from frame to frame is known once the pictures are aligned
-_ROUNDS = 12  # of aligning and averaging; three or four are enough
-_SETTLED_PX = 0.005  # the mean has settled once no frame moves further
-_REWEIGHTINGS = 5  # of the pixels by Tukey's function
-_NOISE_FLOOR = 0.002  # of the mean's range: under a picture's noise, for clean pictures have none
-_LEAST_WEIGHT = 1e-6  # of a pixel that lies off in all pictures
-_SMOOTH_PX = 0.7  # before slopes are taken: they are then free of most noise
+_ROUNDS = 12  # of adjusting; five are enough where pictures are about as sharp as one another
+_SETTLED_PX, _SETTLED_PX2 = 0.005, 0.02  # no picture moves or is blurred further
 _ROOM_PX = 10  # about the chip, to move in
 _SPREAD_PX = 1.0  # over which it is averaged, for a few pictures alone hardly tell it, yet it changes at the edges
 _GRAIN_PX = 1.0  # taken where one picture cannot tell how far its grain reaches
@@ -66,20 +63,8 @@ def template_of(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
         raise ValueError("a template needs a picture of its mark")
     pitch_um = float(np.median([chip.pitch_um for chip in chips]))
     side = 2 * int(np.ceil(size_mm * 500 / pitch_um)) + 1  # odd: the origin is the middle pixel
-    places = [np.array(chip.pixel_from_mark) for chip in chips]
-    steady = np.ones((side, side), dtype=bool)
-    for _ in range(_PHASES):
-        for _ in range(_ROUNDS):
-            stack = np.stack([_resampled(*pair, side, pitch_um) for pair in zip(chips, places, strict=True)])
-            levelled, weights, alike = _weighed(stack)
-            moves = _moves(levelled, weights, steady)
-            for place, move in zip(places, moves, strict=True):
-                place[:, 2] += place[:, :2] @ (move * (1.0, -1.0) * pitch_um / 1000)
-            if np.hypot(*moves.T).max() < _SETTLED_PX:
-                break
-        steady = alike
-    image = np.asarray((weights * levelled).sum(axis=0) / weights.sum(axis=0))
-    shares = weights.sum(axis=(1, 2)) / weights.sum()
+    shared, steady = _aligned(chips, side, pitch_um)
+    image = shared.image
     return MarkTemplate(
         image,
         pitch_um,
@@ -87,11 +72,31 @@ def template_of(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
         polarity="light",  # as the chip shows it
         detail_mm=_detail_px(image) * pitch_um / 1000,
         noise_dn=float(np.median([_noise_dn(chip.grey) for chip in chips])),
-        shares={chip.scan: float(share) for chip, share in zip(chips, shares, strict=True)},
+        shares={chip.scan: float(share) for chip, share in zip(chips, shared.shares, strict=True)},
         steady=steady,
-        steadiness=_steadiness(levelled, image, steady) if len(chips) > 1 else None,
+        steadiness=_steadiness(shared.residuals, image, steady) if len(chips) > 1 else None,
         learned_mm=size_mm,
     )
+
+
+def _aligned(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[SharedPicture, Mask]:
+    """The picture (side, side) that chips share, and which of its pixels are steady."""
+    places = [np.array(chip.pixel_from_mark) for chip in chips]
+
+    def stack() -> Array:
+        return np.stack([_resampled(*pair, side, pitch_um) for pair in zip(chips, places, strict=True)])
+
+    shared, steady = first_picture(stack()), np.ones((side, side), dtype=bool)
+    for _ in range(_PHASES if len(chips) > 1 else 0):
+        for _ in range(_ROUNDS):
+            before, shared = shared, adjusted(shared, stack(), steady)
+            for place, move in zip(places, shared.moves, strict=True):
+                place[:, 2] += place[:, :2] @ (move * (1.0, -1.0) * pitch_um / 1000)
+            blurred = np.abs(shared.variances_px2 - before.variances_px2).max()
+            if np.hypot(*shared.moves.T).max() < _SETTLED_PX and blurred < _SETTLED_PX2:
+                break
+        steady = shared.alike
+    return shared, steady
 
 
 def honest_covariance(template: MarkTemplate, scan: str, fit: Match) -> Array:
@@ -114,61 +119,13 @@ def _resampled(chip: Chip, pixel_from_mark: Array, side: int, pitch_um: float) -
     return np.asarray(ndimage.map_coordinates(chip.grey, [row, col], order=3, mode="nearest"))
 
 
-def _weighed(stack: Array) -> tuple[Array, Array, Mask]:
-    """The pictures (n, side, side) brought to the grey values of their mean, the weight of every pixel in it: by its
-    picture's noise, and by Tukey's function where it lies off (dust, the landscape behind the mark); and where the
-    pictures are alike, more of them than not."""
-    weights, alike = np.ones(stack.shape), np.ones(stack.shape)
-    levelled = np.stack([_levelled(image, stack[0], weights[0]) for image in stack])
-    for round_ in range(_REWEIGHTINGS):
-        mean = np.median(levelled, axis=0) if round_ == 0 else _mean(levelled, weights)
-        levelled = np.stack([_levelled(*each) for each in zip(stack, [mean] * len(stack), weights, strict=True)])
-        floor = _NOISE_FLOOR * float(np.ptp(mean))
-        alike = np.zeros(stack.shape)
-        for index, residual in enumerate(levelled - mean):
-            scale = max(robust_scale(residual), floor)
-            alike[index] = tukey_weights(residual, scale)
-            weights[index] = (alike[index] + _LEAST_WEIGHT) / scale**2
-    return levelled, weights, cv2.GaussianBlur(alike.mean(axis=0), (0, 0), _SMOOTH_PX) > 0.5
-
-
-def _steadiness(levelled: Array, image: Array, steady: Mask) -> Array:
+def _steadiness(residuals: Array, image: Array, steady: Mask) -> Array:
     """(side, side) standard deviation of noise, which is what most of the steady pixels have, over that of the
     differences between the pictures (n, side, side) and their mean."""
-    squares = ((levelled - image) ** 2).mean(axis=0)
+    squares = (residuals**2).mean(axis=0)
     about = np.sqrt(cv2.GaussianBlur(squares, (0, 0), _SPREAD_PX))
-    noise = max(float(np.median(about[steady])) if steady.any() else 0.0, _NOISE_FLOOR * float(np.ptp(image)), 1e-9)
+    noise = max(float(np.median(about[steady])) if steady.any() else 0.0, NOISE_FLOOR * float(np.ptp(image)), 1e-9)
     return np.asarray(noise / np.maximum(about, noise))
-
-
-def _mean(stack: Array, weights: Array) -> Array:
-    return np.asarray((weights * stack).sum(axis=0) / weights.sum(axis=0))
-
-
-def _levelled(image: Array, like: Array, weights: Array) -> Array:
-    """The image with the gain and offset that make it most like another."""
-    centre, wanted = np.average(image, weights=weights), np.average(like, weights=weights)
-    product = float((weights * (image - centre) * (like - wanted)).sum())
-    gain = product / max(float((weights * (image - centre) ** 2).sum()), 1e-12)
-    return np.asarray(wanted + gain * (image - centre))
-
-
-def _moves(stack: Array, weights: Array, used: Mask) -> Array:
-    """(n, 2) px by column and row: how far each picture has to move onto the mean of the others, by the pixels used,
-    their sum being none. A picture is not compared with itself: that would hold it where it is."""
-    if len(stack) == 1:
-        return np.zeros((1, 2))
-    total, sums = weights.sum(axis=0), (weights * stack).sum(axis=0)
-    moves = np.empty((len(stack), 2))
-    for index, (image, weight) in enumerate(zip(stack, weights, strict=True)):
-        others = (sums - weight * image) / (total - weight)
-        by_row, by_col = np.gradient(cv2.GaussianBlur(others, (0, 0), _SMOOTH_PX))
-        design = np.stack([part[used] for part in (by_col, by_row, others, np.ones_like(others))], axis=1)
-        root = np.sqrt(weight[used])
-        step = np.linalg.lstsq(design * root[:, None], (others - image)[used] * root, rcond=None)[0][:2]
-        share = float(weight.sum() / total.sum())  # by which it moves the mean of all
-        moves[index] = (1 - share) * np.clip(step, -1.0, 1.0)
-    return np.asarray(moves - moves.mean(axis=0))
 
 
 def _noise_dn(grey: Array) -> float:
