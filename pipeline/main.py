@@ -5,6 +5,8 @@ import os
 import signal
 import sys
 
+_INTERRUPTED = 130
+
 
 def main() -> None:
     """Run the command line. One BLAS thread: two on two cores made the adjustment several times slower.
@@ -14,4 +16,7 @@ def main() -> None:
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as an interrupt does, worker processes with it
-    sys.exit(importlib.import_module("pipeline.cli").run())
+    try:
+        sys.exit(importlib.import_module("pipeline.cli").run())
+    except KeyboardInterrupt:  # while the modules are imported: later the command line answers for it
+        sys.exit(_INTERRUPTED)
