@@ -62,13 +62,15 @@ def measure_fiducials(
     if frame is None:
         return absent_frame(scan, layout, reason)
     found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
-    pose = Pose(options.pose, True, _SET)
+    pose, against = Pose(options.pose, True, _SET), ""
     if options.pose == "auto":
         pose, placement = _named(search, found, frame)
         if pose.name != frame.placement.pose:
             frame = measure_frame(scan, layout, placement, options)
+    else:
+        against = _against_the_set_pose(search, found, frame)
     chance = doubt(search, frame)
-    problems = [f"{sentence}." for sentence in (*_rivals(found, frame.placement), chance) if sentence]
+    problems = [f"{sentence}." for sentence in (*_rivals(found, frame.placement), chance, against) if sentence]
     doubts = problems if frame.measured else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = Pose(pose.name, False, (*pose.evidence, *doubts))
@@ -222,6 +224,21 @@ def _named(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> tup
     posed = [_posed(found, frame.placement, pose) for pose in POSES]
     pose = decide_pose(search.scan, search.layout, posed, frame, search.options)
     return pose, posed[POSES.index(pose.name)]
+
+
+def _against_the_set_pose(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> str:
+    """A sentence where what is seen decides for another pose than the one that the project sets."""
+    likeliest, placement = _named(search, found, frame)
+    if likeliest.name == frame.placement.pose or not frame.measured:
+        return ""
+    pose = decide_pose(search.scan, search.layout, [frame.placement, placement], frame, search.options)
+    if not pose.decided or pose.name == frame.placement.pose:
+        return ""
+    evidence = " ".join(pose.evidence).rstrip(".")
+    return (
+        f"pose {frame.placement.pose} is set in the project, but what is seen of this frame decides for {pose.name}, "
+        f'and then the marks have other names (pose = "auto" takes each scan as it lies): {evidence}'
+    )
 
 
 def _posed(found: Sequence[Placement], best: Placement, pose: str) -> Placement:

@@ -114,6 +114,19 @@ def test_the_users_pose_is_taken(tmp_path: Path) -> None:
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided, result.pose.evidence) == ("270m", True, ("set in the project.",))
     assert_right(result, ALIKE, matrix)
+    assert result.problems == ()
+
+
+def test_a_pose_of_the_user_that_the_picture_contradicts_is_told(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("90m")
+    result = measured(frame_picture(NUMBERED, matrix), NUMBERED, tmp_path, FiducialOptions(pose="0"))
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided) == ("0", True)
+    assert any(
+        "pose 0 is set in the project, but what is seen of this frame decides for 90m" in problem
+        and "identification dots" in problem
+        for problem in result.problems
+    )
 
 
 def test_marks_places_decide_where_they_are_not_symmetric(tmp_path: Path) -> None:
