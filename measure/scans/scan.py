@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
+from functools import cached_property
 from itertools import product
 from math import lcm
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
+from measure.scans.earlier_compression import earlier_step_dn
 from measure.scans.parallel import side_by_side
 from measure.scans.picture_scan import open_picture
 from measure.scans.radiometry import Samples
@@ -29,6 +31,9 @@ SINGLE_CHANNELS = (1.0, 0.0, 0.0), _GREEN, (0.0, 0.0, 1.0)
 _BAND_PIXELS = 1 << 18  # that a thread averages at a time: they stay in the processor's cache
 _PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, about
 _LARGEST_PART_PX = 2048  # the side of a part in whole segments: beyond it segments are divided
+_COMPRESSION_PX = 256  # the side of the part in the middle that tells of an earlier compression: 1000 blocks
+_PLAINLY_COARSER = 1.5  # than what the file itself rounds to, which shows as well
+_LEAST_UNIT_DN = 16  # of 8 bits in a file of 16: as 12 bits stored from the top have it
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -38,9 +43,8 @@ class Scan:
     """An opened scan: its size, its pitch, and windows of grey values that grow with light on the scanner's sensor.
 
     width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows;
-    rounding_step_dn: of a compression with loss, which is_lossy says that there is; pitch_um: (x, y) from the file's
-    resolution tags, None where it has none that can be believed, and then pitch_note says why;
-    notes: what else is unusual about the file, a sentence each.
+    pitch_um: (x, y) from the file's resolution tags, None where it has none that can be believed, and then pitch_note
+    says why.
     The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
     """
 
@@ -57,11 +61,9 @@ class Scan:
         self.height_px = segments.height_px
         self.channels = segments.channels
         self.full_scale_dn = segments.full_scale_dn
-        self.rounding_step_dn = segments.rounding_step_dn
-        self.is_lossy = self.rounding_step_dn > 0
         self.pitch_um = pitch.um
         self.pitch_note = pitch.note
-        self.notes = notes
+        self._file_notes = notes
         self._segments = segments
         self._cache = SegmentCache(segments)
         self._source = segments if isinstance(segments, RawRows) else self._cache
@@ -72,6 +74,26 @@ class Scan:
     def weights(self) -> Sequence[float]:
         """What each channel counts in the grey values, (channels,)."""
         return self._grey_weights
+
+    @cached_property
+    def rounding_step_dn(self) -> float:
+        """To which a compression with loss rounded coarse detail, that of the file itself or an earlier one; 0 where
+        there was none."""
+        return max(self._segments.rounding_step_dn, self._earlier_step_dn)
+
+    @property
+    def is_lossy(self) -> bool:
+        return self.rounding_step_dn > 0
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is unusual about the file, a sentence each."""
+        if not self._earlier_step_dn:
+            return self._file_notes
+        return *self._file_notes, (
+            "the picture was compressed as JPEG before it was stored as it is (to steps of some"
+            f" {self._earlier_step_dn:.0f} grey values): its marks have the larger standard deviations of such a file"
+        )
 
     @property
     def samples_dtype(self) -> type[np.uint8] | type[np.uint16]:
@@ -164,6 +186,19 @@ class Scan:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    @cached_property
+    def _earlier_step_dn(self) -> float:
+        """Of a compression before that of the file, as the luminance in the middle of the scan shows it; 0 where none
+        was plainly coarser. JPEG has 8 bits: in a file of 16 its grey values are multiples of a unit."""
+        width, height = (min(side, _COMPRESSION_PX) for side in (self.width_px, self.height_px))
+        samples = self.samples((self.width_px - width) // 2, (self.height_px - height) // 2, width, height)
+        unit = 1 if samples.dtype == np.uint8 else int(np.gcd.reduce(samples, axis=None))
+        if samples.dtype != np.uint8 and unit < _LEAST_UNIT_DN:
+            return 0.0
+        luminance = weighted(samples, LUMINANCE if self.channels > 1 else (1.0,))
+        step_dn = unit * earlier_step_dn(luminance / np.float32(unit))
+        return step_dn if step_dn > _PLAINLY_COARSER * self._segments.rounding_step_dn else 0.0
 
     def _reduced_channels(self, factor: int, width: int, height: int) -> Array:
         """(height, width, channels): every segment is decoded once."""

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from numpy.typing import NDArray
 
 from measure.scans.quantisation import UNKNOWN_DN, rounding_step_dn
 from measure.scans.scan import open_scan
@@ -39,3 +40,43 @@ def test_tiff_files_have_it_too_and_what_is_not_compressed_with_loss_has_none(tm
 
 def test_a_file_without_tables_is_taken_for_a_poor_one() -> None:
     assert rounding_step_dn(b"\xff\xd8\xff\xd9") == UNKNOWN_DN
+
+
+def film() -> NDArray[np.uint8]:
+    """Grain on a ground that changes slowly, in grey values that JPEG has not seen."""
+    rng, cols = np.random.default_rng(3), np.arange(401)
+    grain = cv2.GaussianBlur(rng.normal(0.0, 60.0, (397, 401)), (0, 0), 1.0)
+    return np.asarray(np.clip(120 + 40 * np.sin(cols / 90) + grain, 0, 255).round().astype(np.uint8))
+
+
+def stored_after_jpeg(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    data = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), np.uint8)
+
+
+@pytest.mark.parametrize(("quality", "share"), [(50, 1.0), (75, 0.5), (90, 0.2)])
+def test_a_file_without_loss_tells_that_its_picture_was_jpeg(quality: int, share: float, tmp_path: Path) -> None:
+    """Cropped, in colour, in 16 bits; and stored as a finer JPEG."""
+    was = stored_after_jpeg(film(), quality)[3:, 5:]
+    colour = stored_after_jpeg(np.dstack([film(), film()[::-1], film()]), quality)
+    expected = np.mean([max(int(step * share + 0.5), 1) for step in COARSE])
+    tifffile.imwrite(tmp_path / "grey.tif", was)
+    tifffile.imwrite(tmp_path / "deep.tif", was.astype(np.uint16) * 257)
+    cv2.imwrite(str(tmp_path / "colour.png"), colour)
+    cv2.imwrite(str(tmp_path / "again.jpg"), was, (cv2.IMWRITE_JPEG_QUALITY, 98))
+    for name, unit in (("grey.tif", 1), ("deep.tif", 257), ("colour.png", 1), ("again.jpg", 1)):
+        with open_scan(tmp_path / name) as scan:
+            assert scan.rounding_step_dn == pytest.approx(unit * expected, rel=0.05)
+            assert "was compressed as JPEG before" in scan.notes[-1]
+
+
+@pytest.mark.parametrize("levels", [256, 64, 16])
+def test_what_never_was_jpeg_is_not_taken_for_it(levels: int, tmp_path: Path) -> None:
+    """Few grey values, and a board whose squares repeat with the blocks' period, are no comb of one grid alone."""
+    board = np.kron(np.indices((48, 48)).sum(axis=0) % 2, np.ones((8, 8))) * 130 + 60
+    for index, picture in enumerate((film(), np.asarray(board, np.uint8))):
+        path = tmp_path / f"{index}.tif"
+        tifffile.imwrite(path, picture // (256 // levels) * (256 // levels))
+        with open_scan(path) as scan:
+            assert not scan.is_lossy
+            assert not scan.notes
