@@ -1,7 +1,9 @@
 """How a picture shows a flat sheet: a homography, and the radial distortion of a lens."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -12,6 +14,10 @@ Array = NDArray[np.float64]
 
 _RADIAL_FROM, _SECOND_RADIAL_FROM = 10, 30  # points, from which on the lens's radial distortion is estimated too
 _LARGEST_RADIAL = 0.6  # at the picture's corner, relative
+_SETTLING = 5  # rounds, in which a view takes in what the lens moved
+_FAR = 4.0  # medians of the distances, beyond which a point does not tell where the sheet lies
+_LEAST_FAR_PX = 1.0
+_USUAL_FOCAL = 2.0  # half diagonals, where no view is oblique enough to tell it
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +63,29 @@ class SheetView:
         ]  # fmt: skip
         return np.stack(columns, axis=-1)
 
+    def pixel_from_space(self, sheet: Array, focal: float, step: float) -> Array:
+        """(n, 2, 3) how far a unit along the sheet, both ways, and one above it move its points, px; focal: the lens's
+        focal length in half diagonals; step: a small length on the sheet."""
+        along = self.pixel_from_disks(sheet, step) / step
+        to_camera = np.diag([1.0, 1.0, focal])
+        column, row = (to_camera @ self.homography[:, :2]).T
+        above = np.linalg.solve(to_camera, np.cross(column, row)) / np.sqrt(
+            np.linalg.norm(column) * np.linalg.norm(row)
+        )
+        mapped = np.column_stack([sheet, np.ones(len(sheet))]) @ self.homography.T
+        # Of the homography, but for the depth by which all three are divided.
+        ideal = np.column_stack([self.homography[:, :2], above])
+        moved = ideal[:2] - (mapped[:, :2] / mapped[:, 2:])[:, :, None] * ideal[2]
+        on_sheet = np.linalg.solve(moved[..., :2], moved[..., 2:])
+        return np.concatenate([along, along @ on_sheet], axis=2)
+
+    def focal_terms(self) -> tuple[Array, Array]:
+        """(2,) a and b of a + b focal² = 0: the sheet's two directions are at right angles and of one scale (Zhang
+        2000)."""
+        column, row = (self.homography[:, :2] / np.linalg.norm(self.homography[:, :2])).T
+        in_picture = np.array([column[:2] @ row[:2], column[:2] @ column[:2] - row[:2] @ row[:2]])
+        return in_picture, np.array([column[2] * row[2], column[2] ** 2 - row[2] ** 2])
+
     @property
     def _middle(self) -> Array:
         return (np.array(self.size_px) - 1.0) / 2.0
@@ -90,6 +119,34 @@ def fitted_view(view: SheetView, points: Array, seen: Array) -> SheetView | None
     solution = least_squares(residuals, values, loss="soft_l1", f_scale=width, max_nfev=30)
     found = with_parameters(solution.x)
     return found if np.abs(found.radial).max() < _LARGEST_RADIAL else start
+
+
+def robust_view(points: Array, seen: Array, size_px: tuple[int, int]) -> SheetView | None:
+    """The view that more than half of the points (n, 2), seen at (n, 2) px, agree with, wherever the others are; None
+    where no camera sees them so.
+
+    Least median of squares (Rousseeuw 1984) without a lens, then the lens as well, by those that do not lie far off.
+    """
+    homography = cv2.findHomography(points, seen, cv2.LMEDS)[0]
+    if homography is None:
+        return None
+    off = np.hypot(*(cv2.perspectiveTransform(points[:, None], homography)[:, 0] - seen).T)
+    view = SheetView(np.eye(3), np.zeros(2), size_px)
+    for _ in range(_SETTLING):
+        near = off <= max(_FAR * float(np.median(off)), _LEAST_FAR_PX)
+        fitted = fitted_view(view, points[near], seen[near])
+        if fitted is None:
+            return None
+        view = fitted
+        off = np.nan_to_num(np.hypot(*(view.places_px(points) - seen).T), nan=np.inf)
+    return view
+
+
+def focal_length(views: Sequence[SheetView]) -> float:
+    """Of the camera that took the views, in half diagonals, as their perspective tells it."""
+    terms = [view.focal_terms() for view in views]
+    square = -sum(float(a @ b) for a, b in terms) / max(sum(float(b @ b) for _, b in terms), 1e-12)
+    return float(np.sqrt(square)) if square > 0.0 else _USUAL_FOCAL
 
 
 def homography_through(source: Array, target: Array) -> Array | None:

@@ -49,10 +49,12 @@ class TargetPlaces:
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Of n targets, each without itself: off_px (n, 2), how far it was seen from where the others put it; chance (n,):
-    that a right one lies so far off or farther."""
+    that a right one lies so far off or farther; covariance_px2 (n, 2, 2): of how far off it was seen, were its own
+    coordinates exact."""
 
     off_px: Array
     chance: Array
+    covariance_px2: Array
 
 
 def compared(targets: TargetPlaces, seen_px: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Comparison:
@@ -61,7 +63,8 @@ def compared(targets: TargetPlaces, seen_px: Array, covariance_px2: Array, size_
     offsets = seen_px - targets.places_px
     fits = [_fitted(_design(targets, size_px, bending), offsets, known, targets.is_free) for bending in _BENDING]
     best = min(fits, key=lambda fit: float(np.median(np.linalg.norm(fit.off_px, axis=1))))
-    return Comparison(best.off_px, _chances(best, targets))
+    own = best.claimed[:, None, None] * covariance_px2 + best.more_px2[:, None, None] * np.eye(2)
+    return Comparison(best.off_px, _chances(best, targets), own + best.predicted_px2)
 
 
 def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> Array:
@@ -84,43 +87,63 @@ def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> 
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """off_px (n, 2), squares (n,): each target against the others, the latter in its variances; unknowns: how many the
-    n targets tell."""
+    n targets tell; predicted_px2 (n, 2, 2): of what the others say; claimed (n,): what was known of each counts so
+    much, and more_px2 (n,) comes on top."""
 
     off_px: Array
     squares: Array
     unknowns: float
+    predicted_px2: Array
+    claimed: Array
+    more_px2: Array
 
 
 def _fitted(design: Array, offsets: Array, known: Array, is_free: Mask) -> _Fit:
     """Student's t by expectation and maximisation, the scatter anew in each round."""
-    off, predicted = offsets - np.median(offsets, axis=0), np.zeros_like(known)
-    weights = np.ones(len(offsets))
+    off, predicted, unknowns = offsets - np.median(offsets, axis=0), np.zeros_like(known), design.shape[2]
+    claimed, more_px2 = _scatter(off, predicted, known, is_free)
+    weights = _weights(_squares(off, _variances(claimed, more_px2, known)))
     fit = None
     for _ in range(_ROUNDS):
-        variances = _variances(off, predicted, known, is_free)
+        variances = _variances(claimed, more_px2, known)
         spread = variances / weights[:, None, None]
         by_weight = np.linalg.inv(spread)
-        normal = np.eye(design.shape[2]) + np.einsum("nia,nij,njb->ab", design, by_weight, design, optimize=True)
-        right = np.einsum("nia,nij,nj->a", design, by_weight, offsets, optimize=True)
-        cofactor = np.linalg.inv(normal)
-        hat = np.einsum("nia,ab,njb->nij", design, cofactor, design, optimize=True)
+        weighted = (by_weight @ design).reshape(-1, unknowns)
+        cofactor = np.linalg.inv(np.eye(unknowns) + weighted.T @ design.reshape(-1, unknowns))
+        hat = design @ cofactor @ design.swapaxes(1, 2)
         without = np.linalg.inv(spread - hat)  # of what the target itself adds to the fit
-        residuals = offsets - np.einsum("nia,a->ni", design, cofactor @ right)
-        off = np.einsum("nij,njk,nk->ni", spread, without, residuals)
+        residuals = offsets - design @ (cofactor @ (weighted.T @ offsets.ravel()))
+        off = (spread @ without @ residuals[..., None])[..., 0]
         predicted = hat + hat @ without @ hat
-        squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(variances + predicted), off)
-        before, weights = weights, (_FREEDOM + 2.0) / (_FREEDOM + squares)
-        fit = _Fit(off, squares, float(np.einsum("nij,nji->", hat, by_weight)))
+        squares = _squares(off, variances + predicted)
+        before, weights = weights, _weights(squares)
+        fit = _Fit(off, squares, float(np.einsum("nij,nji->", hat, by_weight)), predicted, claimed, more_px2)
+        claimed, more_px2 = _scatter(off, predicted, known, is_free)
         if np.abs(weights - before).max() < _SETTLED:
             break
     assert fit is not None
     return fit
 
 
-def _variances(off: Array, predicted: Array, known: Array, is_free: Mask) -> Array:
-    """(n, 2, 2) of the targets about their places: what is known, and beside it what all of them scatter more; where
-    they scatter less, so much less. Points whose coordinates are free have a scatter of their own."""
-    variances = known.copy()
+def _squares(off: Array, covariances: Array) -> Array:
+    """(n,) of how far n targets lie off, in their standard deviations."""
+    return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances), off))
+
+
+def _weights(squares: Array) -> Array:
+    """(n,) of observations that lie so far off, in Student's t distribution."""
+    return (_FREEDOM + 2.0) / (_FREEDOM + squares)
+
+
+def _variances(claimed: Array, more_px2: Array, known: Array) -> Array:
+    """(n, 2, 2) of the targets about their places."""
+    return claimed[:, None, None] * known + more_px2[:, None, None] * np.eye(2)
+
+
+def _scatter(off: Array, predicted: Array, known: Array, is_free: Mask) -> tuple[Array, Array]:
+    """Of the targets about their places: (n,) what is known counts so much, for they may scatter less; and (n,) px²
+    comes on top, which all of them scatter more. Points whose coordinates are free have a scatter of their own."""
+    factors, more_px2 = np.ones(len(off)), np.zeros(len(off))
     for group in (is_free, ~is_free):
         if not group.any():
             continue
@@ -128,9 +151,9 @@ def _variances(off: Array, predicted: Array, known: Array, is_free: Mask) -> Arr
         claimed = float(np.median(np.einsum("nii->n", known[group]))) / 2.0
         open_px2 = float(np.median(np.einsum("nii->n", predicted[group]))) / 2.0
         own = max(seen - open_px2, _LEAST_PX2)
-        variances[group] *= min(own / max(claimed, _LEAST_PX2), 1.0)
-        variances[group] += max(own - claimed, _LEAST_PX2) * np.eye(2)
-    return variances
+        factors[group] = min(own / max(claimed, _LEAST_PX2), 1.0)
+        more_px2[group] = max(own - claimed, _LEAST_PX2)
+    return factors, more_px2
 
 
 def _chances(fit: _Fit, targets: TargetPlaces) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.ring_codes import read_code
+from measure.codes_and_boards.sheet_places import along_plane, is_flat
 from measure.scans.scan import Scan
 from measure.single_targets.disk_patches import Candidate, DiskSearch
 from measure.single_targets.disk_search import disk_candidates
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 
 _LEAST_DIAMETER_PX, _GREATEST_SHARE = 8.0, 0.04  # of a dot; the greatest of the picture's diagonal
 _LEAST_CONTRAST = 0.06  # of the full scale: coded targets are printed to be seen
-_FLAT = 0.01  # of the points' extent: a sheet may be as uneven as this
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +58,8 @@ class CodedPoints:
                 f"{project.path}: [object] points: {len(coordinates)} points with X, Y and Z name no coded targets; "
                 "give 4."
             )
-        about = coordinates - coordinates.mean(axis=0)
-        axes = np.linalg.svd(about, full_matrices=False).Vh
-        is_flat = bool(np.ptp(about @ axes[2]) <= _FLAT * np.ptp(about @ axes[0]))
-        return cls(tuple(xyz), coordinates, about @ axes[:2].T, is_flat, settings)
+        along = along_plane(coordinates)
+        return cls(tuple(xyz), coordinates, along[:, :2], is_flat(along), settings)
 
 
 def coded_candidates(scan: Scan, coded: CodedPoints) -> list[Candidate]:

@@ -24,6 +24,7 @@ from pipeline.files.learned_table import LearnedFrom
 from pipeline.files.project_file import Project
 from pipeline.measuring.learn_stage import learn_marks, pose_of
 from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.measuring.sheet_check import with_checked_sheet
 from pipeline.measuring.target_stage import check_targets, measure_targets
 from pipeline.measuring.tie_stage import check_tie_names, with_ties
 from pipeline.progress import Reporter
@@ -46,7 +47,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
         learned = learn_marks(project, reporter, workers)
         scans = _measured_scans(learned, reporter, workers)
         scans = _of_each_camera(project, scans, _at_one_definition)
-        checked = tuple(_of_each_camera(learned, scans, _cross_checked))
+        checked = with_checked_sheet(project, _of_each_camera(learned, scans, _cross_checked))
         if project.ties is None:
             return checked
         with reporter.stage("natural points sought in") as count:

@@ -1,0 +1,103 @@
+"""The points of a flat sheet or board checked over all pictures of it: what one picture alone shows off its place."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from measure.codes_and_boards.sheet_places import SeenSheet, along_plane, is_flat, sheet_points
+from measure.results import MarkMeasurement
+from measure.single_targets.common_points import ImagePoints, compared_together
+from measure.status import Status
+from pipeline.files.project_file import Project
+from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.measuring.target_field import Field, target_field
+
+_DOUBTED, _REFUSED = 0.01, 1e-4  # the chance of doubting, or refusing, any right mark of all pictures
+_WITNESSES = 3  # other pictures: two just tell where a point is that lies off its sheet
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """off_px: how far a mark lies from where all else puts it; one_of: so many right ones have one that lies so far
+    off; chance: that of all pictures any right one does; others: how many other pictures show the point."""
+
+    off_px: float
+    one_of: float
+    chance: float
+    others: int
+
+
+def with_checked_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
+    """The scans, those points of a sheet or board doubted or refused that lie where neither the other points of their
+    picture nor the other pictures of the sheet put them."""
+    settings = project.targets
+    if settings is None or (settings.code is None and settings.board is None):
+        return tuple(scans)
+    field = target_field(project)
+    sheet = along_plane(field.xyz)
+    if not is_flat(sheet):
+        return tuple(scans)
+    images = _images(project, scans, field)
+    verdicts = dict(zip(images, _verdicts(list(images.values()), field), strict=True))
+    return tuple(_judged(scan, verdicts.get(scan.frame.image, {})) for scan in scans)
+
+
+def _images(project: Project, scans: Sequence[MeasuredScan], field: Field) -> dict[str, ImagePoints]:
+    """What each image shows of the sheet, by its name; those of one camera share a lens."""
+    row = {id: i for i, id in enumerate(field.ids)}
+    images: dict[str, ImagePoints] = {}
+    for camera in project.cameras.values():
+        own = [scan for scan in scans if project.camera_of(scan.frame.image) is camera]
+        points = sheet_points([_seen(scan, row) for scan in own], along_plane(field.xyz))
+        images |= {scan.frame.image: one for scan, one in zip(own, points, strict=True) if one is not None}
+    return images
+
+
+def _seen(scan: MeasuredScan, row: Mapping[str, int]) -> SeenSheet:
+    marks = [mark for mark in scan.frame.marks if mark.status.is_observation and mark.point in row]
+    return SeenSheet(
+        np.array([row[mark.point] for mark in marks], dtype=np.intp),
+        np.array([mark.center_px for mark in marks]).reshape(-1, 2),
+        np.array([mark.covariance_px2 for mark in marks]).reshape(-1, 2, 2),
+        (scan.width_px, scan.height_px),
+    )
+
+
+def _verdicts(images: Sequence[ImagePoints], field: Field) -> list[dict[str, _Verdict]]:
+    """Of each image, by point."""
+    shown = Counter(int(point) for image in images for point in image.index)
+    tests = sum(shown.values())
+    return [
+        {
+            field.ids[point]: _Verdict(float(np.hypot(*off)), 1.0 / chance, tests * chance, shown[point] - 1)
+            for point, off, chance in zip(image.index.tolist(), one.off_px, one.chance.tolist(), strict=True)
+        }
+        for image, one in zip(images, compared_together(images, along_plane(field.xyz)), strict=True)
+    ]
+
+
+def _judged(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> MeasuredScan:
+    marks = tuple(
+        _judged_mark(mark, verdicts[mark.point]) if mark.point in verdicts else mark for mark in scan.frame.marks
+    )
+    return replace(scan, frame=replace(scan.frame, marks=marks))
+
+
+def _judged_mark(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
+    """Without another picture nobody knows whether the mark is off its place, or the point on the sheet; of a few which
+    one is off."""
+    if verdict.chance > _DOUBTED:
+        return mark
+    if not verdict.others:
+        how = (
+            f"it lies {verdict.off_px:.2f} px from where the sheet's other points put it, and no other picture tells "
+            "whether it does so on the sheet"
+        )
+    else:
+        how = f"it lies {verdict.off_px:.2f} px from where the sheet's other points and other pictures put it"
+    if verdict.others >= _WITNESSES and verdict.chance < _REFUSED:
+        return replace(mark, status=Status.REJECTED, reason=f"another mark, or one disturbed: {how}")
+    reason = f"{how}, as one of {verdict.one_of:.0f} right ones does"
+    return replace(mark, status=Status.WEAK, reason="; ".join(filter(None, (mark.reason, reason))))

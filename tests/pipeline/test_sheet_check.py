@@ -1,0 +1,78 @@
+"""Points of a board seen by several pictures of an own pinhole with distortion: what one picture alone shows off its
+place is told from what lies off on the board."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.results import FrameMeasurement, MarkMeasurement
+from measure.status import Status
+from pipeline.files.project_file import Project, read_project
+from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.measuring.sheet_check import with_checked_sheet
+from pipeline.measuring.target_field import target_field
+
+Array = NDArray[np.float64]
+COLUMNS, ROWS, WIDTH, HEIGHT, NOISE_PX = 9, 8, 2200, 1700, 0.05
+BUCKLED, MISPRINTED = "r2c3", "r5c6"
+
+
+def board(folder: Path) -> Project:
+    (folder / "camera.toml").write_text('name = "c"\nframe_mm = [11.0, 8.5]\n', encoding="utf-8")
+    (folder / "comparator.csv").touch()
+    (folder / "project.toml").write_text(
+        f'camera = "camera.toml"\n[targets]\nkind = "chessboard"\ncolumns = {COLUMNS}\nrows = {ROWS}\n'
+        'square_mm = 20.0\n[object]\nunit = "mm"\n',
+        encoding="utf-8",
+    )
+    return read_project(folder / "project.toml")
+
+
+def rotation(axis: int, angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.roll(np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]), axis, (0, 1))
+
+
+def seen(rng: np.random.Generator, xyz: Array) -> Array:
+    """(n, 2) px: up to 40 degrees oblique, rolled, with 8 % of barrel distortion, not about the picture's middle."""
+    turned = rotation(2, rng.uniform(0.0, 6.28)) @ rotation(0, np.pi - rng.uniform(0.3, 0.7))
+    camera = (xyz - xyz.mean(axis=0)) @ (turned @ rotation(2, rng.uniform(0.0, 6.28))).T + (0.0, 0.0, 260.0)
+    ideal = camera[:, :2] / camera[:, 2:]
+    bent = ideal * (1.0 - 0.3 * ((ideal - (0.02, -0.01)) ** 2).sum(axis=1, keepdims=True))
+    return np.asarray(bent * 2000.0 + (WIDTH / 2, HEIGHT / 2) + rng.normal(0.0, NOISE_PX, ideal.shape))
+
+
+def measured(rng: np.random.Generator, project: Project, name: str, wrong: dict[str, float]) -> MeasuredScan:
+    """One picture, some of its points so many px off in some direction."""
+    field = target_field(project)
+    xyz = dict(zip(field.ids, field.xyz, strict=True))
+    xyz[BUCKLED] = xyz[BUCKLED] + (0.0, 0.0, 1.0)
+    xyz[MISPRINTED] = xyz[MISPRINTED] + (0.4, -0.3, 0.0)
+    marks = []
+    for id, place in zip(xyz, seen(rng, np.array(list(xyz.values()))), strict=True):
+        angle = rng.uniform(0.0, 6.28)
+        off = wrong.get(id, 0.0) * np.array([np.cos(angle), np.sin(angle)])
+        marks.append(MarkMeasurement(id, "target", place + off, NOISE_PX**2 * np.eye(2), Status.MEASURED))
+    return MeasuredScan(Path(name), WIDTH, HEIGHT, (5.0, 5.0), FrameMeasurement(name, tuple(marks)))
+
+
+def status(scans: tuple[MeasuredScan, ...], wanted: Status) -> set[tuple[str, str]]:
+    return {(scan.frame.image, mark.point) for scan in scans for mark in scan.frame.marks if mark.status is wanted}
+
+
+def test_what_one_picture_alone_shows_off_its_place_is_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    project = board(tmp_path)
+    wrong = {"p0": {"r0c0": 1.5, "r3c4": 0.8}, "p2": {"r7c8": 2.0, BUCKLED: 1.0}, "p4": {"r4c4": 40.0, "r6c1": 0.6}}
+    names = [f"p{number}" for number in range(5)]
+    checked = with_checked_sheet(project, [measured(rng, project, name, wrong.get(name, {})) for name in names])
+    assert status(checked, Status.REJECTED) == {(name, id) for name, ids in wrong.items() for id in ids}
+    assert not status(checked, Status.WEAK)
+    alone = with_checked_sheet(project, [measured(rng, project, "p0", {"r3c4": 3.0})])
+    doubted = status(alone, Status.WEAK)
+    assert not status(alone, Status.REJECTED)
+    assert ("p0", "r3c4") in doubted
+    assert {id for _, id in doubted} <= {"r3c4", BUCKLED, MISPRINTED}
+    reason = next(mark.reason for mark in alone[0].frame.marks if mark.point == "r3c4")
+    assert "no other picture tells" in reason
