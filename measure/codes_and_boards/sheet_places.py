@@ -17,7 +17,7 @@ _LEAST_POINTS = 8  # fewer say nothing of one another: eight numbers tell where 
 # its middle is not the picture's.
 _PERSPECTIVE, _DECENTRED = 0.1, 0.003
 _STEP = 1e-3  # of the sheet's size, for derivatives
-_FLAT = 0.01  # of the points' extent: a sheet may be as uneven as this
+FLAT = 0.01  # of the points' extent: a sheet may be as uneven as this
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ def along_plane(xyz: Array) -> Array:
 def is_flat(along: Array) -> bool:
     """Whether points (n, 3) along a plane and above it are those of a sheet."""
     extent = np.ptp(along, axis=0)
-    return bool(extent[2] <= _FLAT * extent[0])
+    return bool(extent[2] <= FLAT * extent[0])
 
 
 def sheet_points(pictures: Sequence[SeenSheet], sheet: Array) -> list[ImagePoints | None]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from measure.codes_and_boards.sheet_places import SeenSheet, along_plane, is_flat, sheet_points
+from measure.codes_and_boards.sheet_places import FLAT, SeenSheet, along_plane, is_flat, sheet_points
 from measure.results import MarkMeasurement
 from measure.single_targets.common_points import ImagePoints, compared_together
 from measure.status import Status
@@ -20,13 +20,14 @@ _WITNESSES = 3  # other pictures: two just tell where a point is that lies off i
 
 @dataclass(frozen=True)
 class _Verdict:
-    """off_px: how far a mark lies from where all else puts it; one_of: so many right ones have one that lies so far
-    off; chance: that of all pictures any right one does; others: how many other pictures show the point."""
+    """off_px: how far a mark lies from where all else puts it; chance: that of all pictures any right one lies so far
+    off; others: how many other pictures show the point; is_beyond: it is farther than the point itself can be off its
+    sheet."""
 
     off_px: float
-    one_of: float
     chance: float
     others: int
+    is_beyond: bool
 
 
 def with_checked_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
@@ -67,15 +68,22 @@ def _seen(scan: MeasuredScan, row: Mapping[str, int]) -> SeenSheet:
 
 def _verdicts(images: Sequence[ImagePoints], field: Field) -> list[dict[str, _Verdict]]:
     """Of each image, by point."""
+    if not images:
+        return []
     shown = Counter(int(point) for image in images for point in image.index)
     tests = sum(shown.values())
-    return [
-        {
-            field.ids[point]: _Verdict(float(np.hypot(*off)), 1.0 / chance, tests * chance, shown[point] - 1)
-            for point, off, chance in zip(image.index.tolist(), one.off_px, one.chance.tolist(), strict=True)
-        }
-        for image, one in zip(images, compared_together(images, along_plane(field.xyz)), strict=True)
-    ]
+    verdicts: list[dict[str, _Verdict]] = []
+    for image, one in zip(images, compared_together(images, along_plane(field.xyz)), strict=True):
+        most_px = FLAT * float(np.hypot(*np.ptp(image.targets.places_px, axis=0)))
+        far = np.hypot(*one.off_px.T)
+        rows = zip(image.index.tolist(), far.tolist(), one.chance.tolist(), strict=True)
+        verdicts.append(
+            {
+                field.ids[point]: _Verdict(off, tests * chance, shown[point] - 1, off > most_px)
+                for point, off, chance in rows
+            }
+        )
+    return verdicts
 
 
 def _judged(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> MeasuredScan:
@@ -90,14 +98,10 @@ def _judged_mark(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
     one is off."""
     if verdict.chance > _DOUBTED:
         return mark
-    if not verdict.others:
-        how = (
-            f"it lies {verdict.off_px:.2f} px from where the sheet's other points put it, and no other picture tells "
-            "whether it does so on the sheet"
-        )
-    else:
-        how = f"it lies {verdict.off_px:.2f} px from where the sheet's other points and other pictures put it"
-    if verdict.others >= _WITNESSES and verdict.chance < _REFUSED:
+    witnesses = "the sheet's other points" + (" and other pictures" if verdict.others else "")
+    how = f"it lies {verdict.off_px:.2f} px from where {witnesses} put it"
+    if (verdict.others >= _WITNESSES or verdict.is_beyond) and verdict.chance < _REFUSED:
         return replace(mark, status=Status.REJECTED, reason=f"another mark, or one disturbed: {how}")
-    reason = f"{how}, as one of {verdict.one_of:.0f} right ones does"
+    alone = "" if verdict.others else ", and no other picture tells whether it does so on the sheet"
+    reason = f"{how}{alone}; the chance that any right one does is {verdict.chance:.1g}"
     return replace(mark, status=Status.WEAK, reason="; ".join(filter(None, (mark.reason, reason))))
