@@ -1,14 +1,17 @@
 """The faint marks of a frame: looked for once more where the marks that agree put them."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.fitting.matching import Match
 from measure.frames.faint_marks import FaintMark, find_faint
 from measure.frames.frame_sighter import CHANCE, FrameSighter
 from measure.frames.refinement import Sighting
 from measure.frames.unseen import Ground, reason_unseen
 from measure.marks.rendering import extent_px
-from measure.marks.shapes import FrameCorner
+from measure.marks.shapes import FrameCorner, Mark
 from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
@@ -20,6 +23,7 @@ _SAME_PX = 1.0  # apart: two places of one mark, each of which is known to bette
 _REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
 _EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
+_LOOKED_AT = 8  # marks that agree: these tell how light or dark marks are
 
 
 def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
@@ -33,22 +37,26 @@ def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
         if sighting is not None and sighting.inside and not (sighter.clear(index) and near[index])
         if not isinstance(sighter.layout.marks[index].mark, FrameCorner)  # it has no lines to stand out of texture
     ]
-    agreeing = [
-        s.fit for s, ok in zip(sighter.sightings, sighter.belongs, strict=True) if ok and s is not None and s.fit
-    ]
+    agreeing = {
+        index: sighting.fit
+        for index, sighting in enumerate(sighter.sightings)
+        if sighter.belongs[index] and sighting is not None and sighting.fit
+    }
     if not faint or not agreeing:
         return
     # The marks that agree tell both better than a faint mark does itself.
-    blur_px = float(np.median([fit.blur_px for fit in agreeing]))
-    usual_dn = float(np.median([abs(fit.contrast_dn) for fit in agreeing]))
+    blur_px = float(np.median([fit.blur_px for fit in agreeing.values()]))
+    usual_dn = float(np.median([abs(fit.contrast_dn) for fit in agreeing.values()]))
     extremes = np.percentile(sighter.scan.reduced(sighter.placement.reduction, sighter.weights), _EXTREMES)
+    reached = _reached_dn(sighter, agreeing)
     for index, sighting in faint:
         expected = sighter.expected(index, reach_px)
         extreme_dn = float(extremes[int(expected.polarity > 0)])
         seen = find_faint(sighter.scan, expected, extreme_dn, blur_px)
         known = seen is not None and seen.sigma_px <= _FAINT_SIGMA_PX
         certain = seen is not None and _is_certain(sighter, seen)
-        unseen = reason_unseen(_ground(sighter, expected, extreme_dn), usual_dn, reach_px, seen, certain)
+        ground = _ground(sighter, expected, (extreme_dn, *reached.get(expected.polarity, ())))
+        unseen = reason_unseen(ground, usual_dn, reach_px, seen, certain)
         _take(sighter, index, sighting, seen if certain and known else None, unseen)
 
 
@@ -57,13 +65,28 @@ def faint_reach_px(sighter: FrameSighter) -> float:
     return min(sighter.gate_px, max(_REACH * sighter.scatter_mm() / float(sighter.pitch.mean()), _LEAST_REACH_PX))
 
 
-def _ground(sighter: FrameSighter, expected: MarkPrediction, extreme_dn: float) -> Ground:
-    """About a mark's place; extreme_dn: the grey value that the mark cannot pass."""
-    least, greatest = extent_px(expected.mark, expected.pixel_from_mark)
-    low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
-    grey = sighter.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), sighter.weights).astype(float)
-    room_dn = max(expected.polarity * (extreme_dn - float(np.median(grey))), 0.0)
+def _reached_dn(sighter: FrameSighter, agreeing: Mapping[int, Match]) -> dict[int, list[float]]:
+    """The grey values of some marks that agree, by polarity: in a scan without lights these pass its extreme."""
+    reached: dict[int, list[float]] = {1: [], -1: []}
+    for index, fit in list(agreeing.items())[:_LOOKED_AT]:
+        grey = _about(sighter, sighter.layout.marks[index].mark, fit.pixel_from_mark)
+        reached[1 if fit.contrast_dn > 0 else -1].append(float(np.median(grey)) + fit.contrast_dn)
+    return reached
+
+
+def _ground(sighter: FrameSighter, expected: MarkPrediction, tones_dn: Sequence[float]) -> Ground:
+    """About a mark's place; tones_dn: grey values that a mark can have."""
+    grey = _about(sighter, expected.mark, expected.pixel_from_mark)
+    room_dn = max(*(expected.polarity * (tone_dn - float(np.median(grey))) for tone_dn in tones_dn), 0.0)
     return Ground(expected.polarity > 0, room_dn, float(grey.std()))
+
+
+def _about(sighter: FrameSighter, mark: Mark, pixel_from_mark: Array) -> Array:
+    """The grey values about a mark's place."""
+    least, greatest = extent_px(mark, pixel_from_mark)
+    low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
+    window = sighter.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), sighter.weights)
+    return np.asarray(window, dtype=float)
 
 
 def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark | None, unseen: str) -> None:
