@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 
 ROUNDING_VARIANCE = 1 / 12  # of evenly spread light less the number it is rounded to, in steps
 _LOG_DENSITY = -0.5 * np.log(2 * np.pi)
-# Of the noise, in steps: from what no drawing is exact to, to where rounding is as good as noise.
-_SIGMAS = (0.1, 0.14, 0.2, 0.28, 0.4)
+# Of the noise, in steps: from what no drawing is exact to, to where the weights of grain gain more.
+_SIGMAS = (0.1, 0.14, 0.2)
 COARSEST_VARIANCE = ROUNDING_VARIANCE + _SIGMAS[-1] ** 2
 _SAMPLES, _TAIL = 1001, 6.0
 
