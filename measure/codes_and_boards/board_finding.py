@@ -1,12 +1,14 @@
 """Where a calibration board lies in a scan, to a pixel: OpenCV's detectors on a reduced picture."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.board_specs import ArucoSpec, CharucoSpec, ChessboardSpec, aruco_dictionary
+from measure.codes_and_boards.marker_reading import ReadMarkers, read_markers
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
@@ -27,15 +29,16 @@ class FoundCorner:
 
 @dataclass(frozen=True)
 class FoundBoard:
-    """The corners found, by id; none, and the reason why."""
+    """The corners found, by id; none, and the reason why; refused: the markers that were read and are not used, by
+    number, and why."""
 
     corners: dict[str, FoundCorner]
     reason: str = ""
+    refused: Mapping[int, str] = field(default_factory=dict)
 
 
 def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> FoundBoard:
     """Search a board at a size that shows it whole, then finer: small boards in large scans need it."""
-    reason = ""
     for factor in _search_factors(scan):
         picture, reason = _searchable(scan, factor)
         if reason:
@@ -47,9 +50,8 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> Fo
         else:
             found = _find_aruco(picture, spec)
         if found.corners:
-            return FoundBoard({name: _in_scan(corner, factor) for name, corner in found.corners.items()})
-        reason = found.reason
-    return FoundBoard({}, reason)
+            return replace(found, corners={name: _in_scan(corner, factor) for name, corner in found.corners.items()})
+    return found
 
 
 def _search_factors(scan: Scan) -> list[int]:
@@ -116,16 +118,23 @@ def _find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     """The inner corners whose neighbouring markers are read."""
     size = (spec.columns, spec.rows)
     board = cv2.aruco.CharucoBoard(size, spec.square_mm, spec.marker_mm, aruco_dictionary(spec.dictionary))
-    corners, numbers, _, markers = cv2.aruco.CharucoDetector(board).detectBoard(picture)
+    on_board = dict(zip(np.ravel(board.getIds()).tolist(), np.array(board.getObjPoints())[..., :2], strict=True))
+    read = read_markers(picture, aruco_dictionary(spec.dictionary), on_board)
+    outlines = [read.corners_px[number][None].astype(np.float32) for number in read.corners_px]
+    numbers_read = np.array(list(read.corners_px), np.int32)[:, None]
+    corners, numbers, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(
+        picture, markerCorners=outlines, markerIds=numbers_read
+    )
     if corners is None or len(corners) < 4:
-        read = 0 if markers is None else len(markers)
-        return FoundBoard({}, f"{read} markers of {spec.dictionary} were read, too few to place the board's corners")
+        reason = f"{len(outlines)} markers of {spec.dictionary} were read, too few to place the board's corners"
+        return FoundBoard({}, _with_refused(reason, read), read.refused)
     places, ids = np.asarray(corners, float).reshape(-1, 2), np.asarray(numbers, int).ravel()
     return FoundBoard(
         {
             f"c{number}": FoundCorner(place, steps)
             for number, place, steps in zip(ids, places, _charuco_steps(ids, places, spec), strict=True)
-        }
+        },
+        refused=read.refused,
     )
 
 
@@ -145,15 +154,19 @@ def _homography_steps(homography: Array, place: Array) -> Array:
 
 def _find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
     """The corners of the board's markers that are read; steps are the marker's sides that leave the corner."""
-    detector = cv2.aruco.ArucoDetector(aruco_dictionary(spec.dictionary))
-    outlines, numbers, _ = detector.detectMarkers(picture)
+    points = spec.object_points()
     wanted = range(spec.first_marker, spec.first_marker + spec.columns * spec.rows)
+    on_board = {number: np.array([points[f"{number}.{index}"][:2] for index in range(4)]) for number in wanted}
+    read = read_markers(picture, aruco_dictionary(spec.dictionary), on_board)
     found = {}
-    for outline, number in zip(outlines, [] if numbers is None else np.asarray(numbers).ravel(), strict=True):
-        if number not in wanted:
-            continue
-        corners = np.asarray(outline, float).reshape(4, 2)
+    for number, corners in read.corners_px.items():
         for index, corner in enumerate(corners):
             sides = np.stack([corners[(index + 1) % 4] - corner, corners[(index - 1) % 4] - corner], axis=-1)
             found[f"{number}.{index}"] = FoundCorner(corner, sides)
-    return FoundBoard(found, "" if found else f"no marker {wanted[0]} to {wanted[-1]} of {spec.dictionary} was read")
+    reason = "" if found else f"no marker {wanted[0]} to {wanted[-1]} of {spec.dictionary} was read"
+    return FoundBoard(found, reason and _with_refused(reason, read), read.refused)
+
+
+def _with_refused(reason: str, read: ReadMarkers) -> str:
+    """Why a board was not found, where markers were read that are not used."""
+    return "; ".join([reason, *list(read.refused.values())[:1]])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.board_finding import FoundCorner, find_board
+from measure.codes_and_boards.board_finding import FoundBoard, FoundCorner, find_board
 from measure.codes_and_boards.board_specs import (
     ArucoSpec,
     BoardSpec,
@@ -36,11 +36,12 @@ _WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out 
 @dataclass(frozen=True)
 class BoardMeasurement:
     """A board in a scan: one mark for each of its points, found or not; reason: why the board was not found; notes:
-    what the user should know."""
+    what the user should know; refused: markers that were read and are not used, one sentence each."""
 
     marks: tuple[MarkMeasurement, ...]
     reason: str = ""
     notes: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
 
 
 def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
@@ -54,9 +55,15 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     notes = ()
     if isinstance(spec, ChessboardSpec) and fitted:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
-    missing = board.reason or "not seen: its markers were not read"
-    marks = tuple(_as_mark(name, fitted.get(name), missing) for name in spec.object_points())
-    return BoardMeasurement(marks, board.reason, notes)
+    unseen = board.reason or "not seen: its markers were not read"
+    why = {name: _refused(name, board, spec) or unseen for name in spec.object_points()}
+    marks = tuple(_as_mark(name, fitted.get(name), missing) for name, missing in why.items())
+    return BoardMeasurement(marks, board.reason, notes, tuple(board.refused.values()))
+
+
+def _refused(name: str, board: FoundBoard, spec: BoardSpec) -> str:
+    """Why the marker of a corner is not used, though it was read."""
+    return board.refused.get(int(name.split(".")[0]), "") if isinstance(spec, ArucoSpec) else ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,7 +94,10 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
         return with_targets(measured, *measure_coded_field(scan, coded, project, measured))
     if settings.board is not None:
         board = measure_board(scan, settings.board)
-        problems = (f"The board was not found: {board.reason}.",) if board.reason else ()
+        refused = (
+            (f"Of the board's markers {len(board.refused)} are not used: {board.refused[0]}.",) if board.refused else ()
+        )
+        problems = (f"The board was not found: {board.reason}.",) if board.reason else refused
         # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
         notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
         return with_targets(measured, board.marks, (*problems, *notes))

@@ -186,6 +186,36 @@ def test_aruco_and_apriltag_corners(dictionary: str) -> None:
     assert np.sqrt(np.mean(errors**2)) < 0.03
 
 
+@pytest.mark.parametrize("name", ["aruco", "charuco"])
+def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> None:
+    """A stray copy of one marker is passed over; of two like boards none is measured, and the reason says why."""
+    dictionary = aruco_dictionary("4X4_50")
+    spec: ArucoSpec | CharucoSpec
+    if name == "aruco":
+        spec = ArucoSpec("4X4_50", 3, 2, 60.0, 20.0)
+        drawing = cv2.aruco.GridBoard((3, 2), 60.0, 20.0, dictionary).generateImage((260, 180), marginSize=20)
+    else:
+        spec = CharucoSpec("4X4_50", 5, 4, 48.0, 36.0)
+        drawing = cv2.aruco.CharucoBoard((5, 4), 48.0, 36.0, dictionary).generateImage((260, 212), marginSize=10)
+    height, width = drawing.shape
+    picture = np.full((height + 40, 2 * width + 60), 255.0)
+    picture[20 : 20 + height, 20 : 20 + width] = drawing
+    two = picture.copy()
+    picture[60:120, width + 100 : width + 160] = cv2.aruco.generateImageMarker(dictionary, 3, 60)
+    two[20 : 20 + height, width + 40 : 2 * width + 40] = drawing
+
+    def measured(grey: Array) -> BoardMeasurement:
+        noise = np.random.default_rng(2).normal(0, 300, grey.shape)
+        return measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(grey, (0, 0), 0.8) + noise), spec)
+
+    seen = [mark.center_px for mark in measured(picture).marks if mark.status is Status.MEASURED]
+    assert len(seen) == len(spec.object_points())
+    assert max(center[0] for center in seen if center is not None) < width + 20
+    neither = measured(two)
+    assert "was read at 2 places" in neither.reason
+    assert all(mark.status is Status.ABSENT for mark in neither.marks)
+
+
 @pytest.mark.parametrize(
     "spec",
     [

@@ -1,0 +1,74 @@
+"""The markers of a board read in a picture, each at one place: where one is read at several, its board says which."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.codes_and_boards.sheet_view import SheetView, robust_view
+
+Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class ReadMarkers:
+    """corners_px: (4, 2) of each marker, by number; refused: those that were read, but not where the board has them or
+    at places that nothing tells apart, and why."""
+
+    corners_px: Mapping[int, Array]
+    refused: Mapping[int, str]
+
+
+def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, board: Mapping[int, Array]) -> ReadMarkers:
+    """The markers of a board, its corners (4, 2) on it by number, in the order in which they are read."""
+    outlines, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
+    readings: dict[int, list[Array]] = {}
+    for outline, number in zip(outlines, _integers(numbers), strict=True):
+        if number in board:
+            readings.setdefault(number, []).append(np.asarray(outline, float).reshape(4, 2))
+    view = _view(readings, board, (picture.shape[1], picture.shape[0]))
+    corners: dict[int, Array] = {}
+    refused: dict[int, str] = {}
+    for number, places in readings.items():
+        off = [_off(view, board[number], place) for place in places]
+        best = int(np.argmin(np.nan_to_num(off, nan=np.inf)))
+        if off[best] < 1.0 or (len(places) == 1 and np.isnan(off[best])):
+            corners[number] = places[best]
+        elif len(places) == 1:
+            refused[number] = f"marker {number} was read where the board's other markers do not have it"
+        else:
+            refused[number] = (
+                f"marker {number} was read at {len(places)} places, and nothing tells which is the board's; "
+                "is there another such board?"
+            )
+    return ReadMarkers(corners, refused)
+
+
+def _integers(numbers: object) -> list[int]:
+    """OpenCV's column of numbers, None where there are none."""
+    return [] if numbers is None else [int(number) for number in np.ravel(np.asarray(numbers))]
+
+
+def _view(
+    readings: Mapping[int, list[Array]], board: Mapping[int, Array], size_px: tuple[int, int]
+) -> SheetView | None:
+    """Where the board lies by the markers that were read once; None where not most of them agree."""
+    single = {number: places[0] for number, places in readings.items() if len(places) == 1}
+    if len(single) < 2:
+        return None
+    points = np.concatenate([board[number] for number in single])
+    view = robust_view(points, np.concatenate(list(single.values())), size_px)
+    agreeing = sum(_off(view, board[number], place) < 1.0 for number, place in single.items())
+    return view if 2 * agreeing > len(single) else None
+
+
+def _off(view: SheetView | None, corners: Array, seen_px: Array) -> float:
+    """How far a marker lies from where the board has it, in its sides: another one cannot be nearer than one. nan where
+    that is not known."""
+    if view is None:
+        return np.nan
+    side = float(np.hypot(*(np.roll(seen_px, 1, axis=0) - seen_px).T).max())
+    return float(np.hypot(*(view.places_px(corners) - seen_px).mean(axis=0))) / side
