@@ -97,9 +97,10 @@ class MarkTemplate:
 
     image: (rows, columns), any scale of grey values; origin_px: (column, row) of the measured point in it. detail_mm:
     its finest detail, 0 where that is not known: then two of its pixels. noise_dn: of one pixel of the scans that it is
-    made of, by whose names shares says how much of the chip is each one's own picture. steady: which of its pixels
-    look alike in all of them, None where all do. steadiness: (rows, columns), 1 where a picture differs from the chip
-    by noise, and less where it differs by more: the ratio of the standard deviations; None where that is not known.
+    made of, by whose names shares says how much of the chip is each one's own picture. slope_noise_dn: standard
+    deviation of noise in the chip's own slopes, per pixel, as a fit sees them. steady: which of its pixels look alike
+    in all of them, None where all do. steadiness: (rows, columns), 1 where a picture differs from the chip by noise,
+    and less where it differs by more: the ratio of the standard deviations; None where that is not known.
     learned_mm: the side of the square that was learned, 0 of a chip that somebody cut out.
     """
 
@@ -110,6 +111,7 @@ class MarkTemplate:
     polarity: Polarity = "auto"
     detail_mm: float = 0.0
     noise_dn: float = 0.0
+    slope_noise_dn: float = 0.0
     shares: Mapping[str, float] = field(default_factory=dict)
     steady: NDArray[np.bool_] | None = None
     steadiness: NDArray[np.float64] | None = None

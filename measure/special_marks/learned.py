@@ -19,7 +19,7 @@ from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
 from measure.noise.noise import robust_scale
 from measure.scans.scan import Scan
-from measure.special_marks.shared_picture import NOISE_FLOOR, SharedPicture, adjusted, first_picture
+from measure.special_marks.shared_picture import NOISE_FLOOR, SMOOTHED_PX2, SharedPicture, adjusted, first_picture
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -29,6 +29,7 @@ _ROUNDS = 12  # of adjusting; five are enough where pictures are about as sharp 
 _SETTLED_PX, _SETTLED_PX2 = 0.005, 0.02  # no picture moves or is blurred further
 _ROOM_PX = 10  # about the chip, to move in
 _SPREAD_PX = 1.0  # over which it is averaged, for a few pictures alone hardly tell it, yet it changes at the edges
+_LEAST_TOLD = 0.1  # of the slopes' squares: less would tell nothing
 _GRAIN_PX = 1.0  # taken where one picture cannot tell how far its grain reaches
 
 
@@ -72,6 +73,7 @@ def template_of(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
         polarity="light",  # as the chip shows it
         detail_mm=_detail_px(image) * pitch_um / 1000,
         noise_dn=float(np.median([_noise_dn(chip.grey) for chip in chips])),
+        slope_noise_dn=shared.slope_noise,
         shares={chip.scan: float(share) for chip, share in zip(chips, shared.shares, strict=True)},
         steady=steady,
         steadiness=_steadiness(shared.residuals, image, steady) if len(chips) > 1 else None,
@@ -104,9 +106,29 @@ def honest_covariance(template: MarkTemplate, scan: str, fit: Match) -> Array:
 
     The scan's noise is in the template too and so is missing from the residuals, in which only the rest, one less its
     share, is left. Where the template is that scan's picture alone nothing is left: then noise from the picture itself.
+    Slopes of the template that are noise tell nothing of the place, but the fit took them for slopes of the mark.
     """
     share = template.shares.get(scan, 0.0)
-    return fit.covariance_px2 / (1.0 - share) if share < 1.0 else _covariance_of_noise(template, fit)
+    if share == 1.0:
+        return _covariance_of_noise(template, fit)
+    widened = _without_slope_noise(template, fit)
+    return np.asarray(widened @ fit.covariance_px2 @ widened.T / (1.0 - share))
+
+
+def _without_slope_noise(template: MarkTemplate, fit: Match) -> Array:
+    """(2, 2) what an error of the place is to be multiplied by: the squares of all slopes that the fit saw over those
+    of the mark's."""
+    linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
+    px_per_sample = float(np.sqrt(abs(np.linalg.det(linear)))) * template.pitch_um / 1000
+    side = int(np.ceil(len(template.image) * px_per_sample))
+    place = np.column_stack([linear, np.full(2, (side - 1) / 2)])
+    shown = render(template, place, side, side, float(np.sqrt(blur_px2)))
+    slopes = np.stack([shown.by_col.ravel(), shown.by_row.ravel()]).astype(float)
+    noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
+    noise *= SMOOTHED_PX2 / blur_px2  # more blur takes as much of the slopes of white noise
+    told, axes = np.linalg.eigh(slopes @ slopes.T)
+    marks = np.maximum(told - noise**2 * side**2, _LEAST_TOLD * told)
+    return np.asarray(axes * (told / marks) @ axes.T)
 
 
 def _resampled(chip: Chip, pixel_from_mark: Array, side: int, pitch_um: float) -> Array:

@@ -29,8 +29,8 @@ _LEAST_WEIGHT = 1e-6  # of a pixel that lies off in all pictures
 _LEAST_REDUNDANCY = 0.1  # of a picture: below it residuals do not tell its noise
 _ALIKE_PX = 0.7  # about a pixel, that tell whether pictures are alike there
 _LEAST_GAIN = 0.01  # of a picture that hardly shows the mark
-_SMOOTHED_PX2 = 0.7**2  # variance of a blur of all that is compared: as sharp as pixels, edges are sampled falsely
-_CORRELATED = 4 * np.pi * _SMOOTHED_PX2  # pixels that are one observation, after it
+SMOOTHED_PX2 = 0.7**2  # variance of a blur of all that is compared: as sharp as pixels, edges are sampled falsely
+_CORRELATED = 4 * np.pi * SMOOTHED_PX2  # pixels that are one observation, after it
 _LONGEST_PX = 1.0  # of a move: beyond it the linearisation tells nothing
 _MOST_BLURRED = 2.0  # times the blur, likewise
 _SEEN_PX2 = 1.0  # variance of the blur of a sharp scan, the pixel's share and the smoothing included
@@ -59,8 +59,16 @@ class SharedPicture:
         """(n,) how much of the image is each picture's own, of as fine a detail as a fit sees."""
         side = len(self.image)
         told = self.weights.mean(axis=(1, 2))[:, None, None] * _transfers(side, 2 * self.variances_px2)
-        seen = _transfers(side, np.array([2 * _SMOOTHED_PX2]))
+        seen = _transfers(side, np.array([2 * SMOOTHED_PX2]))
         return np.asarray((seen * told / told.sum(axis=0)).sum(axis=(1, 2)) / seen.sum())
+
+    @property
+    def slope_noise(self) -> float:
+        """Standard deviation of noise in the image's slopes, per pixel, as a fit sees them: by those of the residuals,
+        in which a picture's own share is missing."""
+        shares = self.shares
+        noise = np.array([robust_scale(np.diff(residuals)) for residuals in self.residuals])
+        return float(np.sqrt(np.sum(shares**2 * noise**2 / np.maximum(1 - shares, _LEAST_REDUNDANCY))))
 
 
 def first_picture(stack: Array) -> SharedPicture:
@@ -78,7 +86,7 @@ def first_picture(stack: Array) -> SharedPicture:
 
 def adjusted(shared: SharedPicture, stack: Array, steady: Mask) -> SharedPicture:
     """The shared picture adjusted once more to pictures (n, side, side), moves and blurs by the steady pixels."""
-    smoothed = _seen(stack, np.full(len(stack), _SMOOTHED_PX2))
+    smoothed = _seen(stack, np.full(len(stack), SMOOTHED_PX2))
     designs = _designs(shared.image, shared.variances_px2, steady)
     fits = [_fit(*each) for each in zip(smoothed, designs, shared.weights, strict=True)]
     alike, weights = np.array([fit.alike for fit in fits]), _weights(fits, shared.shares)
@@ -120,7 +128,7 @@ def _cosines(images: Array) -> Array:
 def _designs(image: Array, variances_px2: Array, steady: Mask) -> Array:
     """(n, 5, side, side) of each picture: the shared one as it shows it, one, and how that changes by column, row and
     variance of the blur, where pixels are steady."""
-    views = _seen(image, variances_px2 + _SMOOTHED_PX2)
+    views = _seen(image, variances_px2 + SMOOTHED_PX2)
     by_row, by_col = np.gradient(views, axis=(1, 2))
     by_variance = idctn(-0.5 * _squares(len(image)) * _cosines(views), axes=(1, 2), norm="ortho")
     return np.stack([views, np.ones_like(views), *(part * steady for part in (by_col, by_row, by_variance))], axis=1)
@@ -199,7 +207,7 @@ class _Together:
     def __init__(self, image: Array, variances_px2: Array, weights: Array, steady: Mask) -> None:
         self.image, self.roots = image, np.sqrt(weights)
         self.designs = _designs(image, variances_px2, steady)
-        self.transfers = _transfers(len(image), variances_px2 + _SMOOTHED_PX2)
+        self.transfers = _transfers(len(image), variances_px2 + SMOOTHED_PX2)
         told = self.roots[:, None] * self.designs
         told[variances_px2 == 0, _BLUR] = 0.0
         self.lengths = np.sqrt((told**2).sum(axis=(2, 3)))

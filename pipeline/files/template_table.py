@@ -52,6 +52,7 @@ def template_lines(template: MarkTemplate, name: str, save: SavePicture) -> list
 def _learned_lines(template: MarkTemplate, range_dn: float, name: str, save: SavePicture) -> list[str]:
     lines = [f"[mark.{name}.learned]", f"size_mm = {template.learned_mm!r}"]
     lines += [f"range_dn = {range_dn!r}", f"noise_dn = {template.noise_dn!r}"]
+    lines.append(f"slope_noise_dn = {template.slope_noise_dn!r}")
     for key, values in (("steadiness", template.steadiness), ("steady", template.steady)):
         if values is not None:
             lines.append(f"{key} = {quoted(save(f'{name}-{key}', _picture(values)))}")
@@ -88,6 +89,7 @@ def _learned(template: MarkTemplate, table: Table) -> MarkTemplate:
         template,
         image=template.image * (table.number("range_dn", above=0.0) / float(np.ptp(template.image))),
         noise_dn=table.number("noise_dn", least=0.0),
+        slope_noise_dn=table.number("slope_noise_dn", 0.0, least=0.0),
         shares={scan: shares.number(scan, above=0.0) for scan in shares.names()},
         steadiness=steadiness,
         steady=None if steady is None else steady > 0.5,

@@ -23,7 +23,7 @@ SHIFT = MatchOptions(freedom="shift", estimate_blur=False)
 
 
 def pictures(
-    count: int, seed: int, dust: bool = False, blurs: Sequence[float] = (), scale: int = 1
+    count: int, seed: int, dust: bool = False, blurs: Sequence[float] = (), scale: int = 1, noise_dn: float = NOISE_DN
 ) -> tuple[list[Chip], Array]:
     """Chips of the wedge, each with a gain of its own and placed half a pixel wrong, and the true places (n, 2).
     blurs: of each one, px; all alike where it has none. scale: times the wedge's size."""
@@ -33,7 +33,7 @@ def pictures(
     for index, place in enumerate(true):
         linear = scale * PX_PER_MM * np.array([[1.0, 0.004], [0.003, -1.0]])
         shown = brute_picture(WEDGE, np.column_stack([linear, place]), side, side, blurs[index] if blurs else 0.8)
-        grey = rng.uniform(1500, 2500) + rng.uniform(700, 1300) * shown + rng.normal(0, NOISE_DN, shown.shape)
+        grey = rng.uniform(1500, 2500) + rng.uniform(700, 1300) * shown + rng.normal(0, noise_dn, shown.shape)
         if dust and index == 0:
             grey[26:32, 34:40] += 4000.0
         taken = np.column_stack([linear, place + rng.normal(0, 0.4, 2)])
@@ -73,6 +73,17 @@ def test_pictures_of_unlike_blur_show_an_unsymmetric_mark_at_one_place() -> None
         assert np.abs(off).max() < 0.05
         scores.append(off / sigma / np.sqrt(1 - 1 / 5))
     assert 0.6 < float(np.sqrt(np.mean(np.square(scores)))) < 1.35
+
+
+def test_noise_in_the_template_is_not_taken_for_slopes_of_the_mark() -> None:
+    """A fifth of the contrast: of 4 x 5 x 2 coordinates, twice what is claimed where it is."""
+    scores = []
+    for seed in range(4):
+        chips, true = pictures(5, seed, scale=2, noise_dn=10 * NOISE_DN)
+        places, sigma = measured(chips)
+        off = places - true
+        scores.append((off - off.mean(axis=0)) / sigma / np.sqrt(1 - 1 / 5))
+    assert 0.7 < float(np.sqrt(np.mean(np.square(scores)))) < 1.65
 
 
 def test_dust_on_one_picture_stays_out_of_the_template() -> None:
