@@ -1,6 +1,6 @@
 """A field in space of dots, some of them ring-coded: the codes orient the image, which names the other dots."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,14 @@ from measure.single_targets.targets import TargetOptions, TargetPrediction, meas
 from measure.status import Status
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_model import camera_model
-from pipeline.measuring.coded_points import CodedPoints, coded_candidates, named_by_code, none_coded, read_numbers
+from pipeline.measuring.coded_points import (
+    CodedPoints,
+    coded_candidates,
+    named_by_code,
+    none_coded,
+    points_read,
+    read_numbers,
+)
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field, target_field
 from pipeline.measuring.target_places import checked_places
@@ -27,7 +34,8 @@ def measure_coded_field(
     scan, camera = scan.green(), project.camera_of(measured.frame.image)
     found = coded_candidates(scan, points)
     numbers = read_numbers(scan, found, points, _is_mirrored(measured))
-    coded, notes = named_by_code(numbers, points)
+    read = points_read(numbers, points)
+    coded, notes = named_by_code(read, points)
     model = camera_model(camera, measured)
     field = target_field(project)
     if isinstance(model, str):
@@ -39,13 +47,11 @@ def measure_coded_field(
     if isinstance(named, str):
         marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, named) for id in points.ids)
         return marks, (*notes, f"No target has a name: {named}.")
-    ids = {dot: points.ids[point] for dot, point in coded.items()}
-    strangers = {id: found[dot] for dot, id in ids.items() if named.candidates.get(id) is not found[dot]}
+    ids = {dot: points.ids[point] for dot, point in read.items()}
+    strangers = [(id, found[dot]) for dot, id in ids.items() if named.candidates.get(id) is not found[dot]]
     if strangers:
-        notes = (
-            *notes,
-            f"Rings that read as {listed(sorted(strangers))} lie where the field has another point, or none.",
-        )
+        others = listed(sorted({id for id, _ in strangers}))
+        notes = (*notes, f"Rings that read as {others} lie where the field has another point, or none.")
     predictions = named.predictions(_of_size(field, named, measured), measured)
     contradicted = {
         one.point: MarkMeasurement(one.point, "target", one.center_px, None, Status.REJECTED, reason)
@@ -60,11 +66,11 @@ def measure_coded_field(
     return checked_places(marks, field, named.model, measured), notes
 
 
-def _contradiction(prediction: TargetPrediction, strangers: Mapping[str, Candidate]) -> str:
+def _contradiction(prediction: TargetPrediction, strangers: Sequence[tuple[str, Candidate]]) -> str:
     """Why a point is not what lies at its place, if a ring there says so."""
     reach = float(prediction.half_axes_px[0]) + prediction.search_px
-    for id, dot in strangers.items():
-        if np.hypot(*(dot.center_px - prediction.center_px)) < reach:
+    for id, dot in strangers:
+        if id != prediction.point and np.hypot(*(dot.center_px - prediction.center_px)) < reach:
             return f"the ring at its place reads as {id}"
     return ""
 

@@ -2,7 +2,7 @@
 them."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,14 +80,20 @@ def read_numbers(scan: Scan, found: Sequence[Candidate], coded: CodedPoints, mir
     }
 
 
-def named_by_code(numbers: dict[int, int], coded: CodedPoints) -> tuple[dict[int, int], tuple[str, ...]]:
-    """The point (by index) of each coded dot; a code that is read twice says nothing."""
+def points_read(numbers: Mapping[int, int], coded: CodedPoints) -> dict[int, int]:
+    """The point (by index) that the ring about each dot says, right or not."""
     row = {id: i for i, id in enumerate(coded.ids)}
     points = {dot: coded.settings.numbers.get(number, str(number)) for dot, number in numbers.items()}
+    return {dot: row[point] for dot, point in points.items() if point in row}
+
+
+def named_by_code(points: Mapping[int, int], coded: CodedPoints) -> tuple[dict[int, int], tuple[str, ...]]:
+    """The same but for those that are read at several places: these say nothing, until the others tell which is right;
+    and what is to be said of them."""
     count = Counter(points.values())
-    twice = sorted(point for point in count if count[point] > 1 and point in row)
-    notes = (f"The codes of {listed(twice)} were read at more than one place and are not used.",) if twice else ()
-    return {dot: row[point] for dot, point in points.items() if point in row and count[point] == 1}, notes
+    twice = sorted(coded.ids[point] for point in count if count[point] > 1)
+    notes = (f"The codes of {listed(twice)} were read at more than one place and name nothing.",) if twice else ()
+    return {dot: point for dot, point in points.items() if count[point] == 1}, notes
 
 
 def none_coded(found: Sequence[Candidate], numbers: dict[int, int], coded: CodedPoints) -> str:

@@ -10,7 +10,14 @@ from measure.scans.scan import Scan
 from measure.single_targets.disk_patches import Candidate
 from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_disks
 from measure.status import Status
-from pipeline.measuring.coded_points import CodedPoints, coded_candidates, named_by_code, none_coded, read_numbers
+from pipeline.measuring.coded_points import (
+    CodedPoints,
+    coded_candidates,
+    named_by_code,
+    none_coded,
+    points_read,
+    read_numbers,
+)
 from pipeline.wording import listed
 
 _FOUND_WITHIN_PX = 2.0  # how far the fit may move from where the search has a dot
@@ -21,7 +28,7 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
     scan = scan.green()
     found = coded_candidates(scan, sheet)
     numbers = read_numbers(scan, found, sheet)
-    coded, notes = named_by_code(numbers, sheet)
+    coded, notes = named_by_code(points_read(numbers, sheet), sheet)
     naming: Naming | str = none_coded(found, numbers, sheet)
     if coded:
         alike = [i for i, dot in enumerate(found) if dot.contrast_dn * _sign(found, coded) > 0.0]

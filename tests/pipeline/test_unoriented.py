@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from numpy.typing import NDArray
 
 from measure.results import MarkMeasurement
+from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
 from pipeline.files.tables import read_toml
@@ -105,6 +107,24 @@ def test_ring_codes_in_space_and_two_that_are_confused(tmp_path: Path) -> None:
     confused = errors(scan, places)
     assert set(confused) & {first, second} == set()
     assert len(confused) >= len(places) - 4
+
+
+def test_a_ring_read_twice_is_the_one_at_its_place(tmp_path: Path) -> None:
+    """A ring copied over another one: that dot has the place of one point, the code of the other and the name of none."""
+    project, places = rendered(tmp_path, RINGS)
+    first, second = [id for id in places if int(id) < 4096][:2]
+    scan_file = read_project(project).scans["a"]
+    picture = tifffile.imread(scan_file)
+    (from_col, from_row), (col, row) = (np.round(places[id]).astype(int) for id in (first, second))
+    half = 30
+    chip = picture[from_row - half : from_row + half, from_col - half : from_col + half].copy()
+    picture[row - half : row + half, col - half : col + half] = chip
+    tifffile.imwrite(scan_file, picture)
+    scan = measure_scan(read_project(project), "a")
+    marks = {mark.point: mark for mark in scan.frame.marks}
+    assert set(errors(scan, places)) == set(places) - {second}
+    assert marks[second].status is Status.REJECTED
+    assert marks[second].reason == f"the ring at its place reads as {first}"
 
 
 @pytest.mark.parametrize(
