@@ -110,7 +110,7 @@ def test_ring_codes_in_space_and_two_that_are_confused(tmp_path: Path) -> None:
 
 
 def test_a_ring_read_twice_is_the_one_at_its_place(tmp_path: Path) -> None:
-    """A ring copied over another one: that dot has the place of one point, the code of the other and the name of none."""
+    """A ring copied over another one: that dot has the place of one point, the code of the other, the name of none."""
     project, places = rendered(tmp_path, RINGS)
     first, second = [id for id in places if int(id) < 4096][:2]
     scan_file = read_project(project).scans["a"]
