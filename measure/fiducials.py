@@ -33,6 +33,7 @@ _CHANCE = 0.01  # frames that chance may be expected to find in a scan without a
 _HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 _LOOKS = 2  # in the whole scan, and where the frame's edges put the marks
+_BESIDE = 0.95  # of the frame's size: a rival farther off is another photograph
 _AMBIGUOUS = 0.9  # a placement that scores this share of the best one is a rival
 
 
@@ -70,7 +71,7 @@ def measure_fiducials(
     else:
         against = _against_the_set_pose(search, found, frame)
     chance = doubt(search, frame)
-    problems = [f"{sentence}." for sentence in (*_rivals(found, frame.placement), chance, against) if sentence]
+    problems = [f"{sentence}." for sentence in (*_rivals(search, found, frame), chance, against) if sentence]
     doubts = problems if frame.measured else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = Pose(pose.name, False, (*pose.evidence, *doubts))
@@ -248,18 +249,33 @@ def _posed(found: Sequence[Placement], best: Placement, pose: str) -> Placement:
     )
 
 
-def _rivals(found: Sequence[Placement], best: Placement) -> list[str]:
-    """Sentences about other placements in the same pose that nearly as many marks speak for."""
-    problems = []
+def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> list[str]:
+    """Sentences about other placements in the same pose that nearly as many marks speak for, or that show a frame."""
+    problems, best = [], frame.placement
     for other in found:
         if other.pose != best.pose or other.same_place(best):
             continue
-        if other.score >= _AMBIGUOUS * best.score and other.supported >= best.supported - 1:
+        as_good = other.score >= _AMBIGUOUS * best.score and other.supported >= best.supported - 1
+        if as_good or _is_another_frame(search, other, frame):
             shift = np.linalg.solve(
                 best.pixel_from_camera[:, :2], other.pixel_from_camera[:, 2] - best.pixel_from_camera[:, 2]
             )
+            told = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
             problems.append(
-                f"the constellation fits nearly as well shifted by ({shift[0]:.1f}, {shift[1]:.1f}) mm, on "
-                f"{other.supported} marks against {best.supported}: the marks' names are not certain"
+                f"the scan shows another frame {told} beside this one, with {other.supported} marks where this one has "
+                f"{best.supported}: give a scan of one frame"
+                if (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any()
+                else f"the constellation fits nearly as well shifted by {told}, on {other.supported} marks against "
+                f"{best.supported}: the marks' names are not certain"
             )
     return problems[:3]
+
+
+def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bool:
+    """Whether a placement shows another frame, of as many marks: of two photographs in a scan one may answer better."""
+    if other.supported < frame.placement.supported or not search.was_everywhere(other):
+        return False
+    if search.expected_alike(other) > _CHANCE:
+        return False
+    seen = measure_frame(search.scan, search.layout, other, search.options)
+    return seen.is_sure and not frame.has_all_of(seen)

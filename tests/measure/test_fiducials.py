@@ -203,6 +203,16 @@ def test_the_neighbouring_frames_marks_are_not_taken_for_this_frames(tmp_path: P
     assert_right(result, ALIKE, matrix)
 
 
+def test_of_two_whole_frames_in_a_scan_none_is_taken_in_silence(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("0")
+    grey = np.hstack([frame_picture(NUMBERED, matrix, seed) for seed in (1, 2)])
+    grey[:, FRAME_PX:] = gaussian_filter(grey[:, FRAME_PX:], 1.0)  # this one answers less
+    result = measured(grey, NUMBERED, tmp_path)
+    assert result.pose is not None
+    assert (result.pose.name, result.pose.decided) == ("0", False)
+    assert any("the scan shows another frame (26.0, " in text for text in result.problems)
+
+
 def test_a_mark_off_the_constellation_is_no_observation(tmp_path: Path) -> None:
     places = (*CORNERS, (0.0, -10.0), (0.0, 10.0))
     marks = [MarkShape(RING_CROSS)] * 6
