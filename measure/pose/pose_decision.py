@@ -72,7 +72,7 @@ def decide_pose(
         if each is not None
     ]
     if not named:
-        return _decision([], layout)
+        return _decision([], layout, len(seen))
     scan_from_up = frame.pixel_from_camera[:, :2] @ np.linalg.inv(up_from_camera(frame.placement.pose))
     blur_px = float(np.median([fit.blur_px for fit in seen]))
     drawings = Drawings([mark.mark for mark in layout.marks], scan_from_up, blur_px)
@@ -88,11 +88,11 @@ def decide_pose(
     pictures = np.array(scan.each(of_site, range(len(sites)))).reshape(len(sites), len(named))
     verdicts = [each.verdict(pictures[:, index]) for index, each in enumerate(named)]
     if layout.data_strip is None or not frame.accepted:
-        return _decision(verdicts, layout)
+        return _decision(verdicts, layout, len(seen))
     beside = beside_frame(scan, layout, frame.pixel_from_camera, frame.placement.pose)
     likelihoods = strip_likelihoods(beside, layout.data_strip, [verdict.pose for verdict in verdicts], SPOILT)
     verdicts = [replace(each, strip=own) for each, own in zip(verdicts, likelihoods.tolist(), strict=True)]
-    pose = _decision(verdicts, layout)
+    pose = _decision(verdicts, layout, len(seen))
     return replace(pose, evidence=(*pose.evidence, *_of_strip(verdicts, pose.name, beside, layout.data_strip)))
 
 
@@ -171,17 +171,16 @@ def _given_sigma_mm(mark: LayoutMark) -> float:
     return float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm))
 
 
-def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout) -> Pose:
-    """The likeliest pose, and what speaks for it."""
+def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int) -> Pose:
+    """The likeliest pose, and what speaks for it. found: marks, beside which the places of missed ones count too."""
     if not verdicts:
         return Pose("0", False, ("no pose names the marks that were found.",))
     best = max(verdicts, key=lambda verdict: verdict.total)
     alike = [verdict for verdict in verdicts if best.total - verdict.total < _DECIDED]
     others = sorted((v for v in verdicts if v not in alike), key=lambda verdict: -verdict.total)
     against = _against(best, others[0], layout) if others else ()
-    seen = sum(name >= 0 for name in best.names)
     if len(alike) == 1:
-        return Pose(best.pose, True, against or (f"no other pose explains the {seen} marks found.",))
+        return Pose(best.pose, True, against or (f"no other pose explains the {found} marks found.",))
     names = ", ".join(verdict.pose for verdict in alike)
     lead = best.total - alike[0].total
     if lead > _TOLD:
@@ -191,7 +190,7 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout) -> Pose:
             best.pose,
             False,
             (
-                f"the {seen} marks found do not tell the poses {names} apart with certainty: {best.pose} is assumed, "
+                f"the {found} marks found do not tell the poses {names} apart with certainty: {best.pose} is assumed, "
                 f"{as_likely}likelier than {alike[0].pose} by log-odds of only {lead:.1f}.",
                 *against,
             ),
@@ -200,7 +199,7 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout) -> Pose:
         alike[0].pose,
         False,
         (
-            f"nothing in the {seen} marks found tells the poses {names} apart: "
+            f"nothing in the {found} marks found tells the poses {names} apart: "
             f"their pictures and given coordinates are alike; {alike[0].pose} is assumed.",
             *against,
         ),
