@@ -28,17 +28,17 @@ def said_by(shots: list[Frame], said: Callable[[Frame], Iterable[Sentence]]) -> 
 
 
 def _problems_of(frame: Frame) -> Iterator[Problem]:
-    pose = frame.scan.get("pose")
+    pose, said = frame.scan.get("pose"), set[str]()
     if pose and not pose["decided"]:
-        reason = " ".join(pose.get("evidence", ()))
+        said.update(pose.get("evidence", ()))
         yield Problem(
-            f"pose assumed ({pose['name']}). {reason}",
+            f"pose assumed ({pose['name']}). {' '.join(pose.get('evidence', ()))}",
             'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
         )
-    yield from (Problem(problem) for problem in frame.scan.get("problems", ()))
+    yield from (Problem(problem) for problem in frame.scan.get("problems", ()) if problem not in said)
     lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
-    if lost:
-        found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
+    found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
+    if lost and (found or pose):  # a frame that was not found at all has said so
         yield Problem(
             f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured ({_reasons(lost)}).",
             "Look at their pictures in the report."

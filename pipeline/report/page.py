@@ -57,6 +57,7 @@ def _context(data: ReportData) -> dict[str, Any]:
         "adjustment": adjustment,
         "check": data.check,
         "frames": frame_views(data, shots),
+        "measured": bool(data.measurement),
         "has_pictures": data.thumbnail is not None,
         "cameras": camera_views(data),
         "fractions": list(_fractions(shots)),

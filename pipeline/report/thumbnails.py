@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pipeline.report import svg
 from pipeline.report.data import Json, Thumbnail
 from pipeline.report.marks import Frame, Mark
+from pipeline.report.vectors import LEAST_UM
 
 SIZE_PX = 92.0  # a picture's width and height on the page
 TARGETS = 600  # pictures of targets in a report; with more of them, only the worst of each frame are shown
@@ -50,8 +51,7 @@ def _badness(mark: Mark) -> tuple[bool, bool, float]:
 def arrow_scale(marks: list[Mark]) -> float:
     """How many page pixels 1 um of a residual is drawn: a round number at which the longest arrow fits."""
     lengths = [np.hypot(mark.residual["vx_um"], mark.residual["vy_um"]) for mark in marks if mark.residual]
-    longest = max(lengths, default=0.0)
-    return svg.round_step(ARROW_PX / longest) if longest > 0.0 else 1.0
+    return svg.round_step(ARROW_PX / max(*lengths, LEAST_UM)) if lengths else 1.0
 
 
 def drawn(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) -> Markup:

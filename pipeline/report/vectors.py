@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 MARGIN_PX = 26.0
 FOOT_PX = 30.0
+LEAST_UM = 0.01  # a residual drawn at full length: without redundancy they are rounding errors
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def _vectors_um(residuals: list[Json]) -> Array:
 def vector_scale(residuals: list[Json], longest_px: float) -> float:
     """Page pixels to 1 um, a round number: all but the largest per cent are shorter than `longest_px`."""
     length = float(np.percentile(np.hypot(*_vectors_um(residuals).T), 99.0))
-    return svg.round_step(longest_px / length) if length > 0.0 else 1.0
+    return svg.round_step(longest_px / max(length, LEAST_UM))
 
 
 def image_plot(image: str, residuals: list[Json], on: Plane, px_per_um: float, suspect: list[Json]) -> Markup:

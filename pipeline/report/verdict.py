@@ -198,7 +198,8 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     if not data.comparator and not data.measurement:
         yield "No measurement was handed to this report."
     if not data.adjustment:
-        yield "There is no adjustment yet: run `reseau adjust`."
+        if _observed(data, shots):
+            yield "There is no adjustment yet: run `reseau adjust`."
     elif not data.adjustment["converged"]:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
     elif not data.check:

@@ -136,6 +136,19 @@ def test_only_measured(measured: ReportData) -> None:
     assert "There is no adjustment yet: run `reseau adjust`." in text
 
 
+def test_a_frame_that_was_not_found_says_so_once(measured: ReportData) -> None:
+    reason = "no fiducial was measured: the constellation does not fit"
+    absent = [replace(point, status=Status.ABSENT, reason=reason) for point in measured.comparator]
+    assert measured.measurement is not None
+    lost = {"pose": None, "problems": [f"{reason}."], "marks": []}
+    images = {image: {**scan, **lost} for image, scan in measured.measurement["images"].items()}
+    text = rendered(replace(measured, comparator=tuple(absent), measurement={"images": images})).text
+    assert text.count(f"{reason}.") == 1
+    assert "fiducial marks not measured" not in text
+    assert "run `reseau adjust`" not in text
+    assert "No pixel positions are known: no mark was measured." in text
+
+
 def test_given_coordinates_without_scans(adjusted: ReportData) -> None:
     text = rendered(replace(adjusted, measurement=None, thumbnail=None)).text
     assert "There are no pictures: the scans are not at hand." in text
