@@ -57,7 +57,8 @@ def _images(project: Project, scans: Sequence[MeasuredScan], field: Field) -> di
 
 
 def _seen(scan: MeasuredScan, row: Mapping[str, int]) -> SeenSheet:
-    marks = [mark for mark in scan.frame.marks if mark.status.is_observation and mark.point in row]
+    targets = [mark for mark in scan.frame.marks if mark.kind == "target" and mark.point in row]
+    marks = [mark for mark in targets if mark.status.is_observation]
     return SeenSheet(
         np.array([row[mark.point] for mark in marks], dtype=np.intp),
         np.array([mark.center_px for mark in marks]).reshape(-1, 2),
@@ -88,7 +89,8 @@ def _verdicts(images: Sequence[ImagePoints], field: Field) -> list[dict[str, _Ve
 
 def _judged(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> MeasuredScan:
     marks = tuple(
-        _judged_mark(mark, verdicts[mark.point]) if mark.point in verdicts else mark for mark in scan.frame.marks
+        _judged_mark(mark, verdicts[mark.point]) if mark.kind == "target" and mark.point in verdicts else mark
+        for mark in scan.frame.marks
     )
     return replace(scan, frame=replace(scan.frame, marks=marks))
 

@@ -54,7 +54,8 @@ def measured(rng: np.random.Generator, project: Project, name: str, wrong: dict[
         angle = rng.uniform(0.0, 6.28)
         off = wrong.get(id, 0.0) * np.array([np.cos(angle), np.sin(angle)])
         marks.append(MarkMeasurement(id, "target", place + off, NOISE_PX**2 * np.eye(2), Status.MEASURED))
-    return MeasuredScan(Path(name), WIDTH, HEIGHT, (5.0, 5.0), FrameMeasurement(name, tuple(marks)))
+    fiducial = MarkMeasurement("r4c4", "fiducial", np.zeros(2), np.eye(2), Status.MEASURED)
+    return MeasuredScan(Path(name), WIDTH, HEIGHT, (5.0, 5.0), FrameMeasurement(name, (fiducial, *marks)))
 
 
 def status(scans: tuple[MeasuredScan, ...], wanted: Status) -> set[tuple[str, str]]:
@@ -67,6 +68,7 @@ def test_what_one_picture_alone_shows_off_its_place_is_refused(tmp_path: Path) -
     wrong = {"p0": {"r0c0": 1.5, "r3c4": 0.8}, "p2": {"r7c8": 2.0, BUCKLED: 1.0}, "p4": {"r4c4": 40.0, "r6c1": 0.6}}
     names = [f"p{number}" for number in range(5)]
     checked = with_checked_sheet(project, [measured(rng, project, name, wrong.get(name, {})) for name in names])
+    assert all(scan.frame.marks[0].status is Status.MEASURED for scan in checked)  # a fiducial of a point's name
     assert status(checked, Status.REJECTED) == {(name, id) for name, ids in wrong.items() for id in ids}
     assert not status(checked, Status.WEAK)
     assert with_checked_sheet(project, []) == ()
