@@ -13,6 +13,8 @@ from pipeline.measuring.measurement_file import MeasuredScan
 
 Array = NDArray[np.float64]
 
+_IN_THE_PICTURE = 0.4  # of its size: a principal point is no farther from its middle, unless much was cut off
+
 
 def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str:
     """The image with its orientation left open; or what is missing. Where the camera's file gives no principal
@@ -32,6 +34,22 @@ def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str
         np.eye(3),
         np.zeros(3),
         film,
+    )
+
+
+def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str:
+    """A sentence where a camera without fiducials has a principal point that is hardly in the picture: as if it counted
+    from the middle of the scan."""
+    if camera.fiducials or camera.principal_point_mm is None:
+        return ""
+    size = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]), measured.pitch_um)
+    if (np.abs(np.array(camera.principal_point_mm) - size / 2.0) < _IN_THE_PICTURE * np.abs(size)).all():
+        return ""
+    given, middle = (f"[{x:.4g}, {y:.4g}]" for x, y in (camera.principal_point_mm, (size / 2.0).tolist()))
+    return (
+        f"principal_point_mm = {given} is at the edge of the scan or beyond it. A camera without fiducials has it in "
+        f"comparator coordinates, from the scan's top-left pixel, x to the right and y up: the middle of this scan is "
+        f"{middle}. Give it so, or leave it out."
     )
 
 

@@ -22,6 +22,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.learned_table import LearnedFrom
 from pipeline.files.project_file import Project
+from pipeline.measuring.camera_model import misplaced_principal_point
 from pipeline.measuring.learn_stage import learn_marks, pose_of
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.sheet_check import with_checked_sheet
@@ -140,6 +141,8 @@ def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
     frame = replace(frame, problems=(*frame.problems, *problems))
     notes = (*(f"{note[0].upper()}{note[1:]}." for note in scan.notes), *notes)
     measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame, notes)
+    if misplaced := misplaced_principal_point(camera, measured):
+        measured = replace(measured, frame=replace(frame, problems=(*frame.problems, misplaced)))
     return measure_targets(project, scan, measured)
 
 
