@@ -41,7 +41,8 @@ class ImagePoints:
         """With the points this far (n, 3) off their coordinates, known so well (n, 3, 3)."""
         moved = np.einsum("nij,nj->ni", self.by_point, off)
         known = self.by_point @ covariance @ self.by_point.swapaxes(1, 2)
-        targets = replace(self.targets, places_px=self.targets.places_px + moved, covariance_px2=known)
+        places = self.targets.places_px + moved
+        targets = replace(self.targets, places_px=places, covariance_px2=known, is_claim=False)
         return compared(targets, self.seen_px, self.covariance_px2, self.size_px)
 
 
@@ -76,7 +77,7 @@ class _Known:
 
 
 def _gathered(images: Sequence[ImagePoints], comparisons: Sequence[Comparison], known: _Known) -> _Known:
-    """What the images say of the points, each by its others."""
+    """What the images say of the points, each by its others; nothing new where they share none."""
     count = known.off.shape[:2]
     normal, right, squares = np.zeros((*count, 3, 3)), np.zeros((*count, 3)), np.zeros(count)
     for i, (image, comparison, noise) in enumerate(zip(images, comparisons, _noises(comparisons), strict=True)):
@@ -87,13 +88,14 @@ def _gathered(images: Sequence[ImagePoints], comparisons: Sequence[Comparison], 
         squares[i, image.index] = np.einsum("ni,ni->n", seen, weighted[..., 3])
     readings = _Readings(normal, right, squares)
     is_shared = (squares > 0.0).sum(axis=0) > 1
+    if not is_shared.any():
+        return known
     spread = known.spread
     for _ in range(_SPREADS):
         weights, of_prior = readings.weights(spread)
         off, covariance = readings.solved(weights, of_prior, spread)
-        if is_shared.any():
-            moments = of_prior[:, None] * (off**2 + np.einsum("nii->ni", covariance))
-            spread = np.maximum(np.sqrt(moments[is_shared].mean(axis=0)), _LEAST * known.extent)
+        moments = of_prior[:, None] * (off**2 + np.einsum("nii->ni", covariance))
+        spread = np.maximum(np.sqrt(moments[is_shared].mean(axis=0)), _LEAST * known.extent)
     others = [readings.without(i).solved(np.delete(weights, i, axis=0), of_prior, spread) for i in range(count[0])]
     return replace(
         known,

@@ -32,18 +32,14 @@ _LEAST_PX2 = 0.01**2  # the variance that no prediction falls short of
 class TargetPlaces:
     """Of n targets: places_px (n, 2) as predicted; by_orientation (n, 2, k): how far each unknown of the orientation
     moves them by its standard deviation; covariance_px2 (n, 2, 2): of what is known beside it, as of the points'
-    coordinates; is_free (n,): those of whose coordinates nobody says how good they are."""
+    coordinates; is_free (n,): those of whose coordinates nobody says how good they are; is_claim: that covariance is
+    said by someone, and may be too large, not computed."""
 
     places_px: Array
     by_orientation: Array
     covariance_px2: Array
     is_free: Mask
-
-    def at(self, index: NDArray[np.intp]) -> "TargetPlaces":
-        """Some of them."""
-        return TargetPlaces(
-            self.places_px[index], self.by_orientation[index], self.covariance_px2[index], self.is_free[index]
-        )
+    is_claim: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +55,10 @@ class Comparison:
 
 def compared(targets: TargetPlaces, seen_px: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Comparison:
     """Targets seen at (n, 2) px with covariances (n, 2, 2), in an image of this width and height."""
-    known = targets.covariance_px2 + covariance_px2
     offsets = seen_px - targets.places_px
-    fits = [_fitted(_design(targets, size_px, bending), offsets, known, targets.is_free) for bending in _BENDING]
+    fits = [_fitted(_design(targets, size_px, bending), offsets, targets, covariance_px2) for bending in _BENDING]
     best = min(fits, key=lambda fit: float(np.median(np.linalg.norm(fit.off_px, axis=1))))
-    own = best.claimed[:, None, None] * covariance_px2 + best.more_px2[:, None, None] * np.eye(2)
+    own = covariance_px2 + best.more_px2[:, None, None] * np.eye(2)
     return Comparison(best.off_px, _chances(best, targets), own + best.predicted_px2)
 
 
@@ -87,25 +82,23 @@ def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> 
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """off_px (n, 2), squares (n,): each target against the others, the latter in its variances; unknowns: how many the
-    n targets tell; predicted_px2 (n, 2, 2): of what the others say; claimed (n,): what was known of each counts so
-    much, and more_px2 (n,) comes on top."""
+    n targets tell; predicted_px2 (n, 2, 2): of what the others say; more_px2 (n,): what all scatter more than is
+    known."""
 
     off_px: Array
     squares: Array
     unknowns: float
     predicted_px2: Array
-    claimed: Array
     more_px2: Array
 
 
-def _fitted(design: Array, offsets: Array, known: Array, is_free: Mask) -> _Fit:
+def _fitted(design: Array, offsets: Array, targets: TargetPlaces, seen_px2: Array) -> _Fit:
     """Student's t by expectation and maximisation, the scatter anew in each round."""
-    off, predicted, unknowns = offsets - np.median(offsets, axis=0), np.zeros_like(known), design.shape[2]
-    claimed, more_px2 = _scatter(off, predicted, known, is_free)
-    weights = _weights(_squares(off, _variances(claimed, more_px2, known)))
+    off, predicted, unknowns = offsets - np.median(offsets, axis=0), np.zeros_like(seen_px2), design.shape[2]
+    variances, more_px2 = _scatter(off, predicted, targets, seen_px2)
+    weights = _weights(_squares(off, variances))
     fit = None
     for _ in range(_ROUNDS):
-        variances = _variances(claimed, more_px2, known)
         spread = variances / weights[:, None, None]
         by_weight = np.linalg.inv(spread)
         weighted = (by_weight @ design).reshape(-1, unknowns)
@@ -117,8 +110,8 @@ def _fitted(design: Array, offsets: Array, known: Array, is_free: Mask) -> _Fit:
         predicted = hat + hat @ without @ hat
         squares = _squares(off, variances + predicted)
         before, weights = weights, _weights(squares)
-        fit = _Fit(off, squares, float(np.einsum("nij,nji->", hat, by_weight)), predicted, claimed, more_px2)
-        claimed, more_px2 = _scatter(off, predicted, known, is_free)
+        fit = _Fit(off, squares, float(np.einsum("nij,nji->", hat, by_weight)), predicted, more_px2)
+        variances, more_px2 = _scatter(off, predicted, targets, seen_px2)
         if np.abs(weights - before).max() < _SETTLED:
             break
     assert fit is not None
@@ -135,25 +128,27 @@ def _weights(squares: Array) -> Array:
     return (_FREEDOM + 2.0) / (_FREEDOM + squares)
 
 
-def _variances(claimed: Array, more_px2: Array, known: Array) -> Array:
-    """(n, 2, 2) of the targets about their places."""
-    return claimed[:, None, None] * known + more_px2[:, None, None] * np.eye(2)
+def _scatter(off: Array, predicted: Array, targets: TargetPlaces, seen_px2: Array) -> tuple[Array, Array]:
+    """Of the targets about their places: (n, 2, 2) px², and (n,) px² of it that all of them scatter more than is known.
 
-
-def _scatter(off: Array, predicted: Array, known: Array, is_free: Mask) -> tuple[Array, Array]:
-    """Of the targets about their places: (n,) what is known counts so much, for they may scatter less; and (n,) px²
-    comes on top, which all of them scatter more. Points whose coordinates are free have a scatter of their own."""
-    factors, more_px2 = np.ones(len(off)), np.zeros(len(off))
-    for group in (is_free, ~is_free):
+    They may scatter less than is claimed of their coordinates, or even of where they were seen; then that counts less.
+    Points whose coordinates are free have a scatter of their own.
+    """
+    variances, more_px2 = seen_px2 + targets.covariance_px2, np.zeros(len(off))
+    for group in (targets.is_free, ~targets.is_free):
         if not group.any():
             continue
-        seen = float(np.median((off[group] ** 2).sum(axis=1))) / _MEDIAN
-        claimed = float(np.median(np.einsum("nii->n", known[group]))) / 2.0
-        open_px2 = float(np.median(np.einsum("nii->n", predicted[group]))) / 2.0
-        own = max(seen - open_px2, _LEAST_PX2)
-        factors[group] = min(own / max(claimed, _LEAST_PX2), 1.0)
-        more_px2[group] = max(own - claimed, _LEAST_PX2)
-    return factors, more_px2
+        points, seen, open_px2 = (
+            float(np.median(np.einsum("nii->n", one[group]))) / 2.0
+            for one in (targets.covariance_px2, seen_px2, predicted)
+        )
+        own = max(float(np.median((off[group] ** 2).sum(axis=1))) / _MEDIAN - open_px2, _LEAST_PX2)
+        of_seen = min(own / max(seen, _LEAST_PX2), 1.0)
+        of_points = min(max(own - seen, 0.0) / max(points, _LEAST_PX2), 1.0) if targets.is_claim else 1.0
+        known = of_seen * seen_px2[group] + of_points * targets.covariance_px2[group]
+        more_px2[group] = max(own - seen - points, _LEAST_PX2)
+        variances[group] = known + more_px2[group][:, None, None] * np.eye(2)
+    return variances, more_px2
 
 
 def _chances(fit: _Fit, targets: TargetPlaces) -> Array:
