@@ -57,6 +57,7 @@ def _context(data: ReportData) -> dict[str, Any]:
         "adjustment": adjustment,
         "check": data.check,
         "frames": frame_views(data, shots),
+        "points_word": _points_word(shots),
         "measured": bool(data.measurement),
         "has_pictures": data.thumbnail is not None,
         "cameras": camera_views(data),
@@ -69,6 +70,14 @@ def _context(data: ReportData) -> dict[str, Any]:
         "points": _points(adjustment) if adjustment else [],
         "list_limit": LIST_LIMIT,
     }
+
+
+def _points_word(shots: list[Frame]) -> str:
+    """What the marks are that are no fiducials."""
+    kinds = {mark.kind for frame in shots for mark in frame.marks if not mark.is_fiducial}
+    if "tie" not in kinds:
+        return "targets"
+    return "targets and tie points" if "target" in kinds else "tie points"
 
 
 def _fractions(shots: list[Frame]) -> Iterator[tuple[str, FractionTest, Markup]]:

@@ -211,10 +211,10 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     for note, images in said_by(shots, lambda frame: frame.scan.get("notes", ())).items():
         yield f"{listed(images)}: {note}"
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
-        for kind, word in (("target", "target"), ("tie", "sight of a natural point")):
+        for kind, *words in (("target", "target"), ("tie", "sight of a tie point", "sights of tie points")):
             number = sum(mark.status is status and mark.kind == kind for frame in shots for mark in frame.marks)
             if number:
-                yield f"{counted(number, word)} {status} (their reasons stand with the marks)."
+                yield f"{counted(number, *words)} {status} (their reasons stand with the marks)."
 
 
 def _weight_notes(adjustment: Json) -> Iterator[str]:

@@ -149,6 +149,14 @@ def test_a_frame_that_was_not_found_says_so_once(measured: ReportData) -> None:
     assert "No pixel positions are known: no mark was measured." in text
 
 
+def test_tie_points_are_not_called_targets(measured: ReportData) -> None:
+    points = [p if p.kind == "fiducial" else replace(p, kind="tie", status=Status.WEAK) for p in measured.comparator]
+    text = rendered(replace(measured, comparator=tuple(points), measurement=None, thumbnail=None)).text
+    assert "Tie points" in text
+    assert "sights of tie points weak" in text
+    assert "targets" not in text[: text.index("Pixel fractions")]
+
+
 def test_given_coordinates_without_scans(adjusted: ReportData) -> None:
     text = rendered(replace(adjusted, measurement=None, thumbnail=None)).text
     assert "There are no pictures: the scans are not at hand." in text
