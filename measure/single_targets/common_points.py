@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _ROUNDS = 3  # of comparing the images and gathering what they say of the points
 _SPREADS, _STEPS = 10, 8  # of the points' spread anew, and of weights in each
 _FREEDOM = 4.0  # of Student's t
-_FLAT = 0.01  # of the points' extent: what their spread is taken for at first
+_SPREAD = 0.01  # of the points' extent: what it is taken for at first
 _LEAST = 1e-6  # of the extent: no spread is smaller
 
 
@@ -50,13 +50,9 @@ def compared_together(images: Sequence[ImagePoints], xyz: Array) -> list[Compari
     """Each image's targets against its others and the other images; xyz (m, 3): the points, along a plane and above it
     if they lie on one: each coordinate has a spread of its own."""
     known = _Known.at_first(len(images), xyz)
-    for _ in range(_ROUNDS):
-        comparisons = [
-            image.compared(off[image.index], covariance[image.index])
-            for image, off, covariance in zip(images, known.off, known.covariance, strict=True)
-        ]
-        known = _gathered(images, comparisons, known)
-    return comparisons
+    for _ in range(_ROUNDS - 1):
+        known = _gathered(_Readings.of(images, known), known)
+    return _comparisons(images, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,21 +69,19 @@ class _Known:
     def at_first(cls, images: int, xyz: Array) -> "_Known":
         extent = float(np.ptp(xyz, axis=0).max())
         none = np.zeros((images, *xyz.shape))
-        return cls(none, np.zeros((*none.shape, 3)), np.full(3, _FLAT * extent), extent)
+        return cls(none, np.zeros((*none.shape, 3)), np.full(3, _SPREAD * extent), extent)
 
 
-def _gathered(images: Sequence[ImagePoints], comparisons: Sequence[Comparison], known: _Known) -> _Known:
+def _comparisons(images: Sequence[ImagePoints], known: _Known) -> list[Comparison]:
+    return [
+        image.compared(off[image.index], covariance[image.index])
+        for image, off, covariance in zip(images, known.off, known.covariance, strict=True)
+    ]
+
+
+def _gathered(readings: "_Readings", known: _Known) -> _Known:
     """What the images say of the points, each by its others; nothing new where they share none."""
-    count = known.off.shape[:2]
-    normal, right, squares = np.zeros((*count, 3, 3)), np.zeros((*count, 3)), np.zeros(count)
-    for i, (image, comparison, noise) in enumerate(zip(images, comparisons, _noises(comparisons), strict=True)):
-        seen = comparison.off_px + np.einsum("nij,nj->ni", image.by_point, known.off[i, image.index])
-        weighted = np.linalg.solve(noise, np.dstack([image.by_point, seen]))
-        normal[i, image.index] = image.by_point.swapaxes(1, 2) @ weighted[..., :3]
-        right[i, image.index] = np.einsum("nij,ni->nj", image.by_point, weighted[..., 3])
-        squares[i, image.index] = np.einsum("ni,ni->n", seen, weighted[..., 3])
-    readings = _Readings(normal, right, squares)
-    is_shared = (squares > 0.0).sum(axis=0) > 1
+    is_shared = (readings.squares > 0.0).sum(axis=0) > 1
     if not is_shared.any():
         return known
     spread = known.spread
@@ -96,13 +90,11 @@ def _gathered(images: Sequence[ImagePoints], comparisons: Sequence[Comparison], 
         off, covariance = readings.solved(weights, of_prior, spread)
         moments = of_prior[:, None] * (off**2 + np.einsum("nii->ni", covariance))
         spread = np.maximum(np.sqrt(moments[is_shared].mean(axis=0)), _LEAST * known.extent)
-    others = [readings.without(i).solved(np.delete(weights, i, axis=0), of_prior, spread) for i in range(count[0])]
-    return replace(
-        known,
-        off=np.stack([off for off, _ in others]),
-        covariance=np.stack([covariance for _, covariance in others]),
-        spread=spread,
-    )
+    others = [
+        readings.without(i).solved(np.delete(weights, i, axis=0), of_prior, spread) for i in range(len(weights))
+    ]  # fmt: skip
+    offs, covariances = (np.stack(parts) for parts in zip(*others, strict=True))
+    return replace(known, off=offs, covariance=covariances, spread=spread)
 
 
 def _noises(comparisons: Sequence[Comparison]) -> list[Array]:
@@ -121,6 +113,20 @@ class _Readings:
     normal: Array
     right: Array
     squares: Array
+
+    @classmethod
+    def of(cls, images: Sequence[ImagePoints], known: _Known) -> "_Readings":
+        """What each image shows of the points, compared with what is known of them."""
+        count = known.off.shape[:2]
+        normal, right, squares = np.zeros((*count, 3, 3)), np.zeros((*count, 3)), np.zeros(count)
+        comparisons = _comparisons(images, known)
+        for i, (image, one, noise) in enumerate(zip(images, comparisons, _noises(comparisons), strict=True)):
+            seen = one.off_px + np.einsum("nij,nj->ni", image.by_point, known.off[i, image.index])
+            weighted = np.linalg.solve(noise, np.dstack([image.by_point, seen]))
+            normal[i, image.index] = image.by_point.swapaxes(1, 2) @ weighted[..., :3]
+            right[i, image.index] = np.einsum("nij,ni->nj", image.by_point, weighted[..., 3])
+            squares[i, image.index] = np.einsum("ni,ni->n", seen, weighted[..., 3])
+        return cls(normal, right, squares)
 
     def without(self, image: int) -> "_Readings":
         return _Readings(*(np.delete(part, image, axis=0) for part in (self.normal, self.right, self.squares)))
