@@ -5,17 +5,28 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from measure.codes_and_boards.sheet_places import FLAT, SeenSheet, along_plane, is_flat, sheet_points
+from measure.codes_and_boards.sheet_places import FLAT, SeenSheet, along_plane, sheet_points
 from measure.results import MarkMeasurement
 from measure.single_targets.common_points import ImagePoints, compared_together
 from measure.status import Status
 from pipeline.files.project_file import Project
+from pipeline.measuring.coded_points import CodedPoints
 from pipeline.measuring.measurement_file import MeasuredScan
-from pipeline.measuring.target_field import Field, target_field
+
+Array = NDArray[np.float64]
 
 _DOUBTED, _REFUSED = 0.01, 1e-4  # the chance of doubting, or refusing, any right mark of all pictures
 _WITNESSES = 3  # other pictures: two just tell where a point is that lies off its sheet
+
+
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    """The points of a sheet: their ids, and places (n, 3) along it and above it."""
+
+    ids: tuple[str, ...]
+    places: Array
 
 
 @dataclass(frozen=True)
@@ -33,25 +44,33 @@ class _Verdict:
 def with_checked_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[MeasuredScan, ...]:
     """The scans, those points of a sheet or board doubted or refused that lie where neither the other points of their
     picture nor the other pictures of the sheet put them."""
-    settings = project.targets
-    if settings is None or (settings.code is None and settings.board is None):
+    sheet = _sheet(project)
+    if sheet is None:
         return tuple(scans)
-    field = target_field(project)
-    sheet = along_plane(field.xyz)
-    if not is_flat(sheet):
-        return tuple(scans)
-    images = _images(project, scans, field)
-    verdicts = dict(zip(images, _verdicts(list(images.values()), field), strict=True))
+    images = _images(project, scans, sheet)
+    verdicts = dict(zip(images, _verdicts(list(images.values()), sheet), strict=True))
     return tuple(_judged(scan, verdicts.get(scan.frame.image, {})) for scan in scans)
 
 
-def _images(project: Project, scans: Sequence[MeasuredScan], field: Field) -> dict[str, ImagePoints]:
+def _sheet(project: Project) -> _Sheet | None:
+    """The points of the project's board, as it was printed, or of its coded sheet, if that is one."""
+    settings = project.targets
+    if settings is not None and settings.board is not None:
+        points = settings.board.object_points()
+        return _Sheet(tuple(points), along_plane(np.array(list(points.values()))))
+    if settings is None or settings.code is None:
+        return None
+    coded = CodedPoints.of(project, settings)
+    return _Sheet(coded.ids, along_plane(coded.xyz)) if coded.is_flat else None
+
+
+def _images(project: Project, scans: Sequence[MeasuredScan], sheet: _Sheet) -> dict[str, ImagePoints]:
     """What each image shows of the sheet, by its name; those of one camera share a lens."""
-    row = {id: i for i, id in enumerate(field.ids)}
+    row = {id: i for i, id in enumerate(sheet.ids)}
     images: dict[str, ImagePoints] = {}
     for camera in project.cameras.values():
         own = [scan for scan in scans if project.camera_of(scan.frame.image) is camera]
-        points = sheet_points([_seen(scan, row) for scan in own], along_plane(field.xyz))
+        points = sheet_points([_seen(scan, row) for scan in own], sheet.places)
         images |= {scan.frame.image: one for scan, one in zip(own, points, strict=True) if one is not None}
     return images
 
@@ -67,20 +86,20 @@ def _seen(scan: MeasuredScan, row: Mapping[str, int]) -> SeenSheet:
     )
 
 
-def _verdicts(images: Sequence[ImagePoints], field: Field) -> list[dict[str, _Verdict]]:
+def _verdicts(images: Sequence[ImagePoints], sheet: _Sheet) -> list[dict[str, _Verdict]]:
     """Of each image, by point."""
     if not images:
         return []
     shown = Counter(int(point) for image in images for point in image.index)
     tests = sum(shown.values())
     verdicts: list[dict[str, _Verdict]] = []
-    for image, one in zip(images, compared_together(images, along_plane(field.xyz)), strict=True):
+    for image, one in zip(images, compared_together(images, sheet.places), strict=True):
         most_px = FLAT * float(np.hypot(*np.ptp(image.targets.places_px, axis=0)))
         far = np.hypot(*one.off_px.T)
         rows = zip(image.index.tolist(), far.tolist(), one.chance.tolist(), strict=True)
         verdicts.append(
             {
-                field.ids[point]: _Verdict(off, tests * chance, shown[point] - 1, off > most_px)
+                sheet.ids[point]: _Verdict(off, tests * chance, shown[point] - 1, off > most_px)
                 for point, off, chance in rows
             }
         )

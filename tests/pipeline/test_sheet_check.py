@@ -11,7 +11,6 @@ from measure.status import Status
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.sheet_check import with_checked_sheet
-from pipeline.measuring.target_field import target_field
 
 Array = NDArray[np.float64]
 COLUMNS, ROWS, WIDTH, HEIGHT, NOISE_PX = 9, 8, 2200, 1700, 0.05
@@ -21,9 +20,10 @@ BUCKLED, MISPRINTED = "r2c3", "r5c6"
 def board(folder: Path) -> Project:
     (folder / "camera.toml").write_text('name = "c"\nframe_mm = [11.0, 8.5]\n', encoding="utf-8")
     (folder / "comparator.csv").touch()
+    (folder / "points.csv").write_text("point,X,Y,Z\nr0c0,,,\n", encoding="utf-8")  # a board has places without any
     (folder / "project.toml").write_text(
         f'camera = "camera.toml"\n[targets]\nkind = "chessboard"\ncolumns = {COLUMNS}\nrows = {ROWS}\n'
-        'square_mm = 20.0\n[object]\nunit = "mm"\n',
+        'square_mm = 20.0\n[object]\npoints = "points.csv"\n',
         encoding="utf-8",
     )
     return read_project(folder / "project.toml")
@@ -45,8 +45,9 @@ def seen(rng: np.random.Generator, xyz: Array) -> Array:
 
 def measured(rng: np.random.Generator, project: Project, name: str, wrong: dict[str, float]) -> MeasuredScan:
     """One picture, some of its points so many px off in some direction."""
-    field = target_field(project)
-    xyz = dict(zip(field.ids, field.xyz, strict=True))
+    assert project.targets is not None
+    assert project.targets.board is not None
+    xyz = {id: np.array(place) for id, place in project.targets.board.object_points().items()}
     xyz[BUCKLED] = xyz[BUCKLED] + (0.0, 0.0, 1.0)
     xyz[MISPRINTED] = xyz[MISPRINTED] + (0.4, -0.3, 0.0)
     marks = []
