@@ -9,6 +9,7 @@ import made_up_calibration
 import pytest
 
 from measure.status import MEANING, Status
+from pipeline.measuring.comparator_file import ComparatorPoint
 from pipeline.report import Problem, ReportData, render_report, write_report
 
 
@@ -210,11 +211,21 @@ def test_what_the_user_named_is_escaped(adjusted: ReportData) -> None:
     assert "&lt;script&gt;alert" in html
 
 
+def _key(mark: ComparatorPoint) -> tuple[str, str, str]:
+    return mark.image, mark.kind, mark.point
+
+
 def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted: ReportData) -> None:
     reason = "4.2 px off the other marks' places."
     rejected = replace(adjusted.comparator[2], status=Status.REJECTED, reason=reason)
     rows = [*adjusted.comparator[:2], rejected, *adjusted.comparator[3:]]
-    text = rendered(replace(adjusted, comparator=rows)).text
+    assert adjusted.adjustment is not None
+    outdated = rendered(replace(adjusted, comparator=rows)).text
+    assert "The adjustment is of other coordinates than comparator.csv has now: 3 in f1." in outdated
+    kept = [
+        row for row in adjusted.adjustment["residuals"] if (row["image"], row["kind"], row["point"]) != _key(rejected)
+    ]
+    text = rendered(replace(adjusted, comparator=rows, adjustment={**adjusted.adjustment, "residuals": kept})).text
     assert "! Needs a look" in text
     assert "1 thing needs a look" in text
     assert "f1: 1 fiducial mark not measured, 7 measured (3 rejected: 4.2 px off the other marks' places)." in text
