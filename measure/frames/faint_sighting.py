@@ -22,7 +22,7 @@ _LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
 _SAME_PX = 1.0  # apart: two places of one mark, each of which is known to better than that
 _REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
-_EXTREMES = (0.5, 99.5)  # per cent: of a scan's darkest and lightest grey values
+_EXTREMES = (0.5, 99.5)  # per cent: of the darkest and lightest grey values of a scan, or about a mark
 _LOOKED_AT = 8  # marks that agree: these tell how light or dark marks are
 
 
@@ -55,7 +55,7 @@ def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
         seen = find_faint(sighter.scan, expected, extreme_dn, blur_px)
         known = seen is not None and seen.sigma_px <= _FAINT_SIGMA_PX
         certain = seen is not None and _is_certain(sighter, seen)
-        ground = _ground(sighter, expected, (extreme_dn, *reached.get(expected.polarity, ())))
+        ground = _ground(sighter, expected, (extreme_dn, reached.get(expected.polarity, extreme_dn)))
         unseen = reason_unseen(ground, usual_dn, reach_px, seen, certain)
         _take(sighter, index, sighting, seen if certain and known else None, unseen)
 
@@ -65,13 +65,14 @@ def faint_reach_px(sighter: FrameSighter) -> float:
     return min(sighter.gate_px, max(_REACH * sighter.scatter_mm() / float(sighter.pitch.mean()), _LEAST_REACH_PX))
 
 
-def _reached_dn(sighter: FrameSighter, agreeing: Mapping[int, Match]) -> dict[int, list[float]]:
-    """The grey values of some marks that agree, by polarity: in a scan without lights these pass its extreme."""
-    reached: dict[int, list[float]] = {1: [], -1: []}
+def _reached_dn(sighter: FrameSighter, agreeing: Mapping[int, Match]) -> dict[int, float]:
+    """How light, or dark, the marks that agree are: in a scan without lights they pass its extreme."""
+    reached: dict[int, list[float]] = {}
     for index, fit in list(agreeing.items())[:_LOOKED_AT]:
+        is_light = fit.contrast_dn > 0
         grey = _about(sighter, sighter.layout.marks[index].mark, fit.pixel_from_mark)
-        reached[1 if fit.contrast_dn > 0 else -1].append(float(np.median(grey)) + fit.contrast_dn)
-    return reached
+        reached.setdefault(1 if is_light else -1, []).append(float(np.percentile(grey, _EXTREMES[int(is_light)])))
+    return {polarity: float(np.median(tones)) for polarity, tones in reached.items()}
 
 
 def _ground(sighter: FrameSighter, expected: MarkPrediction, tones_dn: Sequence[float]) -> Ground:

@@ -249,6 +249,26 @@ def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> No
             assert np.abs(mark_found.center_px - matrix @ (*given.xy_mm, 1.0)).max() < 0.5
 
 
+@pytest.mark.parametrize(
+    ("blot_dn", "said"), [(20000.0, "nothing within"), (500.0, "the ground at its place is so dark")]
+)
+def test_a_missing_mark_is_said_to_be_hidden_only_where_its_ground_hides_it(
+    blot_dn: float, said: str, tmp_path: Path
+) -> None:
+    """Nothing but the marks is dark in the scan, so that its darkest half per cent is lighter than they are."""
+    places = [(10.0 * i, 10.0 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    dark = layout_of([MarkShape(RING_CROSS, "dark")] * 9, places)
+    matrix = pixel_from_camera("0")
+    grey = np.random.default_rng(3).normal(20000.0, NOISE_DN, (FRAME_PX, FRAME_PX))
+    for given in dark.marks[:8]:
+        paint(grey, given.mark, given.xy_mm, matrix, -12000.0)
+    col, row = np.rint(matrix @ (*dark.marks[8].xy_mm, 1.0)).astype(int)
+    grey[row - 30 : row + 31, col - 30 : col + 31] += blot_dn - 20000.0
+    result = measured(np.clip(grey, 0.0, None), dark, tmp_path, FiducialOptions(pose="0"))
+    assert [mark.status for mark in result.marks] == [*[Status.MEASURED] * 8, Status.PREDICTED]
+    assert result.marks[8].reason.startswith(said)
+
+
 def test_a_pose_that_is_none_is_refused() -> None:
     with pytest.raises(ValueError, match="auto or one of 0, 90"):
         FiducialOptions(pose="45")
