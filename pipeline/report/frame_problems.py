@@ -1,5 +1,6 @@
 """What of the frames' measurement needs a look, before any adjustment."""
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
@@ -8,6 +9,8 @@ from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
 from pipeline.wording import LISTED, counted, listed
+
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 Sentence = TypeVar("Sentence", Problem, str)
 
@@ -53,11 +56,18 @@ def _problems_of(frame: Frame) -> Iterator[Problem]:
 
 
 def _reasons(lost: list[Mark]) -> str:
-    """What became of marks, said once where several of them say the same."""
-    points: dict[str, list[str]] = {}
+    """What became of marks, said once where several of them say the same but for the numbers: then with those of the
+    first."""
+    alike: dict[str, list[Mark]] = {}
     for mark in lost:
-        points.setdefault(f"{mark.status}: {mark.reason.rstrip('.')}", []).append(mark.point)
-    return "; ".join(f"{listed(names)} {reason}" for reason, names in list(points.items())[:LISTED])
+        alike.setdefault(f"{mark.status}: {_NUMBER.sub('#', mark.reason)}", []).append(mark)
+    return "; ".join(_told(marks) for marks in list(alike.values())[:LISTED])
+
+
+def _told(marks: list[Mark]) -> str:
+    first, names = marks[0], listed([mark.point for mark in marks])
+    like = f", such as {first.point}" if len({mark.reason for mark in marks}) > 1 else ""
+    return f"{names} {first.status}{like}: {first.reason.rstrip('.')}"
 
 
 def pixel_locking(shots: list[Frame]) -> Iterator[Problem]:

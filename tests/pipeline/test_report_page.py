@@ -232,6 +232,15 @@ def test_a_rejected_fiducial_is_a_problem_with_its_reason(adjusted: ReportData) 
     assert "7 of 8 (1 rejected)" in text
 
 
+def test_reasons_that_differ_by_their_numbers_are_told_once(measured: ReportData) -> None:
+    rows = list(measured.comparator)
+    for index, off in ((2, 4.2), (4, 3.1)):
+        rows[index] = replace(rows[index], status=Status.REJECTED, reason=f"{off} px off the other marks' places")
+    names = f"{rows[2].point}, {rows[4].point}"
+    text = rendered(replace(measured, comparator=rows)).text
+    assert f"6 measured ({names} rejected, such as {rows[2].point}: 4.2 px off the other marks' places)." in text
+
+
 def test_of_many_targets_the_worst_are_shown_and_all_fiducials(adjusted: ReportData) -> None:
     """60 frames of 8 fiducials and 24 targets: 600 // 60 = 10 targets a frame."""
     assert adjusted.adjustment is not None
