@@ -17,6 +17,7 @@ from pipeline.report.fractions import LEAST_MARKS, FractionTest, fraction_test, 
 from pipeline.report.frame_views import frame_views, thumbnail_scale
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, significant, value_and_sigma
+from pipeline.report.parameters import spoken_name
 from pipeline.report.svg import round_step
 from pipeline.report.verdict import critical_w, judge, sigma0_bounds
 
@@ -57,6 +58,7 @@ def _context(data: ReportData) -> dict[str, Any]:
         "adjustment": adjustment,
         "check": data.check,
         "frames": frame_views(data, shots),
+        "spoken": lambda name: spoken_name(name, adjustment["cameras"] if adjustment else ()),
         "points_word": _points_word(shots),
         "measured": bool(data.measurement),
         "has_pictures": data.thumbnail is not None,

@@ -1,5 +1,6 @@
 """The table of a camera's parameters: value, standard deviation, what was given, and what that says."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ UNITS = {
 }
 JUHL_UNIT = "µm at 1 dm"
 ANGLES = ("tau_x", "tau_y")
+_SYMBOLS = {"x0": "x₀′", "y0": "y₀′"}
 _POWERS = {0: "–", -1: "mm⁻¹", -2: "mm⁻²", -4: "mm⁻⁴", -6: "mm⁻⁶"}
 
 
@@ -40,7 +42,7 @@ class ParameterRow:
 def parameter_rows(name: str, camera: Json, sigma0: float, radius_mm: float) -> list[ParameterRow]:
     """Principal distance, principal point and distortion. radius_mm: where the distortion's effect is stated."""
     point, distance = camera["principal_point_mm"], camera["principal_distance_mm"]
-    interior = [("c", distance), ("x₀′", point["x"]), ("y₀′", point["y"])]
+    interior = [("c", distance), (_SYMBOLS["x0"], point["x"]), (_SYMBOLS["y0"], point["y"])]
     family = camera["distortion"]["family"]
     effects = largest_effects_um(lens(name, camera), radius_mm) if parameter_names(family) else {}
     rows = [_row(symbol, "mm", quantity, "", _origin(quantity, sigma0)) for symbol, quantity in interior]
@@ -78,6 +80,20 @@ def group_sentences(camera: Json) -> list[str]:
 
 def _group(name: str) -> str:
     return name[0].upper() + name[1:]
+
+
+def spoken_name(name: str, cameras: Collection[str]) -> str:
+    """A quantity of a camera as this report calls it elsewhere: IO.RC 20.x0 is x₀′. With the camera's, where there are
+    several."""
+    for camera in sorted(cameras, key=len, reverse=True):
+        whose = f", {camera}" if len(cameras) > 1 else ""
+        if name.startswith(f"IO.{camera}."):
+            parameter = name.removeprefix(f"IO.{camera}.")
+            return _SYMBOLS.get(parameter, parameter) + whose
+        if name.startswith(f"FID.{camera}."):
+            id, _, axis = name.removeprefix(f"FID.{camera}.").rpartition(".")
+            return f"{axis}′ of fiducial {id}{whose}"
+    return name
 
 
 def _row(symbol: str, unit: str, quantity: Json, effect: str, meaning: str) -> ParameterRow:

@@ -11,6 +11,7 @@ from measure.status import Status
 from pipeline.report import Problem, ReportData, judge
 from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import frames
+from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import critical_w, sigma0_bounds
 
 Json = dict[str, Any]
@@ -253,3 +254,9 @@ def test_a_lattice_that_lies_along_the_pixels_is_no_pixel_locking(measured: Repo
     lattice = replace(measured, comparator=(), measurement={"images": {name: {**scan, "marks": marks}}})
     assert len(frames(lattice)[0].marks) == 400
     assert judge(lattice).level == "good"
+
+
+def test_quantities_are_called_as_in_the_tables() -> None:
+    names = ["IO.RC 20.c", "IO.RC 20.x0", "FID.RC 20.7.1.x", "EO.f1.Z0"]
+    assert [spoken_name(name, ["RC 20"]) for name in names] == ["c", "x₀′", "x′ of fiducial 7.1", "EO.f1.Z0"]
+    assert spoken_name("IO.A.B.k3", ["A", "A.B"]) == "k3, A.B"
