@@ -108,22 +108,31 @@ def _in_the_middle(search: FrameSearch, given: PitchHypothesis) -> tuple[list[Pl
 
 
 def _anywhere(search: FrameSearch, hypotheses: Sequence[PitchHypothesis]) -> tuple[list[Placement], Frame | None]:
-    """The placements, best first, in the whole scan, and the frame in the first of the best ones that is sure, or else
-    accepted, or else that of most marks; None where nothing looks like the marks. A frame is no other one where all
-    its marks are among those of an accepted one that was tried before it."""
+    """The placements, best first, in the whole scan, and the frame in the first of the best ones that is sure and not
+    outdone, or else the sure one of most measured marks, or else the first accepted, or else that of most marks; None
+    where nothing looks like the marks. A frame is no other one where all its marks are among those of an accepted one
+    that was tried before it."""
     found = search.anywhere(hypotheses)
     if not found:
         return [], None
-    frames: list[Frame] = []
-    for placement in (found[0], *_others(found)):
+    placements, frames = [found[0], *_others(found)], list[Frame]()
+    for placement in placements:
         frame = _as_its_pictures_say(search, found, placement)
         if any(before.accepted and before.has_all_of(frame) for before in frames):
             continue
-        if frame.is_sure:
+        if frame.is_sure and not _is_outdone(search, frame, placements):
             return found, frame
         frames.append(frame)
+    sure = [frame for frame in frames if frame.is_sure]
+    if sure:
+        return found, max(sure, key=lambda frame: frame.measured)
     accepted = [frame for frame in frames if frame.accepted]
     return found, accepted[0] if accepted else max(frames, key=lambda frame: int(frame.belongs.sum()))
+
+
+def _is_outdone(search: FrameSearch, frame: Frame, placements: Sequence[Placement]) -> bool:
+    """Whether more marks speak for another placement than the frame has measured ones, and chance may have made it."""
+    return any(placement.supported > frame.measured for placement in placements) and bool(doubt(search, frame))
 
 
 def _as_its_pictures_say(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> Frame:

@@ -1,15 +1,17 @@
 """Frames that show three marks of four: plain ones are believed, and specks among specks are not."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from brute_marks import Array, brute_picture
 from drawn import scan_of
 from drawn_frames import layout_of, paint
 from numpy.typing import NDArray
 
+from measure import fiducials
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
 from measure.frames.chance import doubt
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
@@ -19,6 +21,7 @@ from measure.pose.pose_decision import decide_pose
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
+from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 from measure.status import Status
 
 PX_PER_MM = 20.0
@@ -87,6 +90,30 @@ def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -
     assert not frame.has_all_of(frame)
 
 
+def test_three_marks_of_the_neighbouring_frame_are_no_frame_beside_five_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Three of eight may be chance, although each is plainly a mark, and answer more strongly than the five."""
+    layout = layout_of([DOT] * 8, (*CORNERS, (0.0, -7.0), (-7.0, 0.0), (0.0, 7.0), (7.0, 0.0)), (16.0, 16.0))
+    aside_px, own, neighbours = np.array([50.0, 0.0]), (0, 1, 3, 4, 7), (1, 2, 5)
+    grey, true = np.full((380, 430), 20000.0), placement("0").pixel_from_camera
+    shifted = true + np.column_stack([np.zeros((2, 2)), aside_px])
+    for index, matrix in [*((index, true) for index in own), *((index, shifted) for index in neighbours)]:
+        paint(grey, layout.marks[index].mark, layout.marks[index].xy_mm, matrix, CONTRAST_DN, half=24)
+    whole = FrameSearch.anywhere
+
+    def false_first(search: FrameSearch, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
+        found = whole(search, hypotheses)
+        return [replace(found[0], pixel_from_camera=shifted), *found]
+
+    monkeypatch.setattr(FrameSearch, "anywhere", false_first)
+    monkeypatch.setattr(fiducials, "pitch_hypotheses", lambda *given: pitch_hypotheses(*given)[:1])
+    result = fiducials.measure_fiducials(scan_of(noisy(grey)), layout, (50.0, 50.0), replace(OPTIONS, pose="0"))
+    assert [mark.status is Status.MEASURED for mark in result.marks] == [index in own for index in range(8)]
+    for index in own:
+        assert result.marks[index].center_px == pytest.approx(true @ (*layout.marks[index].xy_mm, 1.0), abs=0.3)
+
+
 def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> None:
     as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
@@ -102,7 +129,9 @@ def test_specks_that_lie_as_all_marks_are_doubted_too() -> None:
     as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
     free = np.hypot(*(elsewhere[:, None] - as_marks).T).min(axis=0) > 22
-    result = measure_fiducials(scan_of(strewn(np.concatenate([elsewhere[free], as_marks]))), DOTS, (50.0, 50.0))
+    result = fiducials.measure_fiducials(
+        scan_of(strewn(np.concatenate([elsewhere[free], as_marks]))), DOTS, (50.0, 50.0)
+    )
     assert Status.MEASURED not in {mark.status for mark in result.marks}
     assert result.pose is None or not result.pose.decided
 
