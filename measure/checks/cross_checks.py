@@ -1,12 +1,12 @@
-"""Each fiducial mark checked by what else is known of it: its place by another method, the lines of opposite marks, and
-the camera's other frames.
+"""Each fiducial mark checked by what else is known of it: its place by another method, the lines of opposite marks, the
+camera's other frames, and of a frame of three the form of its triangle.
 
 Every check is a test at a stated probability of doubting any good mark of all the camera's frames (Bonferroni: divided
 by the number of tests). A mark that fails one is weak: the reason says why, and its covariance is enlarged by what was
 found, for it is known no better than that. What all frames have in common is the camera's, and no error.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -15,27 +15,16 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import brentq
 
+from measure.checks.doubts import CHANCE, FILM_MM, MEDIAN_EFFICIENCY, TOLD, Doubt, doubted, from_others, observed
+from measure.checks.triangles import by_given_triangles, by_other_triangles
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
-from measure.results import FrameMeasurement, MarkMeasurement
-from measure.status import Status
+from measure.results import FrameMeasurement
 
 Array = NDArray[np.float64]
 
-_CHANCE = 0.01  # of doubting any good mark, of each check
-_FILM_MM = 0.005  # scatter of marks by film and scanner, where one frame has to be judged alone
 _OPPOSITE_MM = 0.3  # how far from being opposite about the centre two given marks may be: an affinity keeps midpoints
-_TOLD = np.log(100.0)  # log-odds at which one mark rather than another is taken for the one that is off
 _ROUNDS = 10  # of fitting the frames to the median of all, which comes to rest after a few
 _LEAST_MM = 1e-6  # of a standard deviation
-_MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """Why a mark is no longer called measured, and how far off that puts it."""
-
-    reason: str
-    off_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,42 +51,31 @@ class _Reference:
     variance: Array
 
 
-def cross_checked(frames: Sequence[FrameMeasurement], layout: FiducialLayout) -> tuple[FrameMeasurement, ...]:
-    """The frames of one camera after all checks of their fiducials."""
+def cross_checked(
+    frames: Sequence[FrameMeasurement], layout: FiducialLayout, pitches_um: Sequence[tuple[float, float]]
+) -> tuple[FrameMeasurement, ...]:
+    """The frames of one camera after all checks of their fiducials. pitches_um: of each scan, in x and y."""
+    checked = tuple(frames)
     for check in (_by_other_method, _by_other_frames, _by_midpoints):
-        frames = tuple(_doubted(frame, doubts) for frame, doubts in zip(frames, check(frames, layout), strict=True))
-    return tuple(frames)
+        checked = _after(checked, check(checked, layout))
+    for check_triangles in (by_other_triangles, by_given_triangles):
+        checked = _after(checked, check_triangles(checked, layout, pitches_um))
+    return checked
 
 
-def _doubted(frame: FrameMeasurement, doubts: Mapping[str, Doubt]) -> FrameMeasurement:
-    marks = tuple(
-        _weakened(mark, doubts[mark.point]) if mark.kind == "fiducial" and mark.point in doubts else mark
-        for mark in frame.marks
-    )
-    return replace(frame, marks=marks)
-
-
-def _weakened(mark: MarkMeasurement, doubt: Doubt) -> MarkMeasurement:
-    """Its variance enlarged by the mean square, an axis, of how far it is off."""
-    assert mark.covariance_px2 is not None  # an observation has one
-    reason = f"{mark.reason}; {doubt.reason}" if mark.reason else doubt.reason
-    covariance = mark.covariance_px2 + doubt.off_px**2 / 2 * np.eye(2)
-    return replace(mark, status=Status.WEAK, reason=reason, covariance_px2=covariance)
-
-
-def _observed(frame: FrameMeasurement) -> list[MarkMeasurement]:
-    return [mark for mark in frame.marks if mark.kind == "fiducial" and mark.status.is_observation]
+def _after(frames: Sequence[FrameMeasurement], doubts: Iterable[Mapping[str, Doubt]]) -> tuple[FrameMeasurement, ...]:
+    return tuple(doubted(frame, own) for frame, own in zip(frames, doubts, strict=True))
 
 
 def _by_other_method(frames: Sequence[FrameMeasurement], _: FiducialLayout) -> Iterator[dict[str, Doubt]]:
     """The place by the mark's edges must not differ from the matched one by more than noise explains."""
     name = "second_method_sigmas"
-    tests = sum(name in mark.quality for frame in frames for mark in _observed(frame))
+    tests = sum(name in mark.quality for frame in frames for mark in observed(frame))
     for frame in frames:
         doubts = {}
-        for mark in _observed(frame):
+        for mark in observed(frame):
             sigmas = mark.quality.get(name)
-            if sigmas is not None and stats.chi2.sf(sigmas**2, 2) * tests < _CHANCE:
+            if sigmas is not None and stats.chi2.sf(sigmas**2, 2) * tests < CHANCE:
                 off = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
                 doubts[mark.point] = Doubt(
                     f"its edges put it {off:#.2g} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
@@ -124,21 +102,21 @@ def _by_other_frames(frames: Sequence[FrameMeasurement], layout: FiducialLayout)
         scatter = _Scatter.of(list(apart.values()))
         chances = {place: scatter.chance(each) for place, each in apart.items()}
         worst = min(chances, key=lambda place: chances[place])
-        if chances[worst] * len(apart) >= _CHANCE:
+        if chances[worst] * len(apart) >= CHANCE:
             break
         # Of two frames nobody knows which one is off.
         for place in apart if len(apart) == 2 else (worst,):
             alike, off_mm = _strangers(seen[place], others[place], scatter)
             names = [layout.marks[seen[place].index[number]].id for number in alike]
             for name, off in zip(names, off_mm, strict=True):
-                doubts[place][name] = Doubt(_from_others(off, names), off / seen[place].mm)
+                doubts[place][name] = Doubt(from_others(off, names), off / seen[place].mm)
             seen[place] = seen[place].without(alike)
     yield from doubts
 
 
 def _seen(frame: FrameMeasurement, layout: FiducialLayout) -> _Seen:
     number = {mark.id: place for place, mark in enumerate(layout.marks)}
-    marks = [mark for mark in _observed(frame) if mark.point in number] if frame.pixel_from_camera is not None else []
+    marks = [mark for mark in observed(frame) if mark.point in number] if frame.pixel_from_camera is not None else []
     matrix = np.eye(2, 3) if frame.pixel_from_camera is None else frame.pixel_from_camera
     mm = float(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
     centers = np.array([mark.center_px for mark in marks]).reshape(-1, 2)
@@ -233,7 +211,7 @@ class _Scatter:
             return float(np.median(squares / (variance * film + measured)) - 2 * np.log(2))
 
         variance = 0.0 if too_far(0.0) <= 0 else float(brentq(too_far, 0.0, float((squares / film).max())))
-        return cls(variance, _MEDIAN_EFFICIENCY * sum(each.degrees for each in frames))
+        return cls(variance, MEDIAN_EFFICIENCY * sum(each.degrees for each in frames))
 
     def chi_square(self, fit: _Fit) -> float:
         variance = self.variance_mm2 + np.maximum(fit.sigma, _LEAST_MM) ** 2
@@ -255,18 +233,9 @@ def _strangers(seen: _Seen, reference: _Reference | None, scatter: _Scatter) -> 
         rest[place] = False
         without.append(_Fit(seen, reference.mm, rest))
     misfits = np.array([scatter.chi_square(fit) for fit in without])
-    alike = np.flatnonzero(misfits - misfits.min() < 2 * _TOLD).tolist()
+    alike = np.flatnonzero(misfits - misfits.min() < 2 * TOLD).tolist()
     fit = without[alike[0]] if len(alike) == 1 else _Fit(seen, reference.mm, everything)
     return alike, [float(np.hypot(*fit.off[place])) for place in alike]
-
-
-def _from_others(off_mm: float, names: Sequence[str]) -> str:
-    if len(names) == 1:
-        return f"it lies {off_mm:.3f} mm from where the camera's other frames have it, more than they scatter"
-    return (
-        f"one of the marks {', '.join(names)} lies off where the camera's other frames have it, this one by "
-        f"{off_mm:.3f} mm; which one, they do not tell"
-    )
 
 
 def _by_midpoints(frames: Sequence[FrameMeasurement], layout: FiducialLayout) -> Iterator[dict[str, Doubt]]:
@@ -276,7 +245,7 @@ def _by_midpoints(frames: Sequence[FrameMeasurement], layout: FiducialLayout) ->
     whole = [[pair for pair in pairs if np.isin(pair, each.index).all()] for each in seen]
     tests = sum(len(own) for own in whole if len(own) > 1)
     for each, own in zip(seen, whole, strict=True):
-        yield _off_midpoint(each, own, _CHANCE / max(tests, 1), layout) if len(own) > 1 else {}
+        yield _off_midpoint(each, own, CHANCE / max(tests, 1), layout) if len(own) > 1 else {}
 
 
 def _opposite(layout: FiducialLayout) -> list[tuple[int, int]]:
@@ -298,7 +267,7 @@ def _off_midpoint(
     off = np.zeros((len(layout.marks), 2))
     variance = np.full(len(layout.marks), np.inf)
     off[seen.index] = seen.camera_mm - given[seen.index]
-    variance[seen.index] = seen.sigma_mm**2 + sigma[seen.index] ** 2 + _FILM_MM**2
+    variance[seen.index] = seen.sigma_mm**2 + sigma[seen.index] ** 2 + FILM_MM**2
     midpoints = np.array([off[list(pair)].mean(axis=0) for pair in pairs])
     spread = np.array([variance[list(pair)].sum() / 4 for pair in pairs])
     count = len(pairs)

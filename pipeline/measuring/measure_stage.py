@@ -83,26 +83,28 @@ def expected_time(first_s: float, scans: int) -> str:
 def _of_each_camera(
     project: Project,
     measured: Sequence[MeasuredScan],
-    change: Callable[[CameraFile, Sequence[FrameMeasurement]], Sequence[FrameMeasurement]],
+    change: Callable[[CameraFile, Sequence[MeasuredScan]], Sequence[FrameMeasurement]],
 ) -> list[MeasuredScan]:
     """The scans with the frames of each camera changed, all of a camera together."""
     frames = {scan.scan: scan.frame for scan in measured}
     for camera in project.cameras.values():
         own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
-        changed = change(camera, [scan.frame for scan in own])
+        changed = change(camera, own)
         frames |= {scan.scan: frame for scan, frame in zip(own, changed, strict=True)}
     return [replace(scan, frame=frames[scan.scan]) for scan in measured]
 
 
-def _at_one_definition(_: CameraFile, frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:
+def _at_one_definition(_: CameraFile, scans: Sequence[MeasuredScan]) -> list[FrameMeasurement]:
     """The crossings of boards in one definition of their place."""
+    frames = [scan.frame for scan in scans]
     marks = one_definition([frame.marks for frame in frames])
     return [replace(frame, marks=own) for frame, own in zip(frames, marks, strict=True)]
 
 
-def _cross_checked(camera: CameraFile, frames: Sequence[FrameMeasurement]) -> Sequence[FrameMeasurement]:
+def _cross_checked(camera: CameraFile, scans: Sequence[MeasuredScan]) -> Sequence[FrameMeasurement]:
     """The fiducials checked against one another, if the camera has any."""
-    return cross_checked(frames, camera.layout()) if camera.drawn else frames
+    frames = [scan.frame for scan in scans]
+    return cross_checked(frames, camera.layout(), [scan.pitch_um for scan in scans]) if camera.drawn else frames
 
 
 def _check_marks(project: Project) -> None:

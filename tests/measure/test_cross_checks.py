@@ -40,6 +40,10 @@ def frames_of(
     return frames
 
 
+def checked_together(frames: list[FrameMeasurement], layout: FiducialLayout) -> tuple[FrameMeasurement, ...]:
+    return cross_checked(frames, layout, [(1000 / PX_PER_MM, 1000 / PX_PER_MM)] * len(frames))
+
+
 def moved(frame: FrameMeasurement, mark: int, by_px: tuple[float, float]) -> FrameMeasurement:
     marks = list(frame.marks)
     old = marks[mark]
@@ -57,7 +61,7 @@ def test_good_marks_are_doubted_no_more_often_than_stated() -> None:
     """Two tests of one per cent each: of 100 cameras two or three lose a mark, whatever their marks' true places."""
     rng = np.random.default_rng(1)
     layout = layout_of(EIGHT, sigma_mm=1.0)
-    lost = sum(bool(weak(cross_checked(frames_of(layout, 4, rng, camera_mm=0.01), layout))) for _ in range(100))
+    lost = sum(bool(weak(checked_together(frames_of(layout, 4, rng, camera_mm=0.01), layout))) for _ in range(100))
     assert lost <= 7
 
 
@@ -66,7 +70,7 @@ def test_a_mark_that_only_one_frame_has_elsewhere_is_weak() -> None:
     layout = layout_of(EIGHT, sigma_mm=1.0)
     frames = frames_of(layout, 5, rng, camera_mm=0.05)
     frames[3] = moved(frames[3], 2, (1.5, -1.5))
-    checked = cross_checked(frames, layout)
+    checked = checked_together(frames, layout)
     assert weak(checked) == {("3", "2")}
     mark = checked[3].marks[2]
     assert "from where the camera's other frames have it" in mark.reason
@@ -82,7 +86,7 @@ def test_a_mark_ten_standard_deviations_off_is_mostly_found_in_six_frames() -> N
         frames, mark, angle = frames_of(layout, 6, rng, camera_mm=0.01), camera % 8, rng.uniform(0.0, 2 * np.pi)
         off = 10 * np.hypot(SIGMA_PX, FILM_MM * PX_PER_MM)
         frames[4] = moved(frames[4], mark, (off * np.cos(angle), off * np.sin(angle)))
-        found += weak(cross_checked(frames, layout)) == {("4", str(mark))}
+        found += weak(checked_together(frames, layout)) == {("4", str(mark))}
     assert found >= 14
 
 
@@ -91,7 +95,7 @@ def test_four_marks_do_not_tell_which_of_them_is_off() -> None:
     layout = layout_of(FOUR, sigma_mm=1.0)
     frames = frames_of(layout, 5, rng)
     frames[1] = moved(frames[1], 0, (4.0, 4.0))
-    checked = cross_checked(frames, layout)
+    checked = checked_together(frames, layout)
     assert weak(checked) == {("1", str(k)) for k in range(4)}
     assert "which one, they do not tell" in checked[1].marks[0].reason
 
@@ -100,8 +104,8 @@ def test_lines_of_opposite_marks_that_do_not_meet() -> None:
     rng = np.random.default_rng(4)
     layout = layout_of(EIGHT)
     (frame,) = frames_of(layout, 1, rng)
-    assert weak(cross_checked([frame], layout)) == set()
-    checked = cross_checked([moved(frame, 1, (3.0, 0.0))], layout)
+    assert weak(checked_together([frame], layout)) == set()
+    checked = checked_together([moved(frame, 1, (3.0, 0.0))], layout)
     assert weak(checked) == {("0", "1"), ("0", "6")}  # (-1, 0) and (1, 0)
     assert "do not meet" in checked[0].marks[1].reason
 
@@ -122,6 +126,6 @@ def test_what_the_edges_say_counts_against_chance() -> None:
         )
         for mark, sigmas in zip(frame.marks, (0.3, 1.0, 2.0, 3.0, 3.5, 4.5, 1.0, 2.0), strict=True)
     ]
-    checked = cross_checked([FrameMeasurement("0", tuple(marks), None, frame.pixel_from_camera)], layout)
+    checked = checked_together([FrameMeasurement("0", tuple(marks), None, frame.pixel_from_camera)], layout)
     assert weak(checked) == {("0", "5")}
     assert "its edges put it 0.10 px elsewhere" in checked[0].marks[5].reason
