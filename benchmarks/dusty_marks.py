@@ -99,7 +99,7 @@ def lone_mark(mark: TrueMark, grey: Array, share: float, rng: np.random.Generato
 def frame_of_marks(kind: Kind, share: float, count: int, rng: np.random.Generator) -> list[DustyMark]:
     """The first count of a frame's four corner and four side marks, alike but for the blur, from a placement that is
     about right."""
-    layout = _layout(kind, count)
+    layout = frame_layout(kind, count)
     linear = some_mark(kind, BLUR_PX, rng, px_per_mm=PX_PER_MM).place[:, :2]
     places = np.array([mark.xy_mm for mark in layout.marks])
     side = int(PX_PER_MM * FRAME_MM * 1.6)
@@ -116,7 +116,7 @@ def frame_of_marks(kind: Kind, share: float, count: int, rng: np.random.Generato
         frame[corner[1] :, corner[0] :, 0][: mark.size, : mark.size] = np.rint(speckled)
         parts.append((mark, speckled, seen, corner))
     scan = Scan(Path("dusty.tif"), WholePicture(frame), NO_TAGS)
-    result = measure_frame(scan, layout, _placement(linear, middle, sign, count, rng), FiducialOptions())
+    result = measure_frame(scan, layout, about_right(linear, middle, sign, count, rng), FiducialOptions())
     found = []
     for index, (sighting, (*_, corner)) in enumerate(zip(result.sightings, parts, strict=True)):
         status, reason = result.verdict(index)
@@ -126,14 +126,15 @@ def frame_of_marks(kind: Kind, share: float, count: int, rng: np.random.Generato
     return [DustyMark(*part[:3], each) for part, each in zip(parts, found, strict=True)]
 
 
-def _layout(kind: Kind, count: int) -> FiducialLayout:
-    at = AT_MM
+def frame_layout(kind: Kind, count: int, at: float = AT_MM) -> FiducialLayout:
+    """The first count of four corner and four side marks of one kind, at mm from the middle along either axis."""
     places = [(at, -at), (-at, -at), (-at, at), (at, at), (0.0, -at), (-at, 0.0), (0.0, at), (at, 0.0)]
     marks = [LayoutMark(str(n), place, (GIVEN_MM, GIVEN_MM), kind.shape) for n, place in enumerate(places[:count])]
     return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
 
 
-def _placement(linear: Array, middle: Array, sign: int, count: int, rng: np.random.Generator) -> Placement:
+def about_right(linear: Array, middle: Array, sign: int, count: int, rng: np.random.Generator) -> Placement:
+    """Where a frame lies, (2, 2) px per mm about its middle (2,), as a search gives it; sign: of its marks."""
     scale, turn = rng.normal(0, PLACED, 2)
     about = np.array([[1 + scale, -turn], [turn, 1 + scale]]) @ linear
     pixel_from_camera = np.column_stack([about, middle + rng.normal(0, PLACED_PX, 2)])

@@ -12,6 +12,7 @@ from measure.fitting.matching import Match
 from measure.frames.frame import WRONG_CHANCE, WRONG_PX
 from measure.frames.frame_sighter import FrameSighter
 from measure.frames.mark_comparison import (
+    SharedBlur,
     SharedShape,
     round_moves_beyond,
     round_moves_px,
@@ -23,6 +24,7 @@ from measure.frames.refinement import leans_on_frame, sight, strained_px
 from measure.marks.rendering import reach_px
 from measure.marks.shapes import Disk, Mark, MarkShape, Ring
 from measure.match_options import MatchOptions
+from measure.noise.noise import may_be_noise
 
 Array = NDArray[np.float64]
 
@@ -48,9 +50,9 @@ def settle(sighter: FrameSighter) -> None:
 
 
 def share_blur(sighter: FrameSighter) -> None:
-    """Match marks that hardly tell their own blur once more, with that of the others; what differs from theirs is
-    doubted."""
-    fits = _adjusted(sighter)
+    """Match marks that hardly tell their own blur once more, with that of the others, and marks that were only seen as
+    faint ones; what differs from the others' blur is doubted."""
+    fits = {**_adjusted(sighter), **_only_seen(sighter)}
     told = zip(fits, shared_blurs(list(fits.values())), strict=True)
     shared = {index: blur for index, blur in told if blur is not None}
     if not shared:
@@ -58,6 +60,9 @@ def share_blur(sighter: FrameSighter) -> None:
     frame_sigma = _frame_sigma(sighter)
     for index, blur in shared.items():
         match = replace(sighter.options.match, blur_px=blur.blur_px, blur_sigma=blur.sigma)
+        if fits[index].covariance is None:
+            _match_faint(sighter, index, match, frame_sigma, blur)
+            continue
         _match_again(sighter, index, match, frame_sigma)
         if blur.differs:
             own_px = fits[index].blur_px
@@ -144,6 +149,16 @@ def _adjusted(sighter: FrameSighter) -> dict[int, Match]:
     }
 
 
+def _only_seen(sighter: FrameSighter) -> dict[int, Match]:
+    """The fits of marks that belong and are drawn, but were only seen as faint marks, with no blur of their own."""
+    return {
+        index: sighting.fit
+        for index, sighting in enumerate(sighter.sightings)
+        if sighter.belongs[index] and sighting is not None and sighting.fit is not None
+        if sighting.fit.covariance is None and isinstance(sighter.layout.marks[index].mark, MarkShape)
+    }
+
+
 def _frame_sigma(sighter: FrameSighter) -> float:
     """The standard deviation of the frame's rotation (rad) and scale."""
     belonging = sighter.camera[sighter.belongs]
@@ -153,10 +168,35 @@ def _frame_sigma(sighter: FrameSighter) -> float:
 
 def _match_again(sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float) -> None:
     """Where it was found, with the frame's rotation and scale where it leans on them."""
+    fit = _matched(sighter, index, options, frame_sigma)
+    if fit is not None:
+        _take(sighter, index, fit)
+
+
+def _match_faint(
+    sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float, blur: SharedBlur
+) -> None:
+    """A mark that was only seen, for that takes all that is finer than the mark for texture: in plain noise a match
+    knows its place far better. It counts where it means the same mark, of the others' blur, and is the better known."""
+    seen, fit = sighter.sightings[index], _matched(sighter, index, options, frame_sigma)
+    if seen is None or seen.fit is None or fit is None or not blur.is_borne_out_by(fit):
+        return
+    off = fit.center_px - seen.fit.center_px
+    if fit.sigma_px < seen.fit.sigma_px and may_be_noise(off, seen.fit.covariance_px2 + fit.covariance_px2):
+        _take(sighter, index, fit)
+
+
+def _matched(sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float) -> Match | None:
+    """A mark where it was seen, matched with the frame's rotation and scale where it leans on them."""
     before = sighter.sightings[index]
     if before is None or before.fit is None:
-        return
+        return None
     expected = sighter.expected(index, _SETTLED_PX).moved(before.fit.center_px)
-    after = sight(sighter.scan, expected, options, frame_sigma)
-    if after.fit is not None:
-        sighter.sightings[index] = replace(before, fit=after.fit)
+    return sight(sighter.scan, expected, options, frame_sigma).fit
+
+
+def _take(sighter: FrameSighter, index: int, fit: Match) -> None:
+    """Another fit of a mark that was seen; what was said of it holds."""
+    sighting = sighter.sightings[index]
+    if sighting is not None:
+        sighter.sightings[index] = replace(sighting, fit=fit)

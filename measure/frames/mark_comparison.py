@@ -48,11 +48,18 @@ class SharedBlur:
     sigma: float
     differs: bool
 
+    def is_borne_out_by(self, fit: Match) -> bool:
+        """Whether a match that took it as an observation comes out with such a blur: noise moves the estimate from an
+        observation by the root of what it takes from its variance."""
+        moved = _log_seen_px(fit.blur_px) - _log_seen_px(self.blur_px)
+        off = abs(moved) / np.sqrt(max(self.sigma**2 - fit.blur_sigma**2, 1e-12))
+        return bool(fit.blur_sigma < self.sigma and 2 * stats.norm.sf(off) >= _CHANCE)
+
 
 def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
     """For each mark what the others tell of its blur, None where they need not, for its own picture tells it well and
     it is as theirs, or where they are too few."""
-    own = np.array([np.log(fit.blur_px**2 + PIXEL_VARIANCE_PX2) / 2 for fit in fits])
+    own = np.array([_log_seen_px(fit.blur_px) for fit in fits])
     sigma = np.array([fit.blur_sigma for fit in fits])
     told_by_others = _told_by_others(own, sigma, _blur_spread, _FEWEST_BLURS)
     return [
@@ -142,6 +149,11 @@ def _blur_spread(shown: float, marks: int) -> float:
 
 def _size_spread(shown: float, marks: int) -> float:
     return float(np.sqrt((_BEFORE * _SIZE_SPREAD**2 + (marks - 1) * shown) / (_BEFORE + marks - 1)))
+
+
+def _log_seen_px(blur_px: float) -> float:
+    """The logarithm of a blur with the pixel's share."""
+    return float(np.log(blur_px**2 + PIXEL_VARIANCE_PX2) / 2)
 
 
 def _without_pixel(log_seen_px: float) -> float:

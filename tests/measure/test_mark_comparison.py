@@ -8,6 +8,7 @@ import pytest
 
 from measure.fitting.own_shape import OwnShape
 from measure.frames.mark_comparison import (
+    SharedBlur,
     SharedShape,
     round_moves_beyond,
     round_moves_px,
@@ -45,6 +46,20 @@ def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
         found += told is not None and told.differs
     assert doubted <= 12  # 1 in 100, and more for how much they differ is an estimate itself
     assert found > 270
+
+
+def test_a_match_with_the_others_blur_rarely_contradicts_it_unless_its_own_is_another() -> None:
+    rng, others_sigma, own_sigma = np.random.default_rng(3), 0.06, 0.1
+    told, weight = SharedBlur(np.sqrt(1.1**2 - PIXEL), others_sigma, False), others_sigma**2 / (0.06**2 + 0.1**2)
+    sigma = others_sigma * np.sqrt(1 - weight)  # of the weighted mean of both
+    good = 1.1 * np.exp(weight * rng.normal(0, np.hypot(others_sigma, own_sigma), 2000))
+    other = 1.1 * np.exp(weight * rng.normal(np.log(0.6), own_sigma, 2000))
+    contradicted, found = (
+        sum(not told.is_borne_out_by(fit) for fit in fits(seen, [sigma] * len(seen))) for seen in (good, other)
+    )
+    assert 8 <= contradicted <= 34  # 1 in 100
+    assert found > 1800
+    assert not told.is_borne_out_by(fits([1.1], [np.inf])[0])
 
 
 def test_too_few_marks_tell_nothing() -> None:

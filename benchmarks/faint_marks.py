@@ -1,0 +1,126 @@
+"""Faint marks in frames whose other marks are plainly there, against their truth and the Cramér-Rao bound.
+
+PYTHONPATH=tests/measure python benchmarks/faint_marks.py [FRAMES] [--kind KIND ...] [--seed SEED] [--keep FILE]
+
+FRAMES: of every cell, each with three faint marks; 40 where none is given. Eight marks of one kind stand in a frame
+of 60 mm (10 px a mm), their blurs alike to 5 %: five have 20 times the contrast of the noise, three the SNR of a cell.
+The pictures and bounds are those of `benchmarks/marks.py`, the placements those of `benchmarks/dust.py`; what measures
+is what `reseau measure` runs, `measure.frames.frame_measurement.measure_frame`. Ellipses are targets, and in no frame.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from dusty_marks import BLUR_SPREAD, PX_PER_MM, about_right, frame_layout
+from kept_rows import KeptRows
+from measured_marks import CONTRAST, GROUND, Cell, Found, best_errors
+from numpy.typing import NDArray
+from true_marks import KINDS, Kind, TrueMark, some_mark
+
+from measure.fiducial_options import FiducialOptions
+from measure.frames.frame_measurement import measure_frame
+from measure.marks.shapes import FiducialLayout
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+
+Array = NDArray[np.float64]
+
+PLAIN_SNR, MARKS, FAINT, AT_MM = 20.0, 8, (2, 5, 7), 30.0
+SNRS, BLURS_PX = (3.0, 5.0, 10.0), (1.0, 1.6, 2.5)
+POOL = 6  # different frames in a cell, each drawn once and measured in noise that is always new
+BESIDE_PX = 40  # of noise about a mark's window: what blank film beside a mark is taken from
+SEED = 20
+FRAMED = [kind for kind in KINDS if kind.name != "ellipse"]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnFrame:
+    """A frame's marks in their windows, whose first pixels corners (marks, 2) give in a scan of side px squared; linear
+    (2, 2) px per mm, and middle (2,) px of the frame."""
+
+    layout: FiducialLayout
+    marks: list[TrueMark]
+    corners: list[Array]
+    side: int
+    linear: Array
+    middle: Array
+
+
+def drawn_frame(kind: Kind, blur_px: float, rng: np.random.Generator) -> DrawnFrame:
+    """Somewhere, of some rotation and scale."""
+    layout, side = frame_layout(kind, MARKS, AT_MM), int(PX_PER_MM * AT_MM * 3) + 300
+    linear = some_mark(kind, blur_px, rng, px_per_mm=PX_PER_MM).place[:, :2]
+    middle = side / 2 + rng.uniform(-0.5, 0.5, 2)
+    marks, corners = [], []
+    for center in np.array([mark.xy_mm for mark in layout.marks]) @ linear.T + middle:
+        some = some_mark(kind, blur_px * float(np.exp(rng.normal(0, BLUR_SPREAD))), rng, px_per_mm=PX_PER_MM)
+        corners.append(np.rint(center).astype(int) - some.size // 2)
+        marks.append(replace(some, place=np.column_stack([linear, center - corners[-1]])))
+    return DrawnFrame(layout, marks, corners, side, linear, middle)
+
+
+def measured_faint(
+    frame: DrawnFrame, snr: float, rng: np.random.Generator
+) -> Iterator[tuple[TrueMark, Found | None, Array]]:
+    """Each faint mark as it was found and the noise in its window, its contrast being 1; None where it was not."""
+    sign = int(rng.choice((-1, 1)))
+    ground = GROUND + (1 - sign) / 2 * CONTRAST
+    picture = np.full((frame.side, frame.side, 1), ground, np.uint16)
+    noises = []
+    for number, (mark, corner) in enumerate(zip(frame.marks, frame.corners, strict=True)):
+        noise = rng.standard_normal((mark.size + 2 * BESIDE_PX,) * 2) / PLAIN_SNR
+        share = snr / PLAIN_SNR if number in FAINT else 1.0
+        grey = ground + CONTRAST * noise
+        inner = np.s_[BESIDE_PX:-BESIDE_PX, BESIDE_PX:-BESIDE_PX]
+        grey[inner] += sign * share * CONTRAST * mark.picture
+        col, row = corner - BESIDE_PX
+        picture[row:, col:, 0][: len(grey), : len(grey)] = np.rint(grey)
+        noises.append(sign * noise[inner] / share)
+    placement = about_right(frame.linear, frame.middle, sign, MARKS, rng)
+    scan = Scan(Path("faint.tif"), WholePicture(picture), NO_TAGS)
+    result = measure_frame(scan, frame.layout, placement, FiducialOptions())
+    for number in FAINT:
+        fit = result.fits[number]
+        found = None if fit is None else Found(fit.center_px - frame.corners[number], fit.covariance_px2)
+        yield frame.marks[number], found, noises[number]
+
+
+def row(kind: Kind, blur_px: float, frames: int, seed: int) -> str:
+    """All SNR of a kind and blur."""
+    rng = np.random.default_rng([seed, KINDS.index(kind), int(10 * blur_px)])
+    pool = [drawn_frame(kind, blur_px, rng) for _ in range(min(POOL, frames))]
+    words = []
+    for snr in SNRS:
+        cell = Cell()
+        for number in range(frames):
+            for mark, found, noise in measured_faint(pool[number % len(pool)], snr, rng):
+                cell.add(mark, found, best_errors(mark, noise, 1 / snr, np.zeros(2)), mark.bound(1 / snr))
+        words.append(f"{cell.words():>18}")
+    return f"{kind.name:14}{blur_px:5.1f}" + "".join(words)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("frames", type=int, nargs="?", default=40)
+    parser.add_argument("--kind", action="append", choices=[kind.name for kind in FRAMED])
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--keep", type=Path)
+    given = parser.parse_args()
+    rows = KeptRows(given.keep)
+    print(f"{given.frames} frames a cell, seed {given.seed}; rms / bound, realised / claimed; -n: not found")
+    print(f"{'':14}{'blur':>5}" + "".join(f"{f'SNR {snr:g}':>18}" for snr in SNRS))
+    for kind in FRAMED:
+        if not given.kind or kind.name in given.kind:
+            for blur_px in BLURS_PX:
+                key = f"faint {given.seed} {given.frames} {kind.name} {blur_px}"
+                rows.print(key, partial(row, kind, blur_px, given.frames, given.seed))
+
+
+if __name__ == "__main__":
+    main()

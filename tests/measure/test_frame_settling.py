@@ -1,0 +1,57 @@
+"""Marks of a frame that are faint beside the others, drawn by `synthetic_images`: what the frame makes of them, against
+their truth and the bound."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from true_marks import KIND, TrueMark, some_mark
+
+from measure.fiducial_options import FiducialOptions
+from measure.frames.frame import Frame
+from measure.frames.frame_measurement import measure_frame
+from measure.marks.shapes import FiducialLayout, LayoutMark
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from measure.search.constellation import Placement
+from measure.status import Status
+
+PX_PER_MM, SIDE_PX, AT_MM = 10.0, 600, 20.0
+PLACES = [(x, y) for y in (-AT_MM, 0.0, AT_MM) for x in (-AT_MM, 0.0, AT_MM) if x or y]
+GROUND, CONTRAST, NOISE = 30000.0, 16000.0, 800.0  # 20 times the noise
+FAINT = (0, 3, 6)
+
+
+def frame_of(rng: np.random.Generator, blur_px: float, share: float) -> tuple[Frame, list[tuple[TrueMark, np.ndarray]]]:
+    """A frame of eight crosses with gaps, three of them with a share of the others' contrast: as it was measured, and
+    each mark with its first pixel."""
+    kind, middle = KIND["gap cross"], SIDE_PX / 2 + rng.uniform(-0.5, 0.5, 2)
+    layout = tuple(LayoutMark(str(n), place, (0.005, 0.005), kind.shape) for n, place in enumerate(PLACES))
+    linear = PX_PER_MM * np.diag([1.0, -1.0])
+    grey, marks = GROUND + NOISE * rng.standard_normal((SIDE_PX, SIDE_PX)), []
+    for number, place in enumerate(PLACES):
+        some = some_mark(kind, blur_px * float(np.exp(rng.normal(0, 0.05))), rng)
+        corner = np.rint(linear @ place + middle).astype(int) - some.size // 2
+        mark = replace(some, place=np.column_stack([linear, linear @ place + middle - corner]))
+        contrast = CONTRAST * (share if number in FAINT else 1.0)
+        grey[corner[1] :, corner[0] :][: mark.size, : mark.size] += contrast * mark.picture
+        marks.append((mark, corner))
+    scan = Scan(Path("faint.tif"), WholePicture(np.rint(grey).astype(np.uint16)[..., None]), NO_TAGS)
+    pixel_from_camera = np.column_stack([1.001 * linear, middle + np.array([1.0, -1.0])])
+    placement = Placement("0", pixel_from_camera, 8.0, 8, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
+    return measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions()), marks
+
+
+def test_faint_marks_are_matched_with_the_others_blur() -> None:
+    frame, marks = frame_of(np.random.default_rng(3), 2.5, 0.25)
+    squares, to_bound = [], []
+    for index in FAINT:
+        fit, (mark, corner) = frame.sightings[index].fit, marks[index]
+        assert fit is not None
+        assert frame.verdict(index)[0] is Status.WEAK
+        error = fit.center_px - corner - mark.place[:, 2]
+        squares.append(float(error @ np.linalg.solve(fit.covariance_px2, error)) / 2)
+        to_bound.append(float(np.sqrt(np.trace(fit.covariance_px2) / np.trace(mark.bound(4 * NOISE / CONTRAST)))))
+    assert np.sqrt(np.mean(squares)) < 1.7
+    assert np.mean(to_bound) < 1.15  # of what is only seen it is 1.3
