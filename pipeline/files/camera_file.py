@@ -189,6 +189,8 @@ def _fiducials(table: Table) -> tuple[GivenFiducial, ...]:
     fiducials: dict[str, GivenFiducial] = {}
     for entry in table.tables("fiducial"):
         id = entry.text("id")
+        if not id or id != id.strip() or not id.isprintable():
+            raise entry.error("id", f"must be text on one line without blanks at its ends, not {id!r}.")
         if id in fiducials:
             raise entry.error("id", f"fiducial {id!r} is given twice. Every mark has an id of its own.")
         mark = entry.text("mark", choices=(*marks, NO_MARK)) if "mark" in entry else None

@@ -40,10 +40,11 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
 
 
 def image_name(text: str) -> str:
-    """An image's name: its file's name without folder and without a picture's ending."""
+    """An image's name: its file's name without folder, without a picture's ending, and without blanks at its ends,
+    which no table keeps."""
     path = Path(text)
     endings = {".tif", ".tiff", ".jpg", ".jpeg", ".png"}
-    return path.stem if path.suffix.lower() in endings else path.name
+    return (path.stem if path.suffix.lower() in endings else path.name).strip()
 
 
 def _exterior(row: Row, antenna: tuple[float, float, float]) -> Exterior | None:

@@ -21,6 +21,7 @@ from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 
 FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
+_COARSEST_PITCH_UM = 1e4  # above it nm were meant: film of a few pixels shows no mark
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 
 
@@ -266,4 +267,6 @@ def _pitch(table: Table) -> tuple[float, float] | None:
         raise table.error("pitch_um", f"must be positive, not {list(pitch)}.")
     if min(pitch) < FINEST_PITCH_UM:
         raise table.error("pitch_um", f"{min(pitch):g} um is finer than any scanner. Give um: 20.0, not 0.02.")
+    if max(pitch) > _COARSEST_PITCH_UM:
+        raise table.error("pitch_um", f"{max(pitch):g} um is coarser than any scan. Give um: 20.0, not 20000.")
     return pitch

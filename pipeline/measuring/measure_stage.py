@@ -40,6 +40,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     """
     if not project.scans:
         raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
+    _check_anything_to_measure(project)
     check_targets(project)
     check_tie_names(project)
     _check_marks(project)
@@ -105,6 +106,16 @@ def _cross_checked(camera: CameraFile, scans: Sequence[MeasuredScan]) -> Sequenc
     """The fiducials checked against one another, if the camera has any."""
     frames = [scan.frame for scan in scans]
     return cross_checked(frames, camera.layout(), [scan.pitch_um for scan in scans]) if camera.drawn else frames
+
+
+def _check_anything_to_measure(project: Project) -> None:
+    """Without fiducials, targets and natural points comparator.csv would hold nothing."""
+    sought = [one for camera in project.cameras.values() for one in camera.fiducials if not one.passed_over]
+    if not sought and project.targets is None and project.ties is None:
+        raise InputError(
+            f"{project.path}: there is nothing to measure: {project.default_camera.path} has no fiducial that is not "
+            "passed over, and the project neither [targets] nor [ties]. Add what the scans show."
+        )
 
 
 def _check_marks(project: Project) -> None:

@@ -107,6 +107,21 @@ def pitch_in_mm(folder: Path) -> None:
     replaced(folder / "project.toml", "output =", "pitch_um = 0.045\noutput =")
 
 
+def pitch_in_nm(folder: Path) -> None:
+    replaced(folder / "project.toml", "output =", "pitch_um = 20000\noutput =")
+
+
+def blank_id(folder: Path) -> None:
+    replaced(folder / "camera.toml", 'id = "1"', 'id = "1 "')
+
+
+def nothing_to_measure(folder: Path) -> None:
+    camera = (folder / "camera.toml").read_text(encoding="utf-8")
+    passed_over = re.sub(r"^mark = .*$", 'mark = "none"', camera, flags=re.MULTILINE)
+    (folder / "camera.toml").write_text(passed_over, encoding="utf-8")
+    (folder / "project.toml").write_text('camera = "camera.toml"\nscans = ["scans/*.tif"]\n', encoding="utf-8")
+
+
 def marks_over_points(folder: Path) -> None:
     replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "points.csv"')
 
@@ -164,6 +179,9 @@ def link_to_no_scan(folder: Path) -> None:
         (no_pattern, ["line 3: scans: 'scans' is a folder", "'scans/*.tif'"]),
         (name_in_another_encoding, ["line 3: scans:", "is not text in UTF-8", "Rename it"]),
         (pitch_in_mm, ["line 5: pitch_um: 0.045 um is finer than any scanner"]),
+        (pitch_in_nm, ["line 5: pitch_um: 20000 um is coarser than any scan"]),
+        (blank_id, ["camera.toml, line", "text on one line without blanks at its ends, not '1 '"]),
+        (nothing_to_measure, ["there is nothing to measure", "Add what the scans show"]),
         (marks_over_points, ["line 4: comparator:", "written over [object] points"]),
         (marks_over_a_scan, ["line 4: comparator:", "written over the scan frame2"]),
         (marks_over_a_folder, ["line 4: comparator:", "is a folder"]),

@@ -17,7 +17,7 @@ from pipeline.errors import InputError
 from pipeline.files.atomic import atomic_path, check_writable, write_atomically
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
-from pipeline.files.images_file import read_images
+from pipeline.files.images_file import image_name, read_images
 from pipeline.files.points_file import read_points
 from pipeline.files.tables import read_toml
 from pipeline.files.template_table import saved_in
@@ -300,3 +300,8 @@ def test_trying_whether_a_folder_takes_results_touches_no_file_of_it(tmp_path: P
     assert [path.read_text(encoding="utf-8") for path in tmp_path.iterdir()] == ["the user's own"]
     with pytest.raises(InputError, match="trial: cannot be written"):
         check_writable(tmp_path / "trial")
+
+
+def test_an_image_is_called_as_its_file_without_what_no_table_keeps() -> None:
+    assert image_name("scans/roll 7/ frame 1 .TIF") == "frame 1"
+    assert image_name("frame.2") == "frame.2"
