@@ -20,12 +20,16 @@ _FAINT = "the frame was found at a closer look only, its marks being faint besid
 _ASSUMED = "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere"
 
 
-def absent_frame(scan: Scan, layout: FiducialLayout, reason: str) -> FrameMeasurement:
-    """Of a scan in which no frame was found; reason: why, a part of a sentence."""
+def absent_frame(scan: Scan, layout: FiducialLayout, reason: str, rotation_deg: float) -> FrameMeasurement:
+    """Of a scan in which no frame was found; reason: why, a part of a sentence; rotation_deg: by how much turned it was
+    sought."""
     marks = tuple(
         MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}") for mark in layout.marks
     )
-    problem = f"no fiducial was measured: {reason}; look whether the camera is that of the scan, and the pitch right."
+    problem = (
+        f"no fiducial was measured: {reason}; look whether the camera is that of the scan, the pitch right, and the "
+        f"film laid within {rotation_deg:g} degrees of upright or of a quarter turn."
+    )
     return FrameMeasurement(scan.name, marks, None, None, (problem,))
 
 

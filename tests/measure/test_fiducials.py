@@ -155,6 +155,7 @@ def test_zero_marks_give_no_silent_identity(tmp_path: Path) -> None:
         assert {mark.status for mark in result.marks} == {Status.ABSENT}
         assert all(mark.center_px is None and mark.reason for mark in result.marks)
         assert "no fiducial was measured" in result.problems[0]
+        assert "within 6 degrees of upright or of a quarter turn" in result.problems[0]
 
 
 def test_the_scan_of_another_camera_is_refused_with_a_count(tmp_path: Path) -> None:
