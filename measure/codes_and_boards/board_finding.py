@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 _FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
+_THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
 
 
@@ -30,11 +31,12 @@ class FoundCorner:
 @dataclass(frozen=True)
 class FoundBoard:
     """The corners found, by id; none, and the reason why; refused: the markers that were read and are not used, by
-    number, and why."""
+    number, and why; others_px: the middles of further boards that look the same."""
 
     corners: dict[str, FoundCorner]
     reason: str = ""
     refused: Mapping[int, str] = field(default_factory=dict)
+    others_px: tuple[Array, ...] = ()
 
 
 def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> FoundBoard:
@@ -50,7 +52,8 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> Fo
         else:
             found = _find_aruco(picture, spec)
         if found.corners:
-            return replace(found, corners={name: _in_scan(corner, factor) for name, corner in found.corners.items()})
+            corners = {name: _in_scan(corner, factor) for name, corner in found.corners.items()}
+            return replace(found, corners=corners, others_px=tuple(_scan_px(one, factor) for one in found.others_px))
     return found
 
 
@@ -72,14 +75,30 @@ def _searchable(scan: Scan, factor: int) -> tuple[Bytes, str]:
 
 
 def _in_scan(corner: FoundCorner, factor: int) -> FoundCorner:
+    return FoundCorner(_scan_px(corner.center_px, factor), corner.steps_px * factor)
+
+
+def _scan_px(place_px: Array, factor: int) -> Array:
     """Pixel (i, j) of a reduced picture has its centre at factor j + (factor - 1) / 2."""
-    return FoundCorner(corner.center_px * factor + (factor - 1) / 2, corner.steps_px * factor)
+    return place_px * factor + (factor - 1) / 2
 
 
 def _find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
-    """All inner corners of a chessboard that is wholly seen."""
+    """All inner corners of a chessboard that is wholly seen, and whether it is the only one."""
+    grid = _chessboard_grid(picture, spec)
+    if grid is None:
+        return FoundBoard({}, f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen")
+    corners = {
+        f"r{row}c{column}": FoundCorner(grid[row, column], steps)
+        for (row, column), steps in np.ndenumerate(_grid_steps(grid))
+    }
+    return FoundBoard(corners, others_px=_other_chessboards(picture, grid, spec))
+
+
+def _chessboard_grid(picture: Bytes, spec: ChessboardSpec) -> Array | None:
+    """(rows, columns, 2) the inner corners of a chessboard, None where none is seen."""
     size = (spec.columns, spec.rows)
-    for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE, 0):
+    for flags in (_THOROUGHLY, 0):
         found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
         if found:
             break
@@ -87,15 +106,27 @@ def _find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
         # The older detector can search for minutes in vain; its fast check refuses a picture without squares first.
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
         found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
-    if not found:
-        return FoundBoard({}, f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen")
-    grid = _right_handed(np.asarray(corners, float).reshape(spec.rows, spec.columns, 2))
-    return FoundBoard(
-        {
-            f"r{row}c{column}": FoundCorner(grid[row, column], steps)
-            for (row, column), steps in np.ndenumerate(_grid_steps(grid))
-        }
-    )
+    return _right_handed(np.asarray(corners, float).reshape(spec.rows, spec.columns, 2)) if found else None
+
+
+def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tuple[Array, ...]:
+    """The middles of the chessboards beside those that were found, each painted over before the next is sought."""
+    picture, background = picture.copy(), int(np.median(picture))
+    others: list[Array] = []
+    while True:
+        cv2.fillConvexPoly(picture, np.round(_outline(grid)).astype(np.int32), background)
+        found, corners = cv2.findChessboardCornersSB(picture, (spec.columns, spec.rows), flags=_THOROUGHLY)
+        if not found:
+            return tuple(others)
+        grid = np.asarray(corners, float).reshape(spec.rows, spec.columns, 2)
+        others.append(grid.mean(axis=(0, 1)))
+
+
+def _outline(grid: Array) -> Array:
+    """(n, 2) the convex outline of a chessboard's squares: its inner corners and a step beyond them."""
+    columns = np.concatenate([2 * grid[:, :1] - grid[:, 1:2], grid, 2 * grid[:, -1:] - grid[:, -2:-1]], axis=1)
+    squares = np.concatenate([2 * columns[:1] - columns[1:2], columns, 2 * columns[-1:] - columns[-2:-1]])
+    return np.asarray(cv2.convexHull(squares.reshape(-1, 2).astype(np.float32)), float).reshape(-1, 2)
 
 
 def _right_handed(grid: Array) -> Array:
@@ -169,4 +200,4 @@ def _find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
 
 def _with_refused(reason: str, read: ReadMarkers) -> str:
     """Why a board was not found, where markers were read that are not used."""
-    return "; ".join([reason, *list(read.refused.values())[:1]])
+    return next(iter(read.refused.values()), reason)

@@ -1,7 +1,7 @@
 """The points of a calibration board in a scan: found by OpenCV, measured by least-squares matching."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,29 +36,47 @@ _WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out 
 @dataclass(frozen=True)
 class BoardMeasurement:
     """A board in a scan: one mark for each of its points, found or not; reason: why the board was not found; notes:
-    what the user should know; refused: markers that were read and are not used, one sentence each."""
+    what the user should know; refused: markers that were read and are not used, one sentence each; ambiguous: what else
+    in the scan may be the board as well, so that none of its points is an observation."""
 
     marks: tuple[MarkMeasurement, ...]
     reason: str = ""
     notes: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
+    ambiguous: str = ""
 
 
 def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     """Measure a chessboard, circle grid, ArUco or ChArUco board. A board that is not there is no error."""
     if isinstance(spec, CircleGridSpec):
-        marks, reason, notes = measure_circle_grid(scan, spec)
-        return BoardMeasurement(marks, reason, notes)
+        grid = measure_circle_grid(scan, spec)
+        kind = f"grids of {spec.columns} x {spec.rows} dots"
+        return _unless_alone(BoardMeasurement(grid.marks, grid.reason, grid.notes), kind, grid.others_px)
     board = find_board(scan, spec)
     reach = _common_reach_px(board.corners.values()) if board.corners else 0.0
     fitted = {name: _fit_found(scan, found, spec, reach) for name, found in board.corners.items()}
-    notes = ()
+    notes: tuple[str, ...] = ()
     if isinstance(spec, ChessboardSpec) and fitted:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
     unseen = board.reason or "not seen: its markers were not read"
     why = {name: _refused(name, board, spec) or unseen for name in spec.object_points()}
     marks = tuple(_as_mark(name, fitted.get(name), missing) for name, missing in why.items())
-    return BoardMeasurement(marks, board.reason, notes, tuple(board.refused.values()))
+    measured = BoardMeasurement(marks, board.reason, notes, tuple(board.refused.values()))
+    return _unless_alone(measured, f"boards of {spec.columns} x {spec.rows} inner corners", board.others_px)
+
+
+def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Array]) -> BoardMeasurement:
+    """A board beside others that look the same: its points have places, but nobody knows of which board they are."""
+    if not others_px:
+        return measured
+    middle = np.mean([mark.center_px for mark in measured.marks if mark.center_px is not None], axis=0)
+    places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in (middle, *others_px))
+    why = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
+    marks = tuple(
+        replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
+        for mark in measured.marks
+    )
+    return replace(measured, marks=marks, ambiguous=why)
 
 
 def _refused(name: str, board: FoundBoard, spec: BoardSpec) -> str:

@@ -1,11 +1,13 @@
 """Grids of dots: the disks of the frame put in the grid's order, missing ones looked for where they should be."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.board_specs import CircleGridSpec
-from measure.codes_and_boards.lattices import Place, grid_places
+from measure.codes_and_boards.lattices import Place, grid_places, is_whole
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.single_targets.disk_patches import Candidate, DiskSearch
@@ -19,16 +21,30 @@ _SMALLEST_DOT_PX = 5.0  # its diameter
 _NEAREST_DOTS = 8  # whose places and shapes predict a missing one's
 
 
-def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> tuple[tuple[MarkMeasurement, ...], str, tuple[str, ...]]:
-    """One mark for each dot of the grid, why the grid was not found, and what the user should know."""
+@dataclass(frozen=True)
+class CircleGridMeasurement:
+    """A grid in a scan: one mark for each of its dots; reason: why it was not found; notes: what the user should know;
+    others_px: the middles of further grids that look the same."""
+
+    marks: tuple[MarkMeasurement, ...]
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+    others_px: tuple[Array, ...] = ()
+
+
+def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> CircleGridMeasurement:
+    """Measure the dots of a grid, and say where else the scan shows one. A grid that is not there is no error."""
     names = {place: f"r{place[0]}c{place[1]}" for place in spec.places()}
     patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
     centers = np.array([patch.center_px for patch in patches]).reshape(-1, 2)
-    assignments = grid_places(centers, _looks(patches), spec.places())
-    if not assignments:
+    looks = _looks(patches)
+    assignments = grid_places(centers, looks, spec.places())
+    if not is_whole(assignments):
         reason = f"no grid of {spec.columns} x {spec.rows} dots is wholly seen; {len(patches)} spots look like dots"
+        if assignments:
+            reason = f"a grid of more than {spec.columns} x {spec.rows} dots is seen, or one with a line of it hidden"
         absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, reason) for name in names.values())
-        return tuple(absent), reason, ()
+        return CircleGridMeasurement(tuple(absent), reason)
     assignment = max(assignments, key=lambda found: _upright(found, centers))
     notes = (
         ("the grid looks the same when turned: it was taken as upright in the scan",) if len(assignments) > 1 else ()
@@ -40,7 +56,22 @@ def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> tuple[tuple[MarkMea
         center, shape = seen[place] if place in seen else _predicted(place, seen)
         margin = gap / (1 - gap) * 2 * float(np.linalg.svd(shape, compute_uv=False)[1])
         marks.append(_as_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in seen))
-    return tuple(marks), "", notes
+    others = _other_grids(centers, looks, assignment, spec.places())
+    return CircleGridMeasurement(tuple(marks), "", notes, others)
+
+
+def _other_grids(centers: Array, looks: Array, assignment: dict[Place, int], places: list[Place]) -> tuple[Array, ...]:
+    """The middles of the grids that the points make beside the one that was found."""
+    others: list[Array] = []
+    left = np.arange(len(centers))
+    found = list(assignment.values())
+    while True:
+        left = np.delete(left, found)
+        further = grid_places(centers[left], looks[left], places)
+        if not is_whole(further):
+            return tuple(others)
+        found = list(further[0].values())
+        others.append(centers[left[found]].mean(axis=0))
 
 
 def _looks(patches: list[Candidate]) -> Array:

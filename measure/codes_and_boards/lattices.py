@@ -19,22 +19,31 @@ _LEAST_SHARE = 0.8  # of the grid's places that must be seen
 
 
 def grid_places(points_px: Array, looks: Array, places: list[Place]) -> list[dict[Place, int]]:
-    """Assignments of points to the places (row, column) of a grid, one for each way to turn the grid so that it fits as
-    well as the best one: {place: index of the point}. Empty where no outline fits; the grid is never mirrored.
+    """Assignments of points to the places (row, column) of a grid: {place: index of the point}. The first explains most
+    points; further ones are ways to turn the grid, or to lay it on other points of a larger lattice, that explain as
+    many but for half a line of the grid. A lattice as large as the grid goes before a larger one. Empty where no
+    outline fits; the grid is never mirrored.
 
     points_px (n, 2) may hold strangers; looks (n, k): figures of a point's looks, in which neighbours differ little,
     logarithms of size and contrast. The grid's outline must be seen, a fifth of its places may be missing.
     """
     best: list[dict[Place, int]] = []
     for lattice in _lattices(points_px, looks):
-        for assignment in _outlines(lattice, places):
-            if not best or len(assignment) > len(best[0]):
-                best = [assignment]
-            elif len(assignment) == len(best[0]) and assignment not in best:
-                best.append(assignment)
-        if best and len(best[0]) > 0.98 * len(places):
+        found = _outlines(lattice, places)
+        if found and (not best or _rank(found) > _rank(best)):
+            best = found
+        if best and _rank(best) > (True, 0.98 * len(places)):
             break
     return best
+
+
+def _rank(assignments: list[dict[Place, int]]) -> tuple[bool, int]:
+    return is_whole(assignments), len(assignments[0])
+
+
+def is_whole(assignments: list[dict[Place, int]]) -> bool:
+    """Whether assignments, of the same points all, are of a grid that is no part of a larger lattice."""
+    return len({frozenset(assignment.values()) for assignment in assignments}) == 1
 
 
 def _lattices(points_px: Array, looks: Array) -> list[dict[Place, int]]:
@@ -45,7 +54,7 @@ def _lattices(points_px: Array, looks: Array) -> list[dict[Place, int]]:
     found = [
         _grown(points_px, looks, tree, int(seed)) for seed in np.linspace(0, len(points_px) - 1, _SEEDS).astype(int)
     ]
-    return sorted(found, key=len, reverse=True)[:3]
+    return [lattice for lattice in sorted(found, key=len, reverse=True)[:3] if lattice]
 
 
 def _grown(points_px: Array, looks: Array, tree: cKDTree, seed: int) -> dict[Place, int]:
@@ -90,7 +99,7 @@ def _seed_basis(points_px: Array, tree: cKDTree, seed: int) -> Array | None:
 
 
 def _outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place, int]]:
-    """The ways to lay the grid's outline on a lattice, with as many points as possible."""
+    """The ways to lay the grid's outline on a lattice, those with most points first; others but for half a line."""
     wanted = set(places)
     nodes = np.array(list(lattice)).reshape(-1, 2)
     indices = list(lattice.values())
@@ -106,8 +115,9 @@ def _outlines(lattice: dict[Place, int], places: list[Place]) -> list[dict[Place
             }
             if len(assignment) >= _LEAST_SHARE * len(places) and assignment not in found:
                 found.append(assignment)
-    most = max((len(assignment) for assignment in found), default=0)
-    return [assignment for assignment in found if len(assignment) == most]
+    found.sort(key=len, reverse=True)
+    half_line = 0.5 * min(len({row for row, _ in places}), len({column for _, column in places}))
+    return [assignment for assignment in found if len(assignment) > len(found[0]) - half_line]
 
 
 def _unit_steps(places: list[Place]) -> list[Integers]:

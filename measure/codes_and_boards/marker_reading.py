@@ -29,21 +29,27 @@ def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, board: Mappin
     for outline, number in zip(outlines, _integers(numbers), strict=True):
         if number in board:
             readings.setdefault(number, []).append(np.asarray(outline, float).reshape(4, 2))
-    view = _view(readings, board, (picture.shape[1], picture.shape[0]))
+    half_module = 0.5 / (dictionary.markerSize + 2)
+    view = _view(readings, board, (picture.shape[1], picture.shape[0]), half_module)
     corners: dict[int, Array] = {}
     refused: dict[int, str] = {}
     for number, places in readings.items():
         off = [_off(view, board[number], place) for place in places]
         best = int(np.argmin(np.nan_to_num(off, nan=np.inf)))
-        if off[best] < 1.0 or (len(places) == 1 and np.isnan(off[best])):
+        if off[best] < 1.0 or (len(readings) == len(places) == 1):
             corners[number] = places[best]
-        elif len(places) == 1:
-            refused[number] = f"marker {number} was read where the board's other markers do not have it"
-        else:
+        elif len(places) > 1:
             refused[number] = (
-                f"marker {number} was read at {len(places)} places, and nothing tells which is the board's; "
-                "is there another such board?"
+                f"marker {number} was read at {len(places)} places, and nothing tells which is the board's: "
+                "there may be another such board"
             )
+        elif view is None:
+            refused[number] = (
+                f"marker {number} was read, but the board's markers do not agree on where the board lies: "
+                "there may be another such board"
+            )
+        else:
+            refused[number] = f"marker {number} was read where the board's other markers do not have it"
     return ReadMarkers(corners, refused)
 
 
@@ -53,16 +59,27 @@ def _integers(numbers: object) -> list[int]:
 
 
 def _view(
-    readings: Mapping[int, list[Array]], board: Mapping[int, Array], size_px: tuple[int, int]
+    readings: Mapping[int, list[Array]], board: Mapping[int, Array], size_px: tuple[int, int], half_module: float
 ) -> SheetView | None:
-    """Where the board lies by the markers that were read once; None where not most of them agree."""
+    """Where the board lies by the markers that were read once; None where not most of all that were read agree, or
+    where they are not as large as they would be there: markers of two boards may lie as those of a squeezed one."""
     single = {number: places[0] for number, places in readings.items() if len(places) == 1}
     if len(single) < 2:
         return None
     points = np.concatenate([board[number] for number in single])
     view = robust_view(points, np.concatenate(list(single.values())), size_px)
-    agreeing = sum(_off(view, board[number], place) < 1.0 for number, place in single.items())
-    return view if 2 * agreeing > len(single) else None
+    if view is None:
+        return None
+    misfits = [_misfit(view, board[number], place) for number, place in single.items()]
+    agreeing = sum(
+        min(_off(view, board[number], place) for place in places) < 1.0 for number, places in readings.items()
+    )
+    return view if 2 * agreeing > len(readings) and np.median(misfits) < half_module else None
+
+
+def _misfit(view: SheetView, corners: Array, seen_px: Array) -> float:
+    """How far a marker's corners lie from where the board has them, rms in its sides."""
+    return float(np.sqrt(np.mean(np.sum((view.places_px(corners) - seen_px) ** 2, axis=1)))) / _side_px(seen_px)
 
 
 def _off(view: SheetView | None, corners: Array, seen_px: Array) -> float:
@@ -70,5 +87,9 @@ def _off(view: SheetView | None, corners: Array, seen_px: Array) -> float:
     that is not known."""
     if view is None:
         return np.nan
-    side = float(np.hypot(*(np.roll(seen_px, 1, axis=0) - seen_px).T).max())
-    return float(np.hypot(*(view.places_px(corners) - seen_px).mean(axis=0))) / side
+    return float(np.hypot(*(view.places_px(corners) - seen_px).mean(axis=0))) / _side_px(seen_px)
+
+
+def _side_px(seen_px: Array) -> float:
+    """The longest side of a marker (4, 2) as it is seen."""
+    return float(np.hypot(*(np.roll(seen_px, 1, axis=0) - seen_px).T).max())

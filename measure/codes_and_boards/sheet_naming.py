@@ -175,6 +175,8 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
         return len(tree.query_ball_point(places[point], gate_px)) == 1
 
     shapes = _shapes(view, sheet, dots, pairs)
+    if shapes is None:
+        return None
     like = _alike(dots.pixel_from_disk[list(pairs.values())], shapes[points])
     named = {
         point: dot
@@ -199,11 +201,14 @@ def _unevenness(sheet: Array, points: Indices, residuals: Array) -> Array:
     return np.asarray(np.nanmedian(of_neighbours, axis=1))
 
 
-def _shapes(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Array:
-    """(n, 2, 2) how the dots of all points should look, of the radius on the sheet that most have."""
+def _shapes(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Array | None:
+    """(n, 2, 2) how the dots of all points should look, of the radius on the sheet that most have; None where the view
+    shows no surroundings of any of them."""
     step = 0.01 * float(np.ptp(sheet, axis=0).max())
     unit = view.pixel_from_disks(sheet, step) / step
     areas = _areas(dots.pixel_from_disk[list(pairs.values())]) / _areas(unit[list(pairs)])
+    if not np.isfinite(areas).any():
+        return None
     return np.asarray(unit * np.sqrt(np.nanmedian(areas)))
 
 

@@ -98,6 +98,8 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
             (f"Of the board's markers {len(board.refused)} are not used: {board.refused[0]}.",) if board.refused else ()
         )
         problems = (f"The board was not found: {board.reason}.",) if board.reason else refused
+        if board.ambiguous:
+            problems = (f"No point of the board is used: {board.ambiguous}. Cover all but one, or cut the scan.",)
         # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
         notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
         return with_targets(measured, board.marks, (*problems, *notes))

@@ -1,5 +1,6 @@
 """Boards drawn from their specification, and boards photographed by others with a calibration that was published."""
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -214,6 +215,80 @@ def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> Non
     neither = measured(two)
     assert "was read at 2 places" in neither.reason
     assert all(mark.status is Status.ABSENT for mark in neither.marks)
+
+
+def beside_each_other(spec: BoardSpec, is_dark: Any, shown: tuple[float, ...], fineness: int = 4) -> Array:
+    """Boards of one kind side by side, upright, at 1 mm a pixel times the scale in which each is shown."""
+    extent = np.ptp([point[:2] for point in spec.object_points().values()], axis=0) + 60.0
+    width, height = int(extent[0]), int(extent[1])
+
+    def light(col: Array, row: Array) -> Array:
+        col, row = np.broadcast_arrays(col, row)
+        which = np.clip(col // width, 0, len(shown) - 1).astype(int)
+        scale = np.array(shown)[which]
+        x, y = (col - which * width - 30.0) / scale, (height - row - 30.0) / scale
+        return np.asarray(1.0 - is_dark(x, y))
+
+    clean = drawn(light, width * len(shown), height, 0.8, fineness=fineness)
+    return 8000 + 30000 * clean + np.random.default_rng(4).normal(0, 300, clean.shape)
+
+
+@pytest.mark.parametrize("kind", ["chessboard", "circle-grid"])
+def test_of_boards_that_look_the_same_none_is_observed(kind: str) -> None:
+    """Neither by their size, for nobody knows how far away they are; the reason says how many, and where."""
+    spec: ChessboardSpec | CircleGridSpec
+    if kind == "chessboard":
+        spec = ChessboardSpec(6, 5, 24.0)
+        dark, words = chessboard_dark(spec), "3 boards of 6 x 5 inner corners"
+    else:
+        spec = CircleGridSpec(6, 5, 28.0, 13.0)
+        dark, words = circles_dark(spec), "3 grids of 6 x 5 dots"
+    one = measure_board(scan_of(beside_each_other(spec, dark, (1.0,))), spec)
+    assert not one.ambiguous
+    assert all(mark.status is Status.MEASURED for mark in one.marks)
+    three = measure_board(scan_of(beside_each_other(spec, dark, (1.0, 0.9, 1.0))), spec)
+    assert words in three.ambiguous
+    places = [float(place) for place in re.findall(r"\((\d+), \d+\)", three.ambiguous)]
+    width = np.ptp([point[:2] for point in spec.object_points().values()], axis=0)[0] + 60.0
+    assert sorted(int(place // width) for place in places) == [0, 1, 2]
+    assert {mark.status for mark in three.marks} == {Status.REJECTED}
+    assert {mark.reason for mark in three.marks} == {three.ambiguous}
+
+
+def test_a_circle_grid_is_no_part_of_a_larger_one() -> None:
+    spec, larger = CircleGridSpec(6, 5, 28.0, 13.0), CircleGridSpec(7, 5, 28.0, 13.0)
+    board = measure_board(scan_of(beside_each_other(larger, circles_dark(larger), (1.0,))), spec)
+    assert "a grid of more than 6 x 5 dots" in board.reason
+    assert {mark.status for mark in board.marks} == {Status.ABSENT}
+
+
+def test_a_few_spots_are_no_circle_grid() -> None:
+    """Four of them make no lattice at all."""
+    spec = CircleGridSpec(6, 5, 28.0, 13.0)
+    places = np.array([(40.0, 50.0), (90.0, 52.0), (150.0, 140.0), (260.0, 200.0), (300.0, 90.0)])
+
+    def light(col: Array, row: Array) -> Array:
+        return np.asarray(np.min([np.hypot(col - x, row - y) for x, y in places], axis=0) > 8.0, float)
+
+    board = measure_board(scan_of(8000 + 30000 * drawn(light, 340, 250, 0.8, fineness=4)), spec)
+    assert "no grid of 6 x 5 dots is wholly seen; 5 spots look like dots" in board.reason
+
+
+@pytest.mark.parametrize("gap", [60.0, 130.0])
+def test_markers_of_two_boards_are_not_those_of_one(gap: float) -> None:
+    """Of one board the right column is seen, of another one the left: together they look like a board that is squeezed,
+    and nobody knows which of them is meant."""
+    spec = ArucoSpec("4X4_50", 4, 4, 48.0, 16.0)
+    picture = np.full((296, 110 + int(gap)), 255.0)
+    for row in range(4):
+        top = 20 + 64 * row
+        for number, left in ((4 * row + 3, 10), (4 * row, 48 + int(gap))):
+            marker = cv2.aruco.generateImageMarker(aruco_dictionary("4X4_50"), number, 48)
+            picture[top : top + 48, left : left + 48] = marker
+    noise = np.random.default_rng(2).normal(0, 300, picture.shape)
+    board = measure_board(scan_of(8000 + 120 * cv2.GaussianBlur(picture, (0, 0), 0.8) + noise), spec)
+    assert "do not agree on where the board lies" in board.reason
+    assert all(mark.status is Status.ABSENT for mark in board.marks)
 
 
 @pytest.mark.parametrize(

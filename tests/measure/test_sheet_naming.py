@@ -115,3 +115,16 @@ def test_a_sheet_that_is_not_quite_flat() -> None:
         assert isinstance(naming, Naming), naming
         assert view.wrong(naming) == 0
         assert len(naming.named) >= 0.9 * np.sum(view.origin >= 0)
+
+
+def test_two_codes_of_different_sheets_name_nothing() -> None:
+    """Of one sheet the upper half is seen, of another one like it the lower half; a view through a dot of each may turn
+    its back on the sheet."""
+    sheet = np.array([(48.0 * column, 48.0 * row) for row in range(6) for column in range(7)])
+    moved = np.where(sheet[:, 1:] < 120.0, (0.0, 0.0), (227.66576879, -132.54003258))
+    centers = sheet * (1.0, -1.0) + (100.0, 400.0) + moved
+    shapes = np.repeat(np.diag([7.3, -7.3])[None], 42, axis=0)
+    shapes[0] = shapes[0] @ np.array([[1.0, -0.5948923], [0.0, 1.07725307]])
+    named = name_dots(sheet, Dots(centers, shapes, {21: 21, 0: 0}), (1300, 950))
+    assert isinstance(named, str)
+    assert "do not put the other points of the sheet where dots are" in named

@@ -3,12 +3,14 @@ place is told from what lies off on the board."""
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.files.project_file import Project, read_project
+from pipeline.measuring.measure_stage import measure_scan
 from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.sheet_check import with_checked_sheet
 
@@ -80,3 +82,21 @@ def test_what_one_picture_alone_shows_off_its_place_is_refused(tmp_path: Path) -
     assert {id for _, id in doubted} <= {"r3c4", BUCKLED, MISPRINTED}
     reason = next(mark.reason for mark in alone[0].frame.marks if mark.point == "r3c4")
     assert "no other picture tells" in reason
+
+
+def test_a_scan_of_two_like_boards_says_so(tmp_path: Path) -> None:
+    """And none of their points is an observation."""
+    (tmp_path / "camera.toml").write_text('name = "c"\nframe_mm = [4.2, 1.8]\n', encoding="utf-8")
+    (tmp_path / "project.toml").write_text(
+        'camera = "camera.toml"\nscans = ["two.png"]\npitch_um = 10.0\n'
+        '[targets]\nkind = "chessboard"\ncolumns = 4\nrows = 3\nsquare_mm = 25.0\n',
+        encoding="utf-8",
+    )
+    board = np.kron(np.indices((4, 5)).sum(axis=0) % 2, np.ones((32, 32)))
+    sheet = np.pad(255 * board, 24, constant_values=255)
+    two = cv2.GaussianBlur(np.hstack([sheet, sheet]), (0, 0), 0.8)
+    cv2.imwrite(str(tmp_path / "two.png"), (20 + 0.8 * two).astype(np.uint8))
+    frame = measure_scan(read_project(tmp_path / "project.toml"), "two").frame
+    assert {mark.status for mark in frame.marks} == {Status.REJECTED}
+    words = "No point of the board is used: the scan shows 2 boards of 4 x 3 inner corners"
+    assert frame.problems[-1].startswith(words)
