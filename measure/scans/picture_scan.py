@@ -16,6 +16,7 @@ from measure.scans.segments import Segments
 from measure.scans.tiff_scan import DECODING_ERRORS, broken, orientation_notes, tag_pitch
 
 _JPEG_START, _PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_PNG_DEPTH = 24  # the byte that holds the bits of a sample: IHDR is the first chunk (PNG specification, 11.2.2)
 
 
 def open_picture(path: Path, start: bytes) -> tuple[Segments, Pitch, tuple[str, ...]]:
@@ -70,6 +71,11 @@ def _jpeg_samples(path: Path, data: bytes) -> Samples:
 
 def _png_samples(path: Path, data: bytes) -> Samples:
     """Grey or RGB, 8 or 16 bits."""
+    if data[_PNG_DEPTH : _PNG_DEPTH + 1] == b"\x01":
+        raise MeasurementError(
+            f"{path} is a PNG of black and white pixels only (1 bit), and marks are measured by the grey values along "
+            "their edges: save the scan as grey or RGB with 8 or 16 bits a sample"
+        )
     try:
         return _as_channels(path, imagecodecs.png_decode(data))
     except DECODING_ERRORS as error:

@@ -12,6 +12,7 @@ import pytest
 import tifffile
 from stored_picture import HEIGHT, WIDTH, picture, whole
 
+from measure.errors import MeasurementError
 from measure.scans.scan import open_scan
 
 
@@ -192,6 +193,13 @@ def test_trap_default_dpi_believed(tmp_path: Path, resolution: Any, unit: str, w
     with open_scan(tmp_path / "s.tif") as scan:
         assert scan.pitch_um is None
         assert words in scan.pitch_note
+
+
+def test_trap_black_and_white_png(tmp_path: Path) -> None:
+    black_and_white = 255 * (picture(np.uint8) > 127).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "s.png"), black_and_white, [cv2.IMWRITE_PNG_BILEVEL, 1])
+    with pytest.raises(MeasurementError, match="black and white pixels only"):
+        whole(tmp_path / "s.png")
 
 
 def test_pitch_of_png_and_jpeg(tmp_path: Path) -> None:
