@@ -75,7 +75,7 @@ def measure_fiducials(
     doubts = problems if frame.measured else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = Pose(pose.name, False, (*pose.evidence, *doubts))
-    return present_frame(scan, layout, frame, pose, problems, chance)
+    return present_frame(scan, layout, frame, pose, pitch_um, problems, chance)
 
 
 def _at_first_look(

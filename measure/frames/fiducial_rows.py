@@ -34,10 +34,17 @@ def absent_frame(scan: Scan, layout: FiducialLayout, reason: str, rotation_deg: 
 
 
 def present_frame(
-    scan: Scan, layout: FiducialLayout, frame: Frame, pose: Pose, problems: Sequence[str], chance: str
+    scan: Scan,
+    layout: FiducialLayout,
+    frame: Frame,
+    pose: Pose,
+    pitch_um: tuple[float, float] | None,
+    problems: Sequence[str],
+    chance: str,
 ) -> FrameMeasurement:
-    """Of a frame that was found. problems: why it may lie elsewhere, sentences, beside those that its marks show;
-    chance: why it may be none at all: then none of its marks is certain, nor if it was found at a closer look."""
+    """Of a frame that was found. pitch_um: as given; None: pixels are taken as square. problems: why it may lie
+    elsewhere, sentences, beside those that its marks show; chance: why it may be none at all: then none of its marks is
+    certain, nor if it was found at a closer look."""
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
     if not pose.decided:
         marks = tuple(_of_assumed_name(row, mark) for row, mark in zip(marks, layout.marks, strict=True))
@@ -46,15 +53,16 @@ def present_frame(
         marks = tuple(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
         )
-    problems = (*problems, *_problems(frame))
+    problems = (*problems, *_problems(frame, pitch_um))
     return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights)
 
 
-def _problems(frame: Frame) -> list[str]:
+def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[str]:
     """What the user should look at in the frame itself."""
     problems = []
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
-    if abs(per_mm[0] / per_mm[1] - 1) > 2 * AFFINITY_SIGMA:
+    given = pitch_um or (1.0, 1.0)
+    if abs(per_mm[0] * given[0] / (per_mm[1] * given[1]) - 1) > 2 * AFFINITY_SIGMA:
         problems.append(
             f"by the marks a pixel is {1000 / per_mm[0]:.1f} um wide and {1000 / per_mm[1]:.1f} um tall: film is never "
             "stretched so much. Look whether the scanner, or the camera file, is to blame."
