@@ -3,6 +3,7 @@
 The model of a window is `gain * picture(mark) + offset + slopes`; unknown are the mark's place, if wished its rotation,
 scale and shear, the blur, and four grey-value parameters, all in one Gauss-Newton adjustment. Dust and scratches
 are first weighted down (Tukey's biweight), then cut out where smoothed residuals stand out; the rest decides.
+Where what is left shows a border of the ground, beyond doubt, this enters the model, and all is adjusted once more.
 Where grain correlates the noise, its autocovariance, from the residuals and from blank film beside the mark, weighs the
 last steps and gives the covariance (generalised least squares).
 """
@@ -13,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.fitting.border_search import is_overwhelming, likely_border
+from measure.fitting.bordered_model import BorderedModel
 from measure.fitting.changed_tone import covariance_of_changed_tone
 from measure.fitting.clipping import Sides
 from measure.fitting.generators import is_round
@@ -25,7 +28,7 @@ from measure.fitting.scan_window import ScanWindow
 from measure.fitting.second_order import second_order
 from measure.fitting.second_place import SecondPlace, edge_place, sloping_place
 from measure.marks.rendering import extent_px, frame_beside, known
-from measure.marks.shapes import Mark, MarkTemplate
+from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Polygon
 from measure.match_options import MatchOptions
 from measure.noise.blank_film import blank_patches, is_coloured
 from measure.noise.grain import grain_model
@@ -104,6 +107,7 @@ def match(window: ScanWindow, mark: Mark, pixel_from_mark: Array, options: Match
         if not detail.reason:
             whole = _with_ground(given, detail_part, detail) if fit.reason else fit
             part, fit = detail_part, whole if _is_right(whole) else detail
+    fit = _with_border(given, part, fit)
     result = _result(fit, _surroundings(given, part, fit))
     moved = np.array(result.pixel_from_mark)
     moved[:, 2] += part.corner_px + window.origin_px
@@ -177,6 +181,44 @@ def _with_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
     return fit
 
 
+def _with_border(given: _Given, part: _Part, fit: PictureFit) -> PictureFit:
+    """The mark fitted on a ground with a border, where what the fit leaves shows one beyond doubt and the new fit is
+    right; else the fit as it is."""
+    if not _may_hide_border(given.mark, fit):
+        return fit
+    plain = _begun(given, part, fit.options, None, fit.model.state.moved(np.zeros(2)))
+    plain.choose_area()
+    plain.model.linearise(plain.used)
+    border = likely_border(plain.model, plain.area, fit.floor_dn)
+    if border is None:
+        return fit
+    bordered = _begun(given, part, fit.options, None, kind=BorderedModel)
+    assert isinstance(bordered.model, BorderedModel)
+    bordered.model.begin(plain.model, plain.area, *border)
+    bordered.approach_from_near()
+    bordered.refine()
+    bordered.unround()
+    return bordered if _is_right(bordered) and _has_step(bordered, bordered.model) else fit
+
+
+def _may_hide_border(mark: Mark, fit: PictureFit) -> bool:
+    """Whether a mark left what may be a border of its ground. What has straight edges only looks like one itself; of a
+    disk in perspective, a target, little ground is taken in."""
+    has_lines = isinstance(mark, MarkShape) and not all(isinstance(part, Polygon) for part in mark.parts)
+    if fit.reason or not has_lines or fit.options.freedom == "ellipse":
+        return False
+    noise = noise_model(fit.model.residuals, fit.telling, len(fit.model.design))
+    is_noise = noise.is_white or noise.variance_dn2 < fit.floor_dn**2
+    return not is_noise or fit.damaged_fraction > 0
+
+
+def _has_step(fit: PictureFit, model: BorderedModel) -> bool:
+    """Whether the ground has a step at the border: more than the noise that is left makes."""
+    noise = noise_model(model.residuals, fit.telling, len(model.design)).at_least(fit.floor_dn**2)
+    chi_square = model.step_chi_square(fit.covariance(noise))
+    return is_overwhelming(chi_square, 1, noise, int(fit.telling.sum()) - len(model.design))
+
+
 class _Surroundings(NamedTuple):
     """The whole window (height, width) about a mark: its grey values; free: what may be blank film as that under the
     mark; frame: where it shows the exposed frame that the mark is cut into."""
@@ -191,11 +233,18 @@ def _surroundings(given: _Given, part: _Part, fit: PictureFit) -> _Surroundings:
     where = given.mark, place, width, height, EDGE_BLURS * fit.model.seen_blur_px
     free = given.blank & known(*where)
     free[part.rows, part.cols] &= ~fit.area
+    if isinstance(fit.model, BorderedModel):
+        free &= ~fit.model.near_border(part.corner_px, free.shape)
     return _Surroundings(given.grey, free, given.usable & frame_beside(*where))
 
 
 def _begun(
-    given: _Given, part: _Part, options: MatchOptions, coarse_px: float | None, state: State | None = None
+    given: _Given,
+    part: _Part,
+    options: MatchOptions,
+    coarse_px: float | None,
+    state: State | None = None,
+    kind: type[PictureModel] = PictureModel,
 ) -> PictureFit:
     rows, cols = part
     start, ends, usable = given.start.copy(), given.sides[rows, cols], given.usable[rows, cols]
@@ -203,7 +252,7 @@ def _begun(
     if coarse_px is not None:
         # What is left of a clipped grey value without its surroundings is no limit of anything.
         usable, ends = usable & (ends == 0), np.zeros_like(ends)
-    model = PictureModel(given.grey[rows, cols], ends, given.mark, start, options, coarse_px)
+    model = kind(given.grey[rows, cols], ends, given.mark, start, options, coarse_px)
     model.state = state or model.state
     return PictureFit(model, usable, given.is_lossy)
 
@@ -246,7 +295,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
         center_px=state.pixel_from_mark[:, 2],
         covariance_px2=covariance[:2, :2],
         pixel_from_mark=state.pixel_from_mark,
-        contrast_dn=float(state.greys[0]),
+        contrast_dn=model.contrast_dn,
         noise_dn=float(np.sqrt(noise.variance_dn2)),
         blur_px=model.scan_blur_px,
         damaged_fraction=fit.damaged_fraction,
@@ -254,7 +303,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
         neighbour_correlation=noise.neighbour_correlation,
         covariance_is_white=noise.is_white,
         likeness=_likeness(fit),
-        significance=fit.contrast_dn / precision.gain_sigma,
+        significance=fit.contrast_dn / precision.contrast_sigma,
         blur_sigma=_blur_sigma(model, covariance),
         size_sigma=float(np.sqrt(covariance[2, 2])) if model.tells_size else np.inf,
         edges=precision.edges,
@@ -266,10 +315,10 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
 
 class _Precision(NamedTuple):
     """What the noise makes of a fit: the covariance of its unknowns (unknowns, unknowns), the standard deviation of the
-    gain, and what the linearised fit says beside the unknowns, as `Match` has it."""
+    contrast, and what the linearised fit says beside the unknowns, as `Match` has it."""
 
     covariance: Array
-    gain_sigma: float
+    contrast_sigma: float
     edges: SecondPlace | None = None
     sloping: SecondPlace | None = None
     own_shape: OwnShape | None = None
@@ -280,7 +329,10 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     model = fit.model
     covariance, by_grey = fit.weigh(noise)
     priors_dn2 = model.prior_weights() * noise.variance_dn2
-    covariance[:2, :2] *= 1 + second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
+    own = model.apart_from_border
+    covariance[:2, :2] *= 1 + second_order(
+        model.design[own], model.slopes, fit.used, covariance[np.ix_(own, own)], priors_dn2[own]
+    )
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))
         covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
@@ -291,7 +343,7 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     tells_shape = freedom == "similarity" and not is_round(model.mark)
     return _Precision(
         covariance,
-        gain_sigma=float(np.sqrt(max(covariance[-GREY, -GREY], 1e-12))),
+        contrast_sigma=float(np.sqrt(max(float(model.contrast_by @ covariance @ model.contrast_by), 1e-12))),
         edges=edge_place(linear, model.blur_px),
         sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
         own_shape=own_shape(linear, model.linear, model.departures()) if tells_shape else None,

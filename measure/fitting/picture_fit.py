@@ -62,6 +62,14 @@ class PictureFit:
         if not self.reason:
             self._adjust(robust=True, tolerance_px=0.05)
 
+    def approach_from_near(self) -> None:
+        """Plain, from a state that is right but for what is new in the model."""
+        self.choose_area()
+        if not self.reason:
+            self._adjust(robust=False, tolerance_px=0.05)
+        if self.reason == _UNSETTLED:
+            self.reason = ""
+
     def refine(self) -> None:
         """Robust from there, then on what is undamaged."""
         self.model.bent = BENT
@@ -132,6 +140,10 @@ class PictureFit:
             covariance[:2, :2] += np.sum(moved**2) / 2 * np.eye(2)
         return covariance, by_grey
 
+    def covariance(self, noise: NoiseModel) -> Array:
+        """(unknowns, unknowns) of a fit that took the noise as white."""
+        return self._plain_covariance(noise)[0]
+
     def _plain_covariance(self, noise: NoiseModel) -> tuple[Array, Array]:
         """As `weigh` gives them, of an adjustment that took the noise as white."""
         variance = max(noise.variance_dn2, _LEAST_VARIANCE_DN2)
@@ -172,7 +184,7 @@ class PictureFit:
 
     @property
     def contrast_dn(self) -> float:
-        return abs(float(self.model.state.greys[0]))
+        return abs(self.model.contrast_dn)
 
     @property
     def floor_dn(self) -> float:
