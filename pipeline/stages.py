@@ -125,6 +125,7 @@ def _measured(project: Project) -> ReportData:
         comparator=read_comparator(project.comparator),
         measurement=_json(project.measurement_path),
         frame_mm=_frame_sizes(project),
+        unit=project.unit,
     )
 
 

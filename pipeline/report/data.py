@@ -47,7 +47,7 @@ class ReportData:
     comparator: the rows of comparator.csv. measurement, adjustment, check: the contents of measurement.json,
     adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed frame by
     camera name. thumbnail: from image, point and kind (a fiducial and a target may share a name) to the mark's picture.
-    problems: what the caller has to say beyond the files.
+    problems: what the caller has to say beyond the files. unit: of the object coordinates.
     """
 
     project: str
@@ -59,3 +59,4 @@ class ReportData:
     frame_mm: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     thumbnail: Callable[[str, str, str], Thumbnail | None] | None = None
     problems: tuple[Problem, ...] = ()
+    unit: str = "m"

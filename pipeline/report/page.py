@@ -54,6 +54,7 @@ def _context(data: ReportData) -> dict[str, Any]:
     adjustment = data.adjustment
     return {
         "project": data.project,
+        "unit": data.unit,
         "verdict": judge(data),
         "adjustment": adjustment,
         "check": data.check,

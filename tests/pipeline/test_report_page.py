@@ -164,6 +164,11 @@ def test_given_coordinates_without_scans(adjusted: ReportData) -> None:
     assert "No pixel positions are known: the comparator coordinates were given." in text
 
 
+def test_exterior_orientations_stand_in_the_users_unit(adjusted: ReportData) -> None:
+    assert "Exterior orientation (m, degrees)" in rendered(adjusted).text
+    assert "Exterior orientation (mm, degrees)" in rendered(replace(adjusted, unit="mm")).text
+
+
 def test_no_check_against_opencv_yet(adjusted: ReportData) -> None:
     assert "It has not been made: run reseau check ." in rendered(replace(adjusted, check=None)).text
 
