@@ -44,11 +44,12 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """A frame's marks as the median of the other frames has them: mm (n, 2), and the median's variance (n,) in units of
-    one mark's."""
+    """A frame's marks as the median of the other frames has them: mm (n, 2). variance (n,): the median's, in units of
+    one mark's; measured_mm2 (n,): what of it the other frames' standard deviations make."""
 
     mm: Array
     variance: Array
+    measured_mm2: Array
 
 
 def cross_checked(
@@ -133,6 +134,10 @@ def _others(seen: Sequence[_Seen], layout: FiducialLayout) -> list[_Reference | 
     """
     common = np.array([mark.xy_mm for mark in layout.marks])
     fitted = np.full((len(seen), *common.shape), np.nan)
+    squares = np.full(fitted.shape[:2], np.nan)  # of the marks' standard deviations: frames may be unlike in noise
+    for each, own in zip(seen, squares, strict=True):
+        if len(each.index) > 3:
+            own[each.index] = np.maximum(each.sigma_mm, _LEAST_MM) ** 2
     for _ in range(_ROUNDS):
         for each, places in zip(seen, fitted, strict=True):
             places[:] = np.nan
@@ -148,7 +153,9 @@ def _others(seen: Sequence[_Seen], layout: FiducialLayout) -> list[_Reference | 
         if len(each.index) == 0 or not frames.all():
             result.append(None)
         else:
-            result.append(_Reference(np.nanmedian(rest, axis=0), np.minimum(np.pi / 2, frames / 2 + 0.5) / frames))
+            variance = np.minimum(np.pi / 2, frames / 2 + 0.5) / frames
+            measured = variance * np.nanmedian(np.delete(squares, place, axis=0)[:, each.index], axis=0)
+            result.append(_Reference(np.nanmedian(rest, axis=0), variance, measured))
     return result
 
 
@@ -182,9 +189,10 @@ class _Apart:
         q = np.linalg.qr(_affine(seen.camera_mm))[0]
         own = np.maximum(1 - (q**2).sum(axis=1), 1e-6)  # of a mark's error what its residual shows
         from_marks = (np.eye(len(q)) - q @ q.T) / own[:, None]
-        shares = from_marks**2 * (1 + reference.variance)
+        film = from_marks**2 @ (1 + reference.variance)
+        measured = from_marks**2 @ (np.maximum(seen.sigma_mm, _LEAST_MM) ** 2 + reference.measured_mm2)
         squares = ((from_marks @ reference.mm) ** 2).sum(axis=1)
-        return cls(squares, shares.sum(axis=1), shares @ np.maximum(seen.sigma_mm, _LEAST_MM) ** 2)
+        return cls(squares, film, measured)
 
     @property
     def degrees(self) -> int:

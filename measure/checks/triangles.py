@@ -100,7 +100,8 @@ def _against_others(
         measured = np.array([form.covariance(FILM_MM) for form in left.values()])
         scatter = _scatter(stretched - np.median(stretched, axis=0), measured) * np.eye(_FORM)
         apart = stretched - [np.median(np.delete(stretched, n, axis=0), axis=0) for n in range(len(places))]
-        covariances = (measured + scatter) * (1 + np.pi / 2 / (len(places) - 1))  # with the median's own
+        of_others = (measured.sum(axis=0) - measured) / (len(places) - 1) + scatter
+        covariances = measured + scatter + np.pi / 2 / (len(places) - 1) * of_others  # with the median's own
         misfits = np.array([_misfit(*each) for each in zip(apart, covariances, strict=True)])
         worst = max((n for n, place in enumerate(places) if place in three), key=lambda n: misfits[n])
         degrees = MEDIAN_EFFICIENCY * _FORM * (len(places) - 1)
