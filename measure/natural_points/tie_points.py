@@ -5,7 +5,7 @@ by its own pictures and by comparison with all others.
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,6 +18,7 @@ from scipy.stats import norm
 from measure.natural_points.bending import Bending, bending_variance
 from measure.natural_points.epipolar import contradicting
 from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
+from measure.natural_points.neighbours import astray
 from measure.natural_points.tie_candidates import TieCandidate, widened
 from measure.natural_points.tie_frame import TieFrame
 from measure.noise.noise import robust_scale
@@ -25,6 +26,7 @@ from measure.scans.parallel import mapped
 from measure.scans.scan import open_scan
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Windows = dict[int, tuple[NDArray[np.float32], tuple[int, int]]]
 
 _RADII_PX = (RADIUS_PX, 21, 30)  # of patches: where the texture is too weak for one, of twice its area
@@ -32,6 +34,8 @@ _WIDEST_PX = 2.0 * _RADII_PX[-1]
 _LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
 _FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
 _CHUNK = 16  # points that a worker gets at a time
+_OFF_LINES = "the point lies off the epipolar lines of the other scans, unlike its neighbours"
+_ASTRAY = "the points about it map elsewhere from scan to scan: ground that repeats itself may have been mistaken"
 _CHANCE = 1e-4  # that a test refuses a right point
 _PRECISE_PX = 0.125  # rms length of the error of the weakest measured point: half a pixel is four times as much
 
@@ -218,7 +222,8 @@ def _judge(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
             if point.matched[frame].unevenness < _CHANCE
         }
     _refuse_strange_pictures(points)
-    _refuse_contradictions(frames, points)
+    _refuse_contradictions(frames, points, partial(contradicting, tolerance=_FINE_PX), _OFF_LINES)
+    _refuse_contradictions(frames, points, astray, _ASTRAY)
 
 
 def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
@@ -237,9 +242,12 @@ def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
                 point.refused[frame] = "the picture about the point is unlike that in the other scans: something else"
 
 
-def _refuse_contradictions(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
-    """Where a point lies off the epipolar geometry of two frames, unlike the points about it. It is then wrong in the
-    frame that all its contradictions have in common, or, where it cannot be told, in all."""
+def _refuse_contradictions(
+    frames: Sequence[TieFrame], points: Sequence[TiePoint], differ: Callable[[Array, Array], Mask], reason: str
+) -> None:
+    """Where two frames contradict each other in a point, unlike the points about it: differ tells which do of the
+    places (n, 2) of points in both. It is then wrong in the frame that all its contradictions have in common, or, where
+    it cannot be told, in all."""
     against: dict[int, list[set[int]]] = defaultdict(list)
     for i, j in combinations(range(len(frames)), 2):
         both = [k for k, point in enumerate(points) if i in point.standing and j in point.standing]
@@ -247,10 +255,10 @@ def _refuse_contradictions(frames: Sequence[TieFrame], points: Sequence[TiePoint
             frames[frame].camera_px(np.array([points[k].matched[frame].center_px for k in both]).reshape(-1, 2))
             for frame in (i, j)
         )
-        for k in np.array(both, dtype=int)[contradicting(first, second, _FINE_PX)]:
+        for k in np.array(both, dtype=int)[differ(first, second)]:
             against[int(k)].append({i, j})
     for k, pairs in against.items():
         common = set.intersection(*pairs)
         wrong = common if len(pairs) > 1 and len(common) == 1 else set(points[k].standing)
         for frame in wrong:
-            points[k].refused[frame] = "the point lies off the epipolar lines of the other scans, unlike its neighbours"
+            points[k].refused[frame] = reason
