@@ -1,13 +1,15 @@
 """The simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
-from adjust.errors import AdjustmentError
+from adjust.errors import AdjustmentError, NoImageError
 from adjust.initial_values.approximations import approximate
+from adjust.initial_values.far_points import far_points
 from adjust.least_squares.kept_memory import keep_freed_memory
 from adjust.network import STRAIGHT, Approximations, Network
 from adjust.options import Datum, Method, Options
@@ -16,6 +18,7 @@ from adjust.quality.assessment import RunAssessment
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.result import Adjustment, Cofactor
 from adjust.runs import Run, again, run
+from adjust.slips import Slip, few_points, freed, slips
 from adjust.undetermined.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.undetermined.datum_choice import chosen_coordinates, chosen_points, with_held
 from adjust.validation import validate
@@ -32,7 +35,8 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     (Torlegård, equations F1 to F9). The cofactor matrix is that of all unknowns, nothing held fixed but what a standard
     deviation of 0 fixes. A singular network is a result with its null directions, not an error: its values are the
     approximations, its cofactor matrix is zero and means nothing. Where the iteration does not come to rest it is begun
-    anew from approximations found from the network itself, and a warning says so.
+    anew from approximations found from the network itself, and a warning says so. Given points that are far off are
+    named where the observations do not agree for them; robust estimation and data snooping begin without them.
 
     Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
     has no image, or where the chosen datum does not hold the object space.
@@ -40,10 +44,63 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     keep_freed_memory()
     validate(network)
     options = options or Options()
-    result = adjust_problem(number(network, approximations, options.method == "elements"), options)
-    if result.termination in ("converged", "singular"):
+    if options.robust or options.snooping:
+        result = _without_slips(network, approximations, options)
+        if result is not None and result.converged:
+            return result
+    try:
+        result = adjust_problem(_numbered(network, approximations, options), options)
+    except NoImageError as error:
+        if found := _slips(network, approximations, options):
+            raise AdjustmentError(" ".join(slip.sentence for slip in found)) from error
+        raise
+    if result.termination not in ("converged", "singular"):
+        result = _begun_anew(network, approximations, options, result)
+    if result.termination == "singular" or _agrees(result, options):
         return result
-    return _begun_anew(network, approximations, options, result)
+    if found := _slips(network, approximations, options):
+        return replace(result, slips=tuple(slip.sentence for slip in found))
+    return result if result.converged else replace(result, remarks=(*result.remarks, *few_points(network)))
+
+
+def _numbered(network: Network, approximations: Approximations, options: Options) -> Problem:
+    return number(network, approximations, options.method == "elements")
+
+
+def _agrees(result: Adjustment, options: Options) -> bool:
+    """Whether chance alone explains v'Pv."""
+    chance = result.redundancy < 1 or chdtrc(result.redundancy, result.vpv) > options.probabilities.family
+    return result.converged and bool(chance)
+
+
+def _without_slips(network: Network, approximations: Approximations, options: Options) -> Adjustment | None:
+    """Robust estimation or data snooping that begins without the given points that are slips; None without any.
+
+    From an adjustment with a slip in it neither finds back: its linear equations say nothing of errors so large.
+    """
+    found = _slips(network, approximations, options)
+    if not found:
+        return None
+    _, start = freed(network, approximations, [slip.far for slip in found])
+    problem = _numbered(network, start, options)
+    doubted = [int(position) for slip in found for position in problem.unknowns.point[slip.far.name]]
+    try:
+        return adjust_problem(problem, options, doubted=doubted)
+    except NoImageError:
+        return None
+
+
+def _slips(network: Network, approximations: Approximations, options: Options) -> list[Slip]:
+    """The given points that contradict, beyond chance, an adjustment that knows nothing of their coordinates."""
+    far = far_points(_numbered(network, approximations, options), options.probabilities.family)
+    if not far:
+        return []
+    without, start = freed(network, approximations, far)
+    plain = replace(options, robust=False, snooping=False, variance_components=False)
+    try:
+        return slips(network, far, adjust_problem(_numbered(without, start, plain), plain), options)
+    except AdjustmentError:  # without these points it cannot even begin
+        return []
 
 
 def _begun_anew(network: Network, approximations: Approximations, options: Options, stopped: Adjustment) -> Adjustment:
@@ -54,7 +111,7 @@ def _begun_anew(network: Network, approximations: Approximations, options: Optio
         return stopped
     if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
         return stopped
-    result = adjust_problem(number(network, own, options.method == "elements"), options)
+    result = adjust_problem(_numbered(network, own, options), options)
     if not result.converged:
         return stopped
     warning = (
@@ -65,11 +122,15 @@ def _begun_anew(network: Network, approximations: Approximations, options: Optio
     return replace(result, remarks=(warning, *result.remarks))
 
 
-def adjust_problem(problem: Problem, options: Options, held: Iterable[int] = ()) -> Adjustment:
-    """The same with a network whose quantities are numbered; those at the positions `held` stay where they start."""
+def adjust_problem(
+    problem: Problem, options: Options, held: Iterable[int] = (), doubted: Collection[int] = ()
+) -> Adjustment:
+    """The same with a network whose quantities are numbered; those at the positions `held` stay where they start, the
+    given values of those `doubted` are left out to begin with (see `run`).
+    """
     members = chosen_points(problem, options.datum_points)
     solved = with_datum(problem, options)
-    solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options)
+    solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted)
     if options.datum == "free":
         solution = _freed(problem, solution, members, options)
     result = _result(solution, _cofactor(problem, solution, members if options.datum == "free" else None), options)

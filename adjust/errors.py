@@ -7,3 +7,7 @@ class AdjustmentError(Exception):
     The message says what is wrong, at which image, point or mark, what would be right and what to do. A singular
     network is no error: it is a result whose null directions are named.
     """
+
+
+class NoImageError(AdjustmentError):
+    """An adjustment that cannot start, for with the approximations some point has no image."""

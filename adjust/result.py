@@ -212,6 +212,7 @@ class Adjustment:
     weights (n,): the factors that robust estimation left on the weights of the observations, 1 without it.
     variance_factors: the factors found for the variances of groups, where asked for.
     remarks: on how the adjustment came about, the first of the warnings.
+    slips: sentences on given points so far off that the observations do not agree, or have no solution, for them.
     """
 
     network: Network
@@ -231,6 +232,7 @@ class Adjustment:
     weights: Array = field(default_factory=lambda: np.empty(0))
     variance_factors: Mapping[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    slips: tuple[str, ...] = ()
 
     @property
     def residuals(self) -> Residuals:
@@ -262,8 +264,9 @@ class Adjustment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should look at."""
-        return (*self.remarks, *self.assessment.warnings)
+        """What the user should look at; where slips kept it from a solution, all else there seems to be is theirs."""
+        spoilt = self.slips and not self.converged
+        return (*self.slips, *self.remarks, *(() if spoilt else self.assessment.warnings))
 
     @property
     def converged(self) -> bool:

@@ -1,11 +1,13 @@
 """Adjustments one after the other, until the residuals ask for no other weights."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adjust.errors import AdjustmentError
+from adjust.errors import NoImageError
 from adjust.functional_model.functions import blind_mark
 from adjust.least_squares.factor import Factor
 from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
@@ -24,12 +26,14 @@ ROUNDS = 30  # of robust estimation, of variance components or of data snooping 
 ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway
 
 
-def run(problem: Problem, options: Options) -> "Run":
+def run(problem: Problem, options: Options, doubted: Collection[int] = ()) -> "Run":
     """Adjust a problem, whose datum is settled, from where it starts.
 
-    Raises AdjustmentError where a point has no image there.
+    doubted: quantities whose given values robust estimation and data snooping begin without; where these agree with
+    the rest they come back. Raises NoImageError where a point has no image there.
     """
-    return _snooping(problem, options) if options.snooping else _settled(_first(problem, options), options)
+    begun = _snooping if options.snooping else _weighted
+    return begun(problem, options, doubted)
 
 
 @dataclass(frozen=True)
@@ -68,10 +72,21 @@ class Run:
         return self.solution.factor is not None
 
 
-def _first(problem: Problem, options: Options) -> Run:
+def _first(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
     units = TestedUnits(problem)
     factors = {group: 1.0 for group in options.groups if (units.groups == group).any()}
-    return _run(problem, Weighting(np.ones(len(units)), factors), problem.start(), options.iteration_limit)
+    weights = np.ones(len(units))
+    weights[_units_of(units, doubted)] = NO_WEIGHT
+    return _run(problem, Weighting(weights, factors), problem.start(), options.iteration_limit)
+
+
+def _units_of(units: TestedUnits, quantities: Collection[int]) -> NDArray[np.intp]:
+    """The given values that stand alone, of some quantities."""
+    return len(units) - len(units.positions) + np.flatnonzero(np.isin(units.positions[:, 0], list(quantities)))
+
+
+def _weighted(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
+    return _settled(_first(problem, options, doubted), options)
 
 
 def _settled(last: Run, options: Options) -> Run:
@@ -107,13 +122,19 @@ def again(last: Run, weighting: Weighting, limit: int, state: State | None = Non
     return replace(_run(last.problem, weighting, state or last.end.state, limit), removed=last.removed)
 
 
-def _snooping(problem: Problem, options: Options) -> Run:
+def _snooping(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
     """Adjust without what contradicts the others, until nothing does and what was taken out would do so again.
 
     Variance components come second: those of contaminated groups would hide what contaminates them.
     """
     plain = replace(options, variance_components=False)
-    last = _snooped(_first(problem, plain), plain)
+    last = _first(problem, plain, doubted)
+    if doubted and last.found is not None:
+        tests = statistics(last.found, last.weighting.weights)
+        left_out = map(int, _units_of(TestedUnits(problem), doubted))
+        removed = (Contradiction(unit, float(tests.statistic[unit]), 0.0, tests.error[unit], ()) for unit in left_out)
+        last = replace(last, removed=tuple(removed))
+    last = _snooped(last, plain)
     if not options.groups:
         return last
     factors = {group: 1.0 for group in options.groups if (TestedUnits(problem).groups == group).any()}
@@ -148,7 +169,7 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
     numbering = Numbering(weighted)
     start = linearise(numbering, covariance, state)
     if start is None:
-        raise AdjustmentError(
+        raise NoImageError(
             f"The adjustment cannot start: with the approximations, {blind_mark(problem, state)}. Check the "
             f"approximate orientation of the image, and the sign of W: M rotates from object to camera, which looks "
             f"along its negative z axis."

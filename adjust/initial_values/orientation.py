@@ -120,7 +120,9 @@ def _why_not_oriented(block: Block, image: str) -> str:
         return f"image {image} sees {len(xyz)} known points; resection needs 3, and 4 to be unique. Either {remedy}"
     if len(xyz) == 3:
         return f"image {image} sees 3 known points, which leave several orientations or none. Either {remedy}"
+    which = " (four points do not tell which of them is wrong)" if len(xyz) == 4 else ""
     return (
         f"image {image} sees {len(xyz)} known points, but no orientation brings them where they were measured, or they "
-        f"lie on one line. Check the point numbers, the principal distance and the sign of y, or {remedy}"
+        f"lie on one line. Check the point numbers and coordinates{which}, the principal distance and the sign of y, "
+        f"or {remedy}"
     )

@@ -4,8 +4,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from reference_cases import CASES
+from simulated import field_points, simulated
+from simulated_project import write_project as write_network
 from test_cases import write_project
 
 from pipeline.cli import run
@@ -55,6 +58,28 @@ def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, t
     if "variance" in adjust:
         assert result["variance_sigmas"].keys() == {"target", "fiducial"}
         assert "Variance components: what the variances" in report
+
+
+@pytest.mark.parametrize("adjust", ["", "snooping = true\n"])
+def test_a_control_point_with_exchanged_coordinates_is_named(adjust: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    network, _ = simulated(rng, points=field_points(rng, 15), fiducial_sigma=0.01, point_sigma=0.05)
+    project = write_network(network, tmp_path)
+    project.write_text(project.read_text(encoding="utf-8") + adjust, encoding="utf-8")
+    file = tmp_path / "points.csv"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    name, x, y, *rest = lines[1].split(",")
+    file.write_text("\n".join([lines[0], ",".join([name, y, x, *rest]), *lines[2:]]) + "\n", encoding="utf-8")
+    assert run(["adjust", str(project)]) == 1
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    left_out = {suspect["name"] for suspect in result["suspects"] if suspect["removed"]}
+    if adjust:
+        assert left_out == {f"control point {name} X", f"control point {name} Y"}
+        assert result["sigma0"] < 1.2
+    else:
+        assert left_out == set()
+        assert result["warnings"][0].startswith(f"Control point {name} is not where it is given")
+        assert "X and Y look exchanged." in result["warnings"][0]
 
 
 @pytest.mark.parametrize(
