@@ -44,10 +44,9 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
     keep_freed_memory()
     validate(network)
     options = options or Options()
-    if options.robust or options.snooping:
-        result = _without_slips(network, approximations, options)
-        if result is not None and result.converged:
-            return result
+    begun = _without_slips(network, approximations, options) if options.robust or options.snooping else None
+    if begun is not None and begun.converged:
+        return begun if _agrees(begun, options) else _with_slips(begun, network, approximations, options)
     try:
         result = adjust_problem(_numbered(network, approximations, options), options)
     except NoImageError as error:
@@ -58,6 +57,11 @@ def adjust(network: Network, approximations: Approximations, options: Options | 
         result = _begun_anew(network, approximations, options, result)
     if result.termination == "singular" or _agrees(result, options):
         return result
+    return _with_slips(result, network, approximations, options)
+
+
+def _with_slips(result: Adjustment, network: Network, approximations: Approximations, options: Options) -> Adjustment:
+    """The same, with what is to be said of given points where the observations do not agree."""
     if found := _slips(network, approximations, options):
         return replace(result, slips=tuple(slip.sentence for slip in found))
     return result if result.converged else replace(result, remarks=(*result.remarks, *few_points(network)))

@@ -86,15 +86,21 @@ def _units_of(units: TestedUnits, quantities: Collection[int]) -> NDArray[np.int
 
 
 def _weighted(problem: Problem, options: Options, doubted: Collection[int]) -> Run:
-    return _settled(_first(problem, options, doubted), options)
+    return _settled(_first(problem, options, doubted), options, _units_of(TestedUnits(problem), doubted))
 
 
-def _settled(last: Run, options: Options) -> Run:
-    """Adjust until the weights that robust estimation and variance components ask for are those that were used."""
+def _settled(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
+    """Adjust until the weights that robust estimation and variance components ask for are those that were used.
+
+    doubted: units that the redescending function is the first to weigh: the little that Huber's leaves an error of
+    many thousand sigma is enough to bend the network.
+    """
     limit = min(options.iteration_limit, ITERATIONS_A_ROUND) if options.robust else options.iteration_limit
     for function in options.weight_functions or (None,):
         for _ in range(ROUNDS):
             refined = _reweighted(last, options, function)
+            if function == "huber" and options.robust == "igg3":
+                refined.weights[list(doubted)] = NO_WEIGHT
             if not refined.differs(last.weighting):
                 break
             last = again(last, refined, limit)
