@@ -22,6 +22,8 @@ from adjust.quality.variance_components import refined_factors
 from adjust.result import NullDirection, Termination
 from adjust.undetermined.diagnosis import singular_directions
 
+Array = NDArray[np.float64]
+
 ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most
 ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway
 
@@ -181,10 +183,10 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
             f"along its negative z axis."
         )
     singular = singular_directions(weighted, state, numbering.free, start.factor)
-    if singular:
-        solution = Solution(start, None, "singular", ())
-        return Run(problem, numbering, weighting, solution, singular, start.factor)
-    solution = iterate(numbering, covariance, start, limit)
+    begun = _regular_start(weighted, covariance, state, limit) if singular else start
+    solution = iterate(numbering, covariance, begun, limit) if begun else None
+    if solution is None or (singular and solution.termination != "converged"):
+        return Run(problem, numbering, weighting, Solution(start, None, "singular", ()), singular, start.factor)
     factor = solution.end.factor
     singular = singular_directions(weighted, solution.end.state, numbering.free, factor)
     if singular:
@@ -192,3 +194,27 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
         solution = replace(solution, factor=None, termination=ended)
         return Run(problem, numbering, weighting, solution, singular, factor)
     return Run(problem, numbering, weighting, solution, (), factor)
+
+
+def _regular_start(problem: Problem, covariance_mm2: Array, state: State, limit: int) -> Linearised | None:
+    """Where a network is regular that is singular where it starts: at the adjusted exterior orientations, with the
+    cameras held as they start. None where it is singular there, too, or that adjustment finds no solution.
+
+    Approximations without known planimetry look straight down: from parallel axes heights never tell a principal
+    distance, but from those of tilted images they do.
+    """
+    unknowns = problem.unknowns
+    cameras = np.concatenate([np.asarray(each, dtype=np.intp) for each in unknowns.camera.values()])
+    held = replace(problem, unknowns=unknowns.fixed(cameras[np.isinf(unknowns.sigma[cameras])]))
+    numbering = Numbering(held)
+    start = linearise(numbering, covariance_mm2, state)
+    if start is None or singular_directions(held, state, numbering.free, start.factor):
+        return None
+    solution = iterate(numbering, covariance_mm2, start, limit)
+    if solution.termination != "converged":
+        return None
+    whole = Numbering(problem)
+    begun = linearise(whole, covariance_mm2, solution.end.state)
+    if begun is None or singular_directions(problem, solution.end.state, whole.free, begun.factor):
+        return None
+    return begun

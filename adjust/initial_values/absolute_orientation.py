@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 STARTS = 400  # attitudes tried, some 25 degrees apart
 REFINED = 12
 AS_GOOD = 1e-5  # sum of squares, relative to that of the coordinates: a solution as good as the best
+REWEIGHTINGS = 6  # of least distances
 SINGULAR = 1e-6  # smallest over largest singular value of the derivatives by a turn
 
 
@@ -53,6 +54,34 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
     return max(
         candidates, key=lambda s: float(s.apply(stations)[:, 2].mean() - s.apply(model)[:, 2].mean()), default=None
     )
+
+
+def levelled(model: Array, heights: Array, stations: Array) -> Similarity | None:
+    """The similarity that brings model points (n, 3) to their heights (n,), gross errors tolerated; X and Y are level
+    axes through the model's middle, whichever.
+
+    stations (k, 3): the cameras in the model, which stand above the points. None where heights do not tell the scale:
+    over a flat field they are alike, and in a model of poor images they may fall where it rises.
+    """
+    weights = np.ones(len(model))
+    for _ in range(REWEIGHTINGS):
+        middle, height = np.average(model, axis=0, weights=weights), float(np.average(heights, weights=weights))
+        offsets, relief = model - middle, heights - height
+        squares = float((weights * relief**2).sum())
+        if squares == 0.0:
+            return None
+        rise = (weights * relief) @ offsets / squares
+        left = offsets - np.outer(relief, rise)
+        up = np.linalg.svd(np.sqrt(weights)[:, np.newaxis] * left, full_matrices=False)[2][2]
+        distance = np.abs(left @ up)
+        weights = 1.0 / np.maximum(distance, 0.1 * np.median(distance) + np.finfo(float).tiny)
+    up = up if np.mean((stations - middle) @ up) > 0 else -up
+    if rise @ up <= 0.0:
+        return None
+    right = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)
+    right /= np.linalg.norm(right)
+    scale, rotation = 1.0 / float(rise @ up), np.stack([right, np.cross(up, right), up])
+    return Similarity(scale, rotation, np.array([0.0, 0.0, height]) - scale * rotation @ middle)
 
 
 def _centred(xyz: Array, given: NDArray[np.bool_]) -> Array:

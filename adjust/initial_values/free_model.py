@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.sight import Sight
-from adjust.initial_values.absolute_orientation import Similarity, absolute_orientation
+from adjust.initial_values.absolute_orientation import Similarity, absolute_orientation, levelled
 from adjust.initial_values.block import Block, extend
 from adjust.initial_values.relative_orientation import relative_poses
 from adjust.initial_values.resection import Pose, image_distances
@@ -23,21 +23,23 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
 
     known: coordinates (3,) by point, nan where unknown. A pair of images is oriented relatively, all others are
     resected from its points, and so on; of several pairs, and several solutions of each, the model that holds most
-    images, and among these the smallest residuals, is taken and oriented absolutely. With no coordinate known at all
-    the model keeps the axes of its first image and a base of 1.
+    images, and among these the smallest residuals, is taken and oriented absolutely; by heights alone where nothing
+    else is known. With no coordinate known at all the model keeps the axes of its first image and a base of 1.
     """
     models = [model for first, second in _pairs(sights) for model in _models(sights, first, second)]
     if not models:
         return {}
-    best = min(models, key=lambda model: (-len(model.poses), _typical_residual(model)))
+    best = min(models, key=lambda model: (-len(model.poses), typical_residual(model)))
     if all(np.isnan(xyz).all() for xyz in known.values()):
         return best.poses
     names = sorted(best.points)
-    similarity = absolute_orientation(
-        np.array([best.points[name] for name in names]),
-        np.array([known[name] for name in names]),
-        np.array([best.poses[image].center for image in sorted(best.poses)]),
-    )
+    model, stations = (np.array(each) for each in ([best.points[name] for name in names], _stations(best)))
+    xyz = np.array([known[name] for name in names])
+    with_height = ~np.isnan(xyz[:, 2])
+    if np.isnan(xyz[:, :2]).all() and with_height.sum() > FEWEST_SHARED:
+        similarity = levelled(model[with_height], xyz[with_height, 2], stations)
+    else:
+        similarity = absolute_orientation(model, xyz, stations)
     return {} if similarity is None else {image: _moved(pose, similarity) for image, pose in best.poses.items()}
 
 
@@ -68,7 +70,11 @@ def _rays(sight: Sight, points: list[str]) -> Array:
     return sight.rays[[rows[name] for name in points]]
 
 
-def _typical_residual(model: Block) -> float:
+def _stations(model: Block) -> list[Array]:
+    return [model.poses[image].center for image in sorted(model.poses)]
+
+
+def typical_residual(model: Block) -> float:
     """Median distance in mm of projected from observed points; a point that was not intersected counts as gross."""
     distances = []
     for image, pose in model.poses.items():

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +11,14 @@ from adjust.errors import AdjustmentError
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
 from adjust.initial_values.block import Block, extend, intersected, known_field, resected
-from adjust.initial_values.free_model import orient_free_model
+from adjust.initial_values.free_model import orient_free_model, typical_residual
 from adjust.initial_values.resection import Pose, image_distances
 from adjust.initial_values.vertical_block import orient_vertical_block
 from adjust.network import Distance, Exterior, Network, Prior
 
 Array = NDArray[np.float64]
 
+TILTED = 0.005  # typical residual, in principal distances, that frames tilted by three degrees leave a vertical block
 CLEARLY_WORSE = 5.0  # a given orientation whose residuals are this many times a resection's is set aside
 
 
@@ -31,7 +33,7 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
             block.poses[image.name] = _checked(image.exterior, block, image.name)
     extend(block)
     if sights and not block.poses:
-        block.poses.update(orient_vertical_block(sights, block.firm) or orient_free_model(sights, block.firm))
+        block.poses.update(_oriented_by_images(block))
         extend(block)
         if all(np.isnan(xyz).all() for xyz in block.rough.values()):
             _scale_by_distances(block, network.distances)
@@ -39,6 +41,25 @@ def orient(network: Network, sights: Mapping[str, Sight]) -> tuple[dict[str, Pos
     if missing:
         raise AdjustmentError(_why_not_oriented(block, missing[0]))
     return block.poses, _all_points(block)
+
+
+def _oriented_by_images(block: Block) -> dict[str, Pose]:
+    """Poses where too few points are known to begin with: as if all frames looked straight down, or, where that leaves
+    residuals as tilted frames do, of a model in space, if this leaves less."""
+    vertical = orient_vertical_block(block.sights, block.firm)
+    left = _left_by(block, vertical)
+    if left < TILTED:
+        return vertical
+    model = orient_free_model(block.sights, block.firm)
+    return model if _left_by(block, model) < left or not vertical else vertical
+
+
+def _left_by(block: Block, poses: Mapping[str, Pose]) -> float:
+    """The typical residual of images in these poses, in principal distances; infinite where there are none."""
+    trial = replace(block, poses=dict(poses), points={})
+    extend(trial)
+    c = min(sight.principal_distance_mm for sight in block.sights.values())
+    return typical_residual(trial) / c if poses else np.inf
 
 
 def _coordinates(network: Network, firm: bool) -> dict[str, Array]:

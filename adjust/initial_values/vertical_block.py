@@ -42,10 +42,10 @@ def orient_vertical_block(sights: Mapping[str, Sight], known: Mapping[str, Array
     if len(planimetry) == 1:
         return {}
     mean, relief = _relief(rows, known)
-    plane, _ = _similarities(rows, planimetry or _gauge(rows), len(images), np.ones(len(rows)))
+    plane, _ = _similarities(rows, planimetry, len(images), np.ones(len(rows)))
     scale = 1.0 if planimetry else _scale_of_relief(rows, plane, relief)
     flattened = _flattening(rows, scale * plane, relief)
-    plane, _ = _similarities(rows, planimetry or _gauge(rows), len(images), flattened)
+    plane, _ = _similarities(rows, planimetry, len(images), flattened)
     return {
         image: _pose(scale * plane[2 * i], scale * plane[2 * i + 1], sights[image].principal_distance_mm, mean)
         for i, image in enumerate(images)
@@ -89,13 +89,6 @@ def _shared(sights: Mapping[str, Sight], first: str, second: str) -> int:
     return len(set(sights[first].points) & set(sights[second].points))
 
 
-def _gauge(rows: list[_Row]) -> dict[str, complex]:
-    """Two points of the first frame, far apart, at their image coordinates: the plane's axes where none are given."""
-    first = sorted((row for row in rows if row.image == 0), key=lambda row: row.point)
-    far = max(first, key=lambda row: abs(row.z - first[0].z))
-    return {first[0].point: first[0].z, far.point: far.z}
-
-
 def _relief(rows: list[_Row], known: Mapping[str, Array]) -> tuple[float, Array]:
     """The mean of the known heights, and every row's height above it, 0 where unknown."""
     heights = np.array([known[row.point][2] for row in rows])
@@ -109,7 +102,7 @@ def _scale_of_relief(rows: list[_Row], plane: Complex, relief: Array) -> float:
         return 1.0
     lowest = np.ptp(relief) / min(abs(plane[2 * row.image]) * row.c for row in rows)
     scales = lowest * HEIGHTS
-    left = [_similarities(rows, _gauge(rows), len(plane) // 2, _flattening(rows, s * plane, relief))[1] for s in scales]
+    left = [_similarities(rows, {}, len(plane) // 2, _flattening(rows, s * plane, relief))[1] for s in scales]
     return float(scales[int(np.argmin(left))])
 
 
@@ -122,7 +115,11 @@ def _flattening(rows: list[_Row], similarities: Complex, relief: Array) -> Array
 def _similarities(
     rows: list[_Row], planimetry: Mapping[str, complex], images: int, flattening: Array
 ) -> tuple[Complex, float]:
-    """Scale-and-turn and shift of every image in turn (2 images,): ground = a z + b; the median distance left."""
+    """Scale-and-turn and shift of every image in turn (2 images,): ground = a z + b; the median distance left.
+
+    Where no planimetry is known, the first image keeps its own coordinates: held by two of its points alone, all others
+    would shrink to one place, where their distances are none.
+    """
     by_point = defaultdict(list)
     design = np.zeros((len(rows), 2 * images), dtype=np.complex128)
     for i, row in enumerate(rows):
@@ -136,10 +133,13 @@ def _similarities(
                 right[seen] = planimetry[name]
             else:  # eliminate the unknown ground point: the weighted mean of what its frames say
                 reduced[seen] -= np.average(design[seen], axis=0, weights=weights[seen])
-        root = np.sqrt(weights)
-        scale = np.where((size := np.abs(reduced).max(axis=0)) > 0, size, 1.0)
-        solution = np.linalg.lstsq(root[:, None] * reduced / scale, root * right)[0] / scale
-        distance = np.abs(reduced @ solution - right)
+        held = 0 if planimetry else 2
+        solution = np.concatenate([np.array([1.0, 0.0], complex)[:held], np.zeros(2 * images - held, complex)])
+        right -= reduced @ solution
+        root, unknown = np.sqrt(weights), reduced[:, held:]
+        scale = np.where((size := np.abs(unknown).max(axis=0)) > 0, size, 1.0)
+        solution[held:] = np.linalg.lstsq(root[:, None] * unknown / scale, root * right)[0] / scale
+        distance = np.abs(unknown @ solution[held:] - right)
         weights = 1.0 / np.maximum(distance, 0.1 * np.median(distance) + np.finfo(float).tiny)
         weights /= weights.max()
     return solution, float(np.median(distance))
