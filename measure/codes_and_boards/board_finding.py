@@ -16,6 +16,7 @@ Bytes = NDArray[np.uint8]
 
 _FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # the longer side of the pictures that are searched
 _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+_DRAWINGS = 3  # of the chessboard detector's random numbers for a second board: one in twenty missed one at the edge
 _LEAST_CONTRAST = 0.01  # of the full scale; below it there is nothing to be seen, and searching takes long
 
 
@@ -97,16 +98,25 @@ def _find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
 
 def _chessboard_grid(picture: Bytes, spec: ChessboardSpec) -> Array | None:
     """(rows, columns, 2) the inner corners of a chessboard, None where none is seen."""
-    size = (spec.columns, spec.rows)
     for flags in (_THOROUGHLY, 0):
-        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
-        if found:
-            break
-    else:
-        # The older detector can search for minutes in vain; its fast check refuses a picture without squares first.
-        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-        found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
+        grid = _drawn_chessboard_grid(picture, spec, flags, drawings=1)
+        if grid is not None:
+            return _right_handed(grid)
+    # The older detector can search for minutes in vain; its fast check refuses a picture without squares first.
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    found, corners = cv2.findChessboardCorners(picture, (spec.columns, spec.rows), flags=flags)
     return _right_handed(np.asarray(corners, float).reshape(spec.rows, spec.columns, 2)) if found else None
+
+
+def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, drawings: int) -> Array | None:
+    """(rows, columns, 2) as the newer detector sees them. It draws random numbers: always the same ones here, lest a
+    result depend on what was searched before it."""
+    for seed in range(1, drawings + 1):
+        cv2.setRNGSeed(seed)
+        found, corners = cv2.findChessboardCornersSB(picture, (spec.columns, spec.rows), flags=flags)
+        if found:
+            return np.asarray(corners, float).reshape(spec.rows, spec.columns, 2)
+    return None
 
 
 def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tuple[Array, ...]:
@@ -115,10 +125,10 @@ def _other_chessboards(picture: Bytes, grid: Array, spec: ChessboardSpec) -> tup
     others: list[Array] = []
     while True:
         cv2.fillConvexPoly(picture, np.round(_outline(grid)).astype(np.int32), background)
-        found, corners = cv2.findChessboardCornersSB(picture, (spec.columns, spec.rows), flags=_THOROUGHLY)
-        if not found:
+        other = _drawn_chessboard_grid(picture, spec, _THOROUGHLY, _DRAWINGS)
+        if other is None:
             return tuple(others)
-        grid = np.asarray(corners, float).reshape(spec.rows, spec.columns, 2)
+        grid = other
         others.append(grid.mean(axis=(0, 1)))
 
 
