@@ -22,8 +22,6 @@ from adjust.quality.variance_components import refined_factors
 from adjust.result import NullDirection, Termination
 from adjust.undetermined.diagnosis import singular_directions
 
-Array = NDArray[np.float64]
-
 ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most
 ITERATIONS_A_ROUND = 8  # of the adjustments whose weights robust estimation is to change anyway
 
@@ -101,7 +99,7 @@ def _settled(last: Run, options: Options, doubted: Collection[int] = ()) -> Run:
     for function in options.weight_functions or (None,):
         for _ in range(ROUNDS):
             refined = _reweighted(last, options, function)
-            if function == "huber" and options.robust == "igg3":
+            if function in options.weight_functions[:-1]:
                 refined.weights[list(doubted)] = NO_WEIGHT
             if not refined.differs(last.weighting):
                 break
@@ -173,6 +171,27 @@ def _snooped(last: Run, options: Options) -> Run:
 
 
 def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
+    last = _adjusted(problem, weighting, state, limit)
+    return _from_held_cameras(last, limit) if last.singular and not last.solution.history else last
+
+
+def _from_held_cameras(stuck: Run, limit: int) -> Run:
+    """The run of a network that was singular where it started from where it ends with the cameras held; as it was where
+    that brings no solution.
+
+    Approximations without known planimetry look straight down: from parallel axes heights never tell a principal
+    distance, but from those of tilted images they do.
+    """
+    problem, unknowns = stuck.problem, stuck.problem.unknowns
+    free = [at for positions in unknowns.camera.values() for at in positions if np.isinf(unknowns.sigma[at])]
+    held = _adjusted(replace(problem, unknowns=unknowns.fixed(free)), stuck.weighting, stuck.end.state, limit)
+    if not held.converged:
+        return stuck
+    last = _adjusted(problem, stuck.weighting, held.end.state, limit)
+    return last if last.converged else stuck
+
+
+def _adjusted(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
     weighted, covariance = weighting.applied(problem)
     numbering = Numbering(weighted)
     start = linearise(numbering, covariance, state)
@@ -183,10 +202,10 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
             f"along its negative z axis."
         )
     singular = singular_directions(weighted, state, numbering.free, start.factor)
-    begun = _regular_start(weighted, covariance, state, limit) if singular else start
-    solution = iterate(numbering, covariance, begun, limit) if begun else None
-    if solution is None or (singular and solution.termination != "converged"):
-        return Run(problem, numbering, weighting, Solution(start, None, "singular", ()), singular, start.factor)
+    if singular:
+        solution = Solution(start, None, "singular", ())
+        return Run(problem, numbering, weighting, solution, singular, start.factor)
+    solution = iterate(numbering, covariance, start, limit)
     factor = solution.end.factor
     singular = singular_directions(weighted, solution.end.state, numbering.free, factor)
     if singular:
@@ -194,27 +213,3 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
         solution = replace(solution, factor=None, termination=ended)
         return Run(problem, numbering, weighting, solution, singular, factor)
     return Run(problem, numbering, weighting, solution, (), factor)
-
-
-def _regular_start(problem: Problem, covariance_mm2: Array, state: State, limit: int) -> Linearised | None:
-    """Where a network is regular that is singular where it starts: at the adjusted exterior orientations, with the
-    cameras held as they start. None where it is singular there, too, or that adjustment finds no solution.
-
-    Approximations without known planimetry look straight down: from parallel axes heights never tell a principal
-    distance, but from those of tilted images they do.
-    """
-    unknowns = problem.unknowns
-    cameras = np.concatenate([np.asarray(each, dtype=np.intp) for each in unknowns.camera.values()])
-    held = replace(problem, unknowns=unknowns.fixed(cameras[np.isinf(unknowns.sigma[cameras])]))
-    numbering = Numbering(held)
-    start = linearise(numbering, covariance_mm2, state)
-    if start is None or singular_directions(held, state, numbering.free, start.factor):
-        return None
-    solution = iterate(numbering, covariance_mm2, start, limit)
-    if solution.termination != "converged":
-        return None
-    whole = Numbering(problem)
-    begun = linearise(whole, covariance_mm2, solution.end.state)
-    if begun is None or singular_directions(problem, solution.end.state, whole.free, begun.factor):
-        return None
-    return begun

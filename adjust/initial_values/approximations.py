@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.projection import ideal_from_observed
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
-from adjust.functional_model.sight import Sight
+from adjust.functional_model.sight import Sight, freed_sight
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.initial_values.orientation import orient
@@ -132,13 +131,11 @@ def _known_field(network: Network, frame: _Frame, x0: float, y0: float) -> Known
 
 
 def _sight(camera: Camera, frame: _Frame, interior: Array) -> Sight:
-    """Freed of the distortion as it is known beforehand; a coordinate that it cannot have produced stays as it is."""
+    """Freed of the distortion as it is known beforehand."""
     known = camera.distortion.parameters
     names = parameter_names(camera.distortion.family)
     parameters = np.array([known[name].value if name in known else 0.0 for name in names])
-    ideal, found = ideal_from_observed(camera.distortion, interior, parameters, frame.xy_mm)
-    xy_mm = np.where(found[:, np.newaxis], ideal, frame.xy_mm) - interior[1:]
-    return Sight(frame.points, xy_mm, float(interior[0]), frame.sigma_mm)
+    return freed_sight(frame.points, frame.xy_mm, frame.sigma_mm, interior, camera.distortion, parameters)
 
 
 def _exterior(image: Image, pose: Pose) -> Array:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.projection import ideal_from_observed
-from adjust.functional_model.sight import Sight
+from adjust.functional_model.sight import Sight, freed_sight
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.intersection import intersect
 from adjust.initial_values.resection import Pose, image_distances
@@ -113,15 +112,15 @@ def _sights(problem: Problem) -> dict[str, Sight]:
         if len(rows):
             film = film_kind(image.transformation, image.name in problem.mirrored)
             xy_mm = film.apply(unknowns.start[unknowns.transformation[image.name]], network.observations.xy_mm[rows])
-            interior, distortion = np.split(unknowns.start[unknowns.camera[image.camera]], [3])
-            family = network.camera_by_name[image.camera].distortion
-            ideal, found = ideal_from_observed(family, interior, distortion, xy_mm)
+            interior, known = np.split(unknowns.start[unknowns.camera[image.camera]], [3])
             variances = np.trace(network.observations.covariance_mm2[rows], axis1=1, axis2=2) / 2.0
-            sights[image.name] = Sight(
+            sights[image.name] = freed_sight(
                 tuple(network.observations.point[row] for row in rows),
-                np.where(found[:, np.newaxis], ideal, xy_mm) - interior[1:],
-                float(interior[0]),
+                xy_mm,
                 float(np.sqrt(np.median(variances))),
+                interior,
+                network.camera_by_name[image.camera].distortion,
+                known,
             )
     return sights
 

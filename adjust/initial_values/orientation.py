@@ -56,10 +56,11 @@ def _oriented_by_images(block: Block) -> dict[str, Pose]:
 
 def _left_by(block: Block, poses: Mapping[str, Pose]) -> float:
     """The typical residual of images in these poses, in principal distances; infinite where there are none."""
+    if not poses:
+        return np.inf
     trial = replace(block, poses=dict(poses), points={})
     extend(trial)
-    c = min(sight.principal_distance_mm for sight in block.sights.values())
-    return typical_residual(trial) / c if poses else np.inf
+    return typical_residual(trial) / min(sight.principal_distance_mm for sight in block.sights.values())
 
 
 def _coordinates(network: Network, firm: bool) -> dict[str, Array]:
