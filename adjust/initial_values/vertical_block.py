@@ -1,11 +1,11 @@
 """A block of near-vertical frames from their common points alone: a chain of plane similarities."""
 
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.sight import Sight
@@ -120,19 +120,18 @@ def _similarities(
     Where no planimetry is known, the first image keeps its own coordinates: held by two of its points alone, all others
     would shrink to one place, where their distances are none.
     """
-    by_point = defaultdict(list)
     design = np.zeros((len(rows), 2 * images), dtype=np.complex128)
     for i, row in enumerate(rows):
-        by_point[row.point].append(i)
         design[i, 2 * row.image : 2 * row.image + 2] = row.z * flattening[i], 1.0
+    point = np.unique([row.point for row in rows], return_inverse=True)[1]
+    given = np.array([planimetry.get(row.point, np.nan) for row in rows], complex)
     weights = np.ones(len(rows))
     for _ in range(REWEIGHTINGS):
-        reduced, right = design.copy(), np.zeros(len(rows), dtype=np.complex128)
-        for name, seen in by_point.items():
-            if name in planimetry:
-                right[seen] = planimetry[name]
-            else:  # eliminate the unknown ground point: the weighted mean of what its frames say
-                reduced[seen] -= np.average(design[seen], axis=0, weights=weights[seen])
+        # An unknown ground point is eliminated: it is the weighted mean of what its frames say.
+        share = weights / np.bincount(point, weights)[point]
+        mean = np.asarray(sparse.csr_array((share, (point, np.arange(len(rows))))) @ design)
+        reduced = design - np.where(np.isnan(given)[:, None], mean[point], 0.0)
+        right = np.nan_to_num(given, nan=0.0)
         held = 0 if planimetry else 2
         solution = np.concatenate([np.array([1.0, 0.0], complex)[:held], np.zeros(2 * images - held, complex)])
         right -= reduced @ solution

@@ -1,4 +1,4 @@
-"""Networks simulated with formulas of their own, point by point: nothing of them comes from the code under test."""
+"""Networks simulated with formulas of their own, term by term: nothing of them comes from the code under test."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -57,7 +57,7 @@ def rotation(omega: float, phi: float, kappa: float) -> Array:
     return np.asarray(r3 @ r2 @ r1)
 
 
-def torlegard(truth: Truth, x: float, y: float) -> tuple[float, float]:
+def torlegard(truth: Truth, x: Any, y: Any) -> tuple[Any, Any]:
     """dx, dy at an observed camera point, with r0 = 0."""
     p = dict.fromkeys(("k3", "k5", "k7", "p1", "p2", "p3", "p4"), 0.0) | truth.distortion
     xr, yr = x - truth.x0, y - truth.y0
@@ -70,7 +70,7 @@ def torlegard(truth: Truth, x: float, y: float) -> tuple[float, float]:
     return dx, dy
 
 
-def ebner(truth: Truth, x: float, y: float) -> tuple[float, float]:
+def ebner(truth: Truth, x: Any, y: Any) -> tuple[Any, Any]:
     """dx, dy at an observed camera point by Ebner's twelve parameters in mm, the half frame the unit of length."""
     b = [0.0] + [truth.distortion.get(f"b{i}", 0.0) for i in range(1, 13)]
     u, v = (x - truth.x0) / HALF_MM, (y - truth.y0) / HALF_MM
@@ -81,15 +81,15 @@ def ebner(truth: Truth, x: float, y: float) -> tuple[float, float]:
 
 
 def camera_point(truth: Truth, image: int, xyz: Array) -> Array:
-    """Where an object point is observed in the camera frame: the ideal point plus the correction there."""
-    u, v, w = rotation(*truth.attitudes[image]) @ (xyz - np.array(truth.stations[image]))
+    """Where object points (..., 3) are observed in the camera frame: the ideal point plus the correction there."""
+    u, v, w = rotation(*truth.attitudes[image]) @ np.transpose(xyz - np.array(truth.stations[image]))
     correction = ebner if truth.family == "ebner" else torlegard
     ideal = np.array([truth.x0 - truth.c * u / w, truth.y0 - truth.c * v / w])
 
     xy = ideal
     for _ in range(12):  # the corrections contract: each turn leaves about a hundredth of the error
         xy = ideal + np.array(correction(truth, xy[0], xy[1]))
-    return xy
+    return xy.T
 
 
 def affine(truth: Truth, image: int, kind: Transformation) -> Array:
@@ -129,10 +129,10 @@ def simulated(
     for i in range(len(truth.stations)):
         film = film_parameters(truth, i, kind)
         marks = [(id_, "fiducial", np.array(xy), 0.003) for id_, xy in FIDUCIALS.items()] if kind != "none" else []
-        marks += [(str(j), "target", camera_point(truth, i, xyz), 0.004) for j, xyz in enumerate(points)]
-        for id_, what, xy, sigma in marks:
-            observed = comparator_point(kind, film, truth.mirrored[i], xy)
-            rows.append((f"f{i}", id_, what, observed + noise * rng.normal(0.0, sigma, 2), sigma))
+        marks += [(str(j), "target", xy, 0.004) for j, xy in enumerate(camera_point(truth, i, points))]
+        observed = comparator_point(kind, film, truth.mirrored[i], np.array([xy for _, _, xy, _ in marks]))
+        for (id_, what, _, sigma), xy in zip(marks, observed, strict=True):
+            rows.append((f"f{i}", id_, what, xy + noise * rng.normal(0.0, sigma, 2), sigma))
     given = {name: Prior(value, (free or {}).get(name, 0.0)) for name, value in truth.distortion.items()}
     spread = fiducial_sigma * noise
     camera = Camera(
@@ -235,14 +235,13 @@ def camera_of_film(kind: Transformation, p: Array, mirrored: bool, x: Any, y: An
 
 
 def comparator_point(kind: Transformation, p: Array, mirrored: bool, camera_xy: Array) -> Array:
-    """Where a camera point lies in the comparator: the chord of the film over its first 100 mm, again and again."""
+    """Where camera points (n, 2) lie in the comparator, by the chord of the film over its first 100 mm."""
 
-    def image(x: float, y: float) -> Array:
+    def image(x: Any, y: Any) -> Array:
         return np.array(camera_of_film(kind, p, mirrored, x, y))
 
     chord = np.linalg.inv(np.stack([image(100.0, 0.0) - image(0.0, 0.0), image(0.0, 100.0) - image(0.0, 0.0)], axis=1))
-    xy, step = np.zeros(2), np.ones(2)
-    while np.abs(step).max() > 1e-12:
-        step = 100.0 * chord @ (camera_xy - image(xy[0], xy[1]))
-        xy = xy + step
-    return xy
+    xy = np.zeros(camera_xy.T.shape)
+    for _ in range(20):
+        xy = xy + 100.0 * chord @ (camera_xy.T - image(*xy))
+    return xy.T

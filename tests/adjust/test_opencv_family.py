@@ -146,7 +146,7 @@ def test_torlegard_is_inverted() -> None:
     )
     observed, visible = model.camera_from_object(xyz)
     assert visible.all()
-    expected = np.array([camera_point(truth, 1, point) for point in xyz])
+    expected = camera_point(truth, 1, xyz)
     np.testing.assert_allclose(observed, expected, atol=1e-10)
     ideal, found = model.ideal_from_observed(observed)
     u, v, w = model.rotation @ (xyz - station).T
