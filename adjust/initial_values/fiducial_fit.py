@@ -43,9 +43,10 @@ def fit_transformation(transformation: Transformation, comparator_mm: Array, cam
 def _is_mirrored(comparator_mm: Array, camera_mm: Array) -> bool:
     if len(comparator_mm) < 3:
         return False
-    upright, mirrored = (
-        _robust_fit(film_kind("similarity", mirrored), comparator_mm, camera_mm)[1] for mirrored in (False, True)
-    )
+    kinds = [film_kind("similarity", mirrored) for mirrored in (False, True)]
+    if _agree(_squared(kinds[0], _fit(kinds[0], comparator_mm, camera_mm), comparator_mm, camera_mm)):
+        return False  # at once, as most scans are: all subsets of marks would be tried for a mirrored one that fits
+    upright, mirrored = (_robust_fit(kind, comparator_mm, camera_mm)[1] for kind in kinds)
     return mirrored < PLAINLY * upright
 
 
@@ -56,7 +57,7 @@ def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple
     best = _fit(kind, comparator_mm, camera_mm)
     squared = _squared(kind, best, comparator_mm, camera_mm)
     best_cost = float(np.sort(squared)[:half].sum())
-    if half == n or (squared < GROSS * LEAST_VARIANCE_MM2).all():
+    if half == n or _agree(squared):
         return best, best_cost
     for subset in _subsets(n, fewest):
         candidate = _fit(kind, comparator_mm[subset], camera_mm[subset])
@@ -69,6 +70,11 @@ def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple
     variance = best_cost / (2 * half - len(kind.names))
     agree = _squared(kind, best, comparator_mm, camera_mm) < GROSS * max(variance, LEAST_VARIANCE_MM2)
     return _fit(kind, comparator_mm[agree], camera_mm[agree]), best_cost
+
+
+def _agree(squared: Array) -> bool:
+    """Whether marks are no farther off than film and scanner may well put them."""
+    return bool((squared < GROSS * LEAST_VARIANCE_MM2).all())
 
 
 def _subsets(n: int, size: int) -> list[Indices]:
