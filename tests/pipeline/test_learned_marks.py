@@ -26,11 +26,12 @@ from synthetic_images.render import render_scene
 
 Array = NDArray[np.float64]
 
-CORNERS = {"1": (9.0, -9.0), "2": (-9.0, -9.0), "3": (-9.0, 9.0), "4": (9.0, 9.0)}
+pytestmark = pytest.mark.xdist_group("learned")  # the frames are rendered, and their marks learned, once for all
+CORNERS = {"1": (6.0, -6.0), "2": (-6.0, -6.0), "3": (-6.0, 6.0), "4": (6.0, 6.0)}
 ARROW = areas.polygon(((0.0, 0.0), (1.1, 0.2), (0.5, 0.5), (0.3, 0.7)))  # lopsided: a mirror shows
 LEARNED = """
 name = "small"
-frame_mm = [22.0, 22.0]
+frame_mm = [16.0, 16.0]
 [mark.m]
 kind = "learned"
 size_mm = 2.4
@@ -46,7 +47,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     camera = scene.SceneCamera(
         "small",
-        (22.0, 22.0),
+        (16.0, 16.0),
         30.0,
         fiducials=tuple(scene.SceneFiducial(id, place, scene.DrawnMark((ARROW,))) for id, place in CORNERS.items()),
     )
@@ -56,7 +57,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
         camera,
         scene.DiskField((), 1.0),
         images,
-        scene.Scanner((50.0, 50.0), margin_mm=2.0, noise=0.004),
+        scene.Scanner((50.0, 50.0), margin_mm=1.0, noise=0.004),
         background="terrain",
         pad_mm=1.6,
     )
@@ -89,29 +90,37 @@ def clicks(folder: Path) -> str:
     return f'[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}'
 
 
-def measured(project: Project) -> list[FrameMeasurement]:
+def learned(project: Project) -> Project:
     with ThreadPoolExecutor(1) as workers:
-        learned = learn_marks(project, Reporter(Console(quiet=True)), workers)
-    return [measure_scan(learned, name).frame for name in project.scans]
+        return learn_marks(project, Reporter(Console(quiet=True)), workers)
 
 
-def assert_measured_alike(project: Project, frames: list[FrameMeasurement]) -> None:
+def measured(project: Project) -> list[FrameMeasurement]:
+    known = learned(project)
+    return [measure_scan(known, name).frame for name in project.scans]
+
+
+def assert_measured_alike(project: Project, first: FrameMeasurement) -> None:
     """The camera file that learning left gives the same marks as the run that learned them."""
     text = project.path.read_text().replace('"camera.toml"', '"out/learned/camera.toml"')
     (project.path.parent / "again.toml").write_text(text)
-    for first, second in zip(frames, measured(read_project(project.path.parent / "again.toml")), strict=True):
-        assert first.pose == second.pose
-        for one, other in zip(first.marks, second.marks, strict=True):
-            assert (one.point, one.status, one.reason) == (other.point, other.status, other.reason)
-            np.testing.assert_allclose(np.array(one.center_px), np.array(other.center_px), atol=1e-6)
-            np.testing.assert_allclose(np.array(one.covariance_px2), np.array(other.covariance_px2), rtol=1e-6)
+    second = measure_scan(learned(read_project(project.path.parent / "again.toml")), first.image).frame
+    assert first.pose == second.pose
+    for one, other in zip(first.marks, second.marks, strict=True):
+        assert (one.point, one.status, one.reason) == (other.point, other.status, other.reason)
+        np.testing.assert_allclose(np.array(one.center_px), np.array(other.center_px), atol=1e-6)
+        np.testing.assert_allclose(np.array(one.covariance_px2), np.array(other.covariance_px2), rtol=1e-6)
 
 
-@pytest.mark.parametrize("shown", [True, False])
-def test_learned_marks_lie_off_the_true_ones_alike_in_all_frames(rendered: Path, shown: bool) -> None:
-    project = project_of(rendered, LEARNED + (clicks(rendered) if shown else ""))
-    frames = measured(project)
-    true = truth(rendered)
+@pytest.fixture(scope="module")
+def shown(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Project, Project]:
+    """The project whose marks were clicked in one of its scans, before and after these were learned."""
+    folder = tmp_path_factory.mktemp("shown")
+    project = project_of(folder, LEARNED + clicks(rendered), f'"{rendered}/scans/*.tif"')
+    return project, learned(project)
+
+
+def assert_off_alike(frames: list[FrameMeasurement], true: dict[str, Array]) -> None:
     off = np.array(
         [
             [np.asarray(mark.center_px) - place for mark, place in zip(frame.marks, true[frame.image], strict=True)]
@@ -122,8 +131,19 @@ def test_learned_marks_lie_off_the_true_ones_alike_in_all_frames(rendered: Path,
     scatter = off - off.mean(axis=0)  # the offset turns with the frames by 0.008 rad at most
     assert np.abs(scatter).max() < 0.03 + 0.008 * np.abs(off).max()
     assert np.abs(off).max() < 24.0  # half of size_mm
-    if not shown:
-        assert_measured_alike(project, frames)
+
+
+def test_marks_learned_from_clicks_lie_off_the_true_ones_alike_in_all_frames(
+    rendered: Path, shown: tuple[Project, Project]
+) -> None:
+    assert_off_alike([measure_scan(shown[1], name).frame for name in shown[1].scans], truth(rendered))
+
+
+def test_marks_that_recur_lie_off_the_true_ones_alike_in_all_frames(rendered: Path) -> None:
+    project = project_of(rendered, LEARNED)
+    frames = measured(project)
+    assert_off_alike(frames, truth(rendered))
+    assert_measured_alike(project, frames[0])
 
 
 def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictures(
@@ -137,14 +157,15 @@ def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictu
     upright = tifffile.imread(rendered / "scans" / "f2.tif")
     tifffile.imwrite(tmp_path / "scans" / "f2.tif", np.rot90(upright))  # counter-clockwise
     project = project_of(tmp_path, LEARNED + clicks(rendered), pose="auto")
-    first, turned = measured(project)
-    assert first.pose is not None
+    known = learned(project)
+    assert pose_of(known, known.default_camera, "f1") == "0"
+    turned = measure_scan(known, "f2").frame
     assert turned.pose is not None
     assert (turned.pose.name, turned.pose.decided) == ("90", True), turned.pose.evidence
     for mark, (col, row) in zip(turned.marks, truth(rendered)["f2"].tolist(), strict=True):
         assert mark.center_px is not None
         np.testing.assert_allclose(mark.center_px, (row, upright.shape[1] - 1 - col), atol=5.0)
-    assert_measured_alike(project, [first, turned])
+    assert_measured_alike(project, turned)
 
 
 def test_one_scan_must_be_clicked_and_says_what_it_can_tell(rendered: Path) -> None:
@@ -173,20 +194,17 @@ def test_cameras_whose_files_are_named_alike_are_stored_apart(rendered: Path, tm
     (tmp_path / "project.toml").write_text(
         text.replace("camera.toml", "a/camera.toml") + '[object]\nimages = "images.csv"\n'
     )
-    frames = measured(read_project(tmp_path / "project.toml"))
-    assert all(mark.status.is_observation for frame in frames for mark in frame.marks)
+    known = learned(read_project(tmp_path / "project.toml"))
     for image, file in {"f0": "camera.toml", "f1": "camera-3.toml", "f2": "camera-2.toml"}.items():
-        learned = read_camera(tmp_path / "out" / "learned" / file).learned_from
-        assert learned is not None
-        assert learned.scan == image
+        for camera in (known.camera_of(image), read_camera(tmp_path / "out" / "learned" / file)):
+            assert camera.learned_from is not None
+            assert camera.learned_from.scan == image
 
 
-def test_what_was_learned_is_stored_whole_and_read_without_it_too(rendered: Path) -> None:
+def test_what_was_learned_is_stored_whole_and_read_without_it_too(shown: tuple[Project, Project]) -> None:
     """A file of before has none of what a template's pixels tell, and is read as then. Another scan of the name of the
     one clicked in says nothing of the pose."""
-    project = project_of(rendered, LEARNED + clicks(rendered), pose="auto")
-    with ThreadPoolExecutor(1) as workers:
-        camera = learn_marks(project, Reporter(Console(quiet=True)), workers).default_camera
+    project, camera = shown[0], shown[1].default_camera
     folder = project.output / "learned"
     stored = (folder / "camera.toml").read_text()
     again = read_camera(folder / "camera.toml")
@@ -206,11 +224,10 @@ def test_what_was_learned_is_stored_whole_and_read_without_it_too(rendered: Path
     old = read_camera(folder / "before.toml").fiducials[0].mark
     assert isinstance(old, MarkTemplate)
     assert old.steadiness is None
-    second = replace(project, cameras={"camera.toml": again})
+    second = replace(project, cameras={"camera.toml": again}, pose="auto")
     third = replace(second, scans={**project.scans, "f1": project.scans["f2"]})
     for each, pose in ((second, "0"), (third, "auto")):
-        with ThreadPoolExecutor(1) as workers:
-            known = learn_marks(each, Reporter(Console(quiet=True)), workers)
+        known = learned(each)
         assert pose_of(known, known.default_camera, "f1") == pose
 
 
