@@ -1,6 +1,7 @@
 """Crosses and ring-coded disks in space, rendered: named with no orientation, measured to their standard deviations."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from pipeline.measuring.target_stage import check_targets
 from pipeline.rendered.scene_file import render_project
 
 Array = NDArray[np.float64]
+pytestmark = pytest.mark.xdist_group("unoriented")  # the fields are rendered once for all
 
 SCENE = """seed = 3
 [camera]
@@ -48,10 +50,19 @@ CROSSES = 'kind = "crosses"\narm_mm = 45.0\nline_mm = 12.0'
 RINGS = 'kind = "coded-rings"\ndiameter_mm = 36.0\nevery = 2'
 
 
-def rendered(folder: Path, field: str) -> tuple[Path, dict[str, Array]]:
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The folder of each field's picture. Tests copy it before they change anything."""
+    folders = {field: tmp_path_factory.mktemp("scene") for field in (CROSSES, RINGS)}
+    for field, folder in folders.items():
+        (folder / "scene.toml").write_text(SCENE.format(field=field), encoding="utf-8")
+        render_project(folder / "scene.toml", folder)
+    return folders
+
+
+def rendered(scene: Path, folder: Path) -> tuple[Path, dict[str, Array]]:
     """The project without its orientations, and the true places of the figures that are wholly seen."""
-    (folder / "scene.toml").write_text(SCENE.format(field=field), encoding="utf-8")
-    render_project(folder / "scene.toml", folder)
+    shutil.copytree(scene, folder, dirs_exist_ok=True)
     project = folder / "project.toml"
     lines = project.read_text(encoding="utf-8").splitlines()
     project.write_text("\n".join(line for line in lines if not line.startswith("images")), encoding="utf-8")
@@ -70,8 +81,8 @@ def error(mark: MarkMeasurement, place: Array) -> Array:
     return mark.center_px - place
 
 
-def test_crosses_in_space_with_no_principal_distance(tmp_path: Path) -> None:
-    project, places = rendered(tmp_path, CROSSES)
+def test_crosses_in_space_with_no_principal_distance(scenes: dict[str, Path], tmp_path: Path) -> None:
+    project, places = rendered(scenes[CROSSES], tmp_path)
     camera = tmp_path / "camera.toml"
     lines = camera.read_text(encoding="utf-8").splitlines()
     camera.write_text("\n".join(line for line in lines if "principal_distance" not in line), encoding="utf-8")
@@ -81,8 +92,8 @@ def test_crosses_in_space_with_no_principal_distance(tmp_path: Path) -> None:
     assert max(np.abs(one).max() for one in off.values()) < 0.03
 
 
-def test_an_orientation_that_does_not_fit_is_not_used(tmp_path: Path) -> None:
-    project, places = rendered(tmp_path, CROSSES)
+def test_an_orientation_that_does_not_fit_is_not_used(scenes: dict[str, Path], tmp_path: Path) -> None:
+    project, places = rendered(scenes[CROSSES], tmp_path)
     turned = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,-1.2,0.9,2.0,-25.0,-30.0,-90.0\n"
     (tmp_path / "images.csv").write_text(turned, encoding="utf-8")
     text = project.read_text(encoding="utf-8")
@@ -92,8 +103,8 @@ def test_an_orientation_that_does_not_fit_is_not_used(tmp_path: Path) -> None:
     assert any("orientation in images.csv was not used" in problem for problem in scan.frame.problems)
 
 
-def test_ring_codes_in_space_and_two_that_are_confused(tmp_path: Path) -> None:
-    project, places = rendered(tmp_path, RINGS)
+def test_ring_codes_in_space_and_two_that_are_confused(scenes: dict[str, Path], tmp_path: Path) -> None:
+    project, places = rendered(scenes[RINGS], tmp_path)
     off = errors(measure_scan(read_project(project), "a"), places)
     assert len(off) == len(places) > 12
     assert max(np.abs(one).max() for one in off.values()) < 0.08
@@ -109,9 +120,9 @@ def test_ring_codes_in_space_and_two_that_are_confused(tmp_path: Path) -> None:
     assert len(confused) >= len(places) - 4
 
 
-def test_a_ring_read_twice_is_the_one_at_its_place(tmp_path: Path) -> None:
+def test_a_ring_read_twice_is_the_one_at_its_place(scenes: dict[str, Path], tmp_path: Path) -> None:
     """A ring copied over another one: that dot has the place of one point, the code of the other, the name of none."""
-    project, places = rendered(tmp_path, RINGS)
+    project, places = rendered(scenes[RINGS], tmp_path)
     first, second = [id for id in places if int(id) < 4096][:2]
     scan_file = read_project(project).scans["a"]
     picture = tifffile.imread(scan_file)
@@ -138,8 +149,8 @@ def test_what_a_cross_cannot_be(tmp_path: Path, targets: str, message: str) -> N
         read_targets(read_toml(tmp_path / "t.toml"))
 
 
-def test_coordinates_in_another_unit_than_the_project_says(tmp_path: Path) -> None:
-    project, _ = rendered(tmp_path, CROSSES)
+def test_coordinates_in_another_unit_than_the_project_says(scenes: dict[str, Path], tmp_path: Path) -> None:
+    project, _ = rendered(scenes[CROSSES], tmp_path)
     text = project.read_text(encoding="utf-8")
     project.write_text(text.replace('unit = "m"', 'unit = "mm"'), encoding="utf-8")
     with pytest.raises(InputError, match=r"nine of ten points .* if their coordinates are in mm"):
