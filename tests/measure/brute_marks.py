@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-from drawn import pixel_means
+from drawn import in_strips, pixel_means
 from numpy.typing import NDArray
 
 from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring
@@ -28,11 +28,13 @@ def brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: i
             (np.arange(a, b) + 0.5) / POINTS - 0.5 - pad - center
             for a, b, center in zip(first, last, pixel_from_mark[:, 2], strict=True)
         )
-        x, y = (line[0] * col[None, :] + line[1] * row[:, None] for line in mark_from_pixel)
-        inside[first[1] : last[1], first[0] : last[0]] |= is_inside(part, x, y)
+        box = inside[first[1] : last[1], first[0] : last[0]]
+        for strip, down in zip(in_strips(box, len(col)), in_strips(row, len(col)), strict=True):
+            x, y = (line[0] * col[None, :] + line[1] * down[:, None] for line in mark_from_pixel)
+            strip |= is_inside(part, x, y)
     step = POINTS // KEPT
-    across = np.asarray(np.sum([inside[:, k::step] for k in range(step)], axis=0, dtype=np.uint8))
-    counts = np.asarray(np.sum([across[k::step] for k in range(step)], axis=0, dtype=np.uint8))
+    rowwise = np.asarray(np.sum([inside[k::step] for k in range(step)], axis=0, dtype=np.uint8))
+    counts = np.asarray(np.sum([rowwise[:, k::step] for k in range(step)], axis=0, dtype=np.uint8))
     return pixel_means(counts / step**2, blur_px, KEPT, pad)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
+STRIP = 10_000  # samples that are asked together
 
 
 def scan_of(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0) -> Scan:
@@ -28,15 +30,21 @@ def drawn(
     """(height, width) means over the pixels of a function of columns (1, n) and rows (m, 1), after a Gaussian blur."""
     pad = int(np.ceil(5 * blur_px)) + 1
     fine = [(np.arange((size + 2 * pad) * fineness) + 0.5) / fineness - 0.5 - pad for size in (width, height)]
-    sharp = inside(*np.meshgrid(*fine, sparse=True)).astype(float)
+    columns, rows = np.meshgrid(*fine, sparse=True)
+    sharp = np.concatenate([inside(columns, strip) for strip in in_strips(rows, columns.size)]).astype(float)
     return pixel_means(sharp, blur_px, fineness, pad)
+
+
+def in_strips(rows: NDArray[Any], columns: int) -> list[NDArray[Any]]:
+    """Rows in strips of so few samples that all that is made of them stays in a processor's cache."""
+    return np.array_split(rows, max(len(rows) * columns // STRIP, 1))
 
 
 def pixel_means(sharp: Array, blur_px: float, fineness: int, pad: int) -> Array:
     """Means over the pixels after a Gaussian blur cut off at five sigmas; of samples `fineness` to a pixel along each
     axis, with a border of `pad` pixels, of more than five sigmas, that the result has not."""
     rows, columns = (_means_of_samples(size, blur_px * fineness, fineness, pad) for size in sharp.shape)
-    return np.asarray(rows @ (columns @ sharp.T).T)
+    return np.asarray((columns @ (rows @ sharp).T).T)
 
 
 def _means_of_samples(samples: int, sigma: float, fineness: int, pad: int) -> csr_array:

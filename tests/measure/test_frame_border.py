@@ -44,6 +44,15 @@ def layout(vertices: tuple[Point, ...], at_mm: float) -> FiducialLayout:
 def scanned(at_mm: float, is_notch: bool, blur_px: float = 0.9, landscape: float = 0.0) -> Array:
     """A light frame with a wedge of its dark border, or a notch in it, on each side. landscape: by what share of itself
     its light varies, over some 6 px."""
+    generator = np.random.default_rng(3)
+    light = light_of(at_mm, is_notch, blur_px)
+    noise = generator.normal(0, 400, light.shape)
+    terrain = gaussian_filter(generator.normal(0, 1, light.shape), 6)
+    return np.asarray(3000 + 20000 * light * (1 + landscape * terrain / terrain.std()) + noise)
+
+
+@cache
+def light_of(at_mm: float, is_notch: bool, blur_px: float) -> Array:
     camera_from_pixel = np.linalg.inv(PIXEL_FROM_CAMERA[:, :2])
 
     def exposed(col: Array, row: Array) -> Array:
@@ -57,11 +66,7 @@ def scanned(at_mm: float, is_notch: bool, blur_px: float = 0.9, landscape: float
                 frame &= ~((out > 0) & (along < out * 0.7 / 1.6))
         return np.asarray(frame)
 
-    generator = np.random.default_rng(3)
-    light = drawn(exposed, 520, 520, blur_px, fineness=6)
-    noise = generator.normal(0, 400, light.shape)
-    terrain = gaussian_filter(generator.normal(0, 1, light.shape), 6)
-    return np.asarray(3000 + 20000 * light * (1 + landscape * terrain / terrain.std()) + noise)
+    return drawn(exposed, 520, 520, blur_px, fineness=6)
 
 
 def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
