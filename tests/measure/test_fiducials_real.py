@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
 from measure.results import FrameMeasurement
-from measure.scans.scan import open_scan
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan, open_scan
 from measure.status import Status
 
 SCANS = Path(__file__).parents[3] / "shared" / "data" / "film_scans"
@@ -19,6 +21,7 @@ pytestmark = pytest.mark.skipif(not SCANS.exists(), reason="the real scans are n
 WILD = MarkShape(ring_cross(0.80, 0.17, 1.75, 0.10, 0.08, 45.0), "light")
 RESEAU = MarkShape(cross(0.97, 0.05), "dark")
 RESEAU_PITCH_UM = 27.4
+MIDDLE_PX = 1072  # a step of the lattice is 356
 
 
 def square(mark: MarkShape) -> FiducialLayout:
@@ -27,8 +30,9 @@ def square(mark: MarkShape) -> FiducialLayout:
     return FiducialLayout(marks, (230.0, 230.0))
 
 
-def lattice() -> FiducialLayout:
-    index = range(-2, 3)
+def lattice(steps: int = 2) -> FiducialLayout:
+    """The crosses up to so many steps from the middle one."""
+    index = range(-steps, steps + 1)
     marks = [LayoutMark(f"{i},{j}", (10.0 * i, 10.0 * j), (0.005, 0.005), RESEAU) for j in index for i in index]
     return FiducialLayout(tuple(marks), (53.0, 53.0))
 
@@ -72,14 +76,28 @@ def scouted(number: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDAr
     return columns[:, :2], columns[:, 2:4], columns[:, 4] == 1
 
 
-@pytest.mark.parametrize("number", [11, *(pytest.param(n, marks=pytest.mark.slow) for n in (15, 16, 17))])
-def test_the_crosses_of_a_reseau_on_a_landscape(number: int) -> None:
+def middle(scan: Scan) -> tuple[Scan, NDArray[np.int64]]:
+    """The part that shows the nine crosses in the middle and no others, and its first pixel, at a corner of blocks of
+    the file's compression."""
+    first = (np.array([scan.width_px, scan.height_px]) - MIDDLE_PX) // 16 * 8
+    part = WholePicture(scan.samples(int(first[0]), int(first[1]), MIDDLE_PX, MIDDLE_PX), scan.rounding_step_dn)
+    return Scan(scan.path, part, NO_TAGS), first
+
+
+@pytest.mark.parametrize(
+    ("number", "steps"), [(11, 1), *(pytest.param(n, 2, marks=pytest.mark.slow) for n in (11, 15, 16, 17))]
+)
+def test_the_crosses_of_a_reseau_on_a_landscape(number: int, steps: int) -> None:
     """As many crosses as line profiles found, and on the same crosses no larger residuals: on all of them, those too
     that the profiles' affinity left out, and on those that it used."""
-    layout = lattice()
+    layout = lattice(steps)
     with open_scan(SCANS / "reseau" / f"apollo-{number}.jpg") as scan:
-        result = measure_fiducials(scan, layout, (RESEAU_PITCH_UM, RESEAU_PITCH_UM))
+        shown, first = (scan, np.zeros(2)) if steps == 2 else middle(scan)
+        result = measure_fiducials(shown, layout, (RESEAU_PITCH_UM, RESEAU_PITCH_UM))
     indices, places, used = scouted(number)
+    within = np.all((places > first) & (places < first + np.array([shown.width_px, shown.height_px])), axis=1)
+    indices, places, used = indices[within], places[within] - first, used[within]
+    assert steps == 2 or len(places) == 9
     given, seen = observations(result, layout)
     distance = np.hypot(*np.moveaxis(places[:, None] - seen[None], -1, 0))
     nearest = distance.argmin(axis=1)
