@@ -30,6 +30,9 @@ SEPARATION = re.compile(r"# Separation (.+): ([\d.]+) mm, spread ([\d.]+) \((\d+
 ENDS = {"left to right": ("5", "6"), "top to bottom": ("7", "8"), "1 to 2": ("1", "2"), "3 to 4": ("3", "4")}
 
 
+one_frame = pytest.mark.xdist_group("library frame")  # rendered once for all
+
+
 @pytest.fixture(scope="module")
 def frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project of one rendered frame of a library camera, which it names."""
@@ -134,6 +137,7 @@ def test_images_may_name_a_camera_of_the_library(tmp_path: Path) -> None:
     assert [project.camera_of(name).name for name in "ab"] == ["Wild RC9, 88 mm", "Wild RC8, 153 mm"]
 
 
+@one_frame
 @pytest.mark.usefixtures("in_one_process")
 def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
     """All drawn marks within a tenth of a pixel of the truth; those that are not drawn are passed over."""
@@ -146,6 +150,7 @@ def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
     assert (frame.parent / "comparator.csv").read_text(encoding="utf-8").count(",fiducial,") == 4
 
 
+@one_frame
 def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(
     frame: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -159,6 +164,7 @@ def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(
     assert all(fiducial.x_mm.sigma > 1.0 for fiducial in camera.camera().fiducials.values())
 
 
+@one_frame
 def test_the_frame_is_told_from_another_camera(frame: Path) -> None:
     """A ring with a cross holds the plain cross of older cameras too: the ring then counts as damage."""
     (scan,) = (frame.parent / "scans").glob("*.tif")
@@ -179,6 +185,7 @@ def trial(cameras: tuple[str, ...], score: float, chance: float | None = 0.0) ->
     return Trial(cameras, 4, 4, 0.9, 10.0, score, chance, 1.0, 0.01, "", 2.0, 1e-6)
 
 
+@one_frame
 @pytest.mark.parametrize(("found", "measured"), [(25, 1), (9, 2)])
 def test_a_part_of_a_lattice_is_no_other_camera(
     frame: Path, monkeypatch: pytest.MonkeyPatch, found: int, measured: int
@@ -193,6 +200,7 @@ def test_a_part_of_a_lattice_is_no_other_camera(
     assert sum(each.cameras == ("lattice",) for each in identify(scan, two, 100.0, Reporter()).trials) == measured
 
 
+@one_frame
 def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     frame: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -132,6 +132,19 @@ def test_refraction_and_curvature_through_files(tmp_path: Path) -> None:
     assert check_against_opencv(first).cameras["C"].verdict == "not possible"
 
 
+one_case = pytest.mark.xdist_group("earlier calibration")  # adjusted once for all
+
+
+@pytest.fixture(scope="module")
+def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Adjustment]:
+    """The folder of a reference case, and its adjustment."""
+    folder = tmp_path_factory.mktemp("earlier")
+    write_project(json.loads((CASES / "iii_selfcal_mixed.json").read_text(encoding="utf-8")), folder)
+    first = adjusted(folder)
+    write_adjustment(first, folder / "adjustment.json")
+    return folder, first
+
+
 def with_antennas(earlier: tuple[Path, Adjustment], folder: Path, sigma: str) -> Adjustment:
     """The reference case with antennas observed where its adjustment puts them, 2.5 units away from the lenses."""
     source, first = earlier
@@ -152,6 +165,7 @@ def with_antennas(earlier: tuple[Path, Adjustment], folder: Path, sigma: str) ->
     return adjusted(folder)
 
 
+@one_case
 def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     """They are where the adjustment puts them, so that nothing moves but every station becomes more certain."""
     _, first = earlier
@@ -167,19 +181,10 @@ def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], tmp_p
     assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
 
 
+@one_case
 def test_an_antenna_cannot_be_fixed(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="column sX0: is 0, but an antenna can be observed only"):
         with_antennas(earlier, tmp_path, "0")
-
-
-@pytest.fixture(scope="module")
-def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Adjustment]:
-    """The folder of a reference case, and its adjustment."""
-    folder = tmp_path_factory.mktemp("earlier")
-    write_project(json.loads((CASES / "iii_selfcal_mixed.json").read_text(encoding="utf-8")), folder)
-    first = adjusted(folder)
-    write_adjustment(first, folder / "adjustment.json")
-    return folder, first
 
 
 def once_more(earlier: Path, folder: Path, change: Callable[[str], str] = str) -> Adjustment:
@@ -192,6 +197,7 @@ def once_more(earlier: Path, folder: Path, change: Callable[[str], str] = str) -
     return adjusted(folder)
 
 
+@one_case
 def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], tmp_path: Path) -> None:
     """The same observations twice: the same values, and smaller sigmas."""
     folder, first = earlier
@@ -211,6 +217,7 @@ def test_an_earlier_calibration_through_files(earlier: tuple[Path, Adjustment], 
     assert sum(group["redundancy"] for group in written["groups"].values()) == pytest.approx(written["redundancy"])
 
 
+@one_case
 def test_the_fiducials_of_an_earlier_calibration_can_be_left_out(
     earlier: tuple[Path, Adjustment], tmp_path: Path
 ) -> None:
@@ -219,6 +226,7 @@ def test_the_fiducials_of_an_earlier_calibration_can_be_left_out(
     assert {row.name.split(".")[0] for row in second.further} == {"IO"}
 
 
+@one_case
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ImageModel
@@ -18,6 +19,7 @@ from synthetic_images.frame import frame_truth
 from synthetic_images.truth import Truth, truth_json
 
 
+@pytest.mark.xdist_group("demonstration")  # which is rendered there
 def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered: Path) -> None:
     truth = json.loads((rendered / "truth.json").read_text(encoding="utf-8"))
     (camera,) = truth["cameras"].values()

@@ -26,6 +26,7 @@ def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Array
     }
 
 
+@pytest.mark.xdist_group("stored plainly")  # rendered once for all
 @pytest.mark.parametrize("compression", ["none", "lzw", "deflate", "zstd"])
 @pytest.mark.parametrize("tile_px", [0, 64, 384])
 @pytest.mark.parametrize("colour", [False, True])
