@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from adjust.functional_model.functions import computed_observations
 from adjust.functional_model.transformation import marks_needed
 from adjust.least_squares.iteration import factorise
 from adjust.problem import Problem
@@ -13,7 +14,7 @@ from adjust.quality.probabilities import Probabilities
 from adjust.quality.reliability import Misfits, reliability
 from adjust.quality.residuals import further_residuals, groups, residuals
 from adjust.quality.snooping import contradictions, search, suspects
-from adjust.quality.suspicions import suspicions
+from adjust.quality.suspicions import is_gross, swapped_numbers, unchecked_orientations
 from adjust.quality.tested import TestedUnits
 from adjust.quality.variance_components import factor_sigmas
 from adjust.result import Cofactor, FurtherResidual, Group, Reliability, Residuals, Suspect
@@ -82,8 +83,21 @@ class RunAssessment:
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        doubts = suspicions(self.run.problem.network.observations, self.residuals) if self.run.converged else []
-        return (*_warnings(self.run, self.cofactor), *doubts)
+        observations = self.run.problem.network.observations
+        unchecked = unchecked_orientations(observations, self.residuals) if self.run.converged else []
+        return (*_warnings(self.run, self.cofactor), *self._swapped, *unchecked)
+
+    @property
+    def _swapped(self) -> list[str]:
+        """Told from where the adjustment starts, whose orientations come of what most marks say: at its end it has bent
+        to fit the wrong ones too.
+        """
+        problem = self.run.problem
+        observations = problem.network.observations
+        if self.run.converged and not is_gross(observations, self.residuals.v_mm).any():
+            return []
+        started = computed_observations(problem, problem.start())
+        return [] if started is None else swapped_numbers(observations, started - observations.xy_mm)
 
     @property
     def _found(self) -> Misfits | None:

@@ -1,4 +1,4 @@
-"""What looks wrong in a solved adjustment without contradicting it by itself: swapped numbers, images without check."""
+"""What looks wrong in an adjustment without contradicting it by itself: swapped numbers, images without check."""
 
 from itertools import combinations
 
@@ -16,17 +16,34 @@ NEARER = 0.5  # of the distance of two marks that each may lie from where the ot
 UNCHECKED = 1e-6  # redundancy of all targets of an image that is none
 
 
-def suspicions(observations: Observations, residuals: Residuals) -> list[str]:
-    """Sentences on marks whose numbers may be swapped, and on images whose orientation nothing checks."""
+def is_gross(observations: Observations, v_mm: Array) -> NDArray[np.bool_]:
+    """(n,) Whether residuals (n, 2) can be those of other marks."""
+    sigma = np.sqrt(np.trace(observations.covariance_mm2, axis1=1, axis2=2) / 2)
+    return np.asarray(np.linalg.norm(v_mm, axis=1) > GROSS * sigma)
+
+
+def swapped_numbers(observations: Observations, v_mm: Array) -> list[str]:
+    """Sentences on marks of which each lies where residuals (n, 2) expect the other. Most marks of an image must speak
+    for where it looks: one that starts upside down has all of its marks swapped.
+    """
     found = []
-    gross = _is_gross(observations, residuals.v_mm)
-    for name, rows in _rows_by_image(observations).items():
+    gross = is_gross(observations, v_mm)
+    for rows in _rows_by_image(observations).values():
         fiducial = observations.is_fiducial[rows]
         for kind in (False, True):
-            doubtful = [int(row) for row in rows[(fiducial == kind) & gross[rows]]]
-            crossed = ((i, j) for i, j in combinations(doubtful, 2) if _cross(observations, residuals, i, j))
-            found += [_swapped(observations, i, j) for i, j in crossed]
-        targets = rows[~fiducial]
+            marks = rows[fiducial == kind]
+            pairs = combinations([int(row) for row in marks[gross[marks]]], 2)
+            crossed = [(i, j) for i, j in pairs if _cross(observations, v_mm, i, j)]
+            if 2 * len({row for pair in crossed for row in pair}) < len(marks):
+                found += [_swapped(observations, i, j) for i, j in crossed]
+    return found
+
+
+def unchecked_orientations(observations: Observations, residuals: Residuals) -> list[str]:
+    """Sentences on images whose orientation no redundant target checks."""
+    found = []
+    for name, rows in _rows_by_image(observations).items():
+        targets = rows[~observations.is_fiducial[rows]]
         if len(targets) and residuals.redundancy[targets].sum() < UNCHECKED:
             found.append(
                 f"Nothing checks the orientation of image {name}: its {len(targets)} targets just determine it, "
@@ -43,14 +60,9 @@ def _rows_by_image(observations: Observations) -> dict[str, Indices]:
     return dict(zip(number, rows, strict=True))
 
 
-def _is_gross(observations: Observations, v_mm: Array) -> NDArray[np.bool_]:
-    sigma = np.sqrt(np.trace(observations.covariance_mm2, axis1=1, axis2=2) / 2)
-    return np.asarray(np.linalg.norm(v_mm, axis=1) > GROSS * sigma)
-
-
-def _cross(observations: Observations, residuals: Residuals, i: int, j: int) -> bool:
+def _cross(observations: Observations, v: Array, i: int, j: int) -> bool:
     """Whether two marks each lie where the other is expected."""
-    xy, v = observations.xy_mm, residuals.v_mm
+    xy = observations.xy_mm
     apart = np.linalg.norm(xy[i] - xy[j])
     off = max(np.linalg.norm(xy[i] + v[i] - xy[j]), np.linalg.norm(xy[j] + v[j] - xy[i]))
     return bool(off < NEARER * apart)

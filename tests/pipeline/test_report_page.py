@@ -141,7 +141,7 @@ def test_only_measured(measured: ReportData) -> None:
     text = rendered(measured).text
     assert "✓ Good" in text
     assert "Measured: 160 marks in 5 frames." in text
-    assert "There is no adjustment yet: run `reseau adjust`." in text
+    assert "These marks are not adjusted yet: run `reseau adjust`." in text
 
 
 def test_a_frame_that_was_not_found_says_so_once(measured: ReportData) -> None:
