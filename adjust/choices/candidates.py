@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, fdtrc
 
 from adjust.choices.cross_validation import CrossValidation
 from adjust.choices.models import Model
@@ -90,7 +90,7 @@ def f_test(simpler: Candidate, richer: Candidate) -> Nested:
     more, redundancy = richer.unknowns - simpler.unknowns, richer.redundancy
     variance = richer.vpv / redundancy if redundancy > 0 else 1.0
     f = max(simpler.vpv - richer.vpv, 0.0) / more / variance
-    p = stats.f.sf(f, more, redundancy) if redundancy > 0 else stats.chi2.sf(f * more, more)
+    p = fdtrc(more, redundancy, f) if redundancy > 0 else chdtrc(more, f * more)
     return Nested(simpler.model, richer.model, float(f), (more, redundancy), float(p))
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from adjust.choices.candidates import Candidate, Nested, f_test
 from adjust.choices.models import Model
@@ -16,7 +16,7 @@ def verdict(given: Model, chosen: Candidate | None) -> str:
     text = f"The data ask for {chosen.model.name}."
     if chosen.model == given:
         text += " That is the model as it is given."
-    low, high = (float(np.sqrt(stats.chi2.ppf(p, chosen.redundancy) / chosen.redundancy)) for p in (0.005, 0.995))
+    low, high = (float(np.sqrt(chdtri(chosen.redundancy, above) / chosen.redundancy)) for above in (0.995, 0.005))
     if chosen.redundancy > 0 and not low <= chosen.sigma0 <= high:
         text += (
             f" Its sigma0 of {chosen.sigma0:.2f} is not what the given standard deviations allow, {low:.2f} to "

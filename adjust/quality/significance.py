@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
 from adjust.functional_model.families import family
 from adjust.network import Camera, Prior
@@ -105,10 +105,10 @@ def _tested(
     r = adjustment.redundancy
     if len(parameters) == 1:
         t = float(normalised[0]) / float(np.sqrt(variance))
-        one_sided = stats.t.sf(abs(t), r) if r > 0 else stats.norm.sf(abs(t))
+        one_sided = stdtr(r, -abs(t)) if r > 0 else ndtr(-abs(t))
         return SignificanceTest(name, parameters, t, 2.0 * float(one_sided))
     count = len(parameters)
     square = float(normalised @ np.linalg.solve(cofactor / np.outer(scale, scale), normalised))
     statistic = square / (count * variance)
-    p = stats.f.sf(statistic, count, r) if r > 0 else stats.chi2.sf(square, count)
+    p = fdtrc(count, r, statistic) if r > 0 else chdtrc(count, square)
     return SignificanceTest(name, parameters, statistic, float(p))

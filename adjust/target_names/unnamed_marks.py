@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -79,7 +79,8 @@ def chance_of_a_mark(density: Array, reach: Array | float) -> Array:
 
 def log10_of_agreement(agreeing: int, of: int, chance: float) -> float:
     """The logarithm of the probability that so many or more agree, of so many that agree by chance independently."""
-    return float(binom.logsf(agreeing - 1, of, chance)) / float(np.log(10.0))
+    with np.errstate(divide="ignore"):  # -inf below the smallest number
+        return float(np.log10(bdtrc(agreeing - 1, of, chance)))
 
 
 def _centres(least: Array, greatest: Array, cells: int) -> Array:

@@ -12,8 +12,8 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.optimize import brentq
+from scipy.special import chdtrc, fdtrc
 
 from measure.checks.doubts import CHANCE, FILM_MM, MEDIAN_EFFICIENCY, TOLD, Doubt, doubted, from_others, observed
 from measure.checks.triangles import by_given_triangles, by_other_triangles
@@ -76,7 +76,7 @@ def _by_other_method(frames: Sequence[FrameMeasurement], _: FiducialLayout) -> I
         doubts = {}
         for mark in observed(frame):
             sigmas = mark.quality.get(name)
-            if sigmas is not None and stats.chi2.sf(sigmas**2, 2) * tests < CHANCE:
+            if sigmas is not None and chdtrc(2, sigmas**2) * tests < CHANCE:
                 off = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
                 doubts[mark.point] = Doubt(
                     f"its edges put it {off:#.2g} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
@@ -228,7 +228,7 @@ class _Scatter:
     def chance(self, frame: _Apart) -> float:
         """The probability that a frame of good marks has one as far off."""
         squares = frame.squares_mm2 / (self.variance_mm2 * frame.film + frame.measured_mm2)
-        return len(squares) * float(stats.f.sf(squares.max() / 2, 2, max(self.degrees, 1.0)))
+        return len(squares) * float(fdtrc(2, max(self.degrees, 1.0), squares.max() / 2))
 
 
 def _strangers(seen: _Seen, reference: _Reference | None, scatter: _Scatter) -> tuple[list[int], list[float]]:
@@ -283,7 +283,7 @@ def _off_midpoint(
     spread = spread + (spread.sum() - spread) / (count - 1) ** 2
     squares = (apart**2).sum(axis=1) / spread
     worst = int(squares.argmax())
-    if stats.chi2.sf(squares[worst], 2) > chance:
+    if chdtrc(2, squares[worst]) > chance:
         return {}
     guilty = pairs if count == 2 else [pairs[worst]]
     distance = float(np.hypot(*apart[worst]))

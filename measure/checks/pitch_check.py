@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtri
 
 from measure.frames.frame_fit import AFFINITY_SIGMA
 from measure.marks.shapes import FiducialLayout
@@ -33,7 +33,7 @@ def pitch_problem(
     if not lever_mm > given:
         return None
     sigma = float(np.hypot(AFFINITY_SIGMA, given / lever_mm))
-    limit = float(stats.norm.isf(_CHANCE / 2 / 2)) * sigma
+    limit = -float(ndtri(_CHANCE / 2 / 2)) * sigma
     excess = seen_um / np.asarray(pitch_um) - 1
     if np.abs(excess).max() <= limit:
         return None

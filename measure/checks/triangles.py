@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.optimize import brentq
+from scipy.special import chdtrc, chdtri, fdtrc
 
 from measure.checks.doubts import CHANCE, FILM_MM, MEDIAN_EFFICIENCY, TOLD, Doubt, from_others, observed
 from measure.frames.frame_fit import AFFINITY_SIGMA
@@ -83,7 +83,7 @@ def _names(frame: FrameMeasurement) -> tuple[str, ...]:
 def _against_given(form: _Form, names: Sequence[str], given_mm: Array, tests: int) -> dict[str, Doubt]:
     """Doubts of the marks called names, whose given places are known to given_mm (3,)."""
     covariance = form.covariance(given_mm) + _STRETCH
-    if stats.chi2.sf(_misfit(form.stretched, covariance), _FORM) * tests >= CHANCE:
+    if chdtrc(_FORM, _misfit(form.stretched, covariance)) * tests >= CHANCE:
         return {}
     return _doubts(_off(form, form.stretched, covariance), names, form, _from_given)
 
@@ -105,7 +105,7 @@ def _against_others(
         misfits = np.array([_misfit(*each) for each in zip(apart, covariances, strict=True)])
         worst = max((n for n, place in enumerate(places) if place in three), key=lambda n: misfits[n])
         degrees = MEDIAN_EFFICIENCY * _FORM * (len(places) - 1)
-        if stats.f.sf(misfits[worst] / _FORM, _FORM, degrees) * tests >= CHANCE:
+        if fdtrc(_FORM, degrees, misfits[worst] / _FORM) * tests >= CHANCE:
             break
         form = left.pop(places[worst])
         doubts[places[worst]] = _doubts(_off(form, apart[worst], covariances[worst]), names, form, from_others)
@@ -200,6 +200,6 @@ def _scatter(apart: Array, measured: Array) -> float:
 
     def too_far(variance: float) -> float:
         misfits = [_misfit(each, own + variance * np.eye(_FORM)) for each, own in zip(apart, measured, strict=True)]
-        return float(np.median(misfits) - stats.chi2.ppf(0.5, _FORM))
+        return float(np.median(misfits) - chdtri(_FORM, 0.5))
 
     return 0.0 if too_far(0.0) <= 0 else float(brentq(too_far, 0.0, float((apart**2).sum(axis=1).max())))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import fdtrc
 
 from measure.fitting.picture_model import GREY, PictureModel
 from measure.noise.noise import REACH_PX, NoiseModel, autocovariance, correlated
@@ -54,7 +54,7 @@ def is_overwhelming(chi_square: float, greys: int, noise: NoiseModel, redundancy
     it than as many others would, by the sum of their squared correlations (Bartlett).
     """
     alike = float(np.sum(noise.autocovariance_dn2**2)) / max(noise.variance_dn2**2, 1e-300)
-    return bool(stats.f.sf(chi_square / greys, greys, max(redundancy / max(alike, 1.0), 1.0)) < _CHANCE)
+    return bool(fdtrc(greys, max(redundancy / max(alike, 1.0), 1.0), chi_square / greys) < _CHANCE)
 
 
 class _Search:

@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
-from scipy.special import log_ndtr
+from scipy.special import bdtrc, log_ndtr
 
 from measure.noise.noise import robust_scale
 from measure.scans.scan import Scan
@@ -109,7 +108,7 @@ def _is_cut(grey: NDArray[np.floating]) -> bool:
     if beside.sum() < _FEWEST or not sigma > _LEAST_STEPS * step:
         return False
     tail = int((grey >= greatest - _TAIL * sigma).sum())
-    return bool(stats.binom.sf(pile - 1, tail, step / (_TAIL * sigma)) < _CHANCE)
+    return bool(bdtrc(pile - 1, tail, step / (_TAIL * sigma)) < _CHANCE)
 
 
 def _limits(full_scale_dn: float) -> set[float]:

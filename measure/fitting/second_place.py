@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc
 
 from measure.fitting.linear_fit import LinearFit
 from measure.fitting.picture_model import GREY
@@ -37,7 +37,7 @@ class SecondPlace:
     @property
     def chance(self) -> float:
         """The probability that noise alone makes the difference as long."""
-        return float(stats.chi2.sf(self.sigmas**2, 2))
+        return float(chdtrc(2, self.sigmas**2))
 
 
 def edge_place(fit: LinearFit, blur_px: float) -> SecondPlace | None:

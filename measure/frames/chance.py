@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import bdtrc
 
 from measure.fiducial_options import FiducialOptions
 from measure.frames.first_look import strongest
@@ -104,7 +104,7 @@ def _by_places_beside(
     weakest = min((response(index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
     hits = sum(response(index, place, radius) >= weakest for index, place in places)
     share = (hits + 1) / (len(places) + 2)  # Laplace: none of sixty does not mean never
-    chance = float(stats.binom.sf(found - _FREE - 1, len(inside) - _FREE, share))
+    chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, share))
     if chance <= _LIKELY:
         return ""
     return (

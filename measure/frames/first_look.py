@@ -6,7 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtr
 
 from measure.fitting.matching import window_about
 from measure.marks.rendering import extent_px, known_picture
@@ -90,4 +90,4 @@ class _Look:
         energy = max(float((noise**2).sum() * (chip**2).sum()), 1e-12)
         variance = max((answers**2).sum() / energy, 1e-12) / float(self._counts.sum())
         unlike = max(1 - self.height**2, 1e-12)
-        return float(self._places * stats.norm.sf(self.height / np.sqrt(unlike * variance)))
+        return float(self._places * ndtr(-self.height / np.sqrt(unlike * variance)))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc
 
 from measure.fitting.matching import Match
 from measure.frames.refinement import Sighting
@@ -123,7 +123,7 @@ class Frame:
         if fit.damaged_fraction > CLEAR_DAMAGE:
             reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
-        if stats.chi2.sf((WRONG_PX / sigma_px) ** 2, 2) > WRONG_CHANCE:
+        if chdtrc(2, (WRONG_PX / sigma_px) ** 2) > WRONG_CHANCE:
             reasons.append(f"its standard deviation is {sigma_px:.2f} px")
         if self.misfit_mm[index] > _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM):
             reasons.append(f"it lies {self.misfit_mm[index]:.2f} mm from where the others put it: the film is deformed")

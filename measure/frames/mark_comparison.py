@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtr
 
 from measure.fitting.matching import Match
 from measure.fitting.own_shape import OwnShape
@@ -53,7 +53,7 @@ class SharedBlur:
         observation by the root of what it takes from its variance."""
         moved = _log_seen_px(fit.blur_px) - _log_seen_px(self.blur_px)
         off = abs(moved) / np.sqrt(max(self.sigma**2 - fit.blur_sigma**2, 1e-12))
-        return bool(fit.blur_sigma < self.sigma and 2 * stats.norm.sf(off) >= _CHANCE)
+        return bool(fit.blur_sigma < self.sigma and 2 * ndtr(-off) >= _CHANCE)
 
 
 def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
@@ -89,9 +89,14 @@ class SharedShape:
         """The probability that something touches the mark on one side. reach_px: from its middle to its outline;
         is_damaged: whether something was cut out beside it."""
         share = _DAMAGED if is_damaged else _WHOLE
-        touched = share * np.prod(stats.norm.pdf(self.off, scale=np.hypot(self.sigma, _TOUCHED_PX / reach_px)))
-        untouched = (1 - share) * np.prod(stats.norm.pdf(self.off, scale=self.sigma))
-        return float(touched) / max(float(touched + untouched), 1e-300)
+        touched = share * _density(self.off, np.hypot(self.sigma, _TOUCHED_PX / reach_px))
+        untouched = (1 - share) * _density(self.off, self.sigma)
+        return touched / max(touched + untouched, 1e-300)
+
+
+def _density(off: Array, sigma: Array) -> float:
+    """Of independent normal deviations."""
+    return float(np.prod(np.exp(-0.5 * (off / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)))
 
 
 def round_moves_px(shape: SharedShape, radius_px: float) -> float:
@@ -105,7 +110,7 @@ def round_moves_beyond(px: float, shape: SharedShape, radius_px: float) -> float
     prior, said = (_TOUCHED_PX / radius_px) ** 2, shape.sigma[0] ** 2
     sigma = _AS_MUCH * radius_px * np.sqrt(prior * said / (prior + said))
     moved_px = round_moves_px(shape, radius_px) * prior / (prior + said)
-    return float(stats.norm.sf((px - moved_px) / sigma) + stats.norm.sf((px + moved_px) / sigma))
+    return float(ndtr((moved_px - px) / sigma) + ndtr((-moved_px - px) / sigma))
 
 
 def shared_sizes(fits: Sequence[Match], linear: Array) -> list[SharedShape | None]:
@@ -185,7 +190,7 @@ def _told(own: Array, sigma: Array, index: int, spread: _Spread, fewest: int) ->
     mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
     predicted = float(np.hypot(mean_sigma, apart))
     off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
-    return _Told(mean, predicted, bool(2 * stats.norm.sf(off) * len(own) < _CHANCE))
+    return _Told(mean, predicted, bool(2 * ndtr(-off) * len(own) < _CHANCE))
 
 
 def _mean(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from measure.noise.noise import robust_scale
 
@@ -42,7 +42,7 @@ def contradicting(first: Array, second: Array, tolerance: float) -> Mask:
     distance = _sampson(np.asarray(matrix, np.float64)[:3], first, second)
     near = np.asarray(cKDTree(first).query(first, _NEIGHBOURS + 1)[1])[:, 1:]
     alone = distance - np.median(distance[near], axis=1)
-    limit = float(norm.isf(_CHANCE / 2)) * robust_scale(alone)
+    limit = -float(ndtri(_CHANCE / 2)) * robust_scale(alone)
     return np.asarray(np.abs(alone) > limit)
 
 

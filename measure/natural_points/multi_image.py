@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from measure.natural_points.bending import Bending
 from measure.noise.noise import NoiseModel, correlated, noise_model
@@ -263,7 +263,7 @@ class _Fit:
         spread = np.tensordot(correlated(moves, noise), moves, axes=([1, 2], [1, 2]))
         values, vectors = np.linalg.eigh(spread)
         real = values > 1e-9 * values[-1]
-        return float(chi2.sf(np.sum((vectors.T @ seen)[real] ** 2 / values[real]), real.sum())) if real.any() else 1.0
+        return float(chdtrc(real.sum(), np.sum((vectors.T @ seen)[real] ** 2 / values[real]))) if real.any() else 1.0
 
 
 def _products(first: Array, second: Array) -> Array:

@@ -7,7 +7,7 @@ tree or roof. But the ground about a point maps nearly as one piece: an affine m
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -31,8 +31,8 @@ def astray(first: Array, second: Array) -> Mask:
         if np.count_nonzero(~strange) <= 2 * _NEIGHBOURS:
             return np.zeros(len(first), dtype=bool)
         ratios = _ratios(first, second, np.flatnonzero(~strange))
-        usual, large = np.quantile(ratios, (0.5, float(norm.cdf(1.0))))
-        strange = np.asarray(ratios > usual + float(norm.isf(_CHANCE)) * (large - usual))
+        usual, large = np.quantile(ratios, (0.5, float(ndtr(1.0))))
+        strange = np.asarray(ratios > usual - float(ndtri(_CHANCE)) * (large - usual))
     return strange
 
 

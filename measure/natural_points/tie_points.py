@@ -13,7 +13,7 @@ from itertools import chain, combinations, compress
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from measure.natural_points.bending import Bending, bending_variance
 from measure.natural_points.epipolar import contradicting
@@ -236,7 +236,7 @@ def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
                 strangeness[frame].append((point, float(np.log(point.matched[frame].variance / np.mean(others)))))
     for frame, rows in strangeness.items():
         values = np.array([value for _, value in rows])
-        limit = np.median(values) + float(norm.isf(_CHANCE)) * robust_scale(values)
+        limit = np.median(values) - float(ndtri(_CHANCE)) * robust_scale(values)
         for point, value in rows:
             if value > limit:
                 point.refused[frame] = "the picture about the point is unlike that in the other scans: something else"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import betaln
 
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import FiducialLayout, Side
@@ -45,7 +45,8 @@ class Beside:
     @property
     def log_odds(self) -> float:
         """Of lying on the strip's side, against any other."""
-        on, off = (float(stats.betabinom.logpmf(self.written, self.seen, *law)) for law in (_ON_STRIP, _ELSEWHERE))
+        counted = np.array([self.written, self.seen - self.written])
+        on, off = (float(betaln(*(counted + law)) - betaln(*law)) for law in (_ON_STRIP, _ELSEWHERE))
         return on - off
 
 

@@ -9,8 +9,7 @@ estimation for color images", IEEE Trans. Image Processing 15, 2006.)
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 Array = NDArray[np.float64]
 
@@ -74,11 +73,11 @@ def _combs(coefficients: Array) -> Array:
 
 def _limit(chance: float, looks: int) -> float:
     """The clearness that one of so many looks at no comb exceeds with that chance."""
-    return float(norm.isf(chance / looks))
+    return -float(ndtri(chance / looks))
 
 
 def _stands_out(strength: float, others: Array) -> bool:
     """Whether one of the places differs from all others as chance does not make it (Student's t)."""
     spread = others.std(ddof=1) * np.sqrt(1 + 1 / len(others))
-    limit = student.isf(_CHANCE / (len(others) + 1), len(others) - 1)
+    limit = -stdtrit(len(others) - 1, _CHANCE / (len(others) + 1))
     return bool(strength - others.mean() > limit * spread)

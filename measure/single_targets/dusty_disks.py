@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc
 
 from measure.noise.noise import SIGMA_OF_DEVIATION
 from measure.single_targets.disks import FittedDisk
@@ -59,7 +59,7 @@ def _doubt(disk: FittedDisk, off: Array, kinds: Array) -> str:
     probability of each kind of dust."""
     if kinds[_MUCH].sum() < _SHOWN:
         sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
-        chances = stats.chi2.sf(_LARGE_PX**2 / (sigma**2 + _DUST_MOVES_PX**2), 2)
+        chances = chdtrc(2, _LARGE_PX**2 / (sigma**2 + _DUST_MOVES_PX**2))
         if chances[0] > _LARGE_CHANCE:
             return f"faint: good to {sigma:.2f} px only"
         return f"dust that puts it {_LARGE_PX} px off may hide in it" if chances @ kinds > _LARGE_CHANCE else ""

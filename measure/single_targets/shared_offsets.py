@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.spatial import cKDTree
+from scipy.special import fdtrc
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -161,5 +161,5 @@ def _chances(fit: _Fit, targets: TargetPlaces) -> Array:
         share = group.sum() / len(group)
         freedom = _EFFICIENCY * share * (2.0 * len(group) - fit.unknowns)
         if freedom > 1.0:
-            chance[group] = stats.f.sf(fit.squares[group] / np.maximum(local[group], 1.0) / 2.0, 2, freedom)
+            chance[group] = fdtrc(2, freedom, fit.squares[group] / np.maximum(local[group], 1.0) / 2.0)
     return chance

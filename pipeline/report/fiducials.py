@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtri
 
 from pipeline.files.adjustment_reader import Covariance
 from pipeline.report import svg
@@ -71,7 +71,7 @@ def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
 def figure_plot(change: Figure) -> Markup:
     """The given places, the change of each mark as a stroke, and the 95 % ellipse about its end."""
     axes, angles = _ellipse_axes(change.covariance_um2)
-    radius = np.sqrt(stats.chi2.ppf(0.95, 2)) * axes
+    radius = np.sqrt(chdtri(2, 0.05)) * axes
     reach = np.hypot(*change.change_um.T) + radius.max(axis=1)
     px_per_um = svg.round_step(LONGEST_PX / float(reach.max())) if reach.max() > 0.0 else 1.0
     low, high = change.given_mm.min(axis=0), change.given_mm.max(axis=0)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, ndtri
 
 from measure.status import Status
 from pipeline.report.data import Json, Problem, ReportData
@@ -84,14 +84,13 @@ def camera_is_calibrated(camera: Json) -> bool:
 
 def sigma0_bounds(redundancy: int) -> tuple[float, float]:
     """Where sigma0 lies, with a probability of 99 %, when the a-priori standard deviations are right."""
-    chi_square = stats.chi2(redundancy)
-    low, high = chi_square.ppf(0.5 * (1.0 - CONFIDENCE)), chi_square.ppf(0.5 * (1.0 + CONFIDENCE))
+    low, high = (chdtri(redundancy, 0.5 * above) for above in (1.0 + CONFIDENCE, 1.0 - CONFIDENCE))
     return float(np.sqrt(low / redundancy)), float(np.sqrt(high / redundancy))
 
 
 def critical_w(tests: int) -> float:
     """The standardised residual that one of so many good observations exceeds once in a hundred adjustments."""
-    return float(stats.norm.isf(0.5 * (1.0 - CONFIDENCE) / max(tests, 1)))
+    return -float(ndtri(0.5 * (1.0 - CONFIDENCE) / max(tests, 1)))
 
 
 def suspect_rows(adjustment: Json) -> list[Json]:
