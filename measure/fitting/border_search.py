@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
 from scipy.special import fdtrc
 
 from measure.fitting.picture_model import GREY, PictureModel
@@ -15,11 +16,11 @@ from measure.noise.noise import REACH_PX, NoiseModel, autocovariance, correlated
 from measure.noise.pixel_sums import products
 
 Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _TURN, _APART = np.pi / 15, 2.0  # rad and blurs: between the borders that are tried first
 _FINER = 4  # times as close are those that are tried about the best of these
+_POWERS = 3  # of the picture that an edge is summed with: 0 to 2
 _LEAST_SIDE = 0.05  # of the area: a smaller one is no ground beyond a border
 _FEWEST = 3  # pixels to an unknown
 _LEAST_LEFT = 1e-4  # of a change of contrast, beside the step: less cannot be told from it
@@ -40,10 +41,10 @@ def likely_border(model: PictureModel, area: Mask, floor_dn: float) -> LikelyBor
     if tells.sum() < _FEWEST * len(model.design):
         return None
     search = _Search(model, tells)
-    best = search.best(search.coarse())
+    best = search.best(*search.coarse())
     if best is None:
         return None
-    best = search.best(search.about(best)) or best
+    best = search.best(*search.about(best)) or best
     return best if search.stands_out(best, floor_dn) else None
 
 
@@ -60,7 +61,7 @@ def is_overwhelming(chi_square: float, greys: int, noise: NoiseModel, redundancy
 class _Search:
     """used (height, width): n pixels that tell their grey value; place (2, n): where these are, from the mark's start,
     px; base (unknowns, n): orthonormal rows that span what the mark's unknowns change there; left (n,): what they leave
-    of the grey values; shown (n,): the mark's picture."""
+    of the grey values; shown (n,): the mark's picture; soft_px: as wide a step is about as soft as the mark."""
 
     def __init__(self, model: PictureModel, used: Mask) -> None:
         self.used = used
@@ -70,33 +71,32 @@ class _Search:
         self.left = self._beside(model.grey[used][None])[0]
         self.shown = model.design[-GREY][used]
         self.blur_px = model.seen_blur_px
+        self.soft_px = np.sqrt(2 * np.pi) * self.blur_px
+        both = np.concatenate([self.base, self.left[None]])
+        powers = np.stack([np.ones_like(self.shown), self.shown, self.shown**2])
+        self._rows = np.ascontiguousarray(np.concatenate([both, both * self.shown, powers]).T)
 
-    def coarse(self) -> Array:
-        """(tried, 2) off_px and turn_rad of borders everywhere."""
+    def coarse(self) -> tuple[Array, Array]:
+        """off_px and turn_rad of borders everywhere."""
         reach_px = float(np.hypot(*self.place).max())
-        offs, turns = np.arange(-reach_px, reach_px, _APART * self.blur_px), np.arange(0.0, np.pi, _TURN)
-        return np.stack(np.meshgrid(offs, turns), axis=-1).reshape(-1, 2)
+        return np.arange(-reach_px, reach_px, _APART * self.blur_px), np.arange(0.0, np.pi, _TURN)
 
-    def about(self, best: LikelyBorder) -> Array:
-        """(tried, 2) off_px and turn_rad of borders about one, closer together."""
+    def about(self, best: LikelyBorder) -> tuple[Array, Array]:
+        """off_px and turn_rad of borders about one, closer together."""
         steps = np.arange(1 - _FINER, _FINER) / _FINER
-        offs, turns = best.off_px + steps * _APART * self.blur_px, best.turn_rad + steps * _TURN
-        return np.stack(np.meshgrid(offs, turns), axis=-1).reshape(-1, 2)
+        return best.off_px + steps * _APART * self.blur_px, best.turn_rad + steps * _TURN
 
-    def best(self, tried: Array) -> LikelyBorder | None:
-        """Which of the borders takes most from the squares; None where none divides the area."""
-        edges = self._edges(tried)
-        sides = edges.mean(axis=1)
-        divides = (sides > _LEAST_SIDE) & (sides < 1 - _LEAST_SIDE)
-        if not divides.any():
-            return None
-        gained = np.where(divides, self._gained(edges), 0.0)
-        return LikelyBorder(*tried[int(np.argmax(gained))])
+    def best(self, offs_px: Array, turns_rad: Array) -> LikelyBorder | None:
+        """Which border of any of the distances in any of the directions takes most from the squares; None where none
+        divides the area."""
+        gained = np.array([self._gained(offs_px, turn_rad) for turn_rad in turns_rad])
+        turn, off = np.unravel_index(int(np.argmax(gained)), gained.shape)
+        return LikelyBorder(offs_px[off], turns_rad[turn]) if gained[turn, off] > 0 else None
 
     def stands_out(self, border: LikelyBorder, floor_dn: float) -> bool:
         """Whether step and change of contrast by a linear fit are more than noise makes that is as alike from pixel to
         pixel as what this fit leaves."""
-        edge = self._edges(np.array([border]))[0].astype(float)
+        edge = self._edge(border)
         columns = self._beside(np.stack([edge, edge * self.shown]))
         scores, normal = columns @ self.left, columns @ columns.T
         # Where the border passes beside the mark, the change is none, or one of the whole contrast.
@@ -113,28 +113,52 @@ class _Search:
         )
         return is_overwhelming(chi_square, 2, noise, len(self.left) - len(self.base) - 2)
 
-    def _gained(self, edges: Single) -> Array:
-        """(tried,) by how much each edge (tried, n), with a change of contrast, lessens the sum of squares."""
-        base, left, shown = (each.astype(np.float32) for each in (self.base, self.left, self.shown))
-        squares = (edges**2) @ np.stack([np.ones_like(shown), shown, shown**2], axis=1)
-        by_edge = edges @ np.concatenate([base, left[None]]).T
-        by_change = edges @ (np.concatenate([base, left[None]]) * shown).T
+    def _gained(self, offs_px: Array, turn_rad: float) -> Array:
+        """(offs,) by how much the edge at each distance, with a change of contrast, lessens the sum of squares: 0 where
+        it does not divide the area."""
+        weighted, squares = self._edge_sums(offs_px, turn_rad)
+        by_edge, by_change = np.split(weighted[:, :-_POWERS], 2, axis=1)
         explained = by_edge[:, :-1], by_change[:, :-1]
-        first = squares[:, 0] - (explained[0] ** 2).sum(axis=1)
+        first = np.maximum(squares[:, 0] - (explained[0] ** 2).sum(axis=1), 1e-6)
         both = squares[:, 1] - (explained[0] * explained[1]).sum(axis=1)
-        second = squares[:, 2] - (explained[1] ** 2).sum(axis=1)
-        own = second - both**2 / np.maximum(first, 1e-6)
+        own = squares[:, 2] - (explained[1] ** 2).sum(axis=1) - both**2 / first
         of_edge, of_change = by_edge[:, -1], by_change[:, -1]
-        gained = of_edge**2 / np.maximum(first, 1e-6)
-        further = (of_change - both / np.maximum(first, 1e-6) * of_edge) ** 2 / np.maximum(own, 1e-6)
-        return np.asarray(gained + np.where(own > _LEAST_LEFT * squares[:, 0], further, 0.0), float)
+        further = (of_change - both / first * of_edge) ** 2 / np.maximum(own, 1e-6)
+        gained = of_edge**2 / first + np.where(own > _LEAST_LEFT * squares[:, 0], further, 0.0)
+        side = weighted[:, -_POWERS] / len(self.left)
+        return np.where((side > _LEAST_SIDE) & (side < 1 - _LEAST_SIDE), gained, 0.0)
 
-    def _edges(self, tried: Array) -> Single:
-        """(tried, n) a step of 1 beyond each, about as soft as the mark."""
-        turns = np.stack([np.cos(tried[:, 1]), np.sin(tried[:, 1]), -tried[:, 0]], axis=1)
-        places = np.concatenate([self.place, np.ones_like(self.place[:1])]) / (np.sqrt(2 * np.pi) * self.blur_px)
-        across = turns.astype(np.float32) @ places.astype(np.float32)
-        return np.asarray(np.clip(across + np.float32(0.5), 0.0, 1.0), np.float32)
+    def _edge_sums(self, offs_px: Array, turn_rad: float) -> tuple[Array, Array]:
+        """(offs, columns) the sums of all rows, each pixel by the step of 1 beyond the edge at each distance; and those
+        of the powers of the picture by the step's square.
+
+        The step rises in a straight line from one bound to another: it is the difference of how far a pixel lies beyond
+        each, and what lies beyond a bound is summed up for all of them at once.
+        """
+        across = np.array([np.cos(turn_rad), np.sin(turn_rad)]) @ self.place
+        bounds = np.concatenate([offs_px - self.soft_px / 2, offs_px + self.soft_px / 2])
+        order = np.argsort(bounds)
+        cells = np.searchsorted(bounds[order], across)
+
+        def beyond(power: int, rows: Array) -> Array:
+            moments = csc_array((across**power, cells, np.arange(len(cells) + 1)), shape=(len(bounds) + 1, len(cells)))
+            sums = np.empty((len(bounds), rows.shape[1]))
+            sums[order] = np.cumsum((moments @ rows)[::-1], axis=0)[-2::-1]
+            return sums
+
+        at = bounds[:, None]
+        count, first = beyond(0, self._rows), beyond(1, self._rows)
+        far = first - at * count
+        squares = slice(-_POWERS, None)
+        square = beyond(2, self._rows[:, squares]) - at * (far + first)[:, squares]
+        begin, end = slice(len(offs_px)), slice(len(offs_px), None)
+        of_squares = (square[begin] - square[end]) / self.soft_px - 2 * far[end, squares]
+        return (far[begin] - far[end]) / self.soft_px, of_squares / self.soft_px
+
+    def _edge(self, border: LikelyBorder) -> Array:
+        """(n,) a step of 1 beyond it."""
+        across = np.array([np.cos(border.turn_rad), np.sin(border.turn_rad)]) @ self.place - border.off_px
+        return np.asarray(np.clip(across / self.soft_px + 0.5, 0.0, 1.0))
 
     def _beside(self, rows: Array) -> Array:
         """What the mark's unknowns leave of rows (m, n)."""
