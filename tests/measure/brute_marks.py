@@ -11,26 +11,46 @@ from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring
 from measure.scans.scan import Scan, open_scan
 
 Array = NDArray[np.float64]
+Singles = NDArray[np.float32]
 POINTS, KEPT = 32, 8  # along a pixel's side; asked, and left for the blur
 
 
 def brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
     """(height, width) shares of the pixels inside of the mark, after a Gaussian blur."""
-    pad = int(np.ceil(5 * blur_px)) + 1
+    reach = int(np.ceil(5 * blur_px)) + 1
+    corners = np.concatenate([corners_mm(part) for part in mark.parts])
+    # No blur reaches farther from the mark: all else stays dark.
+    (col0, row0), (col1, row1) = (
+        np.clip(each, 0, (width, height)) for each in bounds_px(corners, pixel_from_mark, reach)
+    )
+    picture = np.zeros((height, width))
+    moved = pixel_from_mark - np.array([[0, 0, col0], [0, 0, row0]])
+    picture[row0:row1, col0:col1] = _brute_picture(mark, moved, col1 - col0, row1 - row0, blur_px, reach)
+    return picture
+
+
+def bounds_px(corners: Array, pixel_from_mark: Array, spare_px: int) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """The first column and row, and those after the last, of the pixels that hold points (n, 2) in mm, and of so many
+    about them."""
+    places = corners @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2]
+    return np.floor(places.min(axis=0)).astype(int) - spare_px, np.ceil(places.max(axis=0)).astype(int) + 1 + spare_px
+
+
+def _brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: int, blur_px: float, pad: int) -> Array:
     rows, cols = height + 2 * pad, width + 2 * pad
     inside = np.zeros((rows * POINTS, cols * POINTS), dtype=bool)
     mark_from_pixel = np.linalg.inv(pixel_from_mark[:, :2])
     for part in mark.parts:
-        places = corners_mm(part) @ pixel_from_mark[:, :2].T + pixel_from_mark[:, 2] + pad
-        first = np.clip(np.floor(places.min(axis=0)).astype(int) - 1, 0, (cols, rows)) * POINTS
-        last = np.clip(np.ceil(places.max(axis=0)).astype(int) + 2, 0, (cols, rows)) * POINTS
+        first, last = (
+            np.clip(each + pad, 0, (cols, rows)) * POINTS for each in bounds_px(corners_mm(part), pixel_from_mark, 1)
+        )
         col, row = (
-            (np.arange(a, b) + 0.5) / POINTS - 0.5 - pad - center
+            ((np.arange(a, b) + 0.5) / POINTS - 0.5 - pad - center).astype(np.float32)  # to a millionth of a pixel
             for a, b, center in zip(first, last, pixel_from_mark[:, 2], strict=True)
         )
         box = inside[first[1] : last[1], first[0] : last[0]]
         for strip, down in zip(in_strips(box, len(col)), in_strips(row, len(col)), strict=True):
-            x, y = (line[0] * col[None, :] + line[1] * down[:, None] for line in mark_from_pixel)
+            x, y = (line[0] * col[None, :] + line[1] * down[:, None] for line in mark_from_pixel.astype(np.float32))
             strip |= is_inside(part, x, y)
     step = POINTS // KEPT
     rowwise = np.asarray(np.sum([inside[k::step] for k in range(step)], axis=0, dtype=np.uint8))
@@ -51,13 +71,14 @@ def corners_mm(part: Part) -> Array:
     return np.array(part.vertices_mm)
 
 
-def is_inside(part: Part, x: Array, y: Array) -> NDArray[np.bool_]:
+def is_inside(part: Part, x: Singles, y: Singles) -> NDArray[np.bool_]:
     """Which points (mm, y up) a part holds."""
     if isinstance(part, Disk):
         return np.asarray((x - part.center_mm[0]) ** 2 + (y - part.center_mm[1]) ** 2 < part.radius_mm**2)
     if isinstance(part, Ring):
-        distance = np.sqrt((x - part.center_mm[0]) ** 2 + (y - part.center_mm[1]) ** 2)
-        return np.asarray(np.abs(distance - part.radius_mm) < part.line_mm / 2)
+        inner, outer = (max(part.radius_mm + half, 0.0) ** 2 for half in (-part.line_mm / 2, part.line_mm / 2))
+        squared = (x - part.center_mm[0]) ** 2 + (y - part.center_mm[1]) ** 2
+        return np.asarray((squared > inner) & (squared < outer))
     if isinstance(part, Bar):
         dx, dy = part.to_mm[0] - part.from_mm[0], part.to_mm[1] - part.from_mm[1]
         length = float(np.sqrt(dx**2 + dy**2))

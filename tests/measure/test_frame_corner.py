@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from brute_marks import written_scan
+from drawn import drawn, transformed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
@@ -32,19 +33,17 @@ MATRIX = np.column_stack(
 def picture(seed: int, radius_mm: float = 0.0, neighbour: bool = False, negative: bool = False) -> Array:
     """A landscape in the frame, whose corners may be rounded, on a dark border with a white stamp across one edge."""
     rng = np.random.default_rng(seed)
-    place = (np.arange(SIZE * FINE) + 0.5) / FINE - 0.5
-    offset = np.stack(np.meshgrid(place, place)) - np.array(CENTER)[:, None, None]
-    x, y = np.tensordot(np.linalg.inv(MATRIX[:, :2]), offset, axes=1)
 
     def exposed(x: Array, y: Array) -> NDArray[np.bool_]:
         beyond_x, beyond_y = np.abs(x) - HALF_MM + radius_mm, np.abs(y) - HALF_MM + radius_mm
         outside = np.hypot(np.maximum(beyond_x, 0.0), np.maximum(beyond_y, 0.0)) - radius_mm
         return np.asarray(np.where(radius_mm > 0, outside, np.maximum(beyond_x, beyond_y)) < 0.0)
 
-    inside = exposed(x, y)
-    if neighbour:
-        inside |= exposed(x - 2 * HALF_MM - 1.2, y)
-    share = inside.reshape(SIZE, FINE, SIZE, FINE).mean(axis=(1, 3))
+    def inside(col: Array, row: Array) -> Array:
+        x, y = transformed(np.linalg.inv(MATRIX[:, :2]), col - CENTER[0], row - CENTER[1])
+        return np.asarray(exposed(x, y) | exposed(x - 2 * HALF_MM - 1.2, y) if neighbour else exposed(x, y))
+
+    share = drawn(inside, SIZE, SIZE, 0.0, FINE)
     land = 15000 + 3000 * gaussian_filter(rng.normal(0, 1, (SIZE, SIZE)), 3.0) / 0.09
     grey = 2000 + share * (np.clip(land, 6000, None) - 2000)
     grey = gaussian_filter(grey, 0.8)
