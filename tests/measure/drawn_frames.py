@@ -14,8 +14,8 @@ from measure.results import FrameMeasurement
 from measure.status import Status
 
 PITCH_UM, PX_PER_MM = 50.0, 20.0
-FRAME_PX = 520
-CORNERS = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))
+FRAME_PX = 400
+CORNERS = ((7.0, -7.0), (-7.0, -7.0), (-7.0, 7.0), (7.0, 7.0))
 RING_CROSS = ring_cross(0.5, 0.1, 0.8, 0.1)
 NOISE_DN = 200.0
 
@@ -23,7 +23,7 @@ NOISE_DN = 200.0
 def layout_of(
     marks: Sequence[MarkShape],
     places: Sequence[tuple[float, float]] = CORNERS,
-    frame_mm: tuple[float, float] = (23.0, 23.0),
+    frame_mm: tuple[float, float] = (17.0, 17.0),
 ) -> FiducialLayout:
     """Marks 1, 2, ... given to a hundredth of a millimetre."""
     given = [
@@ -43,7 +43,7 @@ NUMBERED = layout_of([numbered(count) for count in range(4)])
 ALIKE = layout_of([MarkShape(RING_CROSS)] * 4)
 
 
-def pixel_from_camera(pose: str, turn_rad: float = 0.008, center: tuple[float, float] = (262.3, 257.6)) -> Array:
+def pixel_from_camera(pose: str, turn_rad: float = 0.008, center: tuple[float, float] = (202.3, 197.6)) -> Array:
     """By the definition of a pose: mirror x', then turn counter-clockwise, then look at it with rows downwards."""
     angle = np.deg2rad(float(pose.rstrip("m"))) + turn_rad
     c, s = np.cos(angle), np.sin(angle)

@@ -11,10 +11,10 @@ from measure.fiducials import measure_fiducials
 from measure.marks.shapes import MarkShape, polygon, turned_part
 from measure.status import Status
 
-PX_PER_MM = 30.0
+PX_PER_MM = 20.0
 HALF_MM = 5.5
 AT_MM = 4.4
-MIDDLE_PX = 220.3
+MIDDLE_PX = 150.3
 WING = polygon(((0.0, 0.0), (0.8, 0.35), (0.8, -0.35)))
 PLACES = [(x, y) for x in (-AT_MM, AT_MM) for y in (-AT_MM, AT_MM)]
 
@@ -27,7 +27,7 @@ def wing(x: float, y: float) -> MarkShape:
 @pytest.mark.parametrize("contrast", [4500.0, 0.0])
 def test_wings_are_found_beside_an_edge_that_is_nine_times_as_strong(contrast: float) -> None:
     rng = np.random.default_rng(3)
-    grey = np.full((440, 440), 55000.0)
+    grey = np.full((300, 300), 55000.0)
     edge = slice(round(MIDDLE_PX - HALF_MM * PX_PER_MM), round(MIDDLE_PX + HALF_MM * PX_PER_MM))
     grey[edge, edge] = 13000.0
     matrix = placed(PX_PER_MM, (MIDDLE_PX, MIDDLE_PX))

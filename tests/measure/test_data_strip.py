@@ -7,18 +7,19 @@ import cv2
 import numpy as np
 import pytest
 from brute_marks import Array, written_scan
-from drawn_frames import ALIKE, PITCH_UM, frame_picture, pixel_from_camera
+from drawn_frames import PITCH_UM, RING_CROSS, frame_picture, layout_of, pixel_from_camera
 from scipy.ndimage import gaussian_filter
 
 from measure.fiducials import measure_fiducials
-from measure.marks.shapes import Side
+from measure.marks.shapes import MarkShape, Side
 from measure.pose.data_strip import Beside, beside_frame, strip_likelihoods
 from measure.results import Pose
 
 SIZE_PX = 640
 MIDDLE = (SIZE_PX - 1) / 2
 FRAME_PX = 460
-LAYOUT = replace(ALIKE, data_strip="left")
+CORNERS = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))
+LAYOUT = replace(layout_of([MarkShape(RING_CROSS)] * 4, CORNERS, (23.0, 23.0)), data_strip="left")
 
 
 def written_frame(written: bool = True) -> Array:
@@ -26,7 +27,7 @@ def written_frame(written: bool = True) -> Array:
     the others."""
     rng = np.random.default_rng(7)
     matrix = pixel_from_camera("0", 0.004, (MIDDLE, MIDDLE))
-    grey = frame_picture(ALIKE, matrix, size=SIZE_PX)
+    grey = frame_picture(LAYOUT, matrix, size=SIZE_PX)
     border = np.ones(grey.shape, dtype=bool)
     first = (SIZE_PX - FRAME_PX) // 2
     border[first:-first, first:-first] = False

@@ -15,11 +15,12 @@ from measure.status import Status
 
 Array = NDArray[np.float64]
 
-CENTER = np.array([233.4, 218.7])
-SIZE = (360.0, 300.0)
-PX_PER_MM = 30.0
+CENTER = np.array([158.4, 143.7])
+SIZE = (240.0, 200.0)
+WIDTH, HEIGHT = 320, 290
+PX_PER_MM = 20.0
 PLACES = [(x, y) for x in (-4.2, 4.2) for y in (-3.9, 3.9)]
-DOT = MarkShape(dot(0.15), "light")
+DOT = MarkShape(dot(0.22), "light")
 
 
 def frame(turn_rad: float, inside_dn: float, outside_dn: float) -> Array:
@@ -31,13 +32,13 @@ def frame(turn_rad: float, inside_dn: float, outside_dn: float) -> Array:
         along, down = cos * right + sin * down, cos * down - sin * right
         return np.asarray((np.abs(along) < SIZE[0] / 2) & (np.abs(down) < SIZE[1] / 2))
 
-    return outside_dn + (inside_dn - outside_dn) * drawn(inside, 470, 440, 0.8, fineness=4)
+    return outside_dn + (inside_dn - outside_dn) * drawn(inside, WIDTH, HEIGHT, 0.8, fineness=4)
 
 
 @pytest.mark.parametrize(("turn_rad", "inside_dn", "outside_dn"), [(0.03, 52000.0, 9000.0), (-0.055, 9000.0, 52000.0)])
 def test_a_frame_is_found_by_its_edges(turn_rad: float, inside_dn: float, outside_dn: float) -> None:
     grey = frame(turn_rad, inside_dn, outside_dn)
-    grey[300:360, 20:120] = 30000.0  # a label over an edge
+    grey[195:240, 10:80] = 30000.0  # a label over an edge
     grey += np.random.default_rng(1).normal(0.0, 1500.0, grey.shape)
     found = exposed_frame(scan_of(grey), (SIZE[0] * 1.006, SIZE[1] * 1.006), 0.015, 0.1)
     assert found is not None
@@ -47,17 +48,17 @@ def test_a_frame_is_found_by_its_edges(turn_rad: float, inside_dn: float, outsid
 
 
 def test_a_picture_without_edges_shows_no_frame() -> None:
-    grey = np.random.default_rng(2).normal(30000.0, 3000.0, (440, 470))
+    grey = np.random.default_rng(2).normal(30000.0, 3000.0, (HEIGHT, WIDTH))
     assert exposed_frame(scan_of(grey), SIZE, 0.015, 0.1) is None
 
 
 @pytest.mark.parametrize("contrast_dn", [3500.0, 0.0])
 def test_faint_dots_are_found_where_the_edges_put_them(contrast_dn: float) -> None:
     rng = np.random.default_rng(2)
-    grey = frame(0.0, 50000.0, 8000.0) + rng.normal(0.0, 2000.0, (440, 470))
+    grey = frame(0.0, 50000.0, 8000.0) + rng.normal(0.0, 2000.0, (HEIGHT, WIDTH))
     matrix = placed(PX_PER_MM, (float(CENTER[0]), float(CENTER[1])))
     for place in PLACES:
-        paint(grey, DOT, place, matrix, contrast_dn, half=15, blur_px=0.9)
+        paint(grey, DOT, place, matrix, contrast_dn, half=12, blur_px=0.9)
     layout = layout_of([DOT] * 4, PLACES, (SIZE[0] / PX_PER_MM, SIZE[1] / PX_PER_MM))
     options = FiducialOptions(pose="0", pitch_is_right=True)
     result = measure_fiducials(scan_of(grey), layout, (1000 / PX_PER_MM,) * 2, options)

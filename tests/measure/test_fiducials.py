@@ -100,7 +100,7 @@ def test_a_frame_without_a_mark_free_of_blemish_has_no_decided_pose(tmp_path: Pa
     grey = frame_picture(NUMBERED, matrix)
     for mark in NUMBERED.marks:
         col, row = np.rint(matrix @ (*mark.xy_mm, 1.0)).astype(int)
-        grey[row + 2 : row + 20, col - 18 : col + 17] = 3000
+        grey[row + 1 : row + 20, col - 18 : col + 17] = 3000
     result = measured(grey, NUMBERED, tmp_path)
     assert {mark.status for mark in result.marks} == {Status.WEAK}
     assert result.pose is not None
@@ -130,7 +130,7 @@ def test_a_pose_of_the_user_that_the_picture_contradicts_is_told(tmp_path: Path)
 
 
 def test_marks_places_decide_where_they_are_not_symmetric(tmp_path: Path) -> None:
-    uneven = layout_of([MarkShape(RING_CROSS)] * 4, ((10.0, -10.0), (-10.0, -10.0), (-10.0, 9.0), (9.5, 10.0)))
+    uneven = layout_of([MarkShape(RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -7.0), (-7.0, 6.0), (6.5, 7.0)))
     matrix = pixel_from_camera("90")
     result = measured(frame_picture(uneven, matrix), uneven, tmp_path)
     assert result.pose is not None
@@ -159,7 +159,7 @@ def test_zero_marks_give_no_silent_identity(tmp_path: Path) -> None:
 
 
 def test_the_scan_of_another_camera_is_refused_with_a_count(tmp_path: Path) -> None:
-    smaller = layout_of([MarkShape(RING_CROSS)] * 4, ((8.0, -8.0), (-8.0, -8.5), (-7.0, 8.0), (8.3, 8.0)))
+    smaller = layout_of([MarkShape(RING_CROSS)] * 4, ((5.6, -5.6), (-5.6, -5.9), (-4.9, 5.6), (5.8, 5.6)))
     result = measured(frame_picture(smaller, pixel_from_camera("0")), ALIKE, tmp_path)
     assert result.pixel_from_camera is None
     assert not any(mark.status.is_observation for mark in result.marks)
@@ -170,7 +170,7 @@ def test_predicted_marks_are_not_written_as_measured(tmp_path: Path) -> None:
     """And an affine on three marks is not printed as good."""
     matrix = pixel_from_camera("0")
     grey = frame_picture(ALIKE, matrix)
-    col, row = np.rint(matrix @ (-10.0, 10.0, 1.0)).astype(int)
+    col, row = np.rint(matrix @ (*CORNERS[2], 1.0)).astype(int)
     rng = np.random.default_rng(3)
     grey[row - 30 : row + 31, col - 30 : col + 31] = 3000 + rng.normal(0, NOISE_DN, (61, 61))
     result = measured(grey, ALIKE, tmp_path)
@@ -179,14 +179,14 @@ def test_predicted_marks_are_not_written_as_measured(tmp_path: Path) -> None:
     assert covered.reason
     assert covered.covariance_px2 is None
     assert covered.center_px is not None
-    np.testing.assert_allclose(covered.center_px, matrix @ (-10.0, 10.0, 1.0), atol=0.3)
+    np.testing.assert_allclose(covered.center_px, matrix @ (*CORNERS[2], 1.0), atol=0.3)
     assert [mark.status.is_observation for mark in result.marks] == [True, True, False, True]
     assert any("no check" in problem for problem in result.problems)
 
 
 def test_a_mark_beyond_the_edge_is_absent(tmp_path: Path) -> None:
-    six = layout_of([MarkShape(RING_CROSS)] * 6, (*CORNERS, (10.0, 0.0), (-10.0, 0.0)))
-    matrix = pixel_from_camera("0", center=(262.3, 183.0))
+    six = layout_of([MarkShape(RING_CROSS)] * 6, (*CORNERS, (7.0, 0.0), (-7.0, 0.0)))
+    matrix = pixel_from_camera("0", center=(202.3, 123.0))
     result = measured(frame_picture(six, matrix), six, tmp_path)
     upper = [given.xy_mm[1] > 0 for given in six.marks]
     assert [mark.status for mark in result.marks] == [Status.ABSENT if up else Status.MEASURED for up in upper]
@@ -195,10 +195,10 @@ def test_a_mark_beyond_the_edge_is_absent(tmp_path: Path) -> None:
 
 def test_the_neighbouring_frames_marks_are_not_taken_for_this_frames(tmp_path: Path) -> None:
     matrix = pixel_from_camera("0", turn_rad=0.0)
-    grey = frame_picture(ALIKE, matrix, size=700)
+    grey = frame_picture(ALIKE, matrix, size=540)
     beside = matrix.copy()
-    beside[0, 2] += 25.0 * PX_PER_MM
-    for place in ((-10.0, -10.0), (-10.0, 10.0)):  # its left marks reach into this scan, brighter than our own
+    beside[0, 2] += 18.5 * PX_PER_MM
+    for place in CORNERS[1:3]:  # its left marks reach into this scan, brighter than our own
         paint(grey, MarkShape(RING_CROSS), place, beside, 14000.0)
     result = measured(grey, ALIKE, tmp_path)
     assert_right(result, ALIKE, matrix)
@@ -211,28 +211,28 @@ def test_of_two_whole_frames_in_a_scan_none_is_taken_in_silence(tmp_path: Path) 
     result = measured(grey, NUMBERED, tmp_path)
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == ("0", False)
-    assert any("the scan shows another frame (26.0, " in text for text in result.problems)
+    assert any("the scan shows another frame (20.0, " in text for text in result.problems)
 
 
 def test_a_mark_off_the_constellation_is_no_observation(tmp_path: Path) -> None:
-    places = (*CORNERS, (0.0, -10.0), (0.0, 10.0))
+    places = (*CORNERS, (0.0, -7.0), (0.0, 7.0))
     marks = [MarkShape(RING_CROSS)] * 6
     given = layout_of(marks, places)
-    moved = layout_of(marks, (*places[:5], (0.55, 10.0)))
+    moved = layout_of(marks, (*places[:5], (0.55, 7.0)))
     matrix = pixel_from_camera("0")
     result = measured(frame_picture(moved, matrix), given, tmp_path)
     assert [mark.status for mark in result.marks[:5]] == [Status.MEASURED] * 5
     assert result.marks[5].status is Status.PREDICTED
     assert "nothing within 6 px of its place" in result.marks[5].reason
-    assert result.marks[5].center_px == pytest.approx(matrix @ (0.0, 10.0, 1.0), abs=0.1)
+    assert result.marks[5].center_px == pytest.approx(matrix @ (0.0, 7.0, 1.0), abs=0.1)
 
 
 def test_a_lattice_that_shows_only_in_part_keeps_its_names(tmp_path: Path) -> None:
     mark = MarkShape(cross(0.5, 0.1), "dark")
     index = range(-2, 3)
     lattice = FiducialLayout(
-        tuple(LayoutMark(f"{i},{j}", (5.0 * i, 5.0 * j), (0.005, 0.005), mark) for j in index for i in index),
-        (24.0, 24.0),
+        tuple(LayoutMark(f"{i},{j}", (3.5 * i, 3.5 * j), (0.005, 0.005), mark) for j in index for i in index),
+        (17.0, 17.0),
     )
     matrix = pixel_from_camera("0", turn_rad=0.004)
     rng = np.random.default_rng(9)
@@ -257,7 +257,7 @@ def test_a_missing_mark_is_said_to_be_hidden_only_where_its_ground_hides_it(
     blot_dn: float, said: str, tmp_path: Path
 ) -> None:
     """Nothing but the marks is dark in the scan, so that its darkest half per cent is lighter than they are."""
-    places = [(10.0 * i, 10.0 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    places = [(7.0 * i, 7.0 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     dark = layout_of([MarkShape(RING_CROSS, "dark")] * 9, places)
     matrix = pixel_from_camera("0")
     grey = np.random.default_rng(3).normal(20000.0, NOISE_DN, (FRAME_PX, FRAME_PX))

@@ -15,7 +15,7 @@ from measure.marks.frame_border import at_border, known_outline_mm
 from measure.marks.shapes import FiducialLayout, MarkShape, Point, Polygon, turned_part
 from measure.status import Status
 
-HALF_MM, SIDES = 11.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+HALF_MM, WEDGE_MM, SIDES = 8.0, 7.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 PIXEL_FROM_CAMERA = pixel_from_camera("90", turn_rad=0.03)
 ONE_IN_8000 = 18.0  # of chi-square, two coordinates
 WEDGE = ((0.0, 0.0), (1.6, 0.7), (1.6, -0.7))
@@ -66,7 +66,7 @@ def light_of(at_mm: float, is_notch: bool, blur_px: float) -> Array:
                 frame &= ~((out > 0) & (along < out * 0.7 / 1.6))
         return np.asarray(frame)
 
-    return drawn(exposed, 520, 520, blur_px, fineness=6)
+    return drawn(exposed, 400, 400, blur_px, fineness=6)
 
 
 def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
@@ -85,7 +85,12 @@ def measured(camera: FiducialLayout, picture: Array) -> list[Measured]:
 
 @pytest.mark.parametrize(
     ("vertices", "at_mm", "is_notch"),
-    [(WEDGE, 10.0, False), (WEDGE_AND_BORDER, 10.0, False), (WEDGE_TO_EDGE, 10.0, False), (NOTCH, 11.0, True)],
+    [
+        (WEDGE, WEDGE_MM, False),
+        (WEDGE_AND_BORDER, WEDGE_MM, False),
+        (WEDGE_TO_EDGE, WEDGE_MM, False),
+        (NOTCH, HALF_MM, True),
+    ],
     ids=["beyond", "with its border", "to the edge", "notch"],
 )
 def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
@@ -97,22 +102,22 @@ def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
 
 
 def test_the_border_of_a_soft_scan_reaches_farther_into_the_frame() -> None:
-    for mark in measured(layout(WEDGE_TO_EDGE, 10.0), scanned(10.0, False, blur_px=1.8)):
+    for mark in measured(layout(WEDGE_TO_EDGE, WEDGE_MM), scanned(WEDGE_MM, False, blur_px=1.8)):
         assert mark.off_px < 0.2
         assert mark.chi2 < ONE_IN_8000
 
 
 def test_a_notch_claims_no_more_than_the_landscape_in_it_allows() -> None:
-    camera = layout(NOTCH, 11.0)
-    even, uneven = (measured(camera, scanned(11.0, True, 2.0, landscape)) for landscape in (0.0, 0.05))
+    camera = layout(NOTCH, HALF_MM)
+    even, uneven = (measured(camera, scanned(HALF_MM, True, 2.0, landscape)) for landscape in (0.0, 0.05))
     assert max(mark.off_px for mark in uneven) > 3 * max(mark.sigma_px for mark in even)
     for mark in (*even, *uneven):
         assert mark.chi2 < ONE_IN_8000
 
 
 def test_what_is_known_of_a_drawing_ends_at_the_frame() -> None:
-    (wedge, *_), (notch, *_) = at_border(layout(WEDGE, 10.0)).marks, at_border(layout(NOTCH, 11.0)).marks
-    inner = layout(((0.0, 0.0), (0.8, 0.3), (0.8, -0.3)), 10.0)
+    (wedge, *_), (notch, *_) = at_border(layout(WEDGE, WEDGE_MM)).marks, at_border(layout(NOTCH, HALF_MM)).marks
+    inner = layout(((0.0, 0.0), (0.8, 0.3), (0.8, -0.3)), WEDGE_MM)
     assert isinstance(wedge.mark, MarkShape)
     assert isinstance(notch.mark, MarkShape)
     assert known_outline_mm(wedge.mark)[:, 0].max() == pytest.approx(0.9)

@@ -3,13 +3,14 @@
 from pathlib import Path
 
 import numpy as np
-from brute_marks import Array, written_scan
+from brute_marks import written_scan
 from drawn_frames import (
     ALIKE,
-    FRAME_PX,
     PITCH_UM,
+    RING_CROSS,
     assert_right,
     frame_picture,
+    layout_of,
     measured,
     paint,
     pixel_from_camera,
@@ -18,8 +19,9 @@ from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
+from measure.marks.shapes import MarkShape
 
-# A frame of 20 mm with a hundredth of the usual tolerances bends as little as one of 200 mm.
+# A frame of 14 mm with a hundredth of the usual tolerances bends as little as one of 140 mm.
 STIFF = FiducialOptions(pose="0", misfit_mm=0.03, affinity=1e-4, gate_mm=0.03)
 
 
@@ -42,21 +44,18 @@ def test_pixels_given_as_longer_one_way_need_no_look(tmp_path: Path) -> None:
 
 def test_three_of_many_marks_that_lie_as_the_cameras_are_no_frame(tmp_path: Path) -> None:
     """With pixels longer one way three of sixty strewn marks fit, which is no wonder; three of three are a frame."""
-    matrix = pixel_from_camera("0", turn_rad=0.0)
-    matrix[:, :2] = np.diag([1.012, 0.988]) @ matrix[:, :2]
-    alone = ground_with_three(matrix)
-    result = measured(alone, ALIKE, tmp_path, STIFF)
-    assert [mark.status.is_observation for mark in result.marks] == [True, True, True, False]
-    rng = np.random.default_rng(3)
-    for x, y in rng.uniform(-11.5, 11.5, (60, 2)).tolist():
-        paint(alone, ALIKE.marks[0].mark, (x, y), matrix, 9000.0)
-    result = measured(alone, ALIKE, tmp_path, STIFF)
-    assert not any(mark.status.is_observation for mark in result.marks)
-
-
-def ground_with_three(matrix: Array) -> Array:
+    places = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))
+    layout, matrix = layout_of([MarkShape(RING_CROSS)] * 4, places, (23.0, 23.0)), pixel_from_camera("0", 0.0)
+    matrix = np.diag([1.012, 0.988]) @ np.column_stack([matrix[:, :2], (260.0, 261.0)])
     rng = np.random.default_rng(5)
-    grey = 8000 + 1000 * gaussian_filter(rng.normal(0, 1, (FRAME_PX, FRAME_PX)), 2.0) / 0.14
-    for mark in ALIKE.marks[:3]:
-        paint(grey, mark.mark, mark.xy_mm, matrix, 9000.0)
-    return np.asarray(grey + rng.normal(0, 100.0, grey.shape))
+    alone = 8000 + 1000 * gaussian_filter(rng.normal(0, 1, (520, 520)), 2.0) / 0.14 + rng.normal(0, 100.0, (520, 520))
+    for given in layout.marks[:3]:
+        paint(alone, given.mark, given.xy_mm, matrix, 9000.0)
+    result = measured(alone, layout, tmp_path, STIFF)
+    assert [mark.status.is_observation for mark in result.marks] == [True, True, True, False]
+    another = np.zeros((61, 61))
+    paint(another, MarkShape(RING_CROSS), (0.0, 0.0), np.column_stack([matrix[:, :2], (30.3, 29.6)]), 9000.0)
+    for col, row in np.random.default_rng(4).integers(32, 488, (60, 2)):
+        alone[row - 30 : row + 31, col - 30 : col + 31] += another
+    result = measured(alone, layout, tmp_path, STIFF)
+    assert not any(mark.status.is_observation for mark in result.marks)
