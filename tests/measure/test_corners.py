@@ -59,14 +59,14 @@ def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) ->
     for _ in range(8):
         center, steps = SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
         clean = square_picture(center, steps, blur_px, alone)
-        for _ in range(12):
+        for _ in range(6):
             noisy = clean + rng.normal(0, NOISE, clean.shape)
             corner = fitted(noisy, center + rng.normal(0, 0.3, 2), steps, alone)
             assert not corner.reason
             errors.append(whitened(corner.center_px - center, corner.covariance_px2))
             assert corner.noise_dn == pytest.approx(NOISE, rel=0.35)
-    assert 0.87 < np.sqrt(np.mean(np.square(errors))) < 1.13
-    assert np.abs(np.mean(errors, axis=0)).max() < 0.4
+    assert 0.83 < np.sqrt(np.mean(np.square(errors))) < 1.17  # 96 numbers: 7.2 % standard deviation
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.4  # 2.8 standard deviations
 
 
 @pytest.mark.parametrize("blur_px", [0.5, 1.5])

@@ -67,11 +67,11 @@ def weak(frames: tuple[FrameMeasurement, ...]) -> set[tuple[str, str]]:
 
 
 def test_good_marks_are_doubted_no_more_often_than_stated() -> None:
-    """Two tests of one per cent each: of 100 cameras two or three lose a mark, whatever their marks' true places."""
+    """Two tests of one per cent each: of 60 cameras one or two lose a mark, whatever their marks' true places."""
     rng = np.random.default_rng(1)
     layout = layout_of(EIGHT, sigma_mm=1.0)
-    lost = sum(bool(weak(checked_together(frames_of(layout, 4, rng, camera_mm=0.01), layout))) for _ in range(100))
-    assert lost <= 7
+    lost = sum(bool(weak(checked_together(frames_of(layout, 4, rng, camera_mm=0.01), layout))) for _ in range(60))
+    assert lost <= 5  # 1.2 are expected at most, more than 5 in one run of 700
 
 
 def test_good_marks_of_a_frame_of_less_noise_than_the_others_are_not_doubted() -> None:

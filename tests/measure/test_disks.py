@@ -30,7 +30,7 @@ def test_errors_are_as_large_as_their_sigmas_say(radius_px: float, flatness: flo
     for _ in range(8):
         center, shape = size // 2 + rng.uniform(-0.5, 0.5, 2), some_ellipse(rng, radius_px, flatness)
         clean = GROUND + CONTRAST * drawn(ellipse(center, shape), size, size, 0.9)
-        for _ in range(8):
+        for _ in range(6):
             scan = scan_of(clean + rng.normal(0, NOISE, clean.shape))
             disk = fit_disk(scan, center + rng.normal(0, 0.4, 2), shape * rng.uniform(0.9, 1.1))
             assert not disk.reason
@@ -38,7 +38,7 @@ def test_errors_are_as_large_as_their_sigmas_say(radius_px: float, flatness: flo
             errors.append(whitened(offsets[-1], disk.covariance_px2))
             assert disk.contrast_dn == pytest.approx(CONTRAST, rel=0.1)
             np.testing.assert_allclose(np.sort(disk.half_axes_px), [radius_px * flatness, radius_px], atol=0.25)
-    assert 0.85 < np.sqrt(np.mean(np.square(errors))) < 1.15
+    assert 0.85 < np.sqrt(np.mean(np.square(errors))) < 1.15  # 96 numbers: 7.2 % standard deviation
     assert np.abs(np.mean(offsets, axis=0)).max() < 0.01
 
 

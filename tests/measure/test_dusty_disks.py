@@ -65,7 +65,7 @@ def test_targets_are_odd_by_more_than_noise_and_what_all_differ_by(share: float,
     rng, of_slope = np.random.default_rng(3), np.random.default_rng(4)
     spread = np.array([0.014, 0.014, 0.014, 0.05, 0.1])
     weak, odd = [], []
-    for _ in range(25):
+    for _ in range(15):
         disks, is_odd = [], rng.uniform(size=25) < share
         for change in 20.0 * is_odd * rng.choice((-1, 1), 25):
             mixing = (np.eye(5) + rng.normal(0, 0.3, (5, 5))) * spread

@@ -108,6 +108,7 @@ def test_the_crosses_of_a_reseau_on_a_landscape(number: int, steps: int) -> None
     assert affine_rms_px(given[nearest[used]], seen[nearest[used]]) <= affine_rms_px(indices[used], places[used])
 
 
+@pytest.mark.slow
 def test_a_nearly_black_frame_says_what_became_of_every_mark() -> None:
     layout = lattice()
     with open_scan(SCANS / "reseau" / "apollo-14.jpg") as scan:

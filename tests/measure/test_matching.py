@@ -63,25 +63,25 @@ def errors_and_sigmas(name: str, blur_px: float, snr: float, count: int) -> tupl
 @pytest.mark.parametrize(
     ("name", "blur_px", "count"),
     [
-        ("cross", 0.7, 90),
-        pytest.param("ring-cross", 1.0, 120, marks=same_worker),
-        ("ring-dot", 1.0, 90),
-        ("dot", 0.8, 90),
+        ("cross", 0.7, 54),
+        pytest.param("ring-cross", 1.0, 60, marks=same_worker),
+        ("ring-dot", 1.0, 54),
+        ("dot", 0.8, 54),
     ],
 )
 def test_sigmas_are_those_of_the_errors(name: str, blur_px: float, count: int) -> None:
     errors, sigmas = errors_and_sigmas(name, blur_px, 25.0, count)
     ratio = np.sqrt(np.mean((errors / sigmas) ** 2))
-    assert 0.88 < ratio < 1.13  # 180 numbers: 5.3 % standard deviation
+    assert 0.86 < ratio < 1.15  # 108 numbers: 6.8 % standard deviation
     assert np.abs(errors.mean(axis=0)).max() < 4 * sigmas.mean() / np.sqrt(len(errors))
 
 
 @same_worker
 def test_errors_are_at_the_cramer_rao_bound() -> None:
     name, blur_px, snr = "ring-cross", 1.0, 25.0
-    errors, sigmas = errors_and_sigmas(name, blur_px, snr, 120)
+    errors, sigmas = errors_and_sigmas(name, blur_px, snr, 60)
     bound = bound_px(MARKS[name], drawn(name, blur_px)[0][1], blur_px, snr)
-    assert np.sqrt(np.mean(errors**2)) < 1.12 * bound
+    assert np.sqrt(np.mean(errors**2)) < 1.15 * bound  # 120 numbers: 6.5 % standard deviation
     assert sigmas.mean() == pytest.approx(bound, rel=0.04)
 
 
@@ -134,7 +134,7 @@ def test_the_windows_origin_counts() -> None:
 def test_disturbances_that_cost_nothing(disturbance: str) -> None:
     rng = np.random.default_rng(11)
     ratios = []
-    for index in range(36):
+    for index in range(30):
         shown, place = drawn("ring-cross", 1.0)[index % PHASES]
         grey = GROUND + CONTRAST * shown + rng.normal(0, 20, shown.shape)
         if disturbance == "dark mark":
@@ -147,13 +147,13 @@ def test_disturbances_that_cost_nothing(disturbance: str) -> None:
         assert fit.converged, fit.reason
         assert (fit.contrast_dn < 0) == (disturbance == "dark mark")
         ratios.append((fit.center_px - place[:, 2]) / np.sqrt(np.diag(fit.covariance_px2)))
-    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.22
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.2  # 60 numbers: 9 % standard deviation
 
 
 def test_dust_is_cut_out() -> None:
     rng = np.random.default_rng(13)
     clean, dusty, ratios, fractions = [], [], [], []
-    for index in range(30):
+    for index in range(18):
         shown, place = drawn("ring-cross", 1.0)[index % PHASES]
         grey = GROUND + CONTRAST * shown + rng.normal(0, 25, shown.shape)
         clean.append(measured(grey, MARKS["ring-cross"], place, rng).center_px - place[:, 2])
@@ -172,7 +172,7 @@ def test_dust_is_cut_out() -> None:
 def test_a_large_speck_costs_what_it_covers() -> None:
     """Even where it carries plain least squares away from the mark."""
     rng = np.random.default_rng(31)
-    for index in range(24):
+    for index in range(12):
         shown, place = drawn("cross", 1.0)[index % PHASES]
         speck = brute_picture(MarkShape(dot(0.4)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 1.0)
         clean = GROUND + CONTRAST * shown + rng.normal(0, CONTRAST / 20, shown.shape)
@@ -187,7 +187,7 @@ def test_a_large_speck_costs_what_it_covers() -> None:
 def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
     rng = np.random.default_rng(17)
     ratios = []
-    for index in range(60):
+    for index in range(36):
         shown, place = drawn("ring-cross", 1.0)[index % PHASES]
         grain = gaussian_filter(rng.normal(0, 1, (SIZE, SIZE)), grain_px, mode="wrap")
         fit = measured(GROUND + CONTRAST * shown + 25 * grain / grain.std(), MARKS["ring-cross"], place, rng)
@@ -195,7 +195,7 @@ def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
         assert not fit.covariance_is_white
         error = fit.center_px - place[:, 2]
         ratios.append(error / np.sqrt(np.diag(fit.covariance_px2)))
-    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.25  # 72 numbers: 8.3 % standard deviation
 
 
 def test_a_chip_is_matched_by_the_same_core() -> None:

@@ -47,8 +47,8 @@ def test_a_false_point_takes_none_of_its_neighbours_with_it() -> None:
 
 def test_hills_are_not_astray() -> None:
     rng = np.random.default_rng(3)
-    alarms = sum(int(astray(*seen_twice(rng, relief)).sum()) for relief in (0.0, 2.0, 20.0) for _ in range(40))
-    assert alarms <= 6, "of 24,000 points 2.4 may be"
+    alarms = sum(int(astray(*seen_twice(rng, relief)).sum()) for relief in (0.0, 2.0, 20.0) for _ in range(20))
+    assert alarms <= 4, "of 12,000 points 1.2 may be"
 
 
 def test_too_few_points_tell_nothing() -> None:

@@ -45,7 +45,7 @@ def test_right_pitches_are_called_wrong_as_rarely_as_is_said() -> None:
     generator = np.random.default_rng(5)
     true = np.array([(x, y) for x in (-16.0, 0.0, 16.0) for y in (-11.5, 0.0, 11.5) if (x, y) != (0.0, 0.0)])
     wrong = 0
-    for _ in range(2000):
+    for _ in range(700):
         given = true + generator.normal(0, 1, true.shape)
         marks = [
             LayoutMark(str(k), (place[0], place[1]), (1.0, 1.0), MarkShape(dot(0.1))) for k, place in enumerate(given)
@@ -55,4 +55,4 @@ def test_right_pitches_are_called_wrong_as_rarely_as_is_said() -> None:
         seen = [MarkMeasurement(mark.id, "fiducial", np.zeros(2), np.eye(2), Status.MEASURED) for mark in marks]
         small = FiducialLayout(tuple(marks), (33.0, 24.0))
         wrong += pitch_problem(FrameMeasurement("a", tuple(seen), None, matrix), small, (20.0, 20.0), "x") is not None
-    assert 5 <= wrong <= 30, wrong
+    assert 1 <= wrong <= 14, wrong  # 7 are expected at most, more than 14 in one run of 170
