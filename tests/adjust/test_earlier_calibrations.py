@@ -84,7 +84,7 @@ def with_calibration(network: Network, calibration: Calibration) -> Network:
     return replace(network, cameras=(free,), calibrations=(calibration,))
 
 
-@pytest.mark.parametrize("kind", ["none", "affine"])
+@pytest.mark.parametrize("kind", [pytest.param("none", marks=pytest.mark.slow), "affine"])
 def test_an_earlier_calibration_stands_for_its_observations(kind: Transformation) -> None:
     """A, then B with A's calibration, is A and B together: values, sigmas, v'Pv and redundancy.
 

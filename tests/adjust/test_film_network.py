@@ -65,7 +65,7 @@ def test_perfect_data_leave_nothing_and_give_the_truth_back(kind: Transformation
     assert result.mirrored == {"f1"}
 
 
-@pytest.mark.parametrize("kind", ["polynomial(3)", "polynomial(5)"])
+@pytest.mark.parametrize("kind", [pytest.param("polynomial(3)", marks=pytest.mark.slow), "polynomial(5)"])
 def test_the_origin_of_the_comparator_does_not_matter(kind: Transformation) -> None:
     """A metre and a half off, as on a film strip; with exact observations, which are moved without a rounding."""
     network, _ = simulated(
@@ -139,10 +139,10 @@ def test_a_film_that_folds_over_is_told() -> None:
 
 @pytest.mark.parametrize(
     "kind",
-    ["projective", "bilinear", "conformal(2)"]
+    ["projective", "conformal(2)"]
     + [
         pytest.param(kind, marks=pytest.mark.slow)
-        for kind in ("congruent", "conformal(3)", "polynomial(2)", "polynomial(3)")
+        for kind in ("bilinear", "congruent", "conformal(3)", "polynomial(2)", "polynomial(3)")
     ],
 )
 def test_another_solver_on_an_explicit_model_agrees(kind: Transformation) -> None:
@@ -182,7 +182,7 @@ def reference(network: Network, kind: Transformation, points: Array, result: Adj
 
     away = np.random.default_rng(9).normal(0.0, 2.0, len(names))
     first = np.array([result.value(name) for name in names]) + away * [result.sigma(name) for name in names]
-    tight = 1e-15
+    tight = 1e-12  # of the sum of squares: the last step was below 1e-5 standard deviations
     return names, least_squares(real_residuals, first, jacobian, x_scale="jac", xtol=tight, ftol=tight, gtol=tight)
 
 
@@ -240,7 +240,7 @@ def inverted(kind: Transformation, film: Any, mirrored: bool, x: Any, y: Any) ->
         np.stack(ends, axis=1) - np.array(camera_of_film(kind, film, mirrored, *middle)).real[:, None]
     )
     xy = np.tile(middle[:, None], (1, len(x))).astype(complex)
-    for _ in range(12):
+    for _ in range(8):  # the bend changes by less than a hundredth over an image: two digits a turn
         xy = xy + 50.0 * chord @ (np.stack([x, y]) - np.stack(camera_of_film(kind, film, mirrored, xy[0], xy[1])))
     return xy[0], xy[1]
 

@@ -1,8 +1,10 @@
 """Scans by windows, blocks and reductions: each is a part of the whole, and no part of a file is decoded twice."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -72,6 +74,15 @@ def test_a_window_decodes_only_its_tiles_and_a_whole_pass_each_tile_once(tmp_pat
         assert len(reads) == len(set(reads)) == 7 * 10
 
 
+@pytest.fixture
+def four_threads() -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(4)
+    yield
+    cv2.setNumThreads(before)
+
+
+@pytest.mark.usefixtures("four_threads")
 def test_threads_that_read_a_file_side_by_side_see_what_one_sees(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture(), tile=(32, 32), compression="zstd")
     places = [(col, row) for row in range(0, HEIGHT, 9) for col in range(0, WIDTH, 11)]

@@ -1,26 +1,43 @@
-"""What tests of the pipeline share: the demonstration, rendered and run once for all, and work without processes."""
+"""What tests of the pipeline share: three frames of the demonstration, rendered and run once for all, and work without
+processes."""
 
 import pickle
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 
 from pipeline.cli import run
 from pipeline.rendered.scene_file import render_project
 
+FRAMES = 3  # of the demonstration's five: one upright, one turned, one mirrored; a run of all five is slow
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread_of_opencv() -> Iterator[None]:
+    """As in the processes that measure scans: its threads wait by spinning, and pytest has the cores at work."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(threads)
+
 
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The demonstration's project, not yet run. Tests copy it before they change anything."""
+    """The project of the demonstration's first frames, not yet run. Tests copy it before they change anything."""
+    scenes = tmp_path_factory.mktemp("scenes")
+    for name in ("demo.toml", "metric_camera.toml"):
+        text = resources.files("synthetic_images").joinpath("scenes", name).read_text(encoding="utf-8")
+        head, *images = text.split("[[image]]")
+        (scenes / name).write_text("[[image]]".join([head, *images[:FRAMES]]), encoding="utf-8")
     folder = tmp_path_factory.mktemp("demo")
-    with resources.as_file(resources.files("synthetic_images").joinpath("scenes", "demo.toml")) as scene:
-        render_project(scene, folder)
+    render_project(scenes / "demo.toml", folder)
     return folder
 
 

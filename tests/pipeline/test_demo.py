@@ -1,21 +1,22 @@
-"""The whole chain on rendered film, against its truth."""
+"""The whole chain on rendered film, against its truth: three frames of the demonstration, and by hand all of it."""
 
 import json
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from conftest import FRAMES
 
+from pipeline.cli import DONE, run
 from pipeline.rendered.against_truth import compare_with_truth
 
-pytestmark = pytest.mark.xdist_group("demonstration")  # one run of it serves all
+in_its_group = pytest.mark.xdist_group("demonstration")  # one run of it serves all
 
 
-def test_demo_is_measured_right_and_calibrated_within_its_sigmas(finished: tuple[Path, int]) -> None:
-    folder, code = finished
-    assert code == 0
+def assert_measured_right_and_calibrated_within_its_sigmas(folder: Path, frames: int) -> None:
     out = folder / "out"
     comparison = compare_with_truth(folder / "truth.json", out / "measurement.json", out / "adjustment.json")
+    assert len(comparison.frames) == frames
     for frame in comparison.frames:
         assert frame.wrong == ()
         assert frame.pose == frame.true_pose
@@ -25,10 +26,29 @@ def test_demo_is_measured_right_and_calibrated_within_its_sigmas(finished: tuple
     assert comparison.worst_camera_sigmas < 3.0
 
 
-def test_demo_agrees_with_opencv_and_reports(finished: tuple[Path, int]) -> None:
-    folder, _ = finished
+def assert_agrees_with_opencv_and_reports(folder: Path, last: str) -> None:
     check = json.loads((folder / "out" / "check.json").read_text(encoding="utf-8"))
     assert check["verdict"] == "agrees"
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
     HTMLParser().feed(page)
-    assert "frame5" in page
+    assert last in page
+
+
+@in_its_group
+def test_its_frames_are_measured_right_and_calibrated_within_their_sigmas(finished: tuple[Path, int]) -> None:
+    folder, code = finished
+    assert code == DONE
+    assert_measured_right_and_calibrated_within_its_sigmas(folder, FRAMES)
+
+
+@in_its_group
+def test_its_frames_agree_with_opencv_and_are_reported(finished: tuple[Path, int]) -> None:
+    assert_agrees_with_opencv_and_reports(finished[0], f"frame{FRAMES}")
+
+
+@pytest.mark.slow
+def test_the_demonstration_as_it_is_shown(tmp_path: Path) -> None:
+    """All five frames, by the command that shows them."""
+    assert run(["demo", str(tmp_path / "demo")]) == DONE
+    assert_measured_right_and_calibrated_within_its_sigmas(tmp_path / "demo", 5)
+    assert_agrees_with_opencv_and_reports(tmp_path / "demo", "frame5")

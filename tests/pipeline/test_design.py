@@ -276,14 +276,20 @@ def test_a_camera_in_a_file_of_its_own_can_be_varied() -> None:
         ("field.points", "counts things"),
     ],
 )
-def test_a_wrong_quantity_is_told_with_what_is_near(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], quantity: str, words: str
-) -> None:
-    scene = small(tmp_path, ("[[image]]", f'[[design.sweep]]\nquantity = "{quantity}"\nvalues = [1.5, 2.5]\n[[image]]'))
+def test_a_wrong_quantity_is_told_with_what_is_near(tmp_path: Path, quantity: str, words: str) -> None:
+    scene = Variations.read(small(tmp_path))
+    with pytest.raises(InputError) as caught:
+        sweep(scene, 1, Sweep(quantity, (1.5, 2.5)))
+    assert f"[design.sweep[1]] {quantity} = 1.5" in str(caught.value)
+    assert words in str(caught.value)
+
+
+def test_a_wrong_quantity_is_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = small(
+        tmp_path, ("[[image]]", '[[design.sweep]]\nquantity = "field.points"\nvalues = [1.5, 2.5]\n[[image]]')
+    )
     assert run(["design", str(scene)]) == WRONG_INPUT
-    message = capsys.readouterr().err
-    assert f"[design.sweep[1]] {quantity} = 1.5" in message
-    assert words in message
+    assert "[design.sweep[1]] field.points = 1.5" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pipeline.measuring.identification import assign, log10_of_chance, recognise
 
 def test_pattern_is_named_right_with_targets_missing_and_marks_that_are_none() -> None:
     rng = np.random.default_rng(1)
-    for _ in range(25):
+    for _ in range(12):
         n, size = int(rng.integers(8, 60)), 3000.0
         predicted = rng.uniform(0.0, size, (n, 2))
         angle, scale = rng.normal(0.0, 0.03), 1.0 + rng.normal(0.0, 0.03)

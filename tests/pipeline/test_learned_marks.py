@@ -18,6 +18,7 @@ from measure.results import FrameMeasurement
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import Project, read_project
+from pipeline.measuring import learn_stage
 from pipeline.measuring.learn_stage import learn_marks, pose_of
 from pipeline.measuring.measure_stage import measure_scan
 from pipeline.progress import Reporter
@@ -95,9 +96,10 @@ def learned(project: Project) -> Project:
         return learn_marks(project, Reporter(Console(quiet=True)), workers)
 
 
-def measured(project: Project) -> list[FrameMeasurement]:
+def measured(project: Project, *scans: str) -> list[FrameMeasurement]:
+    """Those scans, measured with what all scans of the project tell."""
     known = learned(project)
-    return [measure_scan(known, name).frame for name in project.scans]
+    return [measure_scan(known, name).frame for name in scans]
 
 
 def assert_measured_alike(project: Project, first: FrameMeasurement) -> None:
@@ -129,19 +131,20 @@ def assert_off_alike(frames: list[FrameMeasurement], true: dict[str, Array]) -> 
     )
     assert all(mark.status.is_observation for frame in frames for mark in frame.marks)
     scatter = off - off.mean(axis=0)  # the offset turns with the frames by 0.008 rad at most
-    assert np.abs(scatter).max() < 0.03 + 0.008 * np.abs(off).max()
+    assert np.abs(scatter).max() < 0.026 + 0.008 * np.abs(off).max()
     assert np.abs(off).max() < 24.0  # half of size_mm
 
 
 def test_marks_learned_from_clicks_lie_off_the_true_ones_alike_in_all_frames(
     rendered: Path, shown: tuple[Project, Project]
 ) -> None:
-    assert_off_alike([measure_scan(shown[1], name).frame for name in shown[1].scans], truth(rendered))
+    """In the scan that was clicked in, and in another one."""
+    assert_off_alike([measure_scan(shown[1], name).frame for name in ("f0", "f1")], truth(rendered))
 
 
 def test_marks_that_recur_lie_off_the_true_ones_alike_in_all_frames(rendered: Path) -> None:
     project = project_of(rendered, LEARNED)
-    frames = measured(project)
+    frames = measured(project, "f0", "f2")
     assert_off_alike(frames, truth(rendered))
     assert_measured_alike(project, frames[0])
 
@@ -171,15 +174,19 @@ def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictu
 def test_one_scan_must_be_clicked_and_says_what_it_can_tell(rendered: Path) -> None:
     project = project_of(rendered, LEARNED, '"scans/f1.tif"')
     with pytest.raises(InputError, match="with one scan nothing says what is a mark"):
-        measured(project)
-    (frame,) = measured(project_of(rendered, LEARNED + clicks(rendered), '"scans/f1.tif"'))
+        learned(project)
+    (frame,) = measured(project_of(rendered, LEARNED + clicks(rendered), '"scans/f1.tif"'), "f1")
     assert {str(mark.status) for mark in frame.marks} == {"weak"}
     assert "its template is its own picture" in frame.marks[0].reason
     assert all(0 < np.trace(np.asarray(mark.covariance_px2)) < 0.01 for mark in frame.marks)
 
 
-def test_cameras_whose_files_are_named_alike_are_stored_apart(rendered: Path, tmp_path: Path) -> None:
-    """The second in another folder, beside a third that has the name which the second would get."""
+def test_cameras_whose_files_are_named_alike_are_stored_apart(
+    rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second in another folder, beside a third that has the name which the second would get. What is stored of each
+    is its first pictures: it has no second scan to seek them in."""
+    monkeypatch.setattr(learn_stage, "_chips", lambda *_: {})
     files = {"f0": "a/camera.toml", "f1": "b/camera.toml", "f2": "b/camera-2.toml"}
     project_of(tmp_path, LEARNED, f'"{rendered}/scans/*.tif"')
     given = (tmp_path / "camera.toml").read_text()
@@ -236,9 +243,9 @@ def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
         project_of(rendered, LEARNED + clicks(rendered).rsplit("4 =", 1)[0])
     project = project_of(rendered, LEARNED + clicks(rendered).replace("f1.tif", "g1.tif"))
     with pytest.raises(InputError, match="'g1', which is none of the project's scans"):
-        measured(project)
+        learned(project)
     camera = project.default_camera
     assert camera.clicks is not None
     outside = replace(camera, clicks=replace(camera.clicks, scan="f1", px={**camera.clicks.px, "2": (9999.0, 3.0)}))
     with pytest.raises(InputError, match=r"click of fiducial '2', \[9999.0, 3.0\], lies outside"):
-        measured(replace(project, cameras={"camera.toml": outside}))
+        learned(replace(project, cameras={"camera.toml": outside}))

@@ -4,7 +4,6 @@ import csv
 import json
 import tomllib
 from collections.abc import Sequence
-from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -33,6 +32,7 @@ READY = sorted(
     for entry in resources.files("synthetic_images").joinpath("scenes").iterdir()
     if not entry.name.endswith("_camera.toml")
 )
+ADJUSTED = ("aerial_five.toml", "demo.toml")  # all frames of these are made for that
 IMAGES = TEMPLATE.index("[[image]]")
 
 
@@ -66,25 +66,30 @@ def test_the_ready_scenes_are_those_that_are_documented() -> None:
     ]
 
 
-@cache
 def true_frames(name: str) -> tuple[FrameTruth, ...]:
     """Where everything lies in the frames of a ready scene."""
     scene = read_scene(scene_path(name)).scene
     return tuple(frame_truth(scene, index) for index in range(len(scene.images)))
 
 
-def in_its_group(name: str) -> object:
-    """A scene whose tests run in one process, so that its frames are made once."""
-    return pytest.param(name, marks=pytest.mark.xdist_group(name))
+@pytest.mark.parametrize("name", [name for name in READY if name not in ADJUSTED])
+def test_the_last_frame_of_a_ready_scene_shows_its_marks_and_enough_targets(name: str) -> None:
+    scene = read_scene(scene_path(name)).scene
+    assert_shown(name, frame_truth(scene, len(scene.images) - 1))
 
 
-@pytest.mark.parametrize("name", [in_its_group(name) for name in READY])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READY)
 def test_every_frame_of_a_ready_scene_shows_its_marks_and_enough_targets(name: str) -> None:
     for truth in true_frames(name):
-        assert not any(position.hidden for position in truth.fiducials.values())
-        assert len(truth.fiducials) == 8
-        if name != "juhl_natural.toml":
-            assert sum(not position.hidden for position in truth.targets.values()) >= 35
+        assert_shown(name, truth)
+
+
+def assert_shown(name: str, truth: FrameTruth) -> None:
+    assert not any(position.hidden for position in truth.fiducials.values())
+    assert len(truth.fiducials) == 8
+    if name != "juhl_natural.toml":
+        assert sum(not position.hidden for position in truth.targets.values()) >= 35
 
 
 def test_the_aerial_scene_has_two_scans_turned_and_one_mirrored() -> None:
@@ -305,15 +310,18 @@ def test_a_folder_that_cannot_be_made_is_an_input_error(tmp_path: Path) -> None:
         render_project(path, path / "out")
 
 
-@pytest.mark.parametrize("name", [in_its_group(name) for name in ("demo.toml", "aerial_five.toml")])
+@pytest.mark.parametrize("name", ADJUSTED)
 def test_the_adjustment_finds_the_scenes_camera(tmp_path: Path, name: str) -> None:
     """Renderer and adjustment share no formula: a sign or a unit that one of them has wrong would show here."""
     scene_file = read_scene(scene_path(name))
     write_project(scene_file, tmp_path)
+    frames = true_frames(name)
+    for truth in frames:
+        assert_shown(name, truth)
     project_file = tmp_path / "project.toml"
     lines = project_file.read_text(encoding="utf-8").splitlines(keepends=True)
     project_file.write_text("".join(line for line in lines if not line.startswith("scans")), encoding="utf-8")
-    (tmp_path / "comparator.csv").write_text(true_comparator(scene_file, true_frames(name), 0.05), encoding="utf-8")
+    (tmp_path / "comparator.csv").write_text(true_comparator(scene_file, frames, 0.05), encoding="utf-8")
     project = read_project(project_file)
     adjustment = adjust_marks(project, read_comparator(project.comparator))
     assert adjustment.converged

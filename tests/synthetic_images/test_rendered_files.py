@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from small_scene import CAMERA, SCANNER, Array, hidden_field, rendered, scene
+from small_scene import CAMERA, SCANNER, hidden_field, rendered, scene
 
 import synthetic_images
-from synthetic_images.render import render_scene
+from synthetic_images.render import STRIP_PX, render_scene
 from synthetic_images.scene import Compression, Film, Tones
+from synthetic_images.tiff import Grey, write_tiff
 
 
 @pytest.fixture(scope="module")
-def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Array]:
-    """The same scene in grey and in colour, uncompressed in strips."""
+def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Grey]:
+    """The grey values of the same scene in grey and in colour, rendered to uncompressed strips."""
     folder = tmp_path_factory.mktemp("plain")
-    return {
-        colour: rendered(folder / str(colour), scene(scanner=replace(SCANNER, colour=colour, noise=0.01)))[0]
-        for colour in (False, True)
-    }
+    for colour in (False, True):
+        render_scene(scene(scanner=replace(SCANNER, colour=colour, noise=0.01, tile_px=0)), folder / str(colour))
+    return {colour: tifffile.imread(folder / str(colour) / "scans" / "f.tif") for colour in (False, True)}
 
 
 @pytest.mark.xdist_group("stored plainly")  # rendered once for all
@@ -31,13 +31,15 @@ def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Array
 @pytest.mark.parametrize("tile_px", [0, 64, 384])
 @pytest.mark.parametrize("colour", [False, True])
 def test_files_hold_the_same_picture(
-    tmp_path: Path, stored_plainly: dict[bool, Array], compression: Compression, tile_px: int, colour: bool
+    tmp_path: Path, stored_plainly: dict[bool, Grey], compression: Compression, tile_px: int, colour: bool
 ) -> None:
     scanner = replace(SCANNER, colour=colour, noise=0.01, compression=compression, tile_px=tile_px)
-    picture, _ = rendered(tmp_path, scene(scanner=scanner))
-    assert picture.shape == ((350, 350, 3) if colour else (350, 350))
-    assert np.array_equal(picture, stored_plainly[colour])
-    with tifffile.TiffFile(tmp_path / "scans" / "f.tif") as file:
+    grey = stored_plainly[colour]
+    assert grey.shape == ((350, 350, 3) if colour else (350, 350))
+    strips = (grey[row : row + STRIP_PX] for row in range(0, 350, STRIP_PX))
+    write_tiff(tmp_path / "f.tif", strips, 350, 350, STRIP_PX, scanner)
+    assert np.array_equal(tifffile.imread(tmp_path / "f.tif"), grey)
+    with tifffile.TiffFile(tmp_path / "f.tif") as file:
         tags = file.pages.first.tags
         assert tags["XResolution"].value[0] / tags["XResolution"].value[1] == pytest.approx(250.0)  # a cm over 40 um
         assert ("TileWidth" in tags) == (tile_px > 0)

@@ -1,0 +1,64 @@
+"""Work shared among threads: in its order, by as many as OpenCV may use, and with the same result as by one."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from measure.scans.parallel import side_by_side
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from measure.single_targets.disk_patches import DiskSearch
+from measure.single_targets.disk_search import disk_candidates
+
+
+@pytest.fixture(autouse=True)
+def _threads_as_before() -> Iterator[None]:
+    threads = cv2.getNumThreads()
+    yield
+    cv2.setNumThreads(threads)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_every_item_is_worked_on_in_its_order_while_opencvs_threads_rest(threads: int) -> None:
+    """All threads are at work at once: each waits for the others."""
+    cv2.setNumThreads(threads)
+    all_there = threading.Barrier(threads)
+
+    def seen(item: int) -> tuple[int, int, int]:
+        all_there.wait(60.0)
+        return item, threading.get_ident(), cv2.getNumThreads()
+
+    found = side_by_side(seen, range(6))
+    assert [item for item, _, _ in found] == list(range(6))
+    assert len({thread for _, thread, _ in found}) == threads
+    assert {own for _, _, own in found} == {1}
+    assert cv2.getNumThreads() == threads
+
+
+def test_what_fails_leaves_opencvs_threads_as_they_were() -> None:
+    cv2.setNumThreads(2)
+    with pytest.raises(ZeroDivisionError):
+        side_by_side(lambda item: 1 // item, [1, 0, 2])
+    assert cv2.getNumThreads() == 2
+
+
+def test_any_number_of_threads_finds_the_same_disks() -> None:
+    rng = np.random.default_rng(1)
+    grey = rng.normal(20000.0, 300.0, (700, 900)).astype(np.float32)
+    places = [(col, row) for row in range(60, 700, 120) for col in range(60, 900, 120)]
+    for place in places:
+        cv2.circle(grey, place, 8, 40000.0, -1)
+    picture = cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.uint16)
+    found = []
+    for threads in (1, 3):
+        cv2.setNumThreads(threads)
+        scan = Scan(Path("disks.tif"), WholePicture(picture[:, :, None]), NO_TAGS)
+        found.append(disk_candidates(scan, DiskSearch((10.0, 24.0), "light", 0.2)))
+    one, other = (np.array([disk.center_px for disk in disks]) for disks in found)
+    assert len(one) == len(places)
+    np.testing.assert_array_equal(one, other)
