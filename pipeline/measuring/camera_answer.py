@@ -1,5 +1,6 @@
 """What trying the library's cameras on a scan says: which of them stand out, in words, in figures and as JSON."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ Json = dict[str, Any]
 
 _OUTSTANDING = 2.0  # times what chance finds
 _CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
+_SHRUNK = 0.03  # of its size: more than film and cameras of a model differ by
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,8 @@ class Trial:
     median of contrast over noise. score: 0 to 1, as `_score` has it. chance: the score of the same marks in wrong
     places, the layout stretched; None where no such comparison is needed. residual_sigmas, residual_mm: what an affine
     transformation leaves, per axis, in standard deviations of marks and given places; None where it leaves nothing
-    over. expected: how many constellations that answer as well at reduced size chance makes in such a scan.
+    over. expected: how many constellations that answer as well at reduced size chance makes in such a scan, infinite
+    where none answers at the given pitch. pixel_um: what the marks' separations say a pixel measures, None without any.
     """
 
     cameras: tuple[str, ...]
@@ -37,6 +40,7 @@ class Trial:
     reason: str
     seconds: float
     expected: float
+    pixel_um: float | None = None
 
     @property
     def against_chance(self) -> str:
@@ -52,11 +56,12 @@ class Trial:
 @dataclass(frozen=True)
 class Identification:
     """The trials, best first, and what follows from them. unreported: by name, what cameras without any calibration
-    report rest on."""
+    report rest on. pitch_um: of the scan in x and y, as given or as its file has it."""
 
     scan: Path
     trials: tuple[Trial, ...]
     unreported: Mapping[str, str] = field(default_factory=dict)
+    pitch_um: tuple[float, float] | None = None
 
     @property
     def best(self) -> tuple[Trial, ...]:
@@ -80,7 +85,20 @@ class Identification:
         elif len(first.cameras) > 1:
             told += " Their marks are alike; the data strip or the focal length must decide."
         named = [name for trial in self.best for name in trial.cameras if name in self.unreported]
-        return told + "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
+        told += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
+        return told + self._against_pitch(first)
+
+    def _against_pitch(self, trial: Trial) -> str:
+        """A sentence where the pitch cannot be right if the scan is of that camera."""
+        if self.pitch_um is None or trial.pixel_um is None:
+            return ""
+        pitch_um = math.sqrt(math.prod(self.pitch_um))
+        if abs(trial.pixel_um / pitch_um - 1) < _SHRUNK:
+            return ""
+        return (
+            f" Its marks lie as far apart as they should only if a pixel measures {trial.pixel_um:.1f} um, not "
+            f"{pitch_um:.1f}: if the scan is of this camera, the pitch that --pitch or its file gives is wrong."
+        )
 
     def as_json(self) -> Json:
         trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
@@ -102,7 +120,8 @@ def _figures(trial: Trial) -> str:
     words.append(f"signal-to-noise {trial.snr:.1f}")
     if trial.residual_mm is not None:
         words.append(f"affine residual {trial.residual_mm:.3f} mm ({trial.residual_sigmas:.0f} sigma)")
-    words.append(f"by chance {trial.expected:.1g}")
+    if math.isfinite(trial.expected):
+        words.append(f"by chance {trial.expected:.1g}")
     if trial.chance is not None:
         words.append(f"in wrong places {trial.chance:.2f}")
     return f"{', '.join(words)}; {trial.seconds:.0f} s"

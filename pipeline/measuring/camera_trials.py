@@ -44,7 +44,8 @@ def identify(
             trials = _trials(scan, cameras, pitch, FiducialOptions(), count)
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
-    return Identification(path, tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected))), unreported)
+    ranked = tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected)))
+    return Identification(path, ranked, unreported, pitch)
 
 
 def _trials(
@@ -139,6 +140,7 @@ def _trial(
         reason="" if seen else frame.marks[0].reason,
         seconds=time.perf_counter() - start,
         expected=expected,
+        pixel_um=None if frame.px_per_mm is None else 1000 / frame.px_per_mm,
     )
 
 

@@ -224,6 +224,14 @@ def test_what_chance_finds_as_well_does_not_stand_out() -> None:
     assert found.as_json()["best"] == []
 
 
+def test_a_pitch_that_the_marks_contradict_is_told() -> None:
+    seen = replace(trial(("a",), 0.8), expected=math.inf, pixel_um=127.3)
+    right = Identification(Path("a.tif"), (seen,), pitch_um=(126.0, 128.0))
+    assert "um" not in right.sentence()
+    wrong = replace(right, pitch_um=(63.5, 63.5))
+    assert "only if a pixel measures 127.3 um, not 63.5" in wrong.sentence()
+
+
 def test_cameras_that_come_close_are_all_named() -> None:
     found = Identification(Path("a.tif"), (trial(("a", "b"), 0.9), trial(("c",), 0.85), trial(("d",), 0.4)))
     assert found.as_json()["best"] == ["a", "b", "c"]
