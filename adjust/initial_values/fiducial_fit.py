@@ -17,6 +17,7 @@ MOST_SUBSETS = 100
 GROSS = 13.8  # squared distance, in variances of a coordinate, beyond which a mark is left out (0.1 % point)
 PLAINLY = 0.01  # of the squared distances left upright, below which those left mirrored tell that a scan is so
 LEAST_VARIANCE_MM2 = 1e-4  # of a coordinate: film and scanner may well do that
+LEAST_ASPECT = 0.1  # of marks, across their longest extent: nearer to a line, their errors may pass for a mirror
 LATTICE = np.stack(np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 8)]), axis=-1).reshape(-1, 2)
 
 
@@ -41,13 +42,35 @@ def fit_transformation(transformation: Transformation, comparator_mm: Array, cam
 
 
 def _is_mirrored(comparator_mm: Array, camera_mm: Array) -> bool:
+    """At once where all marks agree, as in most scans: else all subsets of them are tried, upright and mirrored."""
     if len(comparator_mm) < 3:
         return False
     kinds = [film_kind("similarity", mirrored) for mirrored in (False, True)]
     if _agree(_squared(kinds[0], _fit(kinds[0], comparator_mm, camera_mm), comparator_mm, camera_mm)):
-        return False  # at once, as most scans are: all subsets of marks would be tried for a mirrored one that fits
+        return False
+    determinant = _determinant_where_marks_agree(comparator_mm, camera_mm)
+    if determinant is not None:
+        return determinant < 0
     upright, mirrored = (_robust_fit(kind, comparator_mm, camera_mm)[1] for kind in kinds)
     return mirrored < PLAINLY * upright
+
+
+def _determinant_where_marks_agree(comparator_mm: Array, camera_mm: Array) -> float | None:
+    """Of the affine transformation that they agree on, negative in a mirrored scan; None where they agree on none, are
+    too few to show it, or lie about on one line."""
+    affine = film_kind("affine", False)
+    if len(comparator_mm) <= marks_of(affine) or _about_on_a_line(comparator_mm) or _about_on_a_line(camera_mm):
+        return None
+    parameters = _fit(affine, comparator_mm, camera_mm)
+    if not _agree(_squared(affine, parameters, comparator_mm, camera_mm)):
+        return None
+    origin, *along = affine.apply(parameters, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    return float(np.linalg.det(np.array(along) - origin))
+
+
+def _about_on_a_line(xy_mm: Array) -> bool:
+    most, least = np.linalg.svd(xy_mm - xy_mm.mean(axis=0), compute_uv=False)
+    return bool(least < LEAST_ASPECT * most)
 
 
 def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple[Array, float]:

@@ -82,6 +82,25 @@ def test_marks_on_a_line_do_not_tell_a_mirror(seed: int) -> None:
     np.testing.assert_allclose(found, [5.0, 5.0, 1.0, 0.0], atol=0.02)
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_film_that_shrank_unevenly_is_told_from_a_mirror(mirrored: bool) -> None:
+    """By three tenths of a per cent, as no similarity fits, upright or mirrored, and with a mark 0.08 mm off."""
+    camera = MARKS_MM @ [[1.003, 0.0], [0.0, 1.0]] + np.random.default_rng(3).normal(0.0, 0.005, MARKS_MM.shape)
+    camera[4, 0] += 0.08
+    comparator = [120.0, -110.0] + MARKS_MM * ((-1.0, 1.0) if mirrored else (1.0, 1.0))
+    assert fit_transformation("affine", comparator, camera)[1] == mirrored
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_bent_line_of_marks_does_not_tell_a_mirror(seed: int) -> None:
+    """Along it film differs from a similarity by more than marks do, across it there is but noise."""
+    generator = np.random.default_rng(seed)
+    along = np.linspace(-100.0, 100.0, 8)
+    comparator = np.stack([along, generator.normal(0.0, 0.01, 8)], axis=1)
+    camera = np.stack([along + 0.1 * (along / 100.0) ** 3, generator.normal(0.0, 0.01, 8)], axis=1)
+    assert not fit_transformation("affine", comparator, camera)[1]
+
+
 def test_small_residuals_are_no_gross_errors() -> None:
     rng = np.random.default_rng(2)
     comparator = MARKS_MM + rng.normal(0.0, 0.005, MARKS_MM.shape)
