@@ -24,13 +24,20 @@ def _parse(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
     except IsADirectoryError:
-        raise InputError(f"{path}: is a folder; a TOML file is needed here.") from None
+        raise InputError(f"{path}: is a folder; a TOML file is needed here. {_toml_files_in(path)}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not text in UTF-8; a TOML file, saved as such, is needed here.") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: is not valid TOML: {error}. Mend that line.") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+
+
+def _toml_files_in(folder: Path) -> str:
+    files = sorted(folder.glob("*.toml"))
+    if not files:
+        return "It holds none; `reseau template` prints one to start from."
+    return f"Name one that it holds: {', '.join(map(str, files))}."
 
 
 class Table:
