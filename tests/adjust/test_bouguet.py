@@ -4,12 +4,12 @@ J.-Y. Bouguet, Camera Calibration Toolbox for Matlab, first calibration example.
 deviations, his pixel origin is the centre of the top left pixel, his distortion model is OpenCV's.
 """
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from real_data import DATA, needs
 from scipy.io import loadmat
 
 from adjust.adjustment import adjust
@@ -19,7 +19,9 @@ from adjust.result import Adjustment
 
 Array = NDArray[np.float64]
 
-FILE = Path(__file__).parents[3] / "shared" / "data" / "chessboards" / "bouguet" / "Calib_Results.mat"
+FILE = DATA / "chessboards" / "bouguet" / "Calib_Results.mat"
+pytestmark = needs("chessboards", "bouguet", "Calib_Results.mat")
+
 PITCH_MM = 0.01
 IMAGES = tuple(str(i) for i in range(1, 21))
 CORNERS = 156
@@ -27,8 +29,6 @@ CORNERS = 156
 
 @pytest.fixture(scope="module")
 def published() -> dict[str, Any]:
-    if not FILE.exists():
-        pytest.skip("Bouguet's calibration is not beside the project")
     return dict(loadmat(FILE))
 
 

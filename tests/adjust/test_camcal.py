@@ -11,12 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from real_data import DATA, needs
 
 from adjust.adjustment import Options, adjust
 from adjust.initial_values.approximations import approximate
 from adjust.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
 
-FOLDER = Path(__file__).parents[3] / "shared" / "data" / "coded" / "camcal" / "camcaldemo"
+FOLDER = DATA / "coded" / "camcal" / "camcaldemo"
+pytestmark = needs("coded", "camcal", "camcaldemo")
+
 PIXEL_MM = np.array([5.43764 / 1704 * 1.000389598, 5.43764 / 1704])
 SIGMA_PX = 0.1
 PUBLISHED = {  # value and standard deviation; brown's signs are the opposite of that program's
@@ -33,8 +36,6 @@ PUBLISHED = {  # value and standard deviation; brown's signs are the opposite of
 
 @pytest.fixture(scope="module")
 def network() -> Network:
-    if not FOLDER.is_dir():
-        pytest.skip("the camera calibration demo is not beside the project")
     return network_of_demo()
 
 

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from drawn import drawn, scan_of
 from numpy.typing import NDArray
+from real_data import DATA, needs
 from scipy.io import loadmat
 from scipy.spatial import KDTree
 
@@ -28,8 +28,6 @@ from measure.scans.scan import open_scan
 from measure.status import Status
 
 Array = NDArray[np.float64]
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.exists(), reason="the photographs are not beside the project")
 WIDTH, HEIGHT = 320, 260
 
 
@@ -360,7 +358,7 @@ def chessboards(numbers: Iterable[int]) -> tuple[list[Array], list[Array]]:
     )
 
 
-@needs_data
+@needs("chessboards", "bouguet")
 def test_crossings_under_coma_are_where_a_published_calibration_has_them() -> None:
     """Matched under a symmetric blur they lie elsewhere."""
     corners = loadmat(DATA / "chessboards" / "bouguet" / "Calib_Results.mat")["x_9"].T
@@ -374,7 +372,7 @@ def test_crossings_under_coma_are_where_a_published_calibration_has_them() -> No
 
 
 @pytest.mark.slow
-@needs_data
+@needs("chessboards", "bouguet")
 def test_published_calibration_of_a_chessboard() -> None:
     """Every parameter within three of the published standard deviations, in spite of that lens's coma."""
     objects, images = chessboards(range(1, 21))
@@ -387,7 +385,7 @@ def test_published_calibration_of_a_chessboard() -> None:
 
 
 @pytest.mark.slow
-@needs_data
+@needs("circles", "boofcv")
 def test_hexagonal_circle_grids_of_another_project() -> None:
     spec = CircleGridSpec(24, 28, 1.2 * np.sqrt(3) / 2, 1.0, asymmetric=True, row_spacing_mm=0.6)
     with open_scan(DATA / "circles" / "boofcv" / "Sony_DSC-HX5V_CircleHexagonal" / "image01.jpg") as scan:

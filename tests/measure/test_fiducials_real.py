@@ -1,11 +1,11 @@
 """Fiducial marks on real scans, where they are at hand."""
 
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from real_data import DATA, needs
 
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
@@ -15,8 +15,8 @@ from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan, open_scan
 from measure.status import Status
 
-SCANS = Path(__file__).parents[3] / "shared" / "data" / "film_scans"
-pytestmark = pytest.mark.skipif(not SCANS.exists(), reason="the real scans are not beside the project")
+SCANS = DATA / "film_scans"
+pytestmark = needs("film_scans")
 
 WILD = MarkShape(ring_cross(0.80, 0.17, 1.75, 0.10, 0.08, 45.0), "light")
 RESEAU = MarkShape(cross(0.97, 0.05), "dark")

@@ -18,7 +18,6 @@ USUAL = ("F5-F9", "F7-F9")  # what is not left to the slow tests
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
 
 
-@pytest.mark.skipif(not CASES.is_dir(), reason="the reference cases are not here")
 @pytest.mark.parametrize("name", NAMES)
 def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
     case = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from real_data import DATA, needs
 
 from measure.codes_and_boards.ring_codes import RingCode, read_code
 from measure.codes_and_boards.sheet_naming import Dots, Naming, name_dots
@@ -22,7 +23,7 @@ CODES = {8: 0b000000010111, 12: 0b000101011011, 36: 0b001001111011, 40: 0b000110
 FINE = 180.0  # px of the drawing a step
 RADIUS = 0.1  # of a dot, in steps
 WIDTH, HEIGHT, FINER = 900, 680, 2
-CAMCAL = Path(__file__).parents[3] / "shared" / "data" / "coded" / "camcal"
+CAMCAL = DATA / "coded" / "camcal"
 
 REAL_ROWS = """
 90 92 94 95 97 96 93 91 89 88
@@ -168,11 +169,10 @@ def test_what_the_codes_cannot_be(tmp_path: Path, extra: str, message: str, caps
     assert message in capsys.readouterr().err
 
 
+@needs("coded", "camcal", "images")
 @pytest.mark.parametrize(("picture", "count"), [(21, 100), (26, 93)])
 def test_a_real_sheet(picture: int, count: int) -> None:
     """Every mark that was given for the picture gets its name, and its place to what a search without a fit can do."""
-    if not (CAMCAL / "images").is_dir():
-        pytest.skip("the pictures of the camera calibration demo are not beside the project")
     lines = (CAMCAL / "camcaldemo" / "measurements" / "markpts.txt").read_text(encoding="utf-8").splitlines()
     cells = [line.split(",") for line in lines if line.strip() and not line.startswith("#")]
     own = [row for row in cells if int(row[0]) == picture - 20]

@@ -25,8 +25,6 @@ from pipeline.opencv_check.check import check_against_opencv
 from pipeline.report import ReportData
 from pipeline.report.verdict import judge
 
-pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="the reference cases are not here")
-
 CASE = "iii_selfcal_all_unknown_datum_A"
 
 

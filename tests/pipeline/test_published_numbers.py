@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from real_data import DATA, needs
 
 from pipeline.cli import run
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
 FILM = DATA / "film_numbers"
-pytestmark = pytest.mark.skipif(not FILM.is_dir(), reason="the published numbers are not beside the project")
+pytestmark = needs("film_numbers")
 
 Json = dict[str, Any]
 
@@ -117,11 +117,10 @@ def rc30(kind: str) -> tuple[str, str, list[tuple[object, ...]]]:
     return camera + fiducials(marks, 0.0), f'[adjust]\ntransformation = "{kind}"\n', rows
 
 
+@needs("coded", "camcal", "camcaldemo")
 def test_a_self_calibration_of_2074_marks(tmp_path: Path) -> None:
     """DBAT's camera calibration demo, as in tests/adjust/test_camcal.py, from files and without any approximation."""
     folder = DATA / "coded" / "camcal" / "camcaldemo"
-    if not folder.is_dir():
-        pytest.skip("the camera calibration demo is not beside the project")
     aspect = 1.000389598
     pixel_mm = np.array([aspect, 1.0]) * 5.43764 / 1704
     known = {row[0]: row[2:5] for row in plain_table(folder / "reference" / "camcal-fixed.txt")}

@@ -14,15 +14,12 @@ from synthetic_images.scene import PARAMETERS, Distortion, SceneCamera
 
 Array = NDArray[np.float64]
 
-CASES = Path(__file__).parents[3] / "shared" / "cases"
+CASES = Path(__file__).parents[1] / "cases"
 FRAME = (230.0, 230.0)
 
 
 def case(name: str) -> dict[str, Any]:
-    path = CASES / f"{name}.json"
-    if not path.exists():
-        pytest.skip(f"the reference case {name} is not beside the project")
-    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    content: dict[str, Any] = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))
     return content
 
 
