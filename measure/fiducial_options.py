@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from measure.film import SCATTER_MM
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.match_options import MatchOptions
@@ -29,7 +30,7 @@ class FiducialOptions:
     misfit_mm: float = 0.15
     affinity: float = 0.003
     gate_mm: float = 0.3
-    film_sigma_mm: float = 0.005
+    film_sigma_mm: float = SCATTER_MM
     match: MatchOptions = field(default_factory=lambda: MatchOptions(linear_sigma=0.05))
 
     def __post_init__(self) -> None:

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fiducial_options import FiducialOptions
+from measure.film import AFFINITY_SIGMA
 from measure.frames.chance import doubt, expected_as_good, expected_where_seen
 from measure.frames.fiducial_rows import absent_frame, present_frame
 from measure.frames.frame import Frame
-from measure.frames.frame_fit import AFFINITY_SIGMA
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.frame_border import at_border
 from measure.marks.poses import POSES

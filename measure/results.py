@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.covariance import Covariance
 from measure.status import Status
 
 Kind = Literal["fiducial", "target", "tie"]
@@ -19,7 +20,7 @@ class MarkMeasurement:
 
     center_px: (2,) column and row, the centre of the top-left pixel being (0, 0). With status `predicted` it is the
     predicted place, with `absent` it may be None: there is nothing to say.
-    covariance_px2: (2, 2) of (column, row); None where nothing was fitted.
+    covariance: of the centre, by its causes; None where nothing was fitted.
     reason: one sentence; empty only when the status is `measured`.
     quality: named figures of the fit: snr, contrast_dn, blur_px, noise_dn, damaged_fraction, second_method_sigmas, ...
     """
@@ -27,16 +28,21 @@ class MarkMeasurement:
     point: str
     kind: Kind
     center_px: Array | None
-    covariance_px2: Array | None
+    covariance: Covariance | None
     status: Status
     reason: str = ""
     quality: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.status.is_observation and (self.center_px is None or self.covariance_px2 is None):
+        if self.status.is_observation and (self.center_px is None or self.covariance is None):
             raise ValueError(f"mark {self.point}: a {self.status} mark needs a centre and a covariance")
         if self.status is not Status.MEASURED and not self.reason:
             raise ValueError(f"mark {self.point}: the status {self.status} needs a reason")
+
+    @property
+    def covariance_px2(self) -> Array | None:
+        """(2, 2) of (column, row), all causes together; None where nothing was fitted."""
+        return None if self.covariance is None else self.covariance.px2
 
 
 @dataclass(frozen=True)

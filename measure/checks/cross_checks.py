@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtrc, fdtrc
 
-from measure.checks.doubts import CHANCE, FILM_MM, MEDIAN_EFFICIENCY, TOLD, Doubt, doubted, from_others, observed
+from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, TOLD, Doubt, doubted, from_others, observed
 from measure.checks.triangles import by_given_triangles, by_other_triangles
+from measure.covariance import Cause
+from measure.film import SCATTER_MM
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.results import FrameMeasurement
 
@@ -53,22 +55,26 @@ class _Reference:
 
 
 def cross_checked(
-    frames: Sequence[FrameMeasurement], layout: FiducialLayout, pitches_um: Sequence[tuple[float, float]]
+    frames: Sequence[FrameMeasurement],
+    layout: FiducialLayout,
+    pitches_um: Sequence[tuple[float, float]],
+    film_sigma_mm: float = SCATTER_MM,
 ) -> tuple[FrameMeasurement, ...]:
-    """The frames of one camera after all checks of their fiducials. pitches_um: of each scan, in x and y."""
+    """The frames of one camera after all checks of their fiducials. pitches_um: of each scan, in x and y;
+    film_sigma_mm: scatter of marks by film and scanner, where one frame has to be judged alone."""
     checked = tuple(frames)
-    for check in (_by_other_method, _by_other_frames, _by_midpoints):
-        checked = _after(checked, check(checked, layout))
-    for check_triangles in (by_other_triangles, by_given_triangles):
-        checked = _after(checked, check_triangles(checked, layout, pitches_um))
-    return checked
+    checked = _after(checked, _by_other_method(checked))
+    checked = _after(checked, _by_other_frames(checked, layout))
+    checked = _after(checked, _by_midpoints(checked, layout, film_sigma_mm))
+    checked = _after(checked, by_other_triangles(checked, layout, pitches_um, film_sigma_mm))
+    return _after(checked, by_given_triangles(checked, layout, pitches_um))
 
 
 def _after(frames: Sequence[FrameMeasurement], doubts: Iterable[Mapping[str, Doubt]]) -> tuple[FrameMeasurement, ...]:
     return tuple(doubted(frame, own) for frame, own in zip(frames, doubts, strict=True))
 
 
-def _by_other_method(frames: Sequence[FrameMeasurement], _: FiducialLayout) -> Iterator[dict[str, Doubt]]:
+def _by_other_method(frames: Sequence[FrameMeasurement]) -> Iterator[dict[str, Doubt]]:
     """The place by the mark's edges must not differ from the matched one by more than noise explains."""
     name = "second_method_sigmas"
     tests = sum(name in mark.quality for frame in frames for mark in observed(frame))
@@ -82,6 +88,7 @@ def _by_other_method(frames: Sequence[FrameMeasurement], _: FiducialLayout) -> I
                     f"its edges put it {off:#.2g} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
                     "it is damaged or unlike its drawing",
                     off,
+                    Cause.SECOND_METHOD,
                 )
         yield doubts
 
@@ -110,7 +117,7 @@ def _by_other_frames(frames: Sequence[FrameMeasurement], layout: FiducialLayout)
             alike, off_mm = _strangers(seen[place], others[place], scatter)
             names = [layout.marks[seen[place].index[number]].id for number in alike]
             for name, off in zip(names, off_mm, strict=True):
-                doubts[place][name] = Doubt(from_others(off, names), off / seen[place].mm)
+                doubts[place][name] = Doubt(from_others(off, names), off / seen[place].mm, Cause.OTHER_FRAMES)
             seen[place] = seen[place].without(alike)
     yield from doubts
 
@@ -246,14 +253,16 @@ def _strangers(seen: _Seen, reference: _Reference | None, scatter: _Scatter) -> 
     return alike, [float(np.hypot(*fit.off[place])) for place in alike]
 
 
-def _by_midpoints(frames: Sequence[FrameMeasurement], layout: FiducialLayout) -> Iterator[dict[str, Doubt]]:
+def _by_midpoints(
+    frames: Sequence[FrameMeasurement], layout: FiducialLayout, film_sigma_mm: float
+) -> Iterator[dict[str, Doubt]]:
     """The midpoints of opposite marks lie in one point, as far as the given places have them there."""
     pairs = _opposite(layout)
     seen = [_seen(frame, layout) for frame in frames]
     whole = [[pair for pair in pairs if np.isin(pair, each.index).all()] for each in seen]
     tests = sum(len(own) for own in whole if len(own) > 1)
     for each, own in zip(seen, whole, strict=True):
-        yield _off_midpoint(each, own, CHANCE / max(tests, 1), layout) if len(own) > 1 else {}
+        yield _off_midpoint(each, own, CHANCE / max(tests, 1), layout, film_sigma_mm) if len(own) > 1 else {}
 
 
 def _opposite(layout: FiducialLayout) -> list[tuple[int, int]]:
@@ -267,7 +276,7 @@ def _opposite(layout: FiducialLayout) -> list[tuple[int, int]]:
 
 
 def _off_midpoint(
-    seen: _Seen, pairs: Sequence[tuple[int, int]], chance: float, layout: FiducialLayout
+    seen: _Seen, pairs: Sequence[tuple[int, int]], chance: float, layout: FiducialLayout, film_sigma_mm: float
 ) -> dict[str, Doubt]:
     """The marks of the pair whose midpoint is farthest, in standard deviations, from that of the others."""
     given = np.array([mark.xy_mm for mark in layout.marks])
@@ -275,7 +284,7 @@ def _off_midpoint(
     off = np.zeros((len(layout.marks), 2))
     variance = np.full(len(layout.marks), np.inf)
     off[seen.index] = seen.camera_mm - given[seen.index]
-    variance[seen.index] = seen.sigma_mm**2 + sigma[seen.index] ** 2 + FILM_MM**2
+    variance[seen.index] = seen.sigma_mm**2 + sigma[seen.index] ** 2 + film_sigma_mm**2
     midpoints = np.array([off[list(pair)].mean(axis=0) for pair in pairs])
     spread = np.array([variance[list(pair)].sum() / 4 for pair in pairs])
     count = len(pairs)
@@ -293,4 +302,5 @@ def _off_midpoint(
         f"{np.sqrt(squares[worst]):.1f} standard deviations: a mark of these is off, or film or "
         "scanner bent"
     )
-    return {layout.marks[place].id: Doubt(reason, distance / seen.mm) for pair in guilty for place in pair}
+    doubt = Doubt(reason, distance / seen.mm, Cause.GIVEN_PLACES)
+    return {layout.marks[place].id: doubt for pair in guilty for place in pair}

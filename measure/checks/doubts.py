@@ -5,21 +5,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from measure.covariance import Cause
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 
 CHANCE = 0.01  # of doubting any good mark, of each check
-FILM_MM = 0.005  # scatter of marks by film and scanner, where one frame has to be judged alone
 TOLD = np.log(100.0)  # log-odds at which one cause rather than another is taken for what is off
 MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Why a mark is no longer called measured, and how far off that puts it."""
+    """Why a mark is no longer called measured, how far off that puts it, and the cause to which that is counted."""
 
     reason: str
     off_px: float
+    cause: Cause
 
 
 def observed(frame: FrameMeasurement) -> list[MarkMeasurement]:
@@ -38,10 +39,10 @@ def doubted(frame: FrameMeasurement, doubts: Mapping[str, Doubt]) -> FrameMeasur
 
 def _weakened(mark: MarkMeasurement, doubt: Doubt) -> MarkMeasurement:
     """Its variance enlarged by the mean square, an axis, of how far it is off."""
-    assert mark.covariance_px2 is not None  # an observation has one
+    assert mark.covariance is not None  # an observation has one
     reason = f"{mark.reason}; {doubt.reason}" if mark.reason else doubt.reason
-    covariance = mark.covariance_px2 + doubt.off_px**2 / 2 * np.eye(2)
-    return replace(mark, status=Status.WEAK, reason=reason, covariance_px2=covariance)
+    covariance = mark.covariance.plus(doubt.cause, doubt.off_px**2 / 2 * np.eye(2))
+    return replace(mark, status=Status.WEAK, reason=reason, covariance=covariance)
 
 
 def from_others(off_mm: float, names: Sequence[str]) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from measure.frames.frame_fit import AFFINITY_SIGMA
+from measure.film import AFFINITY_SIGMA
 from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement
 

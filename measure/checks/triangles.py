@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri, fdtrc
 
-from measure.checks.doubts import CHANCE, FILM_MM, MEDIAN_EFFICIENCY, TOLD, Doubt, from_others, observed
-from measure.frames.frame_fit import AFFINITY_SIGMA
+from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, TOLD, Doubt, from_others, observed
+from measure.covariance import Cause
+from measure.film import AFFINITY_SIGMA
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement
 
@@ -60,7 +61,10 @@ def by_given_triangles(
 
 
 def by_other_triangles(
-    frames: Sequence[FrameMeasurement], layout: FiducialLayout, pitches_um: Sequence[tuple[float, float]]
+    frames: Sequence[FrameMeasurement],
+    layout: FiducialLayout,
+    pitches_um: Sequence[tuple[float, float]],
+    film_sigma_mm: float,
 ) -> Iterator[dict[str, Doubt]]:
     """The marks of each frame of three that make another triangle than in the camera's other frames that lie alike."""
     names = [_names(frame) for frame in frames]
@@ -71,7 +75,9 @@ def by_other_triangles(
         forms = {place: form for place, form in enumerate(seen) if form}
         for pose in {form.pose for form in forms.values()}:
             alike = {place: form for place, form in forms.items() if form.pose == pose}
-            doubts |= _against_others(alike, {place for place in three if names[place] == own}, own, len(three))
+            doubts |= _against_others(
+                alike, {place for place in three if names[place] == own}, own, len(three), film_sigma_mm
+            )
     for place in range(len(frames)):
         yield doubts.get(place, {})
 
@@ -85,11 +91,15 @@ def _against_given(form: _Form, names: Sequence[str], given_mm: Array, tests: in
     covariance = form.covariance(given_mm) + _STRETCH
     if chdtrc(_FORM, _misfit(form.stretched, covariance)) * tests >= CHANCE:
         return {}
-    return _doubts(_off(form, form.stretched, covariance), names, form, _from_given)
+    return _doubts(_off(form, form.stretched, covariance), names, form, _from_given, Cause.GIVEN_PLACES)
 
 
 def _against_others(
-    forms: Mapping[int, _Form], three: AbstractSet[int], names: Sequence[str], tests: int
+    forms: Mapping[int, _Form],
+    three: AbstractSet[int],
+    names: Sequence[str],
+    tests: int,
+    film_sigma_mm: float,
 ) -> dict[int, dict[str, Doubt]]:
     """Doubts of the marks called names by frame, of those that show these three only. forms: of all that show them,
     against one another: the one that is worst off first, and without it the others again."""
@@ -97,7 +107,7 @@ def _against_others(
     while len(left) > _LEAST_OTHERS and three & left.keys():
         places = list(left)
         stretched = np.array([form.stretched for form in left.values()])
-        measured = np.array([form.covariance(FILM_MM) for form in left.values()])
+        measured = np.array([form.covariance(film_sigma_mm) for form in left.values()])
         scatter = _scatter(stretched - np.median(stretched, axis=0), measured) * np.eye(_FORM)
         apart = stretched - [np.median(np.delete(stretched, n, axis=0), axis=0) for n in range(len(places))]
         of_others = (measured.sum(axis=0) - measured) / (len(places) - 1) + scatter
@@ -108,7 +118,8 @@ def _against_others(
         if fdtrc(_FORM, degrees, misfits[worst] / _FORM) * tests >= CHANCE:
             break
         form = left.pop(places[worst])
-        doubts[places[worst]] = _doubts(_off(form, apart[worst], covariances[worst]), names, form, from_others)
+        off_mm = _off(form, apart[worst], covariances[worst])
+        doubts[places[worst]] = _doubts(off_mm, names, form, from_others, Cause.OTHER_FRAMES)
     return doubts
 
 
@@ -179,9 +190,11 @@ def _explained(cause: Array, stretched: Array, covariance: Array) -> tuple[float
     return _misfit(stretched - cause @ numbers, covariance), np.asarray(numbers)
 
 
-def _doubts(off_mm: Mapping[int, float], names: Sequence[str], form: _Form, told: _Reason) -> dict[str, Doubt]:
+def _doubts(
+    off_mm: Mapping[int, float], names: Sequence[str], form: _Form, told: _Reason, cause: Cause
+) -> dict[str, Doubt]:
     alike = [names[mark] for mark in off_mm]
-    return {names[mark]: Doubt(told(off, alike), off / form.mm) for mark, off in off_mm.items()}
+    return {names[mark]: Doubt(told(off, alike), off / form.mm, cause) for mark, off in off_mm.items()}
 
 
 def _from_given(off_mm: float, names: Sequence[str]) -> str:

@@ -17,6 +17,7 @@ from measure.codes_and_boards.board_specs import (
 )
 from measure.codes_and_boards.circle_grids import measure_circle_grid
 from measure.codes_and_boards.corners import Corner, Surface, crossing, fit_corner, quarter
+from measure.covariance import Covariance
 from measure.fitting.scan_window import ScanWindow
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
@@ -187,4 +188,6 @@ def _as_mark(name: str, fitted: FittedCorner | None, missing: str) -> MarkMeasur
     weak = corner.damaged_fraction > _WEAK_DAMAGE
     reason = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit" if weak else ""
     status = Status.WEAK if weak else Status.MEASURED
-    return MarkMeasurement(name, "target", corner.center_px, corner.covariance_px2, status, reason, quality)
+    return MarkMeasurement(
+        name, "target", corner.center_px, Covariance.of_noise(corner.covariance_px2), status, reason, quality
+    )

@@ -112,4 +112,4 @@ def _as_mark(name: str, disk: FittedDisk, was_seen: bool) -> MarkMeasurement:
         return MarkMeasurement(name, "target", disk.center_px, None, status, f"not fitted: {disk.reason}")
     weakness = disk.weakness or disk.lone_doubt
     status = Status.WEAK if weakness else Status.MEASURED
-    return MarkMeasurement(name, "target", disk.center_px, disk.covariance_px2, status, weakness, disk.quality)
+    return MarkMeasurement(name, "target", disk.center_px, disk.covariance, status, weakness, disk.quality)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from measure.covariance import Covariance
 from measure.results import MarkMeasurement
 
 Array = NDArray[np.float64]
@@ -57,4 +58,4 @@ def _junction(mark: MarkMeasurement) -> Array:
 def _at_junction(mark: MarkMeasurement, variance_px2: float) -> MarkMeasurement:
     if not _has_junction(mark):
         return mark
-    return replace(mark, center_px=_junction(mark), covariance_px2=variance_px2 * np.eye(2))
+    return replace(mark, center_px=_junction(mark), covariance=Covariance.of_noise(variance_px2 * np.eye(2)))

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.covariance import Cause, Covariance
 from measure.fitting.border_search import is_overwhelming, likely_border
 from measure.fitting.bordered_model import BorderedModel
 from measure.fitting.changed_tone import covariance_of_changed_tone
@@ -33,7 +34,7 @@ from measure.match_options import MatchOptions
 from measure.noise.blank_film import blank_patches, is_coloured
 from measure.noise.grain import grain_model
 from measure.noise.noise import NoiseModel, is_textured, noise_model
-from measure.noise.pixel_sums import combined, factors
+from measure.noise.pixel_sums import combined, factors, products
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
 
@@ -47,8 +48,8 @@ _SPARE_PX = 2.0  # beyond the margin: room for the mark to move
 class Match:
     """A mark as fitted. Where converged is false, reason says why and the numbers are the last approximations.
 
-    center_px (2,), covariance_px2 (2, 2), pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
-    unknowns of the `PictureModel`, None where another model was fitted.
+    center_px (2,) with its place_covariance, pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
+    unknowns of the `PictureModel` by the noise, None where another model was fitted.
     contrast_dn: the mark's grey value less the background's, negative for a dark mark. noise_dn: standard deviation of
     one pixel, of a chip's picture after smoothing. damaged_fraction: share of the pixels about the mark, within
     plain_px of it, that were cut out. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
@@ -64,7 +65,7 @@ class Match:
     converged: bool
     reason: str
     center_px: Array
-    covariance_px2: Array
+    place_covariance: Covariance
     pixel_from_mark: Array
     contrast_dn: float
     noise_dn: float
@@ -81,6 +82,11 @@ class Match:
     sloping: SecondPlace | None = None
     own_shape: OwnShape | None = None
     covariance: Array | None = None
+
+    @property
+    def covariance_px2(self) -> Array:
+        """(2, 2) of the centre, all causes together."""
+        return self.place_covariance.px2
 
     @property
     def sigma_px(self) -> float:
@@ -282,7 +288,8 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
     if fit.least_variance_dn2:  # nor does blank film show more than its rounding
         noise = noise.at_least(fit.least_variance_dn2)
         about = about._replace(free=np.zeros_like(about.free))
-    precision = _Precision(np.full((len(model.design),) * 2, np.inf), np.inf)
+    unknown = np.full((len(model.design),) * 2, np.inf)
+    precision = _Precision(Covariance.of_noise(unknown[:2, :2]), unknown, np.inf)
     if not fit.reason:
         patches = blank_patches(about.grey, about.free, noise.variance_dn2)
         if not noise.is_white or is_coloured(patches):
@@ -293,7 +300,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
         converged=not fit.reason,
         reason=fit.reason,
         center_px=state.pixel_from_mark[:, 2],
-        covariance_px2=covariance[:2, :2],
+        place_covariance=precision.place,
         pixel_from_mark=state.pixel_from_mark,
         contrast_dn=model.contrast_dn,
         noise_dn=float(np.sqrt(noise.variance_dn2)),
@@ -314,9 +321,11 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
 
 
 class _Precision(NamedTuple):
-    """What the noise makes of a fit: the covariance of its unknowns (unknowns, unknowns), the standard deviation of the
-    contrast, and what the linearised fit says beside the unknowns, as `Match` has it."""
+    """How well a fit is known: its place by all causes, the covariance of its unknowns (unknowns, unknowns) and the
+    standard deviation of the contrast by the noise, and what the linearised fit says beside the unknowns, as in
+    `Match`."""
 
+    place: Covariance
     covariance: Array
     contrast_sigma: float
     edges: SecondPlace | None = None
@@ -330,18 +339,23 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     covariance, by_grey = fit.weigh(noise)
     priors_dn2 = model.prior_weights() * noise.variance_dn2
     own = model.apart_from_border
-    covariance[:2, :2] *= 1 + second_order(
-        model.design[own], model.slopes, fit.used, covariance[np.ix_(own, own)], priors_dn2[own]
-    )
+    more = second_order(model.design[own], model.slopes, fit.used, covariance[np.ix_(own, own)], priors_dn2[own])
+    by_noise = covariance[:2, :2]
+    rounded = fit.rounding_variance_dn2 * np.trace(products(by_grey[:2], by_grey[:2]))
+    share = min(float(rounded / np.trace(by_noise)), 1.0)
+    place = Covariance.of_noise((1 - share) * by_noise).plus(Cause.ROUNDING, share * by_noise)
+    place = place.plus(Cause.SECOND_ORDER, more * by_noise)
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))
-        covariance[:2, :2] += covariance_of_changed_tone(model.half_tones, by_grey, change)
+        place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))
     if about.frame.any():
-        covariance[:2, :2] += covariance_of_landscape(about.grey, about.frame, by_grey[:2] * model.design[-GREY])
+        landscape = covariance_of_landscape(about.grey, about.frame, by_grey[:2] * model.design[-GREY])
+        place = place.plus(Cause.LANDSCAPE, landscape)
     linear = LinearFit(model.residuals, used, model.design, by_grey, noise)
     freedom = model.options.freedom
     tells_shape = freedom == "similarity" and not is_round(model.mark)
     return _Precision(
+        place,
         covariance,
         contrast_sigma=float(np.sqrt(max(float(model.contrast_by @ covariance @ model.contrast_by), 1e-12))),
         edges=edge_place(linear, model.blur_px),

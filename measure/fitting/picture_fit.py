@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from measure.fitting.clipping import noise_scale
 from measure.fitting.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
-from measure.fitting.rounding import COARSEST_VARIANCE, likely_sigma, rounding_step, unrounded, unrounded_variance
+from measure.fitting.rounding import (
+    COARSEST_VARIANCE,
+    ROUNDING_VARIANCE,
+    likely_sigma,
+    rounding_step,
+    unrounded,
+    unrounded_variance,
+)
 from measure.fitting.sandwich_covariance import sandwich_covariance
 from measure.marks.rendering import chip_mask, known, picture
 from measure.marks.shapes import MarkTemplate
@@ -36,7 +43,8 @@ EDGE_BLURS = 3.0  # from the frame's border, in which a mark ends: a thousandth 
 
 class PictureFit:
     """The fit in progress. area: the pixels about the mark that are there; used: those of them that are undamaged;
-    least_variance_dn2: what a grey value's noise is at least, by its rounding; reason: why it failed. is_lossy: whether
+    least_variance_dn2: what a grey value's noise is at least, by its rounding; rounding_variance_dn2: what of it that
+    makes; reason: why it failed. is_lossy: whether
     the picture was compressed with loss."""
 
     def __init__(self, model: PictureModel, usable: Mask, is_lossy: bool) -> None:
@@ -44,7 +52,7 @@ class PictureFit:
         self.options = model.options
         self.area = self.used = usable
         self.far = np.zeros_like(usable)
-        self.variance_dn2, self.least_variance_dn2 = 1.0, 0.0
+        self.variance_dn2, self.least_variance_dn2, self.rounding_variance_dn2 = 1.0, 0.0, 0.0
         self.reason = ""
 
     def approach(self) -> None:
@@ -98,6 +106,7 @@ class PictureFit:
         ordinary = self.used & (model.clipped == 0)
         is_whole = not self.is_lossy and model.background_px is None and not isinstance(model.mark, MarkTemplate)
         step = 0.0 if self.reason or not is_whole else rounding_step(rounded[ordinary])
+        self.rounding_variance_dn2 = ROUNDING_VARIANCE * step**2
         if not step or np.mean(model.residuals[ordinary] ** 2) > COARSEST_VARIANCE * step**2:
             return
         for _ in range(_MOST_UNROUNDED):
@@ -105,6 +114,7 @@ class PictureFit:
             off = (rounded - drawn) / step
             sigma = likely_sigma(off[ordinary])
             self.least_variance_dn2 = unrounded_variance(sigma) * step**2
+            self.rounding_variance_dn2 = self.least_variance_dn2 - (sigma * step) ** 2
             model.take_grey(np.where(ordinary, drawn + step * unrounded(off, sigma), rounded))
             self._adjust(robust=False, tolerance_px=_UNROUNDED_PX)
             if self.reason or np.hypot(*(model.state.pixel_from_mark[:, 2] - before)) < _UNROUNDED_PX:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.covariance import Covariance
 from measure.fitting.matching import Match
 from measure.marks.rendering import extent_px, picture
 from measure.scans.scan import Scan
@@ -147,7 +148,7 @@ class _Field:
             converged=True,
             reason="",
             center_px=place,
-            covariance_px2=inverse @ slopes @ inverse,
+            place_covariance=Covariance.of_noise(inverse @ slopes @ inverse),
             pixel_from_mark=np.column_stack([self.linear, place]),
             contrast_dn=self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit)),
             noise_dn=float(np.average(self.texture_dn[patch], weights=lit)),

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from measure.film import AFFINITY_SIGMA
 from measure.fitting.second_place import SecondPlace
 from measure.frames.frame import Frame
-from measure.frames.frame_fit import AFFINITY_SIGMA
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
@@ -93,7 +93,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
         **_by_edges(fit.edges),
     }
     status, reason = frame.verdict(index)
-    covariance = fit.covariance_px2
+    covariance = fit.place_covariance
     if isinstance(mark.mark, MarkTemplate):
         covariance = honest_covariance(mark.mark, scan, fit)
         if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:

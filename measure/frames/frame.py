@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from measure.film import SCATTER_MM
 from measure.fitting.matching import Match
 from measure.frames.refinement import Sighting
 from measure.search.constellation import Placement
@@ -21,7 +22,7 @@ _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit 
 _CHECKED = 4  # marks that agree: an affine transformation through them has a check
 WRONG_PX, WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
-_LEAST_SCATTER_MM = 0.01  # of few marks, which may agree by chance better than film keeps them
+_LEAST_SCATTER_MM = 2 * SCATTER_MM  # of few marks, which may agree by chance better than film keeps them
 _SAME_MARK_PX = 5.0  # two fits of one mark lie nearer to one another, two marks do not: each is some 14 px large
 
 

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.film import AFFINITY_SIGMA
+
 Array = NDArray[np.float64]
 
 _STRANGE = 1e-3  # probability of taking any true mark for a stranger, were the film's deformation random
 _MANY = 8  # marks whose scatter says more than the gate
 _LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most agree
-AFFINITY_SIGMA = 5e-3  # film stretches by a few parts in ten thousand, an office scanner by several thousandths
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.covariance import Cause
 from measure.fitting.generators import is_round
 from measure.fitting.matching import Match
 from measure.frames.frame import WRONG_CHANCE, WRONG_PX
@@ -93,7 +94,7 @@ def _count_touches(sighter: FrameSighter, index: int, size: SharedShape, fit: Ma
     """What may touch a round mark, as its size has it: in its variance, and as a doubt where it may be far off."""
     radius_px = _radius_px(sighter.layout.marks[index].mark, fit.pixel_from_mark[:, :2])
     touched = size.touched(radius_px, fit.damaged_fraction > 0)
-    sighter.widen(index, touched * round_moves_px(size, radius_px) ** 2 / 2)
+    sighter.widen(index, Cause.TOUCHED, touched * round_moves_px(size, radius_px) ** 2 / 2)
     chance = touched * round_moves_beyond(WRONG_PX, size, radius_px)
     if chance > WRONG_CHANCE and not size.differs:
         reason = f"it is {size.ratio:.2f} times as large as the other marks: something may touch it and have moved it"
@@ -121,7 +122,7 @@ def compare_shapes(sighter: FrameSighter) -> None:
         middle_px = reach_px(sighter.layout.marks[index].mark, fits[index].pixel_from_mark[:, :2]) / 2
         moved_px = float(np.hypot(*(shape.on_place @ other.off)))
         touched = other.touched(middle_px, fits[index].damaged_fraction > 0)
-        sighter.widen(index, touched * moved_px**2 / 2)
+        sighter.widen(index, Cause.TOUCHED, touched * moved_px**2 / 2)
 
 
 def _radius_px(mark: Mark, linear: Array) -> float:

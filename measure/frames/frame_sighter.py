@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.covariance import Cause
 from measure.fiducial_options import FiducialOptions
 from measure.fitting.matching import Match
 from measure.frames.channels import best_weights
@@ -161,12 +162,12 @@ class FrameSighter:
             reasons = [each for each in (sighting.reason, reason) if each]
             self.sightings[index] = replace(sighting, reason="; ".join(reasons))
 
-    def widen(self, index: int, variance_px2: float) -> None:
-        """Add a variance, along each coordinate, to what is known of the place of a mark that was seen."""
+    def widen(self, index: int, cause: Cause, variance_px2: float) -> None:
+        """Count a variance, along each coordinate, to a cause for the place of a mark that was seen."""
         sighting = self.sightings[index]
         if sighting is not None and sighting.fit is not None:
-            covariance = sighting.fit.covariance_px2 + variance_px2 * np.eye(2)
-            self.sightings[index] = replace(sighting, fit=replace(sighting.fit, covariance_px2=covariance))
+            covariance = sighting.fit.place_covariance.plus(cause, variance_px2 * np.eye(2))
+            self.sightings[index] = replace(sighting, fit=replace(sighting.fit, place_covariance=covariance))
 
     def clear(self, index: int) -> bool:
         """Whether a mark needs no second look: it is plainly there, be it where the others put it or not."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.covariance import Cause
 from measure.fitting.beyond_edge import beyond_edge
 from measure.fitting.matching import Match, MatchOptions, match, window_about
 from measure.fitting.scan_window import read_window
@@ -12,7 +13,7 @@ from measure.frames.first_look import seen
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
 from measure.noise.blank_film import BESIDE_PX
-from measure.scans.compression import with_loss
+from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT
 from measure.search.correlation import CLOSE
@@ -63,7 +64,8 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     reason = _unlike(fit, expected, scan.full_scale_dn)
     if reason:
         return Sighting(predicted, True, None, reason)
-    fit = replace(fit, covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn))
+    loss = covariance_of_compression(scan, fit.contrast_dn)
+    fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     return Sighting(predicted, True, fit, chance=chance)
 
 

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from measure.covariance import Covariance
 from measure.natural_points.epipolar import FEWEST_PAIRS
 from measure.natural_points.tie_candidates import Shared, candidates, frame_features, verified
 from measure.natural_points.tie_frame import TieFrame
@@ -110,7 +111,8 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
         )
     elif not point.is_sharp(frame):
         status, reason = Status.WEAK, f"the texture fixes it to {point.error_px(frame):.2f} px only"
-    return MarkMeasurement(name, "tie", piece.center_px, piece.covariance_px2, status, reason, quality)
+    covariance = Covariance.of_noise(piece.covariance_px2)
+    return MarkMeasurement(name, "tie", piece.center_px, covariance, status, reason, quality)
 
 
 def _problems(

@@ -17,7 +17,7 @@ _LOST_PX = 0.25  # times the square of step over contrast: rms of what residuals
 _MOST_LOST_PX = 1.0  # where the contrast is hardly two steps, there is nothing left to measure
 
 
-def with_loss(covariance_px2: Array, scan: Scan, contrast_dn: float) -> Array:
-    """The covariance (2, 2) of a mark of that contrast and what the scan's compression adds to it."""
+def covariance_of_compression(scan: Scan, contrast_dn: float) -> Array:
+    """(2, 2) px2: what the scan's compression adds to the covariance of a mark of that contrast."""
     lost = min(_LOST_PX * (scan.rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, _MOST_LOST_PX)
-    return covariance_px2 + lost**2 * np.eye(2)
+    return np.asarray(lost**2 * np.eye(2))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.covariance import Cause, Covariance
 from measure.fitting.matching import Match, MatchOptions, match, window_about
 from measure.fitting.picture_model import GREY
 from measure.fitting.scan_window import read_window
@@ -13,7 +14,7 @@ from measure.fitting.second_place import SecondPlace
 from measure.marks.shapes import Disk, MarkShape
 from measure.noise.blank_film import BESIDE_PX
 from measure.noise.noise import may_be_noise
-from measure.scans.compression import with_loss
+from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.single_targets.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
 from measure.single_targets.disk_patches import LEAST_SNR
@@ -37,14 +38,14 @@ _SURE, _MOST_FAINTER = 3.0, 0.5  # standard deviations by which a contrast may b
 
 @dataclass(frozen=True, eq=False)
 class FittedDisk:
-    """An ellipse as fitted. center_px (2,), covariance_px2 (2, 2); pixel_from_disk (2, 2): the unit disk's image, its
+    """An ellipse as fitted. center_px (2,) with its covariance; pixel_from_disk (2, 2): the unit disk's image, its
     columns two radius vectors, px; contrast_dn: positive for a light disk; appearance_covariance (5, 5): of the
     relative changes of its size, its stretch along the columns, its shear and its contrast, and of its blur's variance,
     px². sloping: where it lies if its paint may slope, None where that is not told. weakness: why it is doubtful;
     reason: why it is no disk, and then the numbers are the fit's last."""
 
     center_px: Array
-    covariance_px2: Array
+    covariance: Covariance
     pixel_from_disk: Array
     contrast_dn: float
     noise_dn: float
@@ -54,6 +55,11 @@ class FittedDisk:
     sloping: SecondPlace | None = None
     weakness: str = ""
     reason: str = ""
+
+    @property
+    def covariance_px2(self) -> Array:
+        """(2, 2) of the centre, all causes together."""
+        return self.covariance.px2
 
     @property
     def half_axes_px(self) -> Array:
@@ -158,9 +164,10 @@ def _fit_by_margin(
 
     def fitted(margin_px: float) -> FittedDisk:
         fit = match(window, shape, start, replace(options, margin_px=margin_px))
+        loss = covariance_of_compression(scan, fit.contrast_dn)
         disk = FittedDisk(
             center_px=fit.center_px,
-            covariance_px2=with_loss(fit.covariance_px2, scan, fit.contrast_dn),
+            covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss),
             pixel_from_disk=fit.pixel_from_mark[:, :2],
             contrast_dn=fit.contrast_dn,
             noise_dn=fit.noise_dn,

@@ -167,4 +167,4 @@ def _mark(row: _Row) -> MarkMeasurement:
         center = None if row.status is Status.ABSENT else np.asarray(row.prediction.center_px, float)
         return MarkMeasurement(point, "target", center, None, row.status, row.reason)
     disk = row.disk
-    return MarkMeasurement(point, "target", disk.center_px, disk.covariance_px2, row.status, row.reason, disk.quality)
+    return MarkMeasurement(point, "target", disk.center_px, disk.covariance, row.status, row.reason, disk.quality)

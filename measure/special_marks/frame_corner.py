@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
+from measure.covariance import Covariance
 from measure.fitting.matching import Match
 from measure.marks.shapes import FrameCorner
 from measure.noise.noise import robust_scale
@@ -249,7 +250,7 @@ def _met(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array) -> Match:
         converged=True,
         reason="",
         center_px=center,
-        covariance_px2=unit @ covariance @ unit.T,
+        place_covariance=Covariance.of_noise(unit @ covariance @ unit.T),
         pixel_from_mark=np.column_stack([pixel_from_mark[:, :2], center]),
         contrast_dn=contrast,
         noise_dn=noise,
@@ -268,7 +269,7 @@ def _missed(pixel_from_mark: Array, reason: str) -> Match:
         converged=False,
         reason=reason,
         center_px=pixel_from_mark[:, 2],
-        covariance_px2=np.full((2, 2), np.inf),
+        place_covariance=Covariance.of_noise(np.full((2, 2), np.inf)),
         pixel_from_mark=pixel_from_mark,
         contrast_dn=0.0,
         noise_dn=0.0,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from measure.covariance import Covariance
 from measure.fitting.matching import Match
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
@@ -101,8 +102,8 @@ def _aligned(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[SharedP
     return shared, steady
 
 
-def honest_covariance(template: MarkTemplate, scan: str, fit: Match) -> Array:
-    """(2, 2) px2, of a mark measured in a scan that has a share in its template.
+def honest_covariance(template: MarkTemplate, scan: str, fit: Match) -> Covariance:
+    """Of a mark measured in a scan that has a share in its template.
 
     The scan's noise is in the template too and so is missing from the residuals, in which only the rest, one less its
     share, is left. Where the template is that scan's picture alone nothing is left: then noise from the picture itself.
@@ -110,9 +111,9 @@ def honest_covariance(template: MarkTemplate, scan: str, fit: Match) -> Array:
     """
     share = template.shares.get(scan, 0.0)
     if share == 1.0:
-        return _covariance_of_noise(template, fit)
+        return Covariance.of_noise(_covariance_of_noise(template, fit))
     widened = _without_slope_noise(template, fit)
-    return np.asarray(widened @ fit.covariance_px2 @ widened.T / (1.0 - share))
+    return fit.place_covariance.through(widened / np.sqrt(1.0 - share))
 
 
 def _without_slope_noise(template: MarkTemplate, fit: Match) -> Array:

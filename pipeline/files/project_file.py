@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from adjust.network import ObjectPoint, Prior
+from measure.film import SCATTER_MM
 from measure.marks.poses import POSES
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
@@ -47,6 +48,11 @@ class Project:
     given_distances: tuple[GivenDistance, ...]
     unit_mm: float
     adjust: AdjustSettings
+
+    @property
+    def film_sigma_mm(self) -> float:
+        """What film and scanner scatter a mark by, as the project says it, or else as it is believed of any film."""
+        return self.adjust.film_sigma_um / 1000.0 or SCATTER_MM
 
     @property
     def adjustment_path(self) -> Path:

@@ -12,6 +12,7 @@ from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
+from measure.film import SCATTER_MM
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.results import FrameMeasurement
 from measure.scans.scan import Scan, open_scan
@@ -187,5 +188,4 @@ def _residual(frame: FrameMeasurement, layout: FiducialLayout) -> tuple[float, f
 def _sigma_mm(covariance_px2: Array | None, given: LayoutMark, px_per_mm: float) -> Array:
     """Of mark, given place and film in x' and y'; the mark's own is small and nearly round, so its turn is left out."""
     own = 0.0 if covariance_px2 is None else float(np.trace(covariance_px2)) / 2 / px_per_mm**2
-    film = FiducialOptions().film_sigma_mm
-    return np.asarray(np.sqrt(np.square(given.sigma_mm) + own + film**2))
+    return np.asarray(np.sqrt(np.square(given.sigma_mm) + own + SCATTER_MM**2))

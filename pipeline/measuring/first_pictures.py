@@ -125,7 +125,8 @@ def _drawn_placement(project: Project, camera: CameraFile, scan: Scan) -> Array 
     if len(camera.drawn) < 2:
         return None
     pitch = project.pitch_um or scan.pitch_um
-    return measure_fiducials(scan, camera.layout(), pitch, FiducialOptions(pose=project.pose)).pixel_from_camera
+    options = FiducialOptions(project.pose, film_sigma_mm=project.film_sigma_mm)
+    return measure_fiducials(scan, camera.layout(), pitch, options).pixel_from_camera
 
 
 def _in_the_middle(project: Project, camera: CameraFile, scan: Scan) -> Array:

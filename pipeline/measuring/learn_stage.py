@@ -88,7 +88,7 @@ def _chips_of(project: Project, camera: CameraFile, learned: Sequence[GivenFiduc
     """The pictures of learned marks in one scan, as far as they are found."""
     with open_scan(project.scans[name]) as scan:
         pitch = project.pitch_um or scan.pitch_um
-        options = FiducialOptions(pose=pose_of(project, camera, scan.name))
+        options = FiducialOptions(pose_of(project, camera, scan.name), film_sigma_mm=project.film_sigma_mm)
         frame = measure_fiducials(scan, camera.layout(), pitch, options)
         matrix = frame.pixel_from_camera
         found = {mark.point: mark.center_px for mark in frame.marks if mark.status.is_observation}

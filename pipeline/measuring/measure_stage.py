@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
         learned = learn_marks(project, reporter, workers)
         scans = _measured_scans(learned, reporter, workers)
         scans = _of_each_camera(project, scans, _at_one_definition)
-        checked = with_checked_sheet(project, _of_each_camera(learned, scans, _cross_checked))
+        checked = with_checked_sheet(project, _of_each_camera(learned, scans, partial(_cross_checked, learned)))
         if project.ties is None:
             return checked
         with reporter.stage("natural points sought in") as count:
@@ -102,10 +103,12 @@ def _at_one_definition(_: CameraFile, scans: Sequence[MeasuredScan]) -> list[Fra
     return [replace(frame, marks=own) for frame, own in zip(frames, marks, strict=True)]
 
 
-def _cross_checked(camera: CameraFile, scans: Sequence[MeasuredScan]) -> Sequence[FrameMeasurement]:
+def _cross_checked(project: Project, camera: CameraFile, scans: Sequence[MeasuredScan]) -> Sequence[FrameMeasurement]:
     """The fiducials checked against one another, if the camera has any."""
     frames = [scan.frame for scan in scans]
-    return cross_checked(frames, camera.layout(), [scan.pitch_um for scan in scans]) if camera.drawn else frames
+    if not camera.drawn:
+        return frames
+    return cross_checked(frames, camera.layout(), [scan.pitch_um for scan in scans], project.film_sigma_mm)
 
 
 def _check_anything_to_measure(project: Project) -> None:
@@ -163,7 +166,8 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
     if all(fiducial.passed_over for fiducial in camera.fiducials):
         return FrameMeasurement(name, ())
     pitch = project.pitch_um or scan.pitch_um
-    layout, options = camera.layout(), FiducialOptions(pose=pose_of(project, camera, scan.name))
+    pose = pose_of(project, camera, scan.name)
+    layout, options = camera.layout(), FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm)
     measured = measure_fiducials(scan, layout, pitch, options)
     if pitch is not None:
         source = "the project" if project.pitch_um is not None else "the scan's file"

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from measure.covariance import Cause, Covariance
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
 from pipeline.errors import InputError
@@ -42,6 +43,12 @@ def read_measurement(path: Path) -> tuple[MeasuredScan, ...]:
         return tuple(_measured(name, image, path.parent) for name, image in images.items())
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: cannot be read as a measurement ({error}). Run `reseau measure` again.") from error
+
+
+def read_covariance(mark: Mapping[str, Any]) -> Covariance | None:
+    """The covariance of an entry of `marks`, by its causes; None where nothing was fitted."""
+    causes = mark.get("causes_px2")
+    return None if causes is None else Covariance({Cause(name): np.array(px2) for name, px2 in causes.items()})
 
 
 def _image(measured: MeasuredScan, folder: Path) -> dict[str, Any]:
@@ -77,10 +84,15 @@ def _mark(mark: MarkMeasurement) -> dict[str, Any]:
         "col_px": col,
         "row_px": row,
         "covariance_px2": None if mark.covariance_px2 is None else mark.covariance_px2.tolist(),
+        "causes_px2": None if mark.covariance is None else _causes(mark.covariance),
         "status": str(mark.status),
         "reason": mark.reason,
         "quality": {name: float(value) for name, value in mark.quality.items() if np.isfinite(value)},
     }
+
+
+def _causes(covariance: Covariance) -> dict[str, Any]:
+    return {str(cause): part.tolist() for cause, part in covariance.parts.items()}
 
 
 def _measured(name: str, image: Mapping[str, Any], folder: Path) -> MeasuredScan:
@@ -98,12 +110,11 @@ def _measured(name: str, image: Mapping[str, Any], folder: Path) -> MeasuredScan
 
 
 def _read_mark(mark: Mapping[str, Any]) -> MarkMeasurement:
-    covariance = mark["covariance_px2"]
     return MarkMeasurement(
         point=mark["point"],
         kind=mark["kind"],
         center_px=None if mark["col_px"] is None else np.array([mark["col_px"], mark["row_px"]]),
-        covariance_px2=None if covariance is None else np.array(covariance),
+        covariance=read_covariance(mark),
         status=Status(mark["status"]),
         reason=mark["reason"],
         quality=mark["quality"],

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
+from measure.covariance import MEANING, Covariance
 from measure.status import Status
 from pipeline.report import thumbnails, vectors
 from pipeline.report.data import Json, ReportData, Thumbnail
@@ -17,16 +18,18 @@ from pipeline.report.verdict import suspect_rows
 OPEN_FRAMES = 12  # with more frames, only those with a lost mark are unfolded
 PLOT_PX = 330.0
 LONGEST_VECTOR_PX = 42.0
+_LEAST_TOLD_PX = 0.0005
 
 
 @dataclass(frozen=True)
 class Card:
-    """A mark's picture and numbers. picture: None where there is no scan to cut it from; by_edges: how far off the
-    second method puts it."""
+    """A mark's picture and numbers. picture: None where there is no scan to cut it from; causes: what sigma consists
+    of; by_edges: how far off the second method puts it."""
 
     mark: Mark
     picture: Markup | None
     sigma: str
+    causes: tuple[tuple[str, str, str], ...]
     by_edges: str
     residual: str
     w: str
@@ -124,6 +127,7 @@ def _card(
         mark=mark,
         picture=thumbnails.drawn(mark, thumbnail, px_per_um, most_px) if thumbnail else None,
         sigma=_sigma(mark),
+        causes=_causes(mark.covariance),
         by_edges=_by_edges(mark.quality),
         residual=f"{fixed(residual['vx_um'], 1, sign=True)}, {fixed(residual['vy_um'], 1, sign=True)}"
         if residual
@@ -144,9 +148,19 @@ def _sigma(mark: Mark) -> str:
     parts = []
     if mark.sigma_um is not None:
         parts.append(" × ".join(fixed(sigma, 1) for sigma in mark.sigma_um) + " µm")
-    if mark.covariance_px2 is not None:
-        parts.append(" × ".join(fixed(sigma, 3) for sigma in np.sqrt(np.diag(mark.covariance_px2))) + " px")
+    if mark.covariance is not None:
+        parts.append(" × ".join(fixed(sigma, 3) for sigma in np.sqrt(np.diag(mark.covariance.px2))) + " px")
     return "; ".join(parts)
+
+
+def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
+    """What the standard deviation in the scan consists of: cause, size in px, meaning; nothing where it has one cause.
+    A thousandth of a pixel is the last digit that is told."""
+    sigmas = {} if covariance is None else covariance.sigmas_px
+    told = {cause: sigma for cause, sigma in sigmas.items() if sigma >= _LEAST_TOLD_PX}
+    return (
+        tuple((str(cause), fixed(sigma, 3), MEANING[cause]) for cause, sigma in told.items()) if len(told) > 1 else ()
+    )
 
 
 def _found(marks: list[Mark]) -> str:

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.covariance import Covariance
 from measure.status import Status
 from pipeline.measuring.comparator_file import ComparatorPoint
+from pipeline.measuring.measurement_file import read_covariance
 from pipeline.report.data import Json, ReportData
 
 Array = NDArray[np.float64]
@@ -18,7 +20,7 @@ Array = NDArray[np.float64]
 class Mark:
     """One mark of one frame.
 
-    center_px (2,), covariance_px2 (2, 2) in the scan, sigma_um (2,) along x and y: None where nothing was fitted.
+    center_px (2,), its covariance in the scan, sigma_um (2,) along x and y: None where nothing was fitted.
     residual: its row of adjustment.json; None where it was no observation of the adjustment. quality: the figures of
     its fit by name.
     """
@@ -29,7 +31,7 @@ class Mark:
     status: Status
     reason: str
     center_px: Array | None
-    covariance_px2: Array | None
+    covariance: Covariance | None
     sigma_um: Array | None
     residual: Json | None
     quality: Json = field(default_factory=dict)
@@ -105,7 +107,7 @@ def _mark(key: tuple[str, bool, str], pixel: Json | None, row: ComparatorPoint |
         status=row.status if row else Status(known["status"]),
         reason=row.reason if row else known["reason"],
         center_px=None if known.get("col_px") is None else np.array([known["col_px"], known["row_px"]]),
-        covariance_px2=None if known.get("covariance_px2") is None else np.array(known["covariance_px2"]),
+        covariance=read_covariance(known),
         sigma_um=_sigma_um(residual, row),
         residual=residual,
         quality=known.get("quality", {}),

@@ -23,6 +23,7 @@ from measure.codes_and_boards.board_specs import (
 )
 from measure.codes_and_boards.boards import BoardMeasurement, measure_board
 from measure.codes_and_boards.coma import one_definition
+from measure.covariance import Covariance
 from measure.results import MarkMeasurement
 from measure.scans.scan import open_scan
 from measure.status import Status
@@ -334,7 +335,11 @@ def test_coma_is_told_from_noise_by_what_neighbours_share(coma_px: float, moves:
         col, row_px = center + coma_px * (center - [190, 150]) / 90 + rng.normal(0, 0.03, 2)
         quality = {"junction_col_px": col, "junction_row_px": row_px}
         name = f"r{row}c{column}"
-        marks.append(MarkMeasurement(name, "target", center, 1e-4 * np.eye(2), Status.MEASURED, quality=quality))
+        marks.append(
+            MarkMeasurement(
+                name, "target", center, Covariance.of_noise(1e-4 * np.eye(2)), Status.MEASURED, quality=quality
+            )
+        )
     (settled,) = one_definition([marks])
     assert all((new is not old) == moves for new, old in zip(settled, marks, strict=True))
 

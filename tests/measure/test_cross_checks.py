@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from measure.checks.cross_checks import cross_checked
+from measure.covariance import Cause, Covariance
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
@@ -42,7 +44,7 @@ def frames_of(
         scatter = np.hypot(sigma_px, film_mm * PX_PER_MM)
         centers = made @ linear.T + matrix[:, 2] + rng.normal(0.0, scatter, made.shape)
         marks = tuple(
-            MarkMeasurement(mark.id, "fiducial", center, sigma_px**2 * np.eye(2), Status.MEASURED)
+            MarkMeasurement(mark.id, "fiducial", center, Covariance.of_noise(sigma_px**2 * np.eye(2)), Status.MEASURED)
             for mark, center in zip(layout.marks, centers, strict=True)
         )
         frames.append(FrameMeasurement(str(number), marks, None, matrix))
@@ -57,7 +59,7 @@ def moved(frame: FrameMeasurement, mark: int, by_px: tuple[float, float]) -> Fra
     marks = list(frame.marks)
     old = marks[mark]
     marks[mark] = MarkMeasurement(
-        old.point, "fiducial", np.asarray(old.center_px) + by_px, old.covariance_px2, Status.MEASURED
+        old.point, "fiducial", np.asarray(old.center_px) + by_px, old.covariance, Status.MEASURED
     )
     return FrameMeasurement(frame.image, tuple(marks), None, frame.pixel_from_camera)
 
@@ -125,6 +127,18 @@ def test_lines_of_opposite_marks_that_do_not_meet() -> None:
     checked = checked_together([moved(frame, 1, (3.0, 0.0))], layout)
     assert weak(checked) == {("0", "1"), ("0", "6")}  # (-1, 0) and (1, 0)
     assert "do not meet" in checked[0].marks[1].reason
+    known = checked[0].marks[1].covariance
+    assert known is not None
+    assert known.sigmas_px[Cause.GIVEN_PLACES] == pytest.approx(1.5 / np.sqrt(2), rel=0.1)
+
+
+def test_the_projects_film_decides_what_lines_of_opposite_marks_may_do() -> None:
+    rng = np.random.default_rng(4)
+    layout = layout_of(EIGHT)
+    (frame,) = frames_of(layout, 1, rng)
+    bent = moved(frame, 1, (3.0, 0.0))
+    pitches = [(1000 / PX_PER_MM, 1000 / PX_PER_MM)]
+    assert weak(cross_checked([bent], layout, pitches, 0.04)) == set()
 
 
 def test_what_the_edges_say_counts_against_chance() -> None:
@@ -136,7 +150,7 @@ def test_what_the_edges_say_counts_against_chance() -> None:
             mark.point,
             "fiducial",
             mark.center_px,
-            mark.covariance_px2,
+            mark.covariance,
             mark.status,
             "",
             {"second_method_sigmas": sigmas, "second_method_col_px": 0.1, "second_method_row_px": 0.0},

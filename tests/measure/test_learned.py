@@ -45,7 +45,7 @@ def measured(chips: list[Chip], options: MatchOptions = SHIFT) -> tuple[Array, A
     """Places (n, 2) and standard deviations (n, 2) with the template that the chips give."""
     template = template_of(chips, SIZE_MM)
     fits = [match(ScanWindow(chip.grey), template, chip.pixel_from_mark, options) for chip in chips]
-    covariances = [honest_covariance(template, chip.scan, fit) for chip, fit in zip(chips, fits, strict=True)]
+    covariances = [honest_covariance(template, chip.scan, fit).px2 for chip, fit in zip(chips, fits, strict=True)]
     return np.array([fit.center_px for fit in fits]), np.sqrt(np.array(covariances)[:, [0, 1], [0, 1]])
 
 
@@ -100,7 +100,7 @@ def test_one_picture_alone_is_its_own_template_and_keeps_an_honest_sigma() -> No
     assert dict(template.shares) == {"frame0": 1.0}
     fit = match(ScanWindow(chips[0].grey), template, chips[0].pixel_from_mark, SHIFT)
     np.testing.assert_allclose(fit.center_px, chips[0].pixel_from_mark[:, 2], atol=0.02)
-    sigma = np.sqrt(np.diag(honest_covariance(template, "frame0", fit)))
+    sigma = np.sqrt(np.diag(honest_covariance(template, "frame0", fit).px2))
     assert 0.005 < sigma.min() < sigma.max() < 0.2  # the residuals, which are nothing, would say nothing
 
 

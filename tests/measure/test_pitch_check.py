@@ -3,6 +3,7 @@
 import numpy as np
 
 from measure.checks.pitch_check import pitch_problem
+from measure.covariance import Covariance
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, dot
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
@@ -18,7 +19,9 @@ def frame(across_um: float, down_um: float) -> FrameMeasurement:
     """A frame turned by 90 degrees."""
     matrix = np.array([[0.0, 1000.0 / across_um, 5000.0], [1000.0 / down_um, 0.0, 5000.0]])
     marks = [
-        MarkMeasurement(mark.id, "fiducial", matrix @ (*mark.xy_mm, 1.0), np.eye(2), Status.MEASURED)
+        MarkMeasurement(
+            mark.id, "fiducial", matrix @ (*mark.xy_mm, 1.0), Covariance.of_noise(np.eye(2)), Status.MEASURED
+        )
         for mark in layout(1.0).marks
     ]
     return FrameMeasurement("a", tuple(marks), None, matrix)
@@ -52,7 +55,10 @@ def test_right_pitches_are_called_wrong_as_rarely_as_is_said() -> None:
         ]
         design = np.column_stack([given, np.ones(len(given))])
         matrix = np.asarray(np.linalg.lstsq(design, true * (50.0, -50.0), rcond=None)[0].T, float)
-        seen = [MarkMeasurement(mark.id, "fiducial", np.zeros(2), np.eye(2), Status.MEASURED) for mark in marks]
+        seen = [
+            MarkMeasurement(mark.id, "fiducial", np.zeros(2), Covariance.of_noise(np.eye(2)), Status.MEASURED)
+            for mark in marks
+        ]
         small = FiducialLayout(tuple(marks), (33.0, 24.0))
         wrong += pitch_problem(FrameMeasurement("a", tuple(seen), None, matrix), small, (20.0, 20.0), "x") is not None
     assert 1 <= wrong <= 14, wrong  # 7 are expected at most, more than 14 in one run of 170

@@ -5,6 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from measure.checks.cross_checks import cross_checked
+from measure.covariance import Covariance
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
@@ -39,7 +40,9 @@ def frame_of(
     for point, place in THREE.items():
         center = linear @ (np.array(place) + (off_mm or {}).get(point, (0.0, 0.0))) + 700.0
         noisy = center + rng.normal(0.0, SIGMA_PX, 2)
-        marks.append(MarkMeasurement(point, "fiducial", noisy, SIGMA_PX**2 * np.eye(2), Status.MEASURED))
+        marks.append(
+            MarkMeasurement(point, "fiducial", noisy, Covariance.of_noise(SIGMA_PX**2 * np.eye(2)), Status.MEASURED)
+        )
     return FrameMeasurement(name, tuple(marks), None, np.column_stack([linear, [700.0, 700.0]]))
 
 

@@ -227,6 +227,7 @@ def measured() -> ReportData:
                 "col_px": float(pixels[i, 0]),
                 "row_px": float(pixels[i, 1]),
                 "covariance_px2": [[0.0016, 0.0], [0.0, 0.0025]],
+                "causes_px2": {"noise": [[0.0012, 0.0], [0.0, 0.0021]], "tone": [[0.0004, 0.0], [0.0, 0.0004]]},
                 "status": "measured",
                 "reason": "",
                 "quality": {"snr": 31.0},

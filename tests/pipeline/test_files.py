@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import tifffile
 
+from measure.covariance import Cause, Covariance
+from measure.film import SCATTER_MM
 from measure.marks.shapes import MarkShape, MarkTemplate, Polygon
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
@@ -19,6 +21,7 @@ from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import image_name, read_images
 from pipeline.files.points_file import read_points
+from pipeline.files.project_file import read_project
 from pipeline.files.tables import read_toml
 from pipeline.files.template_table import saved_in
 from pipeline.measuring.comparator_file import (
@@ -27,6 +30,7 @@ from pipeline.measuring.comparator_file import (
     read_comparator,
     write_comparator,
 )
+from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
 
 CAMERA = """
 name = "C"
@@ -231,7 +235,7 @@ def test_images_file_in_degrees_with_or_without_ending(tmp_path: Path) -> None:
 def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) -> None:
     covariance = np.array([[0.0004, 0.0001], [0.0001, 0.0009]])
     marks = (
-        MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), covariance, Status.MEASURED),
+        MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), Covariance.of_noise(covariance), Status.MEASURED),
         MarkMeasurement("7", "target", None, None, Status.ABSENT, 'outside, "far" off'),
     )
     path = tmp_path / "comparator.csv"
@@ -246,6 +250,26 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
     assert second.xy_mm is None
     assert second.status is Status.ABSENT
     assert second.reason == 'outside, "far" off'
+
+
+def test_a_measurement_is_read_back_with_the_causes_of_its_covariances(tmp_path: Path) -> None:
+    known = Covariance.of_noise(np.array([[4e-4, 1e-4], [1e-4, 9e-4]])).plus(Cause.TONE, np.diag([1e-4, 0.0]))
+    mark = MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), known, Status.MEASURED)
+    scan = MeasuredScan(tmp_path / "a.tif", 300, 400, (20.0, 20.0), FrameMeasurement("a", (mark,)))
+    write_measurement(tmp_path / "measurement.json", [scan])
+    ((back,),) = (one.frame.marks for one in read_measurement(tmp_path / "measurement.json"))
+    assert back.covariance is not None
+    assert back.covariance.parts.keys() == known.parts.keys()
+    for cause, part in known.parts.items():
+        np.testing.assert_array_equal(back.covariance.parts[cause], part)
+
+
+def test_the_projects_film_is_what_measuring_believes_of_it(tmp_path: Path) -> None:
+    written(tmp_path, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
+    written(tmp_path, "comparator.csv", "image,point,kind,x_mm,y_mm\n")
+    project = 'camera = "camera.toml"\n[adjust]\nfilm_sigma_um = '
+    assert read_project(written(tmp_path, "project.toml", project + "12.0")).film_sigma_mm == pytest.approx(0.012)
+    assert read_project(written(tmp_path, "project.toml", project + "0.0")).film_sigma_mm == SCATTER_MM
 
 
 def test_half_pixel_pixel_centres_are_whole_numbers() -> None:

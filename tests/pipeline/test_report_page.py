@@ -287,3 +287,9 @@ def test_the_verdict_of_the_check_stands_with_its_reason(adjusted: ReportData, v
     text = rendered(replace(adjusted, check=check)).text
     assert f"{verdict} : One flat vertical frame." in text
     assert ("! Needs a look" in text) == (verdict == "differs")
+
+
+def test_a_marks_sigma_is_told_by_its_causes(measured: ReportData) -> None:
+    page = render_report(measured)
+    assert "<dt>of which</dt>" in page
+    assert re.search(r">noise 0\.041</span>, <span [^>]*>tone 0\.020</span> px", page)

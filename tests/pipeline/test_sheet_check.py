@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from measure.covariance import Covariance
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.files.project_file import Project, read_project
@@ -57,8 +58,10 @@ def measured(rng: np.random.Generator, project: Project, name: str, wrong: dict[
     for id, place in zip(xyz, seen(rng, np.array(list(xyz.values()))), strict=True):
         angle = rng.uniform(0.0, 6.28)
         off = wrong.get(id, 0.0) * np.array([np.cos(angle), np.sin(angle)])
-        marks.append(MarkMeasurement(id, "target", place + off, NOISE_PX**2 * np.eye(2), Status.MEASURED))
-    fiducial = MarkMeasurement("r4c4", "fiducial", np.zeros(2), np.eye(2), Status.MEASURED)
+        marks.append(
+            MarkMeasurement(id, "target", place + off, Covariance.of_noise(NOISE_PX**2 * np.eye(2)), Status.MEASURED)
+        )
+    fiducial = MarkMeasurement("r4c4", "fiducial", np.zeros(2), Covariance.of_noise(np.eye(2)), Status.MEASURED)
     return MeasuredScan(Path(name), WIDTH, HEIGHT, (5.0, 5.0), FrameMeasurement(name, (fiducial, *marks)))
 
 
