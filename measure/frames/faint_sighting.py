@@ -22,7 +22,8 @@ _LEAST_REACH_PX = 3.0  # film bends marks so far off, however well most agree
 _SAME_PX = 1.0  # apart: two places of one mark, each of which is known to better than that
 _REACH = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
-_EXTREMES = (0.5, 99.5)  # per cent: of the darkest and lightest grey values of a scan, or about a mark
+_EXTREMES = (0.5, 99.5)  # per cent: of the darkest and lightest grey values about all marks, or about one
+_SURROUND = 6.0  # times as far about each as it reaches itself: enough of the scan to tell how dark or light it can be
 _LOOKED_AT = 8  # marks that agree: these tell how light or dark marks are
 
 
@@ -30,7 +31,7 @@ def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
     """Look again at every mark that is not clear, or does not lie where the others put it: what stands out of its
     texture there is this mark, the film being deformed where it lies off. A clear one may be a pattern beside it.
     """
-    near = sighter.belongs & (sighter.misfit_mm() <= _NEAR * sighter.scatter_mm())
+    near = sighter.belongs & (sighter.misfit_mm() <= _NEAR * max(sighter.scatter_mm(), sighter.options.film_sigma_mm))
     faint = [
         (index, sighting)
         for index, sighting in enumerate(sighter.sightings)
@@ -47,7 +48,7 @@ def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
     # The marks that agree tell both better than a faint mark does itself.
     blur_px = float(np.median([fit.blur_px for fit in agreeing.values()]))
     usual_dn = float(np.median([abs(fit.contrast_dn) for fit in agreeing.values()]))
-    extremes = np.percentile(sighter.scan.reduced(sighter.placement.reduction, sighter.weights), _EXTREMES)
+    extremes = _extremes_dn(sighter)
     reached = _reached_dn(sighter, agreeing)
     for index, sighting in faint:
         expected = sighter.expected(index, reach_px)
@@ -63,6 +64,18 @@ def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
 def faint_reach_px(sighter: FrameSighter) -> float:
     """How far a faint mark can be from where many others put it."""
     return min(sighter.gate_px, max(_REACH * sighter.scatter_mm() / float(sighter.pitch.mean()), _LEAST_REACH_PX))
+
+
+def _extremes_dn(sighter: FrameSighter) -> Array:
+    """The darkest and the lightest grey values about the marks: they are spread over the scan, and no more of it has
+    to be read."""
+    expected = [
+        sighter.expected(index, 0.0)
+        for index, sighting in enumerate(sighter.sightings)
+        if sighting is not None and sighting.inside
+    ]
+    grey = [_about(sighter, each.mark, each.pixel_from_mark, _SURROUND).ravel() for each in expected]
+    return np.asarray(np.percentile(np.concatenate(grey), _EXTREMES))
 
 
 def _reached_dn(sighter: FrameSighter, agreeing: Mapping[int, Match]) -> dict[int, float]:
@@ -82,9 +95,10 @@ def _ground(sighter: FrameSighter, expected: MarkPrediction, tones_dn: Sequence[
     return Ground(expected.polarity > 0, room_dn, float(grey.std()))
 
 
-def _about(sighter: FrameSighter, mark: Mark, pixel_from_mark: Array) -> Array:
-    """The grey values about a mark's place."""
-    least, greatest = extent_px(mark, pixel_from_mark)
+def _about(sighter: FrameSighter, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Array:
+    """The grey values about a mark's place, as far as it reaches or so many times as far."""
+    center = pixel_from_mark[:, 2]
+    least, greatest = (center + times * (corner - center) for corner in extent_px(mark, pixel_from_mark))
     low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
     window = sighter.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), sighter.weights)
     return np.asarray(window, dtype=float)
