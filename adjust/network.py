@@ -151,7 +151,7 @@ class ObjectPoint:
     Z: Prior | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Observations:
     """Measured comparator coordinates, one row a mark in an image.
 
@@ -167,6 +167,9 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.image)
+
+    def __repr__(self) -> str:
+        return f"Observations({len(self)} of {len(set(self.point))} marks in {len(set(self.image))} images)"
 
     @cached_property
     def is_fiducial(self) -> NDArray[np.bool_]:
@@ -245,7 +248,7 @@ class Extent:
     half_mm: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Network:
     """Everything that one adjustment knows. Names are unique; the order of things does not matter."""
 
@@ -256,6 +259,12 @@ class Network:
     distances: tuple[Distance, ...] = ()
     calibrations: tuple[Calibration, ...] = ()
     line_of_sight: LineOfSight = STRAIGHT
+
+    def __repr__(self) -> str:
+        return (
+            f"Network({len(self.cameras)} cameras, {len(self.images)} images, {len(self.points)} points, "
+            f"{len(self.observations)} observations)"
+        )
 
     @cached_property
     def camera_by_name(self) -> dict[str, Camera]:
@@ -320,7 +329,7 @@ def _extent(lowest: Array, highest: Array) -> Extent:
     return Extent((lowest + highest) / 2.0, float((highest - lowest).max()) / 2.0 or 1.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Approximations:
     """Where the iteration starts: by camera, image and point name, in the units of the network.
 
@@ -334,3 +343,6 @@ class Approximations:
     transformation: Mapping[str, Array]
     points: Mapping[str, Array]
     mirrored: frozenset[str] = frozenset()
+
+    def __repr__(self) -> str:
+        return f"Approximations({len(self.exterior)} orientations, {len(self.points)} points)"

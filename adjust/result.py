@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from html import escape
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -40,7 +41,7 @@ class NullDirection:
     remedy: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Residuals:
     """One row an observation of the network, in its order.
 
@@ -51,6 +52,10 @@ class Residuals:
     v_mm: Array
     redundancy: Array
     w: Array
+
+    def __repr__(self) -> str:
+        rms_um = 1000.0 * np.sqrt(np.mean(np.square(self.v_mm), axis=0)) if len(self.v_mm) else np.zeros(2)
+        return f"Residuals({len(self.v_mm)} of rms {rms_um[0]:.3g}, {rms_um[1]:.3g} um)"
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,7 @@ class OuterEffect:
     cause: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Reliability:
     """How well the observations check each other: one row for everything that is tested.
 
@@ -149,6 +154,10 @@ class Reliability:
     smallest_together: Array
     outer: tuple[OuterEffect, ...]
     unchecked: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        worst = np.abs(self.w).max(initial=0.0)
+        return f"Reliability({len(self.tested)} tested, largest w {worst:.3g}, {len(self.unchecked)} unchecked)"
 
 
 @dataclass(frozen=True)
@@ -198,7 +207,7 @@ class Assessment(Protocol):
     def warnings(self) -> tuple[str, ...]: ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Adjustment:
     """The result: values, covariance, residuals, and how it came about.
 
@@ -294,3 +303,20 @@ class Adjustment:
     def sigma(self, name: str) -> float:
         """A-posteriori standard deviation."""
         return self.sigma0 * float(np.sqrt(self.cofactor.variances[self.index(name)]))
+
+    def __repr__(self) -> str:
+        return (
+            f"Adjustment({self.termination} after {self.iterations} iterations: {self.conditions} conditions, "
+            f"{self.unknowns} unknowns, redundancy {self.redundancy}, sigma0 {self.sigma0:.3f})"
+        )
+
+    def _repr_html_(self) -> str:
+        """The cameras' parameters, as a notebook shows them."""
+        names = [name for name in self.names if name.startswith("IO.")]
+        rows = "".join(
+            f"<tr><td>{escape(name.removeprefix('IO.'))}</td><td>{self.value(name):.7g}</td>"
+            f"<td>{self.sigma(name):.2g}</td></tr>"
+            for name in names
+        )
+        head = "<tr><th>parameter</th><th>value</th><th>sigma</th></tr>"
+        return f"<p>{escape(repr(self))}</p><table>{head}{rows}</table>"

@@ -1,7 +1,9 @@
 """What a measurement hands on: marks with covariance, status and reason, and the frame they were found in."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from html import escape
 from typing import Literal
 
 import numpy as np
@@ -14,7 +16,7 @@ Kind = Literal["fiducial", "target", "tie"]
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class MarkMeasurement:
     """One mark in one scan.
 
@@ -44,6 +46,16 @@ class MarkMeasurement:
         """(2, 2) of (column, row), all causes together; None where nothing was fitted."""
         return None if self.covariance is None else self.covariance.px2
 
+    def __repr__(self) -> str:
+        return f"MarkMeasurement({self.kind} {' '.join(cell for cell in self.cells() if cell)})"
+
+    def cells(self) -> tuple[str, str, str, str, str]:
+        """Name, status, place, standard deviations and reason in words; blank where there is none."""
+        place = "" if self.center_px is None else f"({self.center_px[0]:.3f}, {self.center_px[1]:.3f})"
+        sigmas = None if self.covariance_px2 is None else np.sqrt(np.diag(self.covariance_px2))
+        told = "" if sigmas is None else f"+- ({sigmas[0]:.3f}, {sigmas[1]:.3f})"
+        return self.point, str(self.status), place, told, self.reason
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -60,7 +72,7 @@ class Pose:
     evidence: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FrameMeasurement:
     """All marks of one scan.
 
@@ -82,3 +94,17 @@ class FrameMeasurement:
         """The scale of pixel_from_camera, the mean of both directions; None without one."""
         matrix = self.pixel_from_camera
         return None if matrix is None else float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+
+    def __repr__(self) -> str:
+        counts = Counter(str(mark.status) for mark in self.marks)
+        told = ", ".join(f"{count} {status}" for status, count in counts.items())
+        pose = "" if self.pose is None else f", pose {self.pose.name}{'' if self.pose.decided else ' (assumed)'}"
+        return f"FrameMeasurement({self.image!r}: {told or 'no marks'}{pose})"
+
+    def _repr_html_(self) -> str:
+        """Its marks, as a notebook shows them."""
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in mark.cells())}</tr>" for mark in self.marks
+        )
+        head = "".join(f"<th>{name}</th>" for name in ("mark", "status", "column, row (px)", "sigmas (px)", "reason"))
+        return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{rows}</table>"

@@ -1,4 +1,9 @@
 """A folder of scans in, everything out: the only package that knows the other three.
 
-docs/code.md lists its modules stage by stage.
+The names below read and write the files that docs/python.md works with; they are loaded when they are first used.
+docs/code.md lists the modules stage by stage.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
