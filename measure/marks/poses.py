@@ -15,3 +15,9 @@ def up_from_camera(pose: str) -> Array:
     turn = np.array([[c, -s], [s, c]])
     mirror = np.diag([-1.0 if pose.endswith("m") else 1.0, 1.0])
     return np.asarray(turn @ mirror)
+
+
+def pose_in_camera(seen: str, frame: str) -> str:
+    """How something lies in the camera's frame that is seen in the scan in one pose, the frame being in another."""
+    own = up_from_camera(frame).T @ up_from_camera(seen)
+    return next(pose for pose in POSES if np.array_equal(up_from_camera(pose), np.rint(own)))

@@ -1,0 +1,1 @@
+"""What is written on the film: found, read, and told which way it lies."""

@@ -1,0 +1,146 @@
+"""Reading what is written on a scan: beside its exposed frame, and along the inside of the frame's edges.
+
+The four sides are looked at one by one, each as a strip that runs from left to right. Lines of writing are found in it
+at two scales and cut out of a finer picture; each is read in the four ways in which it may lie along the strip, so that
+it tells itself which way is right. Light letters on dark film are read as well as dark ones on light.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.marks.shapes import Side
+from measure.scans.scan import Scan
+from measure.writing.detection import Picture, Place, find_writing
+from measure.writing.line import Line, of_one_face
+from measure.writing.networks import Networks
+from measure.writing.recognition import HEIGHT_PX, WAYS, read_ways
+
+Array = NDArray[np.float64]
+
+# Shares of the frame's longer side, 2.3 mm being 1 % of an aerial camera's:
+_BEYOND = 0.13  # how far outside of the frame writing is looked for: its data strip and its own half of a gap
+_WITHIN = 0.045  # and how far inside: plates and counters reach into it
+_FINE_PX = 2400  # the least length of the frame's longer side in the picture that lines are cut out of
+_FOUND_PX = (1800, 900)  # the same where they are found: plates of 1.5 mm, then handwriting
+_LEAST_PX = 12  # of a strip's sides
+_LONGEST_PX = 1600  # of a line as it is read: what is longer is no line
+_BLACK, _WHITE = 0.5, 99.5  # per cents of the pixels of a strip that are made black and white
+_LEAST_LEGIBLE = 1.5  # characters: less is a speck that looks like a letter
+_READ_WELL = 0.6  # the mean confidence of what need not be looked at again at a coarser scale
+
+
+def read_writing(scan: Scan, networks: Networks, frame_px: Array | None = None) -> tuple[Line, ...]:
+    """The lines written on a scan, as they read from the face of the film from which most can be read, those first
+    that say most.
+
+    frame_px: (n, 2) column and row of the corners of the exposed frame; None where it is not known: then what stands
+    along the edges of the scan is read."""
+    lines = [
+        line
+        for side in get_args(Side)
+        for strip in (_strip(scan, side, frame_px),)
+        if strip is not None
+        for line in strip.lines(networks)
+    ]
+    return of_one_face(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class _Strip:
+    """A side of the scan as a picture that runs from left to right. scan_from_strip (2, 3): pixels; poses: in the scan,
+    of what lies so in the strip. found: how much smaller the pictures are that lines are found in."""
+
+    picture: Picture
+    side: Side
+    scan_from_strip: Array
+    poses: Mapping[str, str]
+    found: tuple[float, ...]
+
+    def lines(self, networks: Networks) -> list[Line]:
+        lines, known = list[Line](), list[Place]()
+        for reduction in self.found:
+            size = [max(round(side / reduction), 1) for side in self.picture.shape[::-1]]
+            small = cv2.resize(self.picture, size, interpolation=cv2.INTER_AREA) if reduction > 1 else self.picture
+            for place in (each.scaled(reduction) for each in find_writing(np.asarray(small, np.uint8), networks)):
+                if any(other.covers(place) or place.covers(other) for other in known):
+                    continue
+                line = self._line(place, networks)
+                if line.legible >= _LEAST_LEGIBLE:
+                    lines.append(line)
+                    known += [place] if line.confidence >= _READ_WELL else []
+        return lines
+
+    def _line(self, place: Place, networks: Networks) -> Line:
+        ways = {self.poses[way]: reading for way, reading in read_ways(self._cut(place), networks).items()}
+        outline = place.outline_px() @ self.scan_from_strip[:, :2].T + self.scan_from_strip[:, 2]
+        return Line(
+            ways=ways,
+            pose=max(ways, key=lambda pose: ways[pose].legible),
+            outline_px=tuple((float(col), float(row)) for col, row in outline),
+            side=self.side,
+        )
+
+    def _cut(self, place: Place) -> Picture:
+        """The line (HEIGHT_PX, width), level."""
+        scale = place.height_px / HEIGHT_PX
+        width = int(np.clip(round(place.length_px / scale), HEIGHT_PX // 2, _LONGEST_PX))
+        angle = np.deg2rad(place.tilt_deg)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        linear = turn * (place.length_px / width, scale)
+        start = place.center_px - linear @ np.array([(width - 1) / 2, (HEIGHT_PX - 1) / 2])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        matrix = np.column_stack([linear, start])
+        cut = cv2.warpAffine(self.picture, matrix, (width, HEIGHT_PX), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(cut, np.uint8)
+
+
+def _strip(scan: Scan, side: Side, frame_px: Array | None) -> _Strip | None:
+    """What the scan shows at a side of the frame; None where that is nothing."""
+    low, high, longer_px = _beside(scan, side, frame_px)
+    factor = max(int(longer_px / _FINE_PX), 1)
+    first = np.floor(low / factor).astype(int)
+    last = np.minimum(np.ceil(high / factor).astype(int), (scan.width_px // factor, scan.height_px // factor))
+    width, height = (last - first).tolist()
+    if min(width, height) < _LEAST_PX:
+        return None
+    grey = _in_8_bits(scan.reduced_window(factor, int(first[0]), int(first[1]), width, height))
+    turn = side in ("left", "right")  # a quarter clockwise, so that its columns run up in the scan
+    linear = factor * (np.array([[0.0, 1.0], [-1.0, 0.0]]) if turn else np.eye(2))
+    start = factor * (first + ((0, height - 1) if turn else (0, 0))) + (factor - 1) / 2
+    return _Strip(
+        picture=np.ascontiguousarray(np.rot90(grey, -1) if turn else grey),
+        side=side,
+        scan_from_strip=np.column_stack([linear, start]),
+        poses=dict(zip(WAYS, ("90", "270", "90m", "270m") if turn else WAYS, strict=True)),
+        found=tuple(max(longer_px / factor / pixels, 1.0) for pixels in _FOUND_PX),
+    )
+
+
+def _beside(scan: Scan, side: Side, frame_px: Array | None) -> tuple[Array, Array, float]:
+    """The first place and the end of what is read at a side, in px (column, row), and the frame's longer side."""
+    low, high = np.zeros(2), np.array([scan.width_px, scan.height_px], dtype=float)
+    longer_px = float(high.max())
+    inner_low, inner_high = low + _BEYOND * longer_px, high - _BEYOND * longer_px
+    if frame_px is not None:
+        longer_px = float(np.ptp(frame_px, axis=0).max())
+        corners = np.sort(frame_px, axis=0)  # a frame may be turned a little
+        half = len(corners) // 2
+        low = np.maximum(low, corners[0] - _BEYOND * longer_px)
+        high = np.minimum(high, corners[-1] + _BEYOND * longer_px)
+        inner_low, inner_high = corners[half - 1] + _WITHIN * longer_px, corners[half] - _WITHIN * longer_px
+    axis = 0 if side in ("left", "right") else 1
+    if side in ("left", "top"):
+        high[axis] = inner_low[axis]
+    else:
+        low[axis] = inner_high[axis]
+    return low, high, longer_px
+
+
+def _in_8_bits(grey: NDArray[np.float32]) -> Picture:
+    black, white = np.percentile(grey[::2, ::2], (_BLACK, _WHITE))
+    return np.ascontiguousarray((255 * (grey - black) / max(white - black, 1e-9)).clip(0, 255), np.uint8)

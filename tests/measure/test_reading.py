@@ -1,0 +1,110 @@
+"""Writing on a scan: found at its sides, read, and told which way it lies, by nothing but what OpenCV draws."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from brute_marks import Array, written_scan
+
+from measure.marks.poses import POSES
+from measure.writing import networks as networks_module
+from measure.writing.line import Line
+from measure.writing.networks import Networks, networks
+from measure.writing.reading import read_writing
+
+SIZE_PX = 640
+TITLE, PLATE = "RUN 20 CST 7300", "Nr 13043"
+SIDES = ("top", "right", "bottom", "left")  # clockwise
+
+
+def required() -> Networks:
+    found = networks()
+    assert found is not None, f"{networks_module.MISSING}; `make test` installs them"
+    return found
+
+
+def written_film(dark: float = 3000.0, light: float = 14000.0) -> Array:
+    """A title above the exposed frame, upright; a plate below it, upside down."""
+    rng = np.random.default_rng(3)
+    grey = np.full((SIZE_PX, SIZE_PX), dark)
+    grey[90:-70, 70:-70] = dark + 0.5 * (light - dark)
+    letters = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+    cv2.putText(letters, PLATE, (380, 50), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 255, 2, cv2.LINE_AA)
+    letters = letters[::-1, ::-1].copy()
+    cv2.putText(letters, TITLE, (100, 60), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 255, 2, cv2.LINE_AA)
+    return np.asarray(grey + letters / 255.0 * (light - dark) + rng.normal(0, 200, grey.shape))
+
+
+def posed(grey: Array, pose: str) -> Array:
+    """As a scan of that pose shows it: mirrored first, then turned counter-clockwise."""
+    mirrored = grey[:, ::-1] if pose.endswith("m") else grey
+    return np.ascontiguousarray(np.rot90(mirrored, int(pose.rstrip("m")) // 90))
+
+
+def read(grey: Array, folder: Path, frame_px: Array | None = None) -> tuple[Line, ...]:
+    with written_scan(grey, folder) as scan:
+        return read_writing(scan, required(), frame_px)
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_title_and_plate_are_read_whichever_way_the_scan_lies(pose: str, tmp_path: Path) -> None:
+    title, plate = read(posed(written_film(), pose), tmp_path)
+    assert (title.text.replace(" ", ""), title.pose) == (TITLE.replace(" ", ""), pose)
+    assert plate.text.replace(" ", "") == PLATE.replace(" ", "")
+    mirrored = "m" if pose.endswith("m") else ""
+    turn = int(pose.rstrip("m"))
+    assert plate.pose == f"{(turn + 180) % 360}{mirrored}"
+    top = SIDES[-turn // 90 % 4]  # neither moves by a mirror that leaves the top where it is
+    assert (title.side, plate.side) == (top, SIDES[(SIDES.index(top) + 2) % 4])
+    for line in (title, plate):
+        assert line.legible > 0.8 * len(line.text.replace(" ", ""))
+        assert line.legible > 2 * sorted(way.legible for way in line.ways.values())[-2]
+
+
+def test_dark_letters_on_light_film_are_read_as_well(tmp_path: Path) -> None:
+    title, _ = read(written_film(dark=60000.0, light=30000.0), tmp_path)
+    assert (title.text.replace(" ", ""), title.pose) == (TITLE.replace(" ", ""), "0")
+
+
+def test_the_outline_lies_about_the_letters(tmp_path: Path) -> None:
+    film = written_film()
+    title, plate = read(film, tmp_path)
+    film[90:-70, 70:-70] = 0.0
+    for line, first_row in ((title, 0), (plate, SIZE_PX // 2)):
+        row, col = np.nonzero(film[first_row : first_row + SIZE_PX // 2] > 8000)
+        drawn = np.array([[col.min(), row.min() + first_row], [col.max(), row.max() + first_row]])
+        outline = np.array(line.outline_px)
+        assert np.abs(np.stack([outline.min(axis=0), outline.max(axis=0)]) - drawn).max() < 8
+        assert line.center_px == pytest.approx(drawn.mean(axis=0), abs=5)
+
+
+def test_a_number_that_is_the_same_upside_down_does_not_tell_its_turn(tmp_path: Path) -> None:
+    letters = np.zeros((60, SIZE_PX), np.uint8)
+    (half, _), _ = cv2.getTextSize("608", cv2.FONT_HERSHEY_SIMPLEX, 0.9, 2)
+    cv2.putText(letters, "608", (SIZE_PX // 2 - half, 41), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 255, 2, cv2.LINE_AA)
+    grey = np.full((SIZE_PX, SIZE_PX), 3000.0)
+    grey[10:70] += 40.0 * np.maximum(letters, letters[::-1, ::-1])
+    (number,) = read(grey, tmp_path)
+    assert [number.ways[way].text.replace(" ", "") for way in ("0", "180")] == ["608809"] * 2
+    assert number.ways["180"].legible == pytest.approx(number.ways["0"].legible, rel=0.15)
+
+
+def test_only_the_frames_surroundings_are_read(tmp_path: Path) -> None:
+    """What the ground shows within the frame is no writing on the film."""
+    corners = np.array([[70.0, 90.0], [570.0, 90.0], [570.0, 570.0], [70.0, 570.0]])
+    letters = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+    cv2.putText(letters, "HELLO", (250, 150), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 255, 2, cv2.LINE_AA)
+    grey = written_film() + letters * 30.0
+    assert sorted(line.text.replace(" ", "") for line in read(grey, tmp_path, corners)) == ["Nr13043", "RUN20CST7300"]
+    assert "HELLO" in {line.text for line in read(grey[80:], tmp_path)}
+
+
+def test_film_without_writing_says_nothing(tmp_path: Path) -> None:
+    grey = written_film(dark=3000.0, light=3000.0)
+    assert read(grey, tmp_path) == ()
+
+
+def test_without_the_package_there_are_no_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(networks_module, "PACKAGE", "no_such_package_of_networks")
+    assert networks.__wrapped__() is None
