@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.scanner import NO_BEND, Bend, is_term
 from adjust.functional_model.transformation import film_kind
 
 Array = NDArray[np.float64]
@@ -124,13 +125,49 @@ class Exterior:
 
 
 @dataclass(frozen=True)
+class Scanner:
+    """A scanner as all its scans have it: the terms of its bend with their priors, see `functional_model.scanner`.
+
+    center_mm, half_mm: middle and half the extent of the scans, in the comparator.
+    """
+
+    name: str
+    terms: Mapping[str, Prior] = field(default_factory=dict)
+    center_mm: tuple[float, float] = (0.0, 0.0)
+    half_mm: tuple[float, float] = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        strangers = sorted(name for name in self.terms if not is_term(name))
+        if strangers:
+            raise ValueError(
+                f"a scanner's bend has no term {strangers[0]}; it has stretch, shear, tilt_x, tilt_y, and a20, b11 and "
+                f"the like with the degrees in x and y, together 2 to 6"
+            )
+        if not (np.isfinite(self.center_mm).all() and all(0.0 < half < np.inf for half in self.half_mm)):
+            raise ValueError(f"half the extent of a scan must be two positive lengths in mm, not {self.half_mm}")
+
+    @property
+    def bend(self) -> Bend:
+        return Bend(tuple(self.terms), self.center_mm, self.half_mm) if self.terms else NO_BEND
+
+    @property
+    def given(self) -> Array:
+        """The given values (k,) of the terms."""
+        return np.array([prior.value for prior in self.terms.values()])
+
+
+@dataclass(frozen=True)
 class Image:
-    """One frame: its camera's name, its film transformation, its exterior orientation where something is known."""
+    """One frame: its camera's name, its film transformation, its exterior orientation where something is known.
+
+    scanner: the name of the scanner whose bend is adjusted with it, empty where none is.
+    """
 
     name: str
     camera: str
     transformation: Transformation = "affine"
     exterior: Exterior | None = None
+    scanner: str = ""
 
     def __post_init__(self) -> None:
         film_kind(self.transformation)
@@ -259,6 +296,28 @@ class Network:
     distances: tuple[Distance, ...] = ()
     calibrations: tuple[Calibration, ...] = ()
     line_of_sight: LineOfSight = STRAIGHT
+    scanners: tuple[Scanner, ...] = ()
+
+    @cached_property
+    def scanner_by_name(self) -> dict[str, Scanner]:
+        return {scanner.name: scanner for scanner in self.scanners}
+
+    @cached_property
+    def rows_by_scanner(self) -> dict[str, Indices]:
+        """The observations in the scans of every scanner that bends them."""
+        names = np.array([image.scanner for image in self.images])[self.image_numbers]
+        return {scanner.name: np.flatnonzero(names == scanner.name) for scanner in self.scanners if scanner.terms}
+
+    @cached_property
+    def straight_xy_mm(self) -> Array:
+        """The observed coordinates (n, 2), freed of the scanners' bends as far as these are given."""
+        xy_mm = self.observations.xy_mm
+        if self.rows_by_scanner:
+            xy_mm = xy_mm.copy()
+        for name, rows in self.rows_by_scanner.items():
+            scanner = self.scanner_by_name[name]
+            xy_mm[rows] = scanner.bend.apply(scanner.given, xy_mm[rows])
+        return xy_mm
 
     def __repr__(self) -> str:
         return (

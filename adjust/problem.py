@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.film_kinds import FilmKind
 from adjust.functional_model.further_observations import FurtherObservation, further_observations
 from adjust.functional_model.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
+from adjust.functional_model.scanner import Bend
 from adjust.functional_model.transformation import film_kind
 from adjust.network import Approximations, Network, Transformation
 from adjust.unknowns import Unknowns, list_unknowns
@@ -46,11 +47,12 @@ class State:
 class Films:
     """The images with one kind of film transformation, and their observations.
 
-    positions (m, k) of the parameters of the m images; center_mm (m, 2), half_mm (m,) of their extents; rows (n,):
-    their observations; of (n,): the image of each of these, counted among the m.
+    images (m,): their numbers; positions (m, k) of their parameters; center_mm (m, 2), half_mm (m,) of their extents;
+    rows (n,): their observations; of (n,): the image of each of these, counted among the m.
     """
 
     kind: FilmKind
+    images: Indices
     positions: Indices
     center_mm: Array
     half_mm: Array
@@ -69,9 +71,18 @@ class Films:
 
 
 @dataclass(frozen=True)
+class Scans:
+    """The scans of one scanner that bends them: positions (k,) of its parameters, rows (n,) of the observations."""
+
+    bend: Bend
+    positions: Indices
+    rows: Indices
+
+
+@dataclass(frozen=True)
 class Part:
     """Some columns of an observation's derivatives: by which members of an image's elements, a place's coordinates, a
-    film's parameters or a camera's, and where they stand.
+    film's parameters, a camera's or a scanner's, and where they stand.
     """
 
     members: Indices
@@ -85,6 +96,12 @@ class Parts(NamedTuple):
     place: Part
     film: Part
     camera: Part
+    scanner: Part
+
+    @property
+    def width(self) -> int:
+        """Of all columns."""
+        return int(self.scanner.columns.stop)
 
 
 @dataclass(frozen=True)
@@ -146,6 +163,7 @@ class Problem:
         rows = np.flatnonzero(place[self.image_numbers] != ABSENT)
         return Films(
             kind,
+            images,
             np.array([self.unknowns.transformation[name] for name in names], dtype=np.intp),
             np.array([extent.center_mm for extent in extents]),
             np.array([extent.half_mm for extent in extents]),
@@ -154,11 +172,25 @@ class Problem:
         )
 
     @cached_property
+    def scans(self) -> list[Scans]:
+        """The scans of the scanners that bend them, those of one together."""
+        return [
+            Scans(self.network.scanner_by_name[name].bend, self.unknowns.scanner[name], rows)
+            for name, rows in self.network.rows_by_scanner.items()
+        ]
+
+    @cached_property
     def parts(self) -> Parts:
         """The columns of an observation's derivatives: those that are by free unknowns in some observation."""
         free = np.append(self.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
         shown = np.unique(self.image_numbers[~self.is_fiducial])
-        positions = (self.exterior[shown], self.places, self._film_positions, self._camera_positions[shown])
+        positions = (
+            self.exterior[shown],
+            self.places,
+            self._film_positions,
+            self._camera_positions[shown],
+            self._scanner_positions,
+        )
         used = [np.flatnonzero(free[each].any(axis=0)) for each in positions]
         ends = np.cumsum([len(members) for members in used])
         return Parts(*(Part(members, slice(end - len(members), end)) for members, end in zip(used, ends, strict=True)))
@@ -172,6 +204,12 @@ class Problem:
     def _camera_positions(self) -> Indices:
         """(images, k) positions of interior orientation and distortion, ABSENT behind shorter ones."""
         return side_by_side([self.unknowns.camera[image.camera] for image in self.network.images])
+
+    @cached_property
+    def _scanner_positions(self) -> Indices:
+        """(images, k) positions of the terms of the scanners' bends, ABSENT behind shorter ones."""
+        none = np.empty(0, dtype=np.intp)
+        return side_by_side([self.unknowns.scanner.get(image.scanner, none) for image in self.network.images])
 
     @cached_property
     def further(self) -> tuple[FurtherObservation, ...]:
@@ -219,9 +257,14 @@ class Problem:
     @cached_property
     def columns(self) -> Indices:
         """(n, k) positions of the unknowns in an observation's derivatives, those of `parts`."""
-        exterior, place, film, camera = self.parts
-        by_image = np.empty((len(self.network.images), camera.columns.stop), dtype=np.intp)
-        of_images = ((exterior, self.exterior), (film, self._film_positions), (camera, self._camera_positions))
+        exterior, place, film, camera, scanner = self.parts
+        by_image = np.empty((len(self.network.images), self.parts.width), dtype=np.intp)
+        of_images = (
+            (exterior, self.exterior),
+            (film, self._film_positions),
+            (camera, self._camera_positions),
+            (scanner, self._scanner_positions),
+        )
         for part, positions in of_images:
             by_image[:, part.columns] = positions[:, part.members]
         columns = by_image[self.image_numbers]

@@ -23,7 +23,8 @@ class Unknowns:
 
     given (n,): nan where nothing is given. sigma (n,): 0 fixed, inf free. start (n,): where the iteration starts.
     Positions in these: camera by name (c, x0', y0', then the distortion parameters), fiducial by (camera, id),
-    point by id, transformation and exterior by image name. Cameras and points stand before the images.
+    scanner by name, point by id, transformation and exterior by image name. Cameras, scanners and points stand before
+    the images.
     """
 
     names: tuple[str, ...]
@@ -32,6 +33,7 @@ class Unknowns:
     start: Array
     camera: dict[str, Indices]
     fiducial: dict[tuple[str, str], Indices]
+    scanner: dict[str, Indices]
     point: dict[str, Indices]
     transformation: dict[str, Indices]
     exterior: dict[str, Indices]
@@ -67,7 +69,7 @@ class Unknowns:
 
 
 def list_unknowns(network: Network, approximations: Approximations, observed: frozenset[tuple[str, str]]) -> Unknowns:
-    """Take down all quantities: cameras with their fiducials, points, images.
+    """Take down all quantities: cameras with their fiducials, scanners, points, images.
 
     observed: (camera, id) of every fiducial and ("", id) of every point that is seen in an image. Cameras without an
     image are left out, and so are points that nobody saw; a fiducial that nobody saw and that is free is held where it
@@ -91,6 +93,10 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
                 priors = (_held(mark.x_mm), _held(mark.y_mm))
             pair: list[Quantity] = [("x", priors[0], None), ("y", priors[1], None)]
             fiducial[each.name, id_] = listing.add(f"FID.{each.name}.{id_}", pair)
+    scanner = {
+        each.name: listing.add(f"SC.{each.name}", [(name, prior, None) for name, prior in each.terms.items()])
+        for each in network.scanners
+    }
     point = {
         each.id: listing.add(f"PT.{each.id}", _point_quantities(each, approximations))
         for each in network.points
@@ -104,7 +110,8 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
         exterior[image.name] = listing.add(f"EO.{image.name}", _stopped(quantities) if stopped else quantities)
         transformation[image.name] = listing.add(f"T.{image.name}", _transformation_quantities(image, approximations))
     given, sigma, start = np.array(listing.rows, dtype=np.float64).T
-    return Unknowns(tuple(listing.names), given, sigma, start, camera, fiducial, point, transformation, exterior)
+    owned = camera, fiducial, scanner, point, transformation, exterior
+    return Unknowns(tuple(listing.names), given, sigma, start, *owned)
 
 
 class _Listing:

@@ -19,8 +19,10 @@ def validate(network: Network) -> None:
     _check_not_empty(network)
     _check_unique("camera", (camera.name for camera in network.cameras))
     _check_unique("image", (image.name for image in network.images))
+    _check_unique("scanner", (scanner.name for scanner in network.scanners))
     _check_unique("object point", (point.id for point in network.points))
     _check_cameras(network)
+    _check_scanners(network)
     _check_shapes(network.observations)
     _check_names(network)
     _check_distances(network)
@@ -73,6 +75,15 @@ def _check_cameras(network: Network) -> None:
             raise AdjustmentError(
                 f"camera {camera.name}: the distortion family {camera.distortion.family} counts in halves of the "
                 f"frame. Give half_mm, two positive lengths, such as (115.0, 115.0) for an aerial camera."
+            )
+
+
+def _check_scanners(network: Network) -> None:
+    for image in network.images:
+        if image.scanner and image.scanner not in network.scanner_by_name:
+            known = ", ".join(sorted(network.scanner_by_name)) or "none"
+            raise AdjustmentError(
+                f"image {image.name} is of the scanner {image.scanner}, which is not given; given: {known}."
             )
 
 

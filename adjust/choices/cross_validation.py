@@ -141,7 +141,11 @@ def _fitted_without(
     fitted = _as_approximations(reduced, values, adjustment.mirrored)
     oriented = [image for image in reduced.images if image.name not in reduced.unoriented]
     return {
-        image.name: replace(approximate_image(reduced, fitted, image.name), parameters=values[f"IO.{image.camera}"][3:])
+        image.name: replace(
+            approximate_image(reduced, fitted, image.name),
+            parameters=values[f"IO.{image.camera}"][3:],
+            bend_parameters=values.get(f"SC.{image.scanner}", np.empty(0)),
+        )
         for image in oriented
     }
 

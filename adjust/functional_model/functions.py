@@ -1,13 +1,14 @@
 """The functions F1 to F4 of all observations: the observations that satisfy them, and their derivatives there.
 
-A target obeys T(x, y) = image of its ray, a fiducial T(x, y) = its place in the camera frame. The derivatives are taken
+A target obeys T(S(x, y)) = image of its ray, a fiducial T(S(x, y)) = its place in the camera frame, with S the bend of
+the scanner. The derivatives are taken
 at computed observations, those that satisfy the functions for the unknowns of the moment: after convergence these are
 the adjusted observations. By elements the distortion is taken at the observed camera point instead: then
-F = T(x, y) - image of the ray - distortion there, which depends on the observations by T alone.
+F = T(S(x, y)) - image of the ray - distortion there, which depends on the observations by T and S alone.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,19 +117,32 @@ def _camera(problem: Problem, state: State, name: str) -> tuple[Array, Array, Di
 def _observed_in_camera(problem: Problem, state: State) -> Array:
     """The camera coordinates (n, 2) of the observations as they were made."""
     camera_xy = np.empty_like(problem.network.observations.xy_mm)
+    straight_mm = _straight(problem, state, problem.network.observations.xy_mm)
     for films in problem.films:
         parameters = state.values[films.positions][films.of]
-        camera_xy[films.rows] = films.kind.apply(parameters, problem.network.observations.xy_mm[films.rows])
+        camera_xy[films.rows] = films.kind.apply(parameters, straight_mm[films.rows])
     return camera_xy
 
 
+def _straight(problem: Problem, state: State, xy_mm: Array) -> Array:
+    """The places (n, 2) of comparator coordinates (n, 2), freed of the scanners' bends."""
+    straight_mm = xy_mm.copy() if problem.scans else xy_mm
+    for scans in problem.scans:
+        straight_mm[scans.rows] = scans.bend.apply(state.values[scans.positions], xy_mm[scans.rows])
+    return straight_mm
+
+
 def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) -> tuple[Array, Mask]:
-    """The comparator coordinates (n, 2) of camera coordinates (n, 2), and which the film transformations give."""
+    """The comparator coordinates (n, 2) of camera coordinates (n, 2), and which films and scanners give."""
     xy_mm = np.empty_like(camera_xy)
     found = np.empty(len(camera_xy), dtype=bool)
     for films in problem.films:
         parameters, rows = state.values[films.positions][films.of], _in_order(films.rows)
         xy_mm[rows], found[rows] = films.kind.inverse(parameters, camera_xy[rows], films.centers_mm)
+    for scans in problem.scans:
+        rows = scans.rows
+        xy_mm[rows], unfolded = scans.bend.inverse(state.values[scans.positions], xy_mm[rows])
+        found[rows] &= unfolded
     return xy_mm, found
 
 
@@ -139,9 +153,7 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     film = _film_derivatives(problem, state, xy_mm)
     at_distorted = _film_derivatives(problem, state, distorted) if problem.by_elements else film
     by_camera_xy = laid_out(np.broadcast_to(np.eye(2), (len(xy_mm), 2, 2)))
-    by_unknowns = np.zeros((parts.camera.columns.stop, len(xy_mm), 2)).transpose(
-        1, 2, 0
-    )  # columns, as blocks have them
+    by_unknowns = np.zeros((parts.width, len(xy_mm), 2)).transpose(1, 2, 0)  # columns, as blocks have them
     by_unknowns[:, :, parts.place.columns] = -np.eye(2, 3)[:, parts.place.members]  # F3, F4; those of targets follow
     straight = problem.network.line_of_sight.is_straight
     for seen in computed.targets:
@@ -163,8 +175,13 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
         _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
         _fill(by_unknowns, rows, parts.camera, [at.by_quantity(k) for k in parts.camera.members])
-    by_film = film.by_parameters + product(by_camera_xy - np.eye(2), at_distorted.by_parameters)
-    _fill(by_unknowns, slice(None), parts.film, [by_film[..., k] for k in parts.film.members])
+    for part, of_film, of_distorted in (
+        (parts.film, film.by_parameters, at_distorted.by_parameters),
+        (parts.scanner, film.by_scanner, at_distorted.by_scanner),
+    ):
+        if len(part.members):
+            by_parameters = of_film + product(by_camera_xy - np.eye(2), of_distorted)
+            _fill(by_unknowns, slice(None), part, [by_parameters[..., k] for k in part.members])
     return Derivatives(film.by_xy if problem.by_elements else product(by_camera_xy, film.by_xy), by_unknowns)
 
 
@@ -182,19 +199,37 @@ def _by_in_camera(by_ray: Array, seen: SeenTargets) -> Array:
 
 @dataclass(frozen=True)
 class _FilmDerivatives:
-    """Camera coordinates (n, 2), their derivatives by the comparator's (n, 2, 2) and centred parameters (n, 2, k)."""
+    """Camera coordinates (n, 2), their derivatives by the comparator's (n, 2, 2), by the films' centred parameters
+    (n, 2, k) and by those of the scanners' bends (n, 2, s).
+    """
 
     camera_xy: Array
     by_xy: Array
     by_parameters: Array
+    by_scanner: Array
 
 
 def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
+    film = _by_film(problem, state, _straight(problem, state, xy_mm))
+    if not problem.scans:
+        return film
+    width = max(len(scans.positions) for scans in problem.scans)
+    by_xy, by_scanner = film.by_xy.copy(), zeros(len(xy_mm), 2, width)
+    for scans in problem.scans:
+        rows = scans.rows
+        at = scans.bend.displacement(state.values[scans.positions], xy_mm[rows])
+        by_xy[rows] = product(film.by_xy[rows], np.eye(2) - at.by_xy)
+        by_scanner[rows, :, : len(scans.positions)] = -product(film.by_xy[rows], at.by_parameters)
+    return replace(film, by_xy=by_xy, by_scanner=by_scanner)
+
+
+def _by_film(problem: Problem, state: State, xy_mm: Array) -> _FilmDerivatives:
+    """Of places that are freed of the scanners' bends, without the derivatives by these."""
     of_films = [_of_films(films, state, xy_mm) for films in problem.films]
     if len(of_films) == 1:
         return of_films[0]
     count, width = len(xy_mm), max(each.by_parameters.shape[2] for each in of_films)
-    result = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), zeros(count, 2, width))
+    result = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), zeros(count, 2, width), zeros(count, 2, 0))
     for films, each in zip(problem.films, of_films, strict=True):
         result.camera_xy[films.rows], result.by_xy[films.rows] = each.camera_xy, each.by_xy
         result.by_parameters[films.rows, :, : each.by_parameters.shape[2]] = each.by_parameters
@@ -205,7 +240,9 @@ def _of_films(films: Films, state: State, xy_mm: Array) -> _FilmDerivatives:
     """The derivatives of the films of one kind alone."""
     parameters, xy = state.values[films.positions][films.of], xy_mm[_in_order(films.rows)]
     design = films.kind.design(parameters, xy, films.centers_mm, films.halves_mm)
-    return _FilmDerivatives(films.kind.apply(parameters, xy), films.kind.gradient(parameters, xy), design)
+    return _FilmDerivatives(
+        films.kind.apply(parameters, xy), films.kind.gradient(parameters, xy), design, zeros(len(xy), 2, 0)
+    )
 
 
 def _in_order(rows: Indices) -> Rows:

@@ -45,10 +45,15 @@ class PolynomialSet:
 
 def legendre(order: int) -> PolynomialSet:
     """a and b are the coefficients of dx and dy; their first index is the degree in x, the second in y."""
-    polynomials = [tuple(series.leg2poly([0.0] * degree + [1.0]).tolist()) for degree in range(order + 1)]
     combined: dict[str, Term] = {"a10": STRETCH, "a01": SHEAR, "a11": TILT_Y, "b11": TILT_X}
     single: dict[str, Term] = {f"{'ab'[axis]}{m}{n}": (axis, m, n) for axis, m, n in _single_terms(order)}
-    return _set(polynomials, 5 / 6, combined | single)
+    return legendre_terms(combined | single, order)
+
+
+def legendre_terms(terms: dict[str, Term], degree: int) -> PolynomialSet:
+    """Some terms by their names, of products of Legendre polynomials up to a degree in x and in y."""
+    polynomials = [tuple(series.leg2poly([0.0] * each + [1.0]).tolist()) for each in range(degree + 1)]
+    return _set(polynomials, 5 / 6, terms)
 
 
 def _single_terms(degree: int) -> list[tuple[int, int, int]]:
@@ -96,15 +101,19 @@ def by_degree(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
 
 def correct(of: PolynomialSet, settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
     """The correction of a set, which is subtracted from the observed point."""
-    half = np.array(settings.half_mm)
+    return summed(of, np.array(settings.half_mm), xy, principal_point, parameters)
+
+
+def summed(of: PolynomialSet, half: Array, xy: Array, center: Array, parameters: Array) -> Correction:
+    """The terms of a set at places (n, 2), times their parameters (k,). center, half (2,): of the extent."""
     coefficients = _coefficients(of, float(half[1] / half[0]))
-    scaled = (xy - principal_point) / half
+    scaled = (xy - center) / half
     (x, x_slope), (y, y_slope) = (_polynomials(of, scaled[:, axis]) for axis in (0, 1))
     count = len(of.polynomials) ** 2
     products = (x[:, :, None] * y[:, None, :]).reshape(len(xy), count)
     by_parameters = (products @ coefficients.reshape(-1, count).T).reshape(len(xy), 2, len(of.terms))
-    summed = np.einsum("akij,k->aij", coefficients, parameters)
-    by_scaled = [np.einsum("aij,ni,nj->na", summed, *pair) for pair in ((x_slope, y), (x, y_slope))]
+    products_of = np.einsum("akij,k->aij", coefficients, parameters)
+    by_scaled = [np.einsum("aij,ni,nj->na", products_of, *pair) for pair in ((x_slope, y), (x, y_slope))]
     by_xy = np.stack(by_scaled, axis=2) / half
     return Correction(by_parameters @ parameters, by_xy, -by_xy, by_parameters)
 

@@ -1,6 +1,6 @@
 """Object points into images and back: rays, camera points, comparator points, with the adjustment's own functions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,11 @@ from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.line_of_sight import sight_vectors
 from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.network import EXTERIOR_NAMES, STRAIGHT, Approximations, Distortion, Image, LineOfSight, Network
 from adjust.result import Adjustment
-from adjust.small_matrices import applied, determinant, solved
+from adjust.small_matrices import applied, determinant, product, solved
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,10 +25,10 @@ NEWTON_TOLERANCE = 1e-14  # of the principal distance
 
 @dataclass(frozen=True)
 class ImageModel:
-    """One image as it is known at a time: interior and exterior orientation, distortion, film transformation.
+    """One image as it is known at a time: interior and exterior orientation, distortion, film transformation, scanner.
 
     interior (3,): c, x0', y0' in mm; parameters (k,) of the distortion in the order of `families.parameter_names`;
-    rotation (3, 3) object to camera; station (3,) in object units.
+    rotation (3, 3) object to camera; station (3,) in object units; bend_parameters (k,) of the scanner's bend.
     """
 
     distortion: Distortion
@@ -37,6 +38,8 @@ class ImageModel:
     station: Array
     film: Film
     line_of_sight: LineOfSight = STRAIGHT
+    bend: Bend = NO_BEND
+    bend_parameters: Array = field(default_factory=lambda: np.empty(0))
 
     def camera_from_object(self, xyz: Array) -> tuple[Array, Mask]:
         """Observed, that is distorted, camera coordinates (n, 2) in mm of object points (n, 3); which have an image."""
@@ -52,11 +55,18 @@ class ImageModel:
 
     def camera_from_comparator(self, xy_mm: Array) -> Array:
         """Observed camera coordinates (n, 2) of comparator coordinates (n, 2), mm."""
-        return self.film.camera_from_comparator(xy_mm)
+        return self.film.camera_from_comparator(self.bend.apply(self.bend_parameters, xy_mm))
+
+    def camera_by_comparator(self, xy_mm: Array) -> Array:
+        """Their derivatives (n, 2, 2) by the comparator coordinates."""
+        straight_mm = self.bend.apply(self.bend_parameters, xy_mm)
+        return product(self.film.gradient(straight_mm), self.bend.gradient(self.bend_parameters, xy_mm))
 
     def comparator_from_camera(self, xy_mm: Array) -> tuple[Array, Mask]:
-        """Comparator coordinates (n, 2) of observed camera coordinates (n, 2), mm; which of them the film has."""
-        return self.film.comparator_from_camera(xy_mm)
+        """Comparator coordinates (n, 2) of observed camera coordinates (n, 2), mm; which film and scanner have."""
+        straight_mm, found = self.film.comparator_from_camera(xy_mm)
+        scan_mm, unfolded = self.bend.inverse(self.bend_parameters, straight_mm)
+        return scan_mm, found & unfolded
 
     def ideal_from_observed(self, xy_mm: Array) -> tuple[Array, Mask]:
         """Camera coordinates (n, 2) free of distortion, of observed ones (n, 2), mm; which could be corrected."""
@@ -74,6 +84,7 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
 
     exterior = values(f"EO.{name}", EXTERIOR_NAMES)
     parameters = values(f"T.{name}", film_parameter_names(image.transformation))
+    bend = bend_of(network, image)
     return ImageModel(
         distortion=camera.distortion,
         interior=values(f"IO.{camera.name}", ("c", "x0", "y0")),
@@ -82,7 +93,14 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
         station=exterior[:3],
         film=_film(network, image, parameters, name in adjustment.mirrored),
         line_of_sight=network.line_of_sight,
+        bend=bend,
+        bend_parameters=values(f"SC.{image.scanner}", bend.terms),
     )
+
+
+def bend_of(network: Network, image: Image) -> Bend:
+    """That of the image's scanner."""
+    return network.scanner_by_name[image.scanner].bend if image.scanner else NO_BEND
 
 
 def approximate_image(network: Network, approximations: Approximations, name: str) -> ImageModel:
@@ -101,6 +119,8 @@ def approximate_image(network: Network, approximations: Approximations, name: st
         station=exterior[:3],
         film=_film(network, image, film_parameters, name in approximations.mirrored),
         line_of_sight=network.line_of_sight,
+        bend=bend_of(network, image),
+        bend_parameters=network.scanner_by_name[image.scanner].given if image.scanner else np.empty(0),
     )
 
 

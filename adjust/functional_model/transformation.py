@@ -108,6 +108,11 @@ def simpler(spelling: str) -> str | None:
     return None
 
 
+def order_of(spelling: str) -> int:
+    """The order of a conformal or general polynomial; 1 of those that are linear or nearly so."""
+    return _name_and_order(spelling)[1] if spelling.startswith(("conformal", "polynomial")) else 1
+
+
 def follows_tilts(spelling: str) -> bool:
     """Whether a transformation can undo what a small tilt of the camera does to the image: x' + t x'², y' + t x'y'.
 

@@ -82,7 +82,7 @@ def _film_transformation(network: Network, image: Image, rows: list[int]) -> tup
     camera_mm = np.array(
         [[mark.x_mm.value, mark.y_mm.value] for mark in (given[observations.point[row]] for row in marks)]
     )
-    return fit_transformation(image.transformation, observations.xy_mm[marks], camera_mm.reshape(-1, 2))
+    return fit_transformation(image.transformation, network.straight_xy_mm[marks], camera_mm.reshape(-1, 2))
 
 
 def _frame(network: Network, image: Image, rows: list[int], fit: tuple[Array, bool]) -> _Frame:
@@ -92,7 +92,7 @@ def _frame(network: Network, image: Image, rows: list[int], fit: tuple[Array, bo
     variances = np.trace(observations.covariance_mm2[targets], axis1=1, axis2=2) / 2
     return _Frame(
         tuple(observations.point[row] for row in targets),
-        film_kind(image.transformation, mirrored).apply(parameters, observations.xy_mm[targets]),
+        film_kind(image.transformation, mirrored).apply(parameters, network.straight_xy_mm[targets]),
         float(np.sqrt(np.median(variances))) if targets else 0.0,
     )
 

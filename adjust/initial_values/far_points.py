@@ -111,7 +111,7 @@ def _sights(problem: Problem) -> dict[str, Sight]:
         rows = of_image[~problem.is_fiducial[of_image]]
         if len(rows):
             film = film_kind(image.transformation, image.name in problem.mirrored)
-            xy_mm = film.apply(unknowns.start[unknowns.transformation[image.name]], network.observations.xy_mm[rows])
+            xy_mm = film.apply(unknowns.start[unknowns.transformation[image.name]], network.straight_xy_mm[rows])
             interior, known = np.split(unknowns.start[unknowns.camera[image.camera]], [3])
             variances = np.trace(network.observations.covariance_mm2[rows], axis1=1, axis2=2) / 2.0
             sights[image.name] = freed_sight(

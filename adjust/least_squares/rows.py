@@ -133,9 +133,10 @@ def prior_root_weights(numbering: Numbering) -> Array:
 
 
 def of_cameras(numbering: Numbering) -> NDArray[np.bool_]:
-    """Which free unknowns (f,) are those of cameras: fiducials, interior orientation, distortion (F5 to F9)."""
+    """Which free unknowns (f,) are those of cameras and scanners: fiducials, interior orientation, distortion (F5 to
+    F9), and the terms of bends."""
     unknowns = numbering.problem.unknowns
-    positions = [*unknowns.camera.values(), *unknowns.fiducial.values()]
+    positions = [*unknowns.camera.values(), *unknowns.fiducial.values(), *unknowns.scanner.values()]
     return np.isin(numbering.free, np.concatenate(positions))
 
 

@@ -20,6 +20,7 @@ from adjust.quality.variance_components import factor_sigmas
 from adjust.result import Cofactor, FurtherResidual, Group, Reliability, Residuals, Suspect
 from adjust.runs import ROUNDS, Run
 from adjust.undetermined.diagnosis import undetermined, weak_directions
+from adjust.undetermined.scanner_directions import hardly_told
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,7 @@ def _warnings(last: Run, cofactor: Cofactor) -> list[str]:
     ]
     if last.converged:
         warnings += filter(None, [undetermined(problem, last.end.state, cofactor.variances)])
+        warnings += hardly_told(problem, last.end.state, last.numbering.free, last.factor, cofactor.variances)
     return warnings + _unseen(problem) + _films_by_targets(problem)
 
 

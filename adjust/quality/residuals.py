@@ -71,7 +71,7 @@ def groups(
     """
     units = TestedUnits(problem)
     result = {}
-    for name in ("target", "tie", "fiducial", "control", "datum", "interior", "exterior"):
+    for name in ("target", "tie", "fiducial", "control", "datum", "interior", "scanner", "exterior"):
         members = (units.groups == name) & weighting.used
         if not members.any() and name not in ("target", "fiducial", "control"):
             continue

@@ -1,4 +1,4 @@
-"""Whether the data need a parameter: tests of distortion and interior orientation, one by one and in groups.
+"""Whether the data need a parameter: of distortion, interior orientation and scanner, one by one and in groups.
 
 A parameter, or a group of k, is compared with a value x0 that would make it superfluous: 0 for distortion, the given
 value for c, x0' and y0'. With d = x - x0 and Q the cofactor matrix of d,
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
 from adjust.functional_model.families import family
-from adjust.network import Camera, Prior
+from adjust.network import Camera, Prior, Scanner
 from adjust.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ def parameter_tests(adjustment: Adjustment, camera: Camera) -> tuple[Significanc
     interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
     tests = [_against_given(adjustment, camera.name, name, prior) for name, prior in interior.items()]
     found = [test for test in tests if test is not None]
-    return (*found, *(_against_zero(adjustment, camera.name, name, (name,)) for name in _estimated(camera)))
+    return (*found, *(_against_zero(adjustment, f"IO.{camera.name}", name, (name,)) for name in _estimated(camera)))
 
 
 def group_tests(adjustment: Adjustment, camera: Camera) -> tuple[SignificanceTest, ...]:
@@ -64,7 +64,17 @@ def group_tests(adjustment: Adjustment, camera: Camera) -> tuple[SignificanceTes
     several = {name: members for name, members in present.items() if len(members) > 1}
     if len(several) == 2 and len(set(several.values())) == 1:
         del several["all"]
-    return tuple(_against_zero(adjustment, camera.name, name, members) for name, members in several.items())
+    return tuple(_against_zero(adjustment, f"IO.{camera.name}", name, members) for name, members in several.items())
+
+
+def scanner_tests(adjustment: Adjustment, scanner: Scanner) -> tuple[SignificanceTest, ...]:
+    """Of every term of a scanner's bend that was estimated, and of all of them together."""
+    estimated = tuple(name for name, prior in scanner.terms.items() if prior.sigma > 0.0)
+    if not adjustment.converged or not estimated:
+        return ()
+    several = {"all": estimated} if len(estimated) > 1 else {}
+    tested = {name: (name,) for name in estimated} | several
+    return tuple(_against_zero(adjustment, f"SC.{scanner.name}", name, members) for name, members in tested.items())
 
 
 def _has_tests(adjustment: Adjustment, camera: Camera) -> bool:
@@ -90,8 +100,8 @@ def _against_given(adjustment: Adjustment, camera: str, name: str, prior: Prior 
     return _tested(adjustment, name, (name,), np.array([adjustment.value(full) - prior.value]), np.array([[cofactor]]))
 
 
-def _against_zero(adjustment: Adjustment, camera: str, name: str, parameters: Sequence[str]) -> SignificanceTest:
-    full = [f"IO.{camera}.{each}" for each in parameters]
+def _against_zero(adjustment: Adjustment, owner: str, name: str, parameters: Sequence[str]) -> SignificanceTest:
+    full = [f"{owner}.{each}" for each in parameters]
     values = np.array([adjustment.value(each) for each in full])
     return _tested(adjustment, name, tuple(parameters), values, adjustment.cofactor_of(full))
 

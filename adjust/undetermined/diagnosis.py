@@ -14,6 +14,7 @@ from adjust.undetermined.datum import free_coordinates, object_datum
 from adjust.undetermined.directions import camera_leads, datum_sentence, field_of, following
 from adjust.undetermined.null_space import SINGULAR, BlindBlock, blind_blocks, null_space
 from adjust.undetermined.own_directions import many_sentence, own_sentence, unnamed_sentence
+from adjust.undetermined.scanner_directions import scanner_leads
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -44,10 +45,11 @@ def weak_directions(
 ) -> tuple[NullDirection, ...]:
     """What the observations hardly see, and priors do not settle: there the solution is made by noise.
 
-    The factor is to be that without the cameras' priors. Of all directions below WEAK those are told in which these
-    priors weigh less than SETTLED times what the observations do. Directions that move fiducials with priors are no
-    cause for alarm: their priors are meant to place them. singular: the null directions, which are not told again. Many
-    directions without a name are told as one: the longer a strip is, the more ways there are in which it can bend.
+    The factor is to be that without the priors of cameras and scanners. Of all directions below WEAK those are told in
+    which these priors weigh less than SETTLED times what the observations do. Directions that move fiducials with
+    priors are no cause for alarm: their priors are meant to place them. singular: the null directions, which are not
+    told again. Many directions without a name are told as one: the longer a strip is, the more ways there are in which
+    it can bend.
     """
     blind = blind_blocks(factor)
     hardly, told = null_space(factor, blind, WEAK)
@@ -55,7 +57,9 @@ def weak_directions(
         return ()
     marks = np.isin(free, [i for pair in problem.unknowns.fiducial.values() for i in pair])
     sigma = np.where(
-        np.char.startswith(np.array(problem.unknowns.names)[free], "IO."), problem.unknowns.sigma[free], np.inf
+        np.isin(np.char.partition(np.array(problem.unknowns.names)[free], ".")[:, 0], ("IO", "SC")),
+        problem.unknowns.sigma[free],
+        np.inf,
     )
     calibrated = [each.positions for each in problem.further if each.group == "calibration"]
     placed = marks & (np.isfinite(problem.unknowns.sigma[free]) | np.isin(free, np.concatenate([[], *calibrated])))
@@ -106,7 +110,7 @@ def _collapsed(names: list[str]) -> tuple[str, ...]:
     """Names of unknowns, those of one kind shown as one with a star where they are many."""
     kinds: dict[str, list[str]] = {}
     for name in names:
-        kind = name if name.startswith("IO.") else re.sub(r"^(FID\.[^.]*|[A-Z]+)\..*\.", r"\1.*.", name)
+        kind = name if name.startswith(("IO.", "SC.")) else re.sub(r"^(FID\.[^.]*|[A-Z]+)\..*\.", r"\1.*.", name)
         kinds.setdefault(kind, []).append(name)
     shown = []
     for kind, members in kinds.items():
@@ -147,7 +151,7 @@ def _named(
     names = [problem.unknowns.names[i] for i in free]
     datum, sentences, rest = _datum_part(problem, state, free, factor, blind, null)
     still = _with_points_still(problem, free, datum, rest)
-    leads = camera_leads(problem, state)
+    leads = [*scanner_leads(problem, state), *camera_leads(problem, state)]
     functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
     lengths = np.linalg.norm(functionals, axis=1, keepdims=True)
     seen = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest

@@ -46,6 +46,7 @@ class Lead:
 
 
 FOLLOWERS = (  # what follows a motion: the unknowns' kind, quantities (all where empty), words, a word that told it
+    ("FID", (), "the fiducial marks", "fiducial mark"),
     ("T", (), "the film transformations", ""),
     ("IO", ("x0", "y0"), "the principal point", "principal point's"),
     ("IO", ("c",), "the principal distance", "principal distance"),
@@ -95,7 +96,8 @@ def camera_leads(problem: Problem, state: State) -> list[Lead]:
     """What a null direction is called after.
 
     Ranks: -1 a tilt, which moves much else along, 0 what is a change of the camera's own axes, 1 other changes of its
-    fiducials, 2 interior orientation, 3 distortion.
+    fiducials, 2 interior orientation, 3 distortion; -2 of a scanner's bend, which moves still more (see
+    `scanner_directions`).
     """
     leads = []
     for name, positions in problem.unknowns.camera.items():

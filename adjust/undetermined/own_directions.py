@@ -93,6 +93,11 @@ def unnamed_sentence(name: str, followers: str) -> tuple[str, str]:
                 f"The film transformation of image {owner} can change ({quantity} most){followers}.",
                 "Measure more fiducial marks in this image, or choose a transformation with fewer parameters.",
             )
+        case "SC":
+            return (
+                f"The term {quantity} of the bend of scanner {owner} can change{followers}.",
+                f"Give {quantity} a standard deviation, or leave it out.",
+            )
         case _:
             return (
                 f"The quantity {quantity} of camera {owner} can change{followers}.",

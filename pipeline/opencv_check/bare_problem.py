@@ -165,7 +165,7 @@ def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Arra
     points = [observations.point[row] for row in rows]
     model = adjusted_image(adjustment, image)
     xyz = np.array([[adjustment.value(f"PT.{point}.{axis}") for axis in "XYZ"] for point in points]).reshape(-1, 3)
-    gradient = model.film.gradient(observations.xy_mm[rows])
+    gradient = model.camera_by_comparator(observations.xy_mm[rows])
     covariance = gradient @ observations.covariance_mm2[rows] @ gradient.swapaxes(1, 2)
     sigmas = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
     return ImagePoints(image, xyz, model.camera_from_comparator(observations.xy_mm[rows])), sigmas, points

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bent_scans import MIDDLE_MM, in_a_bent_scanner
 from numpy.typing import NDArray
 from simulated import KINDS, Truth, simulated
 
@@ -12,12 +13,13 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.functions import compute, computed_observations, derivatives
 from adjust.functional_model.projection import rays
 from adjust.functional_model.rotation import rotation_from_angles, rotation_from_vector, vector_by_angles
-from adjust.network import Decentering, Distortion, Transformation
+from adjust.network import Decentering, Distortion, Prior, Transformation
 from adjust.problem import Problem, number
 
 Array = NDArray[np.float64]
 
 STEP = 1e-30
+BEND = {"a20": Prior(0.9, np.inf), "b11": Prior(-0.7, np.inf), "a03": Prior(0.5, np.inf), "b60": Prior(0.0, np.inf)}
 
 PARAMETER_VALUES: dict[str, list[float]] = {
     "none": [],
@@ -84,13 +86,18 @@ def test_rays_accept_complex_steps() -> None:
     np.testing.assert_allclose(ray.imag / STEP, expected, rtol=1e-13)
 
 
+@pytest.mark.parametrize("bent", [False, True], ids=["straight", "bent"])
 @pytest.mark.parametrize("by_elements", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-def test_functions_by_differences_of_computed_observations(kind: Transformation, by_elements: bool) -> None:
+def test_functions_by_differences_of_computed_observations(kind: Transformation, by_elements: bool, bent: bool) -> None:
     """F(l(x), x) = 0 defines l(x), so that dl/dx = -A^-1 B: by central differences of l for every unknown."""
     rng = np.random.default_rng(11)
-    truth = Truth(mirrored=(False, kind != "none", False, False))
+    middle_mm = MIDDLE_MM if bent and kind != "none" else (0.0, 0.0)
+    truth = Truth(mirrored=(False, kind != "none", False, False), middle_mm=middle_mm)
     network, start = simulated(rng, truth, kind, point_sigma=np.inf, free={"k3": np.inf, "k5": np.inf})
+    if bent:
+        network = in_a_bent_scanner(network, {}, BEND)
+        network = replace(network, images=(replace(network.images[0], scanner=""), *network.images[1:]))
     problem = number(network, start, by_elements)
     every = np.where(problem.unknowns.sigma > 0.0, problem.unknowns.sigma, np.inf)
     problem = replace(problem, unknowns=replace(problem.unknowns, sigma=every))
@@ -129,7 +136,7 @@ def step_of(name: str) -> float:
     if owner in ("EO", "PT"):
         return 1e-5 if quantity in ("omega", "phi", "kappa") else 0.01
     if owner == "T":
-        return 1e-5 if quantity == "angle" else 1e-3
+        return {"angle": 1e-5, "c1": 3e-4, "c2": 3e-4}.get(quantity, 1e-3)
     powers = {"k3": 1e-10, "k5": 1e-14, "k7": 1e-18, "p1": 1e-8, "p2": 1e-8, "p3": 1e-7, "p4": 1e-11}
     return powers.get(quantity, 1e-3)
 

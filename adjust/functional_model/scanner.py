@@ -1,0 +1,147 @@
+"""What a scanner does to its scans: a smooth bend S, fixed to its own axes, before the film transformations.
+
+    x = x_s - sum of a[mn] P_m(ξ) P_n(η),   y = y_s - sum of b[mn] P_m(ξ) P_n(η),   F1 = T_i(S(x_s, y_s)) - ...
+
+ξ, η are the scan's coordinates about the middle of its extent, half of it the unit, P Legendre polynomials, and the sum
+is how far the scanner puts a point beside its place; all parameters are in mm. What the film transformation of an image
+can take, its scanner's bend cannot be told from: only terms that no transformation takes are offered. A term `a21` is
+one product alone; `stretch`, `shear`, `tilt_x` and `tilt_y` are the combinations that a similarity, or a projective
+transformation, leaves of products of which it takes others (see `polynomial_sets`).
+"""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.correction import Correction
+from adjust.functional_model.polynomial_sets import (
+    SHEAR,
+    STRETCH,
+    TILT_X,
+    TILT_Y,
+    PolynomialSet,
+    Term,
+    legendre_terms,
+    summed,
+)
+from adjust.functional_model.transformation import order_of
+from adjust.small_matrices import determinant, solved
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SMOOTH = (2, 3)  # degrees of the products that a bend consists of
+ALONG = (4, 5, 6)  # degrees of those along one axis alone, the carriage's, which tests may ask for
+COMBINED = {"stretch": STRETCH, "shear": SHEAR, "tilt_x": TILT_X, "tilt_y": TILT_Y}
+STEPS = 30
+TOLERANCE_MM = 1e-11
+
+
+def smooth_terms(films: Iterable[str]) -> tuple[str, ...]:
+    """The terms of degree 2 and 3 that no film transformation of some takes; of degree 1 what similarities leave."""
+    products = [(axis, degree - n, n) for degree in SMOOTH for axis in (0, 1) for n in range(degree + 1)]
+    return _left_by(films, (*COMBINED, *(_name(*each) for each in products)))
+
+
+def carriage_terms(films: Iterable[str]) -> tuple[str, ...]:
+    """Those of degree 4 to 6 along x or y alone."""
+    products = [(axis, *pair) for degree in ALONG for pair in ((degree, 0), (0, degree)) for axis in (0, 1)]
+    return _left_by(films, tuple(_name(*each) for each in products))
+
+
+def _left_by(films: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
+    kinds = set(films) - {"none"}
+    return tuple(name for name in names if all(_is_left(kind, name) for kind in kinds))
+
+
+def _is_left(kind: str, name: str) -> bool:
+    """Whether a film transformation leaves a term as it is, and does not take it or a part of it."""
+    linear = kind not in ("congruent", "similarity") and not kind.startswith("conformal")
+    match name:
+        case "stretch" | "shear":
+            return not linear
+        case "tilt_x" | "tilt_y":
+            return kind == "projective"
+    axis, m, n = _product(name)
+    if kind == "projective":
+        return (m, n) != (1, 1) and (axis, m, n) not in ((0, 2, 0), (1, 0, 2))
+    if kind == "bilinear":
+        return (m, n) != (1, 1)
+    return m + n > order_of(kind)
+
+
+def _name(axis: int, m: int, n: int) -> str:
+    return f"{'ab'[axis]}{m}{n}"
+
+
+def _product(name: str) -> tuple[int, int, int]:
+    return "ab".index(name[0]), int(name[1]), int(name[2])
+
+
+def degree_of(name: str) -> int:
+    """The degree in x and y together of a term."""
+    return {"stretch": 1, "shear": 1, "tilt_x": 2, "tilt_y": 2}[name] if name in COMBINED else sum(_product(name)[1:])
+
+
+def is_term(name: str) -> bool:
+    """Whether a bend may have a parameter of this name."""
+    form = re.fullmatch(r"[ab](\d)(\d)", name)
+    return name in COMBINED or (form is not None and 1 < int(form[1]) + int(form[2]) <= ALONG[-1])
+
+
+@dataclass(frozen=True)
+class Bend:
+    """The formula of S: its terms in their order, the middle and half the extent of the scan in x and y, mm.
+
+    Without a term it is x = x_s, y = y_s.
+    """
+
+    terms: tuple[str, ...] = ()
+    center_mm: tuple[float, float] = (0.0, 0.0)
+    half_mm: tuple[float, float] = (1.0, 1.0)
+
+    def displacement(self, parameters: Array, scan_mm: Array) -> Correction:
+        """How far (n, 2) the scanner puts points beside their places, at the coordinates (n, 2) that it gives them."""
+        return summed(self._set, np.array(self.half_mm), scan_mm, np.array(self.center_mm), parameters)
+
+    def apply(self, parameters: Array, scan_mm: Array) -> Array:
+        """The places (n, 2) of points whose coordinates in the scan (n, 2) are given, mm."""
+        return scan_mm - self.displacement(parameters, scan_mm).value if self.terms else scan_mm
+
+    def gradient(self, parameters: Array, scan_mm: Array) -> Array:
+        """Their derivatives (n, 2, 2) by the coordinates in the scan."""
+        if not self.terms:
+            return np.broadcast_to(np.eye(2), (*scan_mm.shape, 2))
+        return np.asarray(np.eye(2) - self.displacement(parameters, scan_mm).by_xy)
+
+    def inverse(self, parameters: Array, xy_mm: Array) -> tuple[Array, Mask]:
+        """The coordinates in the scan (n, 2) of places (n, 2), and which were found: where the bend folds none are."""
+        found = np.ones(len(xy_mm), dtype=bool)
+        if not self.terms:
+            return xy_mm, found
+        scan_mm = xy_mm
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(STEPS):
+                at = self.displacement(parameters, scan_mm)
+                gradient = np.eye(2) - at.by_xy
+                side = determinant(gradient)
+                regular = np.isfinite(side) & (side > 0.0)
+                step = solved(gradient, scan_mm - at.value - xy_mm, regular, side)
+                scan_mm = scan_mm - step
+                found = regular & (np.abs(step).max(axis=1) <= TOLERANCE_MM)
+                if found.all():
+                    break
+        return scan_mm, found
+
+    @cached_property
+    def _set(self) -> PolynomialSet:
+        terms: dict[str, Term] = {name: COMBINED.get(name) or _product(name) for name in self.terms}
+        degrees = [2 if isinstance(term, str) else max(term[1:]) for term in terms.values()]
+        return legendre_terms(terms, max(degrees))
+
+
+NO_BEND = Bend()

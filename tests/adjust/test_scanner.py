@@ -1,0 +1,214 @@
+"""The scanner apart from the film: derivatives, the truth given back, what tells it from fiducials, what not."""
+
+import numpy as np
+import pytest
+from bent_scans import HALF_MM, MIDDLE_MM, RESEAU_MM, bent, displacement, films, in_a_bent_scanner
+from numpy.typing import NDArray
+from simulated import Truth, field_points, simulated
+
+from adjust.adjustment import Options, adjust
+from adjust.errors import AdjustmentError
+from adjust.functional_model.projection import adjusted_image
+from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
+from adjust.initial_values.approximations import approximate
+from adjust.network import Network, Prior, Scanner, Transformation
+from adjust.quality.significance import scanner_tests
+from adjust.result import Adjustment
+
+Array = NDArray[np.float64]
+
+STEP = 1e-30
+FREE = Prior(0.0, np.inf)
+EVEN = ("a20", "a11", "a02", "b20", "b11", "b02")
+ODD = ("a30", "a21", "a12", "a03")  # with b03, b12, b21, b30 they make what is the same in all four quarters
+BEND_MM = {
+    "a20": 0.02, "a11": -0.015, "a02": 0.01, "b20": -0.012, "b11": 0.008, "b02": -0.02,
+    "a30": 0.006, "a21": -0.004, "a12": 0.005, "a03": 0.003, "b30": -0.005, "b21": 0.004, "b12": -0.006, "b03": 0.007,
+}  # fmt: skip
+EVERY = (*BEND_MM, "stretch", "shear", "tilt_x", "tilt_y", "a40", "b50", "a06", "b06")
+PLACES_MM = np.random.default_rng(3).uniform([10.0, -240.0], [240.0, -5.0], (7, 2))
+
+
+def solved(network: Network, options: Options | None = None) -> Adjustment:
+    return adjust(network, approximate(network), options)
+
+
+def free(*names: str) -> dict[str, Prior]:
+    return dict.fromkeys(names, FREE)
+
+
+def test_every_term_is_the_one_that_is_printed() -> None:
+    bend = Bend(EVERY, MIDDLE_MM, HALF_MM)
+    for k, name in enumerate(EVERY):
+        found = bend.displacement(np.eye(len(EVERY))[k], PLACES_MM).value
+        np.testing.assert_allclose(found, displacement({name: 1.0}, PLACES_MM), atol=1e-13, err_msg=name)
+
+
+def test_derivatives_by_complex_steps() -> None:
+    bend, parameters = Bend(EVERY, MIDDLE_MM, HALF_MM), 0.02 * np.cos(np.arange(len(EVERY)))
+    at = bend.displacement(parameters, PLACES_MM)
+    for axis in (0, 1):
+        stepped = bend.apply(parameters, PLACES_MM + 1j * STEP * np.eye(2)[axis]).imag / STEP
+        np.testing.assert_allclose(bend.gradient(parameters, PLACES_MM)[..., axis], stepped, rtol=0, atol=1e-15)
+    for k in range(len(EVERY)):
+        stepped = bend.apply(parameters + 1j * STEP * np.eye(len(EVERY))[k], PLACES_MM).imag / STEP
+        np.testing.assert_allclose(-at.by_parameters[..., k], stepped, rtol=0, atol=1e-14)
+
+
+def test_a_bend_there_and_back() -> None:
+    bend, parameters = Bend(EVERY, MIDDLE_MM, HALF_MM), 0.02 * np.cos(np.arange(len(EVERY)))
+    scan_mm, found = bend.inverse(parameters, bend.apply(parameters, PLACES_MM))
+    assert found.all()
+    np.testing.assert_allclose(scan_mm, PLACES_MM, atol=1e-11)
+    _, found = Bend(("a20",), MIDDLE_MM, HALF_MM).inverse(np.array([-200.0]), PLACES_MM - np.array([300.0, 0.0]))
+    assert not found.any()
+
+
+@pytest.mark.parametrize(
+    ("kind", "left"),
+    [
+        ("affine", tuple(BEND_MM)),
+        ("similarity", ("stretch", "shear", *BEND_MM)),
+        ("congruent", ("stretch", "shear", *BEND_MM)),
+        ("projective", ("tilt_x", "tilt_y", "a02", "b20", *list(BEND_MM)[6:])),
+        ("bilinear", ("a20", "a02", "b20", "b02", *list(BEND_MM)[6:])),
+        ("polynomial(2)", tuple(list(BEND_MM)[6:])),
+        ("conformal(2)", ("stretch", "shear", *list(BEND_MM)[6:])),
+        ("polynomial(3)", ()),
+    ],
+)
+def test_only_terms_that_no_film_transformation_takes(kind: Transformation, left: tuple[str, ...]) -> None:
+    assert set(smooth_terms([kind])) == set(left)
+    assert set(smooth_terms([kind, "affine"])) <= set(left)
+
+
+@pytest.mark.parametrize("kind", ["similarity", "affine", "projective", "bilinear"])
+def test_what_is_left_no_film_transformation_can_make_up(kind: Transformation) -> None:
+    """Films in one pose, their marks known: the terms are determined beside the films' own parameters."""
+    names = smooth_terms([kind])
+    result = solved(films([0.0], {}, free(*names), kind=kind, sigma_given_mm=1e-3, marks_mm=RESEAU_MM))
+    assert result.converged
+    assert max(result.sigma(f"SC.S.{name}") for name in names) / result.sigma0 < 0.02
+
+
+def test_carriages_have_terms_along_one_axis_up_to_degree_6() -> None:
+    degrees = ("40", "50", "60", "04", "05", "06")
+    assert set(carriage_terms(["affine"])) == {f"{axis}{k}" for axis in "ab" for k in degrees}
+    assert set(carriage_terms(["polynomial(4)"])) == {f"{axis}{k}" for axis in "ab" for k in ("50", "60", "05", "06")}
+
+
+@pytest.mark.parametrize("method", ["combined", "elements"])
+def test_perfect_data_give_the_bend_back(method: str) -> None:
+    """Targets and fiducials in four convergent frames, one of them mirrored: nothing is left, the truth comes out."""
+    truth = Truth(mirrored=(False, True, False, False), middle_mm=MIDDLE_MM)
+    points = field_points(np.random.default_rng(5), 40)
+    straight, _ = simulated(np.random.default_rng(4), truth, points=points, noise=False)
+    network = in_a_bent_scanner(straight, BEND_MM, free(*BEND_MM))
+    result = solved(network, Options(method="combined" if method == "combined" else "elements"))
+    assert result.converged
+    assert np.abs(result.residuals.v_mm).max() < 1e-9
+    for name, value in BEND_MM.items():
+        assert result.value(f"SC.S.{name}") == pytest.approx(value, abs=1e-8)
+    image = adjusted_image(result, "f1")
+    seen = [i for i, name in enumerate(network.observations.image) if name == "f1" and i % 2]
+    camera_mm = image.camera_from_comparator(network.observations.xy_mm[seen])
+    back, found = image.comparator_from_camera(camera_mm)
+    assert found.all()
+    np.testing.assert_allclose(back, network.observations.xy_mm[seen], atol=1e-9)
+    plain = adjusted_image(solved(straight), "f1")
+    np.testing.assert_allclose(camera_mm, plain.camera_from_comparator(straight.observations.xy_mm[seen]), atol=1e-7)
+
+
+def test_the_derivatives_of_an_image_through_scanner_and_film() -> None:
+    network = films([0.0, 90.0, 180.0, 270.0], BEND_MM, free(*EVEN, *ODD))
+    image = adjusted_image(solved(network), "f1")
+    for axis in (0, 1):
+        step = 1e-3 * np.eye(2)[axis]
+        there, here = (image.camera_from_comparator(PLACES_MM + sign * step) for sign in (1.0, -1.0))
+        by_axis = image.camera_by_comparator(PLACES_MM)[..., axis]
+        np.testing.assert_allclose(by_axis, (there - here) / 2e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("turns", "terms", "lost"),
+    [
+        ([0.0] * 4, EVEN, EVEN),
+        ([0.0, 180.0] * 2, EVEN, ()),
+        ([0.0, 180.0] * 2, (*EVEN, *ODD), ODD),
+        ([0.0, 90.0, 180.0, 270.0], (*EVEN, *ODD), ()),
+    ],
+)
+def test_frames_in_two_poses_tell_a_bend_from_the_fiducials(
+    turns: list[float], terms: tuple[str, ...], lost: tuple[str, ...]
+) -> None:
+    result = solved(films(turns, {}, free(*terms), sigma_given_mm=np.inf, scatter=0.0))
+    scanner = [each for each in result.singular if "bend of scanner S" in each.cause]
+    assert {each.cause.split()[2] for each in scanner} == set(lost)
+    assert not [each for each in result.singular if "SC.S" in " ".join(each.parameters) and each not in scanner]
+
+
+def test_frames_that_lie_alike_are_told() -> None:
+    result = solved(films([0.0] * 4, BEND_MM, free("a20")))
+    (warning,) = [text for text in result.warnings if "bend of scanner S" in text]
+    assert "in its term a20: " in warning
+    assert "all frames lie alike in the scanner" in warning
+    assert "turned by 180 degrees" in warning
+    halves = solved(films([0.0, 180.0] * 2, BEND_MM, free("a20", "a21")))
+    (warning,) = [text for text in halves.warnings if "bend of scanner S" in text]
+    assert "in its term a21: " in warning
+    assert "turned by 90 degrees" in warning
+
+
+def test_given_fiducials_separate_the_scanner_in_one_pose_too() -> None:
+    result = solved(films([0.0] * 4, {"a20": 0.02}, free("a20"), sigma_given_mm=1e-3))
+    assert result.converged
+    assert result.warnings == ()
+    assert abs(result.value("SC.S.a20") - 0.02) < 1e-5
+    assert 0.2e-3 < result.sigma("SC.S.a20") / result.sigma0 < 2e-3  # as good as the marks are known
+
+
+def test_a_prior_makes_a_bend_regular_and_is_said_to_be_all() -> None:
+    result = solved(films([0.0] * 4, {}, {"a20": Prior(0.0, 0.01)}, sigma_given_mm=np.inf))
+    assert "SC.S.a20" not in [name for each in result.singular for name in each.parameters]
+
+
+def test_claimed_sigmas_are_realised() -> None:
+    """Frames in four poses, marks nobody knows: the bend's errors over its standard deviations."""
+    names = ("a20", "a11", "b02", "a30", "b21")
+    truth = {name: BEND_MM[name] for name in names}
+    errors, sigmas = [], []
+    for seed in range(30):
+        result = solved(films([0.0, 90.0, 180.0, 270.0], truth, free(*names), np.random.default_rng(seed)))
+        errors.append([result.value(f"SC.S.{name}") - truth[name] for name in names])
+        sigmas.append([result.sigma(f"SC.S.{name}") for name in names])
+    ratio = np.sqrt((np.array(errors) ** 2).mean() / (np.array(sigmas) ** 2).mean())
+    assert 0.8 < ratio < 1.2
+
+
+def test_the_bend_is_tested_for_significance() -> None:
+    network = films([0.0, 90.0, 180.0, 270.0], {"a20": 0.02}, free("a20", "b02"), np.random.default_rng(2))
+    result = solved(network)
+    tests = {test.name: test for test in scanner_tests(result, network.scanners[0])}
+    assert tests["a20"].p < 1e-6
+    assert tests["b02"].p > 0.01
+    assert tests["all"].p < 1e-6
+
+
+def test_approximations_know_a_bend_that_is_given() -> None:
+    """A bend of a millimetre, far more than films do: the fiducials agree only when it is taken out."""
+    truth = {"a20": 1.0, "b11": -0.8}
+    network = films([0.0, 90.0], truth, {name: Prior(value) for name, value in truth.items()})
+    np.testing.assert_allclose(bent(truth, network.straight_xy_mm), network.observations.xy_mm, atol=1e-9)
+    result = solved(network)
+    assert result.converged
+    assert np.abs(result.residuals.v_mm).max() < 1e-9
+
+
+def test_what_is_wrong_with_a_scanner_is_said() -> None:
+    with pytest.raises(ValueError, match="has no term a10"):
+        Scanner("S", free("a10"))
+    with pytest.raises(ValueError, match="two positive lengths"):
+        Scanner("S", free("a20"), half_mm=(0.0, 1.0))
+    network = films([0.0], {}, free("a20"))
+    with pytest.raises(AdjustmentError, match="scanner S, which is not given"):
+        solved(Network(network.cameras, network.images, (), network.observations))
