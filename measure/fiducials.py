@@ -61,6 +61,7 @@ def measure_fiducials(
         closer = [replace(each, tolerance=min(each.tolerance, limit)) for each in hypotheses[0]]
         found, frame = _at_a_closer_look(search, closer)
     if frame is None:
+        reason = f"{reason}; {scan.damage.rstrip('.')}" if scan.damage else reason
         return absent_frame(scan, layout, reason, options.rotation_deg)
     found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
     pose, against = Pose(options.pose, True, _SET), ""

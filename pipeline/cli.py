@@ -4,6 +4,7 @@ import json
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -39,6 +40,10 @@ app = typer.Typer(
 )
 ProjectFile = Annotated[Path, typer.Argument(metavar="PROJECT.toml", help="The project file.", show_default=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")]
+MaxPixels = Annotated[
+    int | None,
+    typer.Option("--max-pixels", metavar="N", min=1, help="Read scans of up to N pixels, whatever their file's size."),
+]
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
@@ -98,21 +103,21 @@ def demo(
 
 
 @app.command("run")
-def run_project(project: ProjectFile, as_json: AsJson = False) -> int:
+def run_project(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """The whole chain: measure, adjust, check, report."""
-    return _with_project(project, stages.run_all, as_json)
+    return _with_project(project, stages.run_all, as_json, max_pixels)
 
 
 @app.command()
-def measure(project: ProjectFile, as_json: AsJson = False) -> int:
+def measure(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """Scans to comparator coordinates."""
-    return _with_project(project, stages.run_measure, as_json)
+    return _with_project(project, stages.run_measure, as_json, max_pixels)
 
 
 @app.command()
-def adjust(project: ProjectFile, as_json: AsJson = False) -> int:
+def adjust(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """Comparator coordinates to the adjusted camera, in adjustment.json."""
-    return _with_project(project, stages.run_adjust, as_json)
+    return _with_project(project, stages.run_adjust, as_json, max_pixels)
 
 
 @app.command()
@@ -134,9 +139,9 @@ def choose(project: ProjectFile, as_json: AsJson = False) -> int:
 
 
 @app.command()
-def report(project: ProjectFile, as_json: AsJson = False) -> int:
+def report(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """What the earlier stages found, in report.html."""
-    return _with_project(project, stages.run_report, as_json)
+    return _with_project(project, stages.run_report, as_json, max_pixels)
 
 
 @app.command()
@@ -191,6 +196,7 @@ def cameras(
         float | None,
         typer.Option("--pitch", metavar="UM", min=FINEST_PITCH_UM, help="The scan's pixel in um, if its file is mute."),
     ] = None,
+    max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
     """The camera library: its list, one of its files, or which of its cameras a scan is of."""
@@ -205,7 +211,7 @@ def cameras(
         else:
             print_library(Console())
         return DONE
-    identification = identify(scan, read_library(), pitch_um, Reporter())
+    identification = identify(scan, read_library(), pitch_um, Reporter(), max_pixels)
     if as_json:
         _echo_json(identification.as_json())
     else:
@@ -213,8 +219,10 @@ def cameras(
     return DONE if identification.best else LOOK
 
 
-def _with_project(path: Path, stage: Callable[[Project, Reporter], Summary], as_json: bool) -> int:
-    return _finish(stage(read_project(path), Reporter()), as_json)
+def _with_project(
+    path: Path, stage: Callable[[Project, Reporter], Summary], as_json: bool, max_pixels: int | None = None
+) -> int:
+    return _finish(stage(replace(read_project(path), max_pixels=max_pixels), Reporter()), as_json)
 
 
 def _finish(summary: Summary, as_json: bool) -> int:

@@ -112,7 +112,7 @@ def _write_check(project: Project, adjustment: Adjustment) -> None:
 
 def _reported(project: Project, data: ReportData) -> Summary:
     scans = read_measurement(project.measurement_path) if data.measurement else ()
-    with Thumbnails(scans) as pictures:
+    with Thumbnails(scans, project.max_pixels) as pictures:
         write_report(replace(data, thumbnail=pictures.of), project.report_path)
     files = {"comparator coordinates": project.comparator, "adjustment": project.adjustment_path}
     return summarise(data, {**{w: p for w, p in files.items() if p.exists()}, "report": project.report_path})

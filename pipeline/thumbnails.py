@@ -22,7 +22,8 @@ _REACH_SIZES = 2.0  # a window's width in the mark's own
 class Thumbnails:
     """Windows about marks, by image, point and kind; one scan is open at a time, none behind the `with` block."""
 
-    def __init__(self, scans: Sequence[MeasuredScan]) -> None:
+    def __init__(self, scans: Sequence[MeasuredScan], max_pixels: int | None = None) -> None:
+        self._max_pixels = max_pixels
         self._scans = {scan.frame.image: scan for scan in scans}
         self._marks = {
             (s.frame.image, mark.point, mark.kind == "fiducial"): mark for s in scans for mark in s.frame.marks
@@ -50,7 +51,7 @@ class Thumbnails:
         if self._open is None or self._open[0] != path:
             if self._open is not None:
                 self._open[1].close()
-            self._open = (path, open_scan(path))
+            self._open = (path, open_scan(path, self._max_pixels))
         return self._open[1]
 
 

@@ -34,9 +34,9 @@ _SOLID_MARGIN_BLURS = 5.0  # the ground and blur of a wide edge are told apart f
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """What was seen where a mark was predicted: predicted_px (2,); fit is None where nothing could be fitted, and
-    reason says why. inside: whether the predicted place lies in the scan. chance: the expected number of places about
-    it that noise makes look as much like the mark. closer: whether it was seen at a closer look only, where the other
-    marks put it."""
+    reason says why. inside: whether the scan shows the predicted place: it lies in it, and its file gives the pixels.
+    chance: the expected number of places about it that noise makes look as much like the mark. closer: whether it was
+    seen at a closer look only, where the other marks put it."""
 
     predicted_px: Array
     inside: bool
@@ -57,6 +57,8 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     if not inside:
         return Sighting(predicted, False, None, "its place is outside of the scan")
     fit, chance = _fitted(scan, expected, options, frame_sigma)
+    if lost := _lost(scan, expected if fit is None or not fit.converged else expected.moved(fit.center_px)):
+        return Sighting(predicted, False, None, lost)
     if fit is None:
         return Sighting(predicted, True, None, f"nothing within {expected.search_px:.0f} px of its place looks like it")
     if not fit.converged:
@@ -67,6 +69,12 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     loss = covariance_of_compression(scan, fit.contrast_dn)
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     return Sighting(predicted, True, fit, chance=chance)
+
+
+def _lost(scan: Scan, expected: MarkPrediction) -> str:
+    """That the file does not give all pixels of the mark, where it is expected or was fitted; empty where it does."""
+    why = scan.lost_in(*window_about(expected.mark, expected.pixel_from_mark, 0.0))
+    return f"the scan's file is damaged at its place: {why}" if why else ""
 
 
 def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> str:

@@ -20,7 +20,6 @@ from measure.natural_points.multi_image import RADIUS_PX
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.tracks import Track, join_tracks
 from measure.scans.parallel import mapped
-from measure.scans.scan import open_scan
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -45,7 +44,7 @@ class TieCandidate:
 def frame_features(wanted: int, frame: TieFrame) -> Features:
     """The features of a scan from which so many natural points are to come."""
     count = max(_FEATURES * wanted, _LEAST_FEATURES)
-    with open_scan(frame.scan) as scan:
+    with frame.open() as scan:
         size = (scan.width_px, scan.height_px)
         return find_features(scan, lambda places: frame.usable(places, size), frame.mirrored, count)
 
@@ -69,7 +68,7 @@ def _shared(pair: tuple[Features, Features]) -> Indices:
 
 
 def _reduction(frame: TieFrame) -> int:
-    with open_scan(frame.scan) as scan:
+    with frame.open() as scan:
         return reduction(scan)
 
 
@@ -138,7 +137,7 @@ def _maps(
 
 
 def _size_px(frame: TieFrame) -> tuple[int, int]:
-    with open_scan(frame.scan) as scan:
+    with frame.open() as scan:
         return scan.width_px, scan.height_px
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX
+from measure.scans.scan import Scan, open_scan
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -18,7 +19,7 @@ class TieFrame:
 
     pixel_from_camera: (2, 3), camera mm (x', y', 1) to column and row. frame_mm: width and height of the exposed frame
     about the camera frame's origin, None where the whole scan is one. taken_px (n, 3): column, row and radius of the
-    marks in it, which are no natural points.
+    marks in it, which are no natural points. max_pixels: of the scan, if the user says it.
     """
 
     image: str
@@ -26,6 +27,11 @@ class TieFrame:
     pixel_from_camera: Array
     frame_mm: tuple[float, float] | None
     taken_px: Array
+    max_pixels: int | None = None
+
+    def open(self) -> Scan:
+        """The scan. Raises MeasurementError where it cannot be read."""
+        return open_scan(self.scan, self.max_pixels)
 
     @property
     def px_per_mm(self) -> float:

@@ -23,7 +23,6 @@ from measure.natural_points.tie_candidates import TieCandidate, widened
 from measure.natural_points.tie_frame import TieFrame
 from measure.noise.noise import robust_scale
 from measure.scans.parallel import mapped
-from measure.scans.scan import open_scan
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -149,7 +148,7 @@ def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate]) -> 
     """The windows of every candidate by frame, one scan after the other: no more than one is open at a time."""
     windows: list[Windows] = [{} for _ in candidates]
     for i, frame in enumerate(frames):
-        with open_scan(frame.scan) as scan:
+        with frame.open() as scan:
             own = [k for k, candidate in enumerate(candidates) if i in candidate.maps]
             for k in sorted(own, key=lambda k: candidates[k].maps[i][1, 2]):
                 matrix = candidates[k].maps[i]

@@ -1,54 +1,64 @@
 """JPEG and PNG files: decoded whole, for neither can be read by parts."""
 
 import struct
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import imagecodecs
 import numpy as np
+from numpy.typing import NDArray
 from tifffile import TiffFile
 
 from measure.errors import MeasurementError
+from measure.scans.broken import DECODING_ERRORS, broken
+from measure.scans.jpeg_stream import decoded, picture_size
 from measure.scans.quantisation import jpeg_headers, rounding_step_dn
 from measure.scans.radiometry import Radiometry, Samples
 from measure.scans.resolution import JFIF_UNIT, NO_TAGS, PNG_UNIT, Pitch, pitch_from_density
-from measure.scans.segments import Segments
-from measure.scans.tiff_scan import DECODING_ERRORS, broken, orientation_notes, tag_pitch
+from measure.scans.segments import LostPart, Segments
+from measure.scans.size_limit import check_size
+from measure.scans.tiff_scan import orientation_notes, tag_pitch
 
 _JPEG_START, _PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-_PNG_DEPTH = 24  # the byte that holds the bits of a sample: IHDR is the first chunk (PNG specification, 11.2.2)
+_PNG_SIZE = slice(16, 25)  # width, height and the bits of a sample: IHDR is the first chunk (PNG specification, 11.2.2)
+_MOST_CHANNELS = 4
 
 
-def open_picture(path: Path, start: bytes) -> tuple[Segments, Pitch, tuple[str, ...]]:
-    """A JPEG or PNG picture, its pitch, and notes. start: the file's first bytes.
+def open_picture(path: Path, start: bytes, max_pixels: int | None = None) -> tuple[Segments, Pitch, tuple[str, ...]]:
+    """A JPEG or PNG picture, its pitch, and notes. start: the file's first bytes; max_pixels: as `check_size` takes it.
 
-    Raises MeasurementError for a truncated file and for one that is no picture.
+    Raises MeasurementError for a truncated file, for one that is no picture, and for one that claims more than such a
+    file can hold.
     """
     if start.startswith(_JPEG_START):
         data = path.read_bytes()
-        samples, pitch, step_dn = _jpeg_samples(path, data), _jpeg_pitch(data), rounding_step_dn(data)
-        notes = _jpeg_notes(data)
-    elif start.startswith(_PNG_START):
-        data = path.read_bytes()
-        samples, pitch, step_dn = _png_samples(path, data), _png_pitch(data), 0.0
-        notes = ()
-    else:
+        samples, damage = _jpeg_samples(path, data, max_pixels)
+        return WholePicture(samples, rounding_step_dn(data), damage), _jpeg_pitch(data), _jpeg_notes(data)
+    if not start.startswith(_PNG_START):
         raise MeasurementError(
             f"{path} is no TIFF, JPEG or PNG picture (it begins with {start[:8]!r}): "
             "give the scan itself, or convert it"
         )
-    return WholePicture(samples, step_dn), pitch, notes
+    data = path.read_bytes()
+    return WholePicture(_png_samples(path, data, max_pixels)), _png_pitch(data), ()
 
 
 class WholePicture:
-    """A picture in memory: (height, width, channels) of 8 or 16 bits, one segment."""
+    """A picture in memory: (height, width, channels) of 8 or 16 bits, one segment. damage: why it cannot be trusted, a
+    part of a sentence, empty where it can."""
 
-    def __init__(self, samples: Samples, rounding_step_dn: float = 0.0) -> None:
+    def __init__(self, samples: Samples, rounding_step_dn: float = 0.0, damage: str = "") -> None:
         self._samples, self.rounding_step_dn = samples, rounding_step_dn
         self.height_px, self.width_px, self.channels = samples.shape
         self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
         self.sample_bytes = samples.itemsize
         self.full_scale_dn = float(2 ** (8 * samples.itemsize) - 1)
+        self.lost: Sequence[LostPart] = ()
+        if damage:
+            self.lost = (LostPart(0, 0, self.width_px, self.height_px, damage),)
+            self._samples = np.full_like(samples, self.full_scale_dn // 2)
 
     def read(self, row: int, column: int) -> Samples:
         """All of it."""
@@ -58,33 +68,47 @@ class WholePicture:
         """Nothing is open."""
 
 
-def _jpeg_samples(path: Path, data: bytes) -> Samples:
-    """Grey or RGB; a decoder that fills a truncated file with grey is not asked."""
+def _jpeg_samples(path: Path, data: bytes, max_pixels: int | None) -> tuple[Samples, str]:
+    """Grey or RGB, and why it cannot be trusted; a decoder that fills a truncated file with grey is not asked."""
+    size = picture_size(data)
+    if size is not None:
+        check_size(path, "a picture", size, size[0] * size[1] * _MOST_CHANNELS, len(data), max_pixels)
     picture = 2 + sum(4 + len(body) for _, body in jpeg_headers(data))
     if b"\xff\xd9" not in data[picture:]:
         raise broken(path, "its end marker is missing")
     try:
-        return _as_channels(path, imagecodecs.jpeg_decode(data))
+        samples, damage = decoded(data, imagecodecs.jpeg_decode)
+        return _as_channels(samples), damage
     except DECODING_ERRORS as error:
-        raise broken(path, str(error)) from error
+        if size is None or 0 in size:
+            raise broken(path, str(error)) from error
+        return np.zeros((size[1], size[0], 1), np.uint8), str(error)
 
 
-def _png_samples(path: Path, data: bytes) -> Samples:
+def _png_samples(path: Path, data: bytes, max_pixels: int | None) -> Samples:
     """Grey or RGB, 8 or 16 bits."""
-    if data[_PNG_DEPTH : _PNG_DEPTH + 1] == b"\x01":
+    header = data[_PNG_SIZE]
+    if len(header) < 9:
+        raise broken(path, "its header is cut short")
+    width, height, bits = struct.unpack(">IIB", header)
+    if bits == 1:
         raise MeasurementError(
             f"{path} is a PNG of black and white pixels only (1 bit), and marks are measured by the grey values along "
             "their edges: save the scan as grey or RGB with 8 or 16 bits a sample"
         )
+    decoded_bytes = width * height * _MOST_CHANNELS * -(-bits // 8)
+    check_size(path, "a picture", (width, height), decoded_bytes, len(data), max_pixels)
     try:
-        return _as_channels(path, imagecodecs.png_decode(data))
+        return _as_channels(imagecodecs.png_decode(data))
     except DECODING_ERRORS as error:
         raise broken(path, str(error)) from error
 
 
-def _as_channels(path: Path, decoded: np.ndarray) -> Samples:
-    """One or three channels of a decoded picture; transparency is left out."""
-    stored = decoded[..., None] if decoded.ndim == 2 else decoded
+def _as_channels(picture: NDArray[Any]) -> Samples:
+    """One or three channels of a decoded picture; transparency is left out. Raises one of DECODING_ERRORS."""
+    if picture.size == 0:
+        raise ValueError("it holds no picture")
+    stored = picture[..., None] if picture.ndim == 2 else picture
     channels = {1: 1, 2: 1, 3: 3, 4: 3}[stored.shape[2]]
     return Radiometry(channels, float(np.iinfo(stored.dtype).max)).apply(stored)
 

@@ -20,8 +20,9 @@ from measure.scans.picture_scan import open_picture
 from measure.scans.radiometry import Samples
 from measure.scans.resolution import Pitch
 from measure.scans.segment_cache import SegmentCache
-from measure.scans.segments import Segments
-from measure.scans.tiff_scan import RawRows, open_tiff
+from measure.scans.segments import LostPart, Segments
+from measure.scans.tiff_scan import open_tiff
+from measure.scans.tiff_segments import RawRows
 
 Array = NDArray[np.float32]
 
@@ -33,6 +34,7 @@ _PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, ab
 _LARGEST_PART_PX = 2048  # the side of a part in whole segments: beyond it segments are divided
 _COMPRESSION_PX = 256  # the side of the part in the middle that tells of an earlier compression: 1000 blocks
 _PLAINLY_COARSER = 1.5  # than what the file itself rounds to, which shows as well
+_NAMED = 3  # damaged parts of a file: more are counted
 _LEAST_UNIT_DN = 16  # of 8 bits in a file of 16: as 12 bits stored from the top have it
 
 Item = TypeVar("Item")
@@ -143,10 +145,33 @@ class Scan:
         return samples
 
     def inside(self, col0: int, row0: int, width: int, height: int) -> NDArray[np.bool_]:
-        """(height, width): which pixels of a window are the scan's, and do not repeat its edge."""
+        """(height, width): which pixels of a window are the scan's: they do not repeat its edge, and were not lost by
+        the file."""
         cols, rows = np.arange(col0, col0 + width), np.arange(row0, row0 + height)
         in_rows = (rows >= 0) & (rows < self.height_px)
-        return np.asarray(in_rows[:, None] & (cols >= 0) & (cols < self.width_px))
+        known = np.asarray(in_rows[:, None] & (cols >= 0) & (cols < self.width_px))
+        for part in self._lost_of(col0, row0, width, height):
+            top, left = max(part.row0 - row0, 0), max(part.col0 - col0, 0)
+            known[top : part.row0 + part.height - row0, left : part.col0 + part.width - col0] = False
+        return known
+
+    def lost_in(self, col0: int, row0: int, width: int, height: int) -> str:
+        """Why the file does not give some pixels of a window, a part of a sentence; empty where it gives all."""
+        return next((part.why for part in self._lost_of(col0, row0, width, height)), "")
+
+    @property
+    def damage(self) -> str:
+        """What of the file was found to be damaged so far, and what to do, a sentence; empty where nothing was."""
+        lost = self._segments.lost
+        if not lost:
+            return ""
+        is_all = sum(part.width * part.height for part in lost) == self.width_px * self.height_px
+        places = "; ".join(f"rows {part.row0} to {part.row0 + part.height - 1}, {part.why}" for part in lost[:_NAMED])
+        more = f"; and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+        what = (
+            f"nothing of it can be trusted ({lost[0].why})" if is_all else f"parts cannot be trusted ({places}{more})"
+        )
+        return f"the scan's file is damaged: {what}. No mark is measured there: copy the file anew, or rescan."
 
     def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
         """The whole scan, area-averaged by an integer factor: pixel (i, j) is the mean over factor x factor pixels,
@@ -186,6 +211,19 @@ class Scan:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _lost_of(self, col0: int, row0: int, width: int, height: int) -> list[LostPart]:
+        """The parts of a window that the file does not give. What a file has in pieces is known once it is read."""
+        if self._source is self._cache:
+            self.samples(col0, row0, width, height)
+        return [
+            part
+            for part in self._segments.lost
+            if col0 < part.col0 + part.width
+            and part.col0 < col0 + width
+            and row0 < part.row0 + part.height
+            and part.row0 < row0 + height
+        ]
 
     @cached_property
     def _earlier_step_dn(self) -> float:
@@ -253,28 +291,31 @@ def _steps_of(factor: int) -> tuple[int, ...]:
     return (factor,) if factor > 1 else ()
 
 
-def open_scan(path: Path) -> Scan:
+def open_scan(path: Path, max_pixels: int | None = None) -> Scan:
     """Open a TIFF, BigTIFF, JPEG or PNG file, told apart by its first bytes and not by its name.
 
+    max_pixels: how many a scan may have; None: as many as `size_limit` says.
     Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture.
     """
     path = Path(path)
     start = _first_bytes(path)
     if start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        segments, pitch, notes = open_tiff(path)
+        segments, pitch, notes = open_tiff(path, max_pixels)
     else:
-        segments, pitch, notes = open_picture(path, start)
+        segments, pitch, notes = open_picture(path, start, max_pixels)
     return Scan(path, segments, pitch, notes)
 
 
 def _first_bytes(path: Path) -> bytes:
-    """The file's first 16 bytes, or why there are none."""
+    """The file's first 16 bytes, or why there are none. A pipe or a device is not opened: either may never end."""
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise MeasurementError(f"{path} is no regular file, but a pipe or a device: give the file of a scan")
         with path.open("rb") as file:
             start = file.read(16)
     except FileNotFoundError:
         raise MeasurementError(
-            f"there is no scan {path} (looked for {path.resolve()}): check its name and its folder"
+            f"there is no scan {path} (looked for {path.absolute()}): check its name and its folder"
         ) from None
     except OSError as error:
         raise MeasurementError(

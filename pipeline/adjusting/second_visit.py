@@ -7,6 +7,7 @@ import numpy as np
 
 from adjust.functional_model.projection import adjusted_image
 from adjust.result import Adjustment
+from measure.checks.lost_pixels import without_lost
 from measure.results import MarkMeasurement
 from measure.scans.scan import open_scan
 from measure.status import Status
@@ -36,7 +37,7 @@ def measure_again(
     with reporter.stage("looking again at") as count:
         for done, scan in enumerate(scans):
             count(scan.frame.image, done, len(scans))
-            visited.append(_visit(field, scan, adjustment, settings))
+            visited.append(_visit(field, scan, adjustment, settings, project.max_pixels))
     return tuple(visited) if any(new is not old for new, old in zip(visited, scans, strict=True)) else None
 
 
@@ -49,7 +50,9 @@ def _with_adjusted_points(field: Field, adjustment: Adjustment) -> Field:
     return replace(field, xyz=xyz)
 
 
-def _visit(field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings) -> MeasuredScan:
+def _visit(
+    field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings, max_pixels: int | None
+) -> MeasuredScan:
     """The same object where the visit brought nothing."""
     network = adjustment.network
     if scan.frame.image not in network.image_by_name or scan.frame.image in network.unoriented:
@@ -63,9 +66,9 @@ def _visit(field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: T
     ]
     if not missed:
         return scan
-    with open_scan(scan.scan) as opened:
+    with open_scan(scan.scan, max_pixels) as opened:
         grey = opened if settings.code is None else opened.green()
-        marks = measure_single_targets(grey, missed, settings)
+        marks = without_lost(opened, measure_single_targets(grey, missed, settings))
     found = {mark.point: mark for mark in marks if mark.status.is_observation}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
     fresh = {point: mark for point, mark in found.items() if _is_free(mark, np.array(taken).reshape(-1, 2))}

@@ -10,6 +10,7 @@ from pathlib import Path
 from adjust.network import ObjectPoint, Prior
 from measure.film import SCATTER_MM
 from measure.marks.poses import POSES
+from measure.scans.scan import Scan, open_scan
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera
@@ -31,7 +32,7 @@ class Project:
     """A project file as read; paths are resolved against the file's folder.
 
     cameras: by file name; the first one serves where images.csv names none. scans: by image name, in their order.
-    unit_mm: how many mm the user's unit of object coordinates has.
+    unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
     """
 
     path: Path
@@ -48,6 +49,11 @@ class Project:
     given_distances: tuple[GivenDistance, ...]
     unit_mm: float
     adjust: AdjustSettings
+    max_pixels: int | None = None
+
+    def open_scan(self, name: str) -> Scan:
+        """The scan of an image. Raises MeasurementError where it cannot be read."""
+        return open_scan(self.scans[name], self.max_pixels)
 
     @property
     def film_sigma_mm(self) -> float:

@@ -32,13 +32,17 @@ _AFFINE = 6  # parameters
 
 
 def identify(
-    path: Path, cameras: Mapping[str, CameraFile], pitch_um: float | None, reporter: Reporter
+    path: Path,
+    cameras: Mapping[str, CameraFile],
+    pitch_um: float | None,
+    reporter: Reporter,
+    max_pixels: int | None = None,
 ) -> Identification:
     """Try every camera with drawn marks on the scan, those with the same marks once.
 
     Raises MeasurementError for a scan that cannot be read.
     """
-    with open_scan(path) as scan, reporter.stage("trying") as count:
+    with open_scan(path, max_pixels) as scan, reporter.stage("trying") as count:
         pitch = scan.pitch_um if pitch_um is None else (pitch_um, pitch_um)
         trials = _trials(scan, cameras, pitch, FiducialOptions(pitch_is_right=True), count)
         if pitch is not None and not any(trial.stands_out for trial in trials):

@@ -18,7 +18,7 @@ from measure.fiducials import measure_fiducials
 from measure.frames.frame_fit import fit_frame
 from measure.marks import shapes
 from measure.marks.poses import POSES, up_from_camera
-from measure.scans.scan import Scan, open_scan
+from measure.scans.scan import Scan
 from measure.special_marks.learned import cut, template_of
 from measure.special_marks.recurring import Recurrence, Window, about, recurrence
 from pipeline.errors import InputError
@@ -51,7 +51,7 @@ def _clicked(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile
             f"{camera.path}: [clicks] scan names {clicks.scan!r}, which is none of the project's scans. "
             f"They are {', '.join(list(project.scans)[:5])}{', ...' if len(project.scans) > 5 else ''}."
         )
-    with open_scan(project.scans[clicks.scan]) as scan:
+    with project.open_scan(clicks.scan) as scan:
         for id, place in clicks.px.items():
             if not (0 <= place[0] < scan.width_px and 0 <= place[1] < scan.height_px):
                 raise InputError(
@@ -94,7 +94,7 @@ def _in_common(project: Project, camera: CameraFile, names: Sequence[str], worke
         one.id: matrix[:, :2] @ (np.array(one.xy_mm) + each.offset_mm) + matrix[:, 2]
         for one, each in zip(camera.learned, found, strict=True)
     }
-    with open_scan(project.scans[name]) as scan:
+    with project.open_scan(name) as scan:
         return _start(camera, scan, matrix, px, alike=tuple(names))
 
 
@@ -107,7 +107,7 @@ class _View:
 
 
 def _view(project: Project, camera: CameraFile, name: str) -> _View | None:
-    with open_scan(project.scans[name]) as scan:
+    with project.open_scan(name) as scan:
         placement = _drawn_placement(project, camera, scan)
         if placement is None and len(camera.drawn) >= 2:
             return None

@@ -14,7 +14,6 @@ import numpy as np
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.results import FrameMeasurement
-from measure.scans.scan import open_scan
 from measure.special_marks.learned import Chip, cut, template_of
 from pipeline.files.atomic import write_atomically
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
@@ -86,7 +85,7 @@ def _chips(
 
 def _chips_of(project: Project, camera: CameraFile, learned: Sequence[GivenFiducial], name: str) -> Mapping[str, Chip]:
     """The pictures of learned marks in one scan, as far as they are found."""
-    with open_scan(project.scans[name]) as scan:
+    with project.open_scan(name) as scan:
         pitch = project.pitch_um or scan.pitch_um
         options = FiducialOptions(pose_of(project, camera, scan.name), film_sigma_mm=project.film_sigma_mm)
         frame = measure_fiducials(scan, camera.layout(), pitch, options)

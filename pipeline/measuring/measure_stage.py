@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from measure.checks.cross_checks import cross_checked
+from measure.checks.lost_pixels import without_lost
 from measure.checks.pitch_check import pitch_problem
 from measure.codes_and_boards.coma import one_definition
 from measure.errors import MeasurementError
@@ -18,7 +18,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.marks.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
-from measure.scans.scan import Scan, open_scan
+from measure.scans.scan import Scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.learned_table import LearnedFrom
@@ -45,7 +45,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     check_targets(project)
     check_tie_names(project)
     _check_marks(project)
-    _check_readable(list(project.scans.values()))
+    _check_readable(project)
     with worker_pool(len(project.scans)) as workers:
         learned = learn_marks(project, reporter, workers)
         scans = _measured_scans(learned, reporter, workers)
@@ -131,12 +131,12 @@ def _check_marks(project: Project) -> None:
             )
 
 
-def _check_readable(paths: Sequence[Path]) -> None:
+def _check_readable(project: Project) -> None:
     """Name every file that cannot be opened, not just the first."""
     messages = []
-    for path in paths:
+    for name in project.scans:
         try:
-            with open_scan(path):
+            with project.open_scan(name):
                 pass
         except MeasurementError as error:
             messages.append(str(error))
@@ -146,7 +146,7 @@ def _check_readable(paths: Sequence[Path]) -> None:
 
 def measure_scan(project: Project, name: str) -> MeasuredScan:
     """Measure one scan of the project: its fiducials, then its targets."""
-    with open_scan(project.scans[name]) as scan:
+    with project.open_scan(name) as scan:
         return _measured(project, name, scan)
 
 
@@ -155,11 +155,24 @@ def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
     frame = _fiducials(project, name, scan, camera)
     pitch, problems, notes = _pitch(project, scan, camera, frame)
     frame = replace(frame, problems=(*frame.problems, *problems))
-    notes = (*(f"{note[0].upper()}{note[1:]}." for note in scan.notes), *notes)
+    notes = (*(f"{_sentence(note)}." for note in scan.notes), *notes)
     measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(camera, measured):
         measured = replace(measured, frame=replace(frame, problems=(*frame.problems, misplaced)))
-    return measure_targets(project, scan, measured)
+    return _without_lost(scan, measure_targets(project, scan, measured))
+
+
+def _without_lost(scan: Scan, measured: MeasuredScan) -> MeasuredScan:
+    """The scan without marks where its file is damaged, which is the first of its problems."""
+    if not scan.damage:
+        return measured
+    frame = measured.frame
+    marks = without_lost(scan, frame.marks)
+    return replace(measured, frame=replace(frame, marks=marks, problems=(_sentence(scan.damage), *frame.problems)))
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}" if text else ""
 
 
 def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> FrameMeasurement:

@@ -74,4 +74,6 @@ def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
         middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
         pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
         frame_mm = None
-    return TieFrame(scan.frame.image, scan.scan, pixel_from_camera, frame_mm, np.array(taken).reshape(-1, 3))
+    return TieFrame(
+        scan.frame.image, scan.scan, pixel_from_camera, frame_mm, np.array(taken).reshape(-1, 3), project.max_pixels
+    )

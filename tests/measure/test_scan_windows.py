@@ -58,6 +58,7 @@ def test_a_window_decodes_only_its_tiles_and_a_whole_pass_each_tile_once(tmp_pat
             segment_height_px, segment_width_px = segments.segment_height_px, segments.segment_width_px
             channels, full_scale_dn = segments.channels, segments.full_scale_dn
             sample_bytes, rounding_step_dn = segments.sample_bytes, segments.rounding_step_dn
+            lost = segments.lost
 
             def read(self, row: int, column: int) -> Any:
                 reads.append((row, column))

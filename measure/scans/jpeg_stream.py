@@ -1,0 +1,109 @@
+"""A JPEG stream decoded, and whether it held what its header says.
+
+A decoder goes on through a damaged stream: behind a lost or a changed byte it soon reads right codes again, but of
+blocks that belong elsewhere. At the end there are then blocks too many or too few. So the picture is decoded as if it
+were taller. Of an intact stream the first block below its end is what the bits that fill its last byte make, and no
+others are there: a decoder leaves them grey (ITU-T T.81, B.1.1.5 and F.1.2.3; libjpeg's `insufficient_data`). The rows
+of the picture itself come out as they would without.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.scans.quantisation import jpeg_headers
+
+Decode = Callable[[bytes], NDArray[np.generic]]
+
+_HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # sequential and progressive: others than lossless and arithmetic ones
+_BLEED_PX = 2  # that the decoder's interpolation of colour takes from the blocks beside
+_BELOW = 2  # rows of blocks added: a picture of one block a row has further ones below its first, too
+_TAIL = bytes(range(64, 192)) * 2  # codes of some blocks, none of them a marker
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """The frame header of a stream: where its height stands, the size of the picture and of a unit of blocks, px, the
+    bits of a sample, and whether rows of colour are interpolated."""
+
+    height_at: int
+    height_px: int
+    width_px: int
+    unit_height_px: int
+    unit_width_px: int
+    bits: int
+    interpolates_rows: bool
+
+
+def decoded(data: bytes, decode: Decode) -> tuple[NDArray[np.generic], str]:
+    """The samples (height, width) or (height, width, channels) that a stream holds, and why they are not to be trusted;
+    empty where they are. decode: a decoder of whole streams, which may raise what it will."""
+    frame = _frame(data)
+    if frame is None:
+        return decode(data), ""
+    rows = -(-frame.height_px // frame.unit_height_px) * frame.unit_height_px
+    taller = decode(_of_height(data, frame, rows + _BELOW * frame.unit_height_px))
+    why = _why_damaged(data, frame, taller, rows, decode)
+    samples = decode(data) if frame.interpolates_rows else taller[: frame.height_px]
+    return samples, why
+
+
+def picture_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height as the frame header says, px; None without one."""
+    for marker, body in jpeg_headers(data):
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(body) >= 6:
+            return int.from_bytes(body[3:5], "big"), int.from_bytes(body[1:3], "big")
+    return None
+
+
+def _frame(data: bytes) -> _Frame | None:
+    """None for streams whose blocks say nothing: lossless and arithmetic ones, and those too tall to be made taller."""
+    position = 2
+    for marker, body in jpeg_headers(data):
+        if marker in _HUFFMAN_FRAMES and len(body) >= 6 and len(body) >= 6 + 3 * body[5]:
+            factors = [body[7 + 3 * component] for component in range(body[5])]
+            across, down = max(f >> 4 for f in factors), max(f & 15 for f in factors)
+            if len(factors) == 1:  # its blocks stand by themselves, whatever its factors say
+                across = down = 1
+            height, width = int.from_bytes(body[1:3], "big"), int.from_bytes(body[3:5], "big")
+            if not (across and down and height and width) or height > 0xFFFF - (_BELOW + 1) * 8 * down:
+                return None
+            return _Frame(position + 5, height, width, 8 * down, 8 * across, body[0], down > 1)
+        position += 4 + len(body)
+    return None
+
+
+def _of_height(data: bytes, frame: _Frame, height_px: int) -> bytes:
+    return data[: frame.height_at] + height_px.to_bytes(2, "big") + data[frame.height_at + 2 :]
+
+
+def _why_damaged(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: int, decode: Decode) -> str:
+    """What the blocks below the picture say of the stream: nothing, or a part of a sentence."""
+    grey = 2 ** (frame.bits - 1)
+    below = taller[rows + _BLEED_PX :] == grey
+    first = below[: frame.unit_height_px - 2 * _BLEED_PX, : frame.unit_width_px - _BLEED_PX].all()
+    beside = below[:, frame.unit_width_px + _BLEED_PX :].all() and below[frame.unit_height_px :].all()
+    if not beside:
+        return "its stream holds more blocks than the picture"
+    if first and not (_ends_grey(taller[:rows], frame, grey) and _ends_whole(data, frame, taller, rows, decode)):
+        return "its stream ends before the picture does"
+    return ""
+
+
+def _ends_grey(samples: NDArray[np.generic], frame: _Frame, grey: int) -> bool:
+    """Whether the last block of the picture is such a grey itself: after it the bits that fill the last byte may be
+    one more."""
+    last = samples[-frame.unit_height_px :, (frame.width_px - 1) // frame.unit_width_px * frame.unit_width_px :]
+    return bool((last == grey).all())
+
+
+def _ends_whole(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: int, decode: Decode) -> bool:
+    """Whether further codes at the end of the stream leave the picture as it is: where blocks are missing, they would
+    be taken for these."""
+    end = data.rfind(b"\xff\xd9")
+    longer = data[:end] + _TAIL + data[end:]
+    again = decode(_of_height(longer, frame, rows + _BELOW * frame.unit_height_px))
+    above = rows - _BLEED_PX
+    return bool(np.array_equal(again[:above], taller[:above]))
