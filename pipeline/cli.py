@@ -1,6 +1,7 @@
 """The command line: arguments in, exit codes and one clear message out."""
 
 import json
+import sys
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -11,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
@@ -20,7 +20,7 @@ from pipeline.adjusting.adjustment_file import without_nan
 from pipeline.adjusting.choose_stage import choice_json, print_choice, run_choose
 from pipeline.demo import run_demo
 from pipeline.design.run import run_design
-from pipeline.errors import InputError
+from pipeline.errors import InputError, what_to_do
 from pipeline.files.library import PREFIX, library_json, library_path, print_library, read_library
 from pipeline.files.project_file import FINEST_PITCH_UM, Project, read_project
 from pipeline.measuring.camera_answer import print_identification
@@ -28,6 +28,7 @@ from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 from pipeline.summary import Summary, print_summary
+from pipeline.terminal import PlainConsole, plain, spell_out_missing_letters
 
 DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 TEMPLATES = ("project", "camera", "scene")
@@ -52,6 +53,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
     arguments: what follows the program's name; by default what it was called with.
     """
+    spell_out_missing_letters()
     try:
         code = app(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # what typer makes of it
@@ -69,9 +71,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         )
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
-        return _message(
-            f"{place}{error.strerror or error}. Make room, or check the path and its permissions.", WRONG_INPUT
-        )
+        return _message(f"{place}{error.strerror or error}. {what_to_do(error)}", WRONG_INPUT)
     except Exception:
         traceback.print_exc()
         return _message("this is a fault of reseau itself; please report it with the lines above", INTERNAL_ERROR)
@@ -134,7 +134,7 @@ def choose(project: ProjectFile, as_json: AsJson = False) -> int:
     if as_json:
         _echo_json(choice_json(choice))
     else:
-        print_choice(choice, Console(), settings.choice_path)
+        print_choice(choice, PlainConsole(), settings.choice_path)
     return DONE if choice.chosen and choice.chosen.model == choice.given else LOOK
 
 
@@ -152,7 +152,7 @@ def render(
     """Synthetic scans with their truth, as a project that can be run."""
     with Reporter().stage("rendering") as count:
         render_project(scene, out_dir, count)
-    typer.echo(f"{out_dir / 'project.toml'}")
+    typer.echo(plain(f"{out_dir / 'project.toml'}"))
     return DONE
 
 
@@ -169,7 +169,7 @@ def design(
     if as_json:
         _echo_json(planned.content)
     else:
-        planned.print(Console())
+        planned.print(PlainConsole())
     return LOOK if planned.needs_a_look else DONE
 
 
@@ -209,13 +209,13 @@ def cameras(
         if as_json:
             _echo_json(library_json())
         else:
-            print_library(Console())
+            print_library(PlainConsole())
         return DONE
     identification = identify(scan, read_library(), pitch_um, Reporter(), max_pixels)
     if as_json:
         _echo_json(identification.as_json())
     else:
-        print_identification(identification, Console())
+        print_identification(identification, PlainConsole())
     return DONE if identification.best else LOOK
 
 
@@ -229,14 +229,15 @@ def _finish(summary: Summary, as_json: bool) -> int:
     if as_json:
         _echo_json(summary.as_json())
     else:
-        print_summary(summary, Console())
+        print_summary(summary, PlainConsole())
     return summary.verdict.exit_code
 
 
 def _echo_json(content: Any) -> None:
-    typer.echo(json.dumps(without_nan(content), indent=1, ensure_ascii=False, allow_nan=False))
+    letters = (sys.stdout.encoding or "").lower().startswith("utf")  # others get them as JSON's own codes
+    typer.echo(json.dumps(without_nan(content), indent=1, ensure_ascii=not letters, allow_nan=False))
 
 
 def _message(text: str, code: int) -> int:
-    typer.echo(f"reseau: {text}", err=True)
+    typer.echo(plain(f"reseau: {text}"), err=True)
     return code

@@ -6,6 +6,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from pipeline.terminal import PlainConsole
+
 Count = Callable[[str, int, int], None]
 
 
@@ -13,13 +15,18 @@ class Reporter:
     """Where the stages say how far they are."""
 
     def __init__(self, console: Console | None = None) -> None:
-        self._console = console or Console(stderr=True, soft_wrap=True)
+        self._console = console or PlainConsole(stderr=True, soft_wrap=True)
 
     @contextmanager
     def stage(self, title: str) -> Iterator[Count]:
         """A stage: call what it yields with the thing in hand, the steps done and their total."""
         if self._console.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+            columns = (
+                TextColumn("{task.description}", markup=False),
+                BarColumn(),
+                TaskProgressColumn(),
+                TimeRemainingColumn(),
+            )
             with Progress(*columns, console=self._console, transient=True) as bar:
                 task = bar.add_task(title)
                 yield lambda what, done, total: bar.update(

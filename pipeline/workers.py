@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -35,7 +36,17 @@ def worker_pool(scans: int) -> Iterator[Executor]:
 
 
 def _prepare() -> None:
-    """An interrupt from the terminal reaches every process; the one that started this one answers it for all."""
+    """An interrupt from the terminal reaches every process; the one that started this one answers it for all, and when
+    it ends, however that is, so does this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
     keep_freed_memory()  # one mark asks for arrays as large as the last one's: a twentieth of a scan's time
+
+
+def _end_with_parent() -> None:
+    """Wait until the process that started this one is no more; then nobody wants what is in hand here."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

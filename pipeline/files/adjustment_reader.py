@@ -1,7 +1,9 @@
 """`adjustment.json` and `adjustment.npz` read back, and refused where they are not what was written."""
 
-import json
+import io
+import math
 import zipfile
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from pipeline.files.text_file import MOST_MB, read_bytes, read_json, shown
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -49,13 +52,11 @@ def read_adjustment(path: Path) -> Json:
     Raises InputError for a file that is missing, no JSON, or lacks a key or has a wrong value at one.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Run `reseau adjust` first.") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: is not valid JSON ({error}). {_AGAIN}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; an adjustment.json is needed here.") from None
     _check(content, _ADJUSTMENT, path, "")
     return dict(content)
 
@@ -64,15 +65,30 @@ def read_covariance(path: Path) -> Covariance:
     """The covariance beside the `adjustment.json` at `path`. Raises InputError where it is missing or broken."""
     file = covariance_path(path)
     try:
-        with np.load(file, allow_pickle=False) as arrays:
-            names, values, matrix = arrays["names"], arrays["values"], arrays["matrix"]
-    except FileNotFoundError:
+        data = read_bytes(file)
+    except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{file}: there is no such file; it belongs to {path.name}. {_AGAIN}") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file}: is not a covariance file ({error}). {_AGAIN}") from None
-    if values.shape != names.shape or matrix.shape != (*names.shape, *names.shape):
+    names, values, matrix = (_array(data, name, file) for name in ("names", "values", "matrix"))
+    if names.dtype.kind != "U" or values.dtype.kind != "f" or matrix.dtype.kind != "f":
+        kinds = ", ".join(f"{array.dtype}" for array in (names, values, matrix))
+        raise InputError(f"{file}: names, values and matrix are to be text and real numbers, not {kinds}. {_AGAIN}")
+    if names.ndim != 1 or values.shape != names.shape or matrix.shape != (*names.shape, *names.shape):
         raise InputError(f"{file}: {names.size} names do not fit a matrix of shape {matrix.shape}. {_AGAIN}")
-    return Covariance(tuple(str(name) for name in names), values, matrix)
+    texts = tuple(str(name) for name in names)
+    twice = next((name for name, count in Counter(texts).items() if count > 1), None)
+    if twice is not None:
+        raise InputError(f"{file}: {twice!r} is named twice. {_AGAIN}")
+    return Covariance(texts, values.astype(np.float64), matrix.astype(np.float64))
+
+
+def _array(data: bytes, name: str, file: Path) -> NDArray[Any]:
+    """One array of an npz file, unpacked up to the size that is read of any file."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(f"{name}.npy") as member:
+            unpacked = io.BytesIO(member.read(MOST_MB * 1_000_000))
+        return np.asarray(np.lib.format.read_array(unpacked, allow_pickle=False))
+    except Exception as error:  # whatever zipfile, zlib and numpy's reader of headers raise at a damaged file
+        raise InputError(f"{file}: is not a covariance file ({name}: {error}). {_AGAIN}") from None
 
 
 _AGAIN = "Run `reseau adjust` again; it writes both files."
@@ -160,7 +176,16 @@ def _check(content: Any, form: Any, path: Path, place: str) -> None:
             _check(content[key], inner, path, f"{place}.{key}" if place else key)
     elif not isinstance(content, form) or (isinstance(content, bool) and form is not bool):
         expected = " or ".join(_JSON_NAMES[kind] for kind in (form if isinstance(form, tuple) else (form,)))
-        raise InputError(f"{path}: {place or 'the file'} is {content!r:.40}; it should be {expected}. {_AGAIN}")
+        raise InputError(f"{path}: {place or 'the file'} is {shown(content)}; it should be {expected}. {_AGAIN}")
+    elif isinstance(content, int | float) and not _is_finite(content):
+        raise InputError(f"{path}: {place} is {shown(content)}; it should be a finite number. {_AGAIN}")
+
+
+def _is_finite(number: float) -> bool:
+    try:
+        return math.isfinite(number)
+    except OverflowError:  # a whole number of hundreds of digits
+        return False
 
 
 _JSON_NAMES = {

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, what_to_do
 
 
 @contextmanager
@@ -31,8 +31,7 @@ def _temporary_file(temporary: Path, told: Path) -> Iterator[Path]:
         ) from error
     except OSError as error:
         raise InputError(
-            f"{told}: cannot be written ({error.strerror or error}). Nothing was changed there. "
-            "Make room or give write permission, or set another output folder."
+            f"{told}: cannot be written ({error.strerror or error}). Nothing was changed there. {what_to_do(error)}"
         ) from error
     finally:
         with suppress(OSError):

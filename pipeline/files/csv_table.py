@@ -1,15 +1,26 @@
-"""CSV files with a header line, checked column by column; lines that begin with # are comments."""
+"""CSV files with a header line, checked column by column; lines that begin with # are comments.
+
+A cell that a spreadsheet would run as a formula is written with an apostrophe in front, and read without it.
+"""
 
 import csv
 import math
+import re
+import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
+from pipeline.files.text_file import read_bytes, shown
 from pipeline.spelling import did_you_mean
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
+
+_LONGEST_NAME = 1000
+_FORMULA = re.compile(r"'*[=+\-@]")
+_NO_FORMULA = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|-")  # a number, or what stands for none
+_TAKEN_FOR_TEXT = re.compile(r"'+[=+\-@]")
 
 
 @dataclass(frozen=True)
@@ -28,10 +39,12 @@ class Row:
         return self.cells.get(column, "")
 
     def name(self, column: str) -> str:
-        """A cell that must not be empty."""
+        """A cell that must be one: not empty, nor without end, and of letters that can be shown."""
         value = self.text(column)
         if not value:
             raise self.error(column, "is empty; every line needs it.")
+        if len(value) > _LONGEST_NAME or any(unicodedata.category(letter) in ("Cc", "Cs") for letter in value):
+            raise self.error(column, f"{shown(value)} can be no name: too long, or not all of it can be read.")
         return value
 
     def number(self, column: str) -> float | None:
@@ -42,9 +55,9 @@ class Row:
         try:
             number = float(value)
         except ValueError:
-            raise self.error(column, f"must be a number with a decimal point or blank, not {value!r}.") from None
+            raise self.error(column, f"must be a number with a decimal point or blank, not {shown(value)}.") from None
         if not math.isfinite(number):
-            raise self.error(column, f"must be a finite number or blank, not {value!r}.")
+            raise self.error(column, f"must be a finite number or blank, not {shown(value)}.")
         return number
 
     def sigma(self, column: str) -> float | None:
@@ -55,16 +68,45 @@ class Row:
         return sigma
 
 
+def csv_line(cells: Sequence[str]) -> str:
+    """The cells as a line of CSV, without its end, that `read_csv` reads back as they are: in quotes where need be,
+    also where a line that begins with the cell would be a comment."""
+    return ",".join(_quoted(_as_text(cell)) for cell in cells)
+
+
+def _as_text(cell: str) -> str:
+    return f"'{cell}" if _FORMULA.match(cell) and not _NO_FORMULA.fullmatch(cell) else cell
+
+
+def _as_it_was(cell: str) -> str:
+    return cell[1:] if _TAKEN_FOR_TEXT.match(cell) else cell
+
+
+def _quoted(cell: str) -> str:
+    return '"' + cell.replace('"', '""') + '"' if cell.startswith("#") or any(c in cell for c in ',"\n') else cell
+
+
 def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
     """The rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, a line cut short."""
-    lines = list(_content_lines(path))
+    try:
+        data = read_bytes(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; a CSV file is needed here. Name one.") from None
+    return parse_csv(data, path, required, optional)
+
+
+def parse_csv(data: bytes, path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
+    """The same of the file's content. path: for messages."""
+    lines = list(_content_lines(data, path))
     if not lines:
         raise InputError(f"{path}: is empty; its first line must name the columns: {','.join(required)}.")
-    header = [cell.strip() for cell in next(csv.reader([lines[0][1]]))]
+    header = _cells(path, *lines[0])
     _check_header(path, lines[0][0], header, required, optional)
     rows = []
     for number, text in lines[1:]:
-        cells = [cell.strip() for cell in next(csv.reader([text]))]
+        cells = _cells(path, number, text)
         if len(cells) > len(header) and any(cells[len(header) :]):
             raise InputError(
                 f"{path}, line {number}: has {len(cells)} values, but the header names {len(header)} columns. "
@@ -79,17 +121,20 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
     return tuple(rows)
 
 
-def _content_lines(path: Path) -> Iterator[tuple[int, str]]:
+def _cells(path: Path, line: int, text: str) -> list[str]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
+        return [_as_it_was(cell.strip()) for cell in next(csv.reader([text]))]
+    except csv.Error as error:
+        raise InputError(f"{path}, line {line}: is no line of CSV ({error}). Mend it.") from None
+
+
+def _content_lines(data: bytes, path: Path) -> Iterator[tuple[int, str]]:
+    try:
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(
             f"{path}: is not text in UTF-8. Save it as such: in a spreadsheet as CSV UTF-8, separated by commas."
         ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line
@@ -115,8 +160,8 @@ def _check_header(
         if column and column not in known:
             hint = did_you_mean(column, known)
             raise InputError(
-                f"{path}, line {line}: {column!r} is no column of this file.{hint} Known: {','.join(known)}."
+                f"{path}, line {line}: {shown(column)} is no column of this file.{hint} Known: {','.join(known)}."
             )
     twice = [column for column in header if header.count(column) > 1]
     if twice:
-        raise InputError(f"{path}, line {line}: the column {twice[0]!r} is named twice.")
+        raise InputError(f"{path}, line {line}: the column {shown(twice[0])} is named twice.")

@@ -1,6 +1,7 @@
 """An earlier calibration of a camera, `adjustment.json` with its covariance, as an observation of the present one."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,15 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.network import Calibration, Camera, Distortion, Fiducial, Prior
-from pipeline.files.adjustment_reader import Covariance, read_adjustment, read_covariance
+from pipeline.files.adjustment_reader import Covariance, covariance_path, read_adjustment, read_covariance
 from pipeline.files.tables import Table
 
 Array = NDArray[np.float64]
 
 INTERIOR = ("c", "x0", "y0")
+
+_ALIKE = 1e-6  # two numbers that differ by less were only rounded
+_TOGETHER = "Take both files as one adjustment wrote them."
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,69 @@ def read_calibration(sigma: Table, camera: Camera) -> EarlierCalibration | None:
     earlier = _taken(path, distortion, covariance, name, camera, fiducials)
     if not np.isfinite(earlier.values).all():
         raise sigma.error("calibration", f"{path} holds no interior orientation: no object point told it.")
+    _check_agreement(sigma, path, name, content["cameras"][name], covariance)
     _check_held(sigma, earlier, camera)
     return earlier
+
+
+def _check_agreement(sigma: Table, path: Path, name: str, camera: Mapping[str, Any], covariance: Covariance) -> None:
+    """Both files are to say the same of the camera: what the network takes is the covariance's."""
+    told = _told(name, camera)
+    listed = {each for each in covariance.names if each.startswith((f"IO.{name}.", f"FID.{name}."))}
+    for each in sorted(told.keys() ^ listed):
+        has, lacks = (path, covariance_path(path)) if each in told else (covariance_path(path), path)
+        raise sigma.error("calibration", f"{has} holds {each}, and {lacks.name} does not. {_TOGETHER}")
+    names = tuple(told)
+    values, matrix = dict(zip(covariance.names, covariance.values.tolist(), strict=True)), covariance.of(names)
+    for each, variance in zip(names, np.diag(matrix).tolist(), strict=True):
+        here = told[each]
+        for what, in_json, in_npz in (
+            ("value", here["value"], values[each]),
+            ("standard deviation", here["sigma"], math.sqrt(variance) if variance >= 0.0 else -math.inf),
+        ):
+            if in_json is not None and not math.isclose(in_json, in_npz, rel_tol=_ALIKE):
+                raise sigma.error(
+                    "calibration",
+                    f"{path} gives {each} the {what} {in_json:.10g}, and {covariance_path(path).name} {in_npz:.10g}. "
+                    f"{_TOGETHER}",
+                )
+    if wrong := _no_covariance(names, matrix):
+        raise sigma.error("calibration", f"{covariance_path(path)}: {wrong}. {_TOGETHER}")
+
+
+def _told(name: str, camera: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What adjustment.json says of a camera, by the names of adjustment.npz."""
+    point = camera["principal_point_mm"]
+    interior = {"c": camera["principal_distance_mm"], "x0": point["x"], "y0": point["y"]}
+    interior |= {key: value for key, value in camera["distortion"].items() if isinstance(value, dict)}
+    told = {f"IO.{name}.{key}": quantity for key, quantity in interior.items()}
+    for id, mark in camera["fiducials"].items():
+        told |= {f"FID.{name}.{id}.{axis}": mark[f"{axis}_mm"] for axis in "xy"}
+    return {each: quantity for each, quantity in told.items() if _is_quantity(quantity)}
+
+
+def _is_quantity(entry: Mapping[str, Any]) -> bool:
+    return all(isinstance(entry.get(key, ""), float | int | None) for key in ("value", "sigma"))
+
+
+def _no_covariance(names: Sequence[str], matrix: Array) -> str:
+    """Why a matrix is none of covariances, and where; "" where it is one."""
+    finite = np.isfinite(matrix)
+    known = np.where(finite, matrix, 0.0)
+    variance = np.clip(np.diag(known), 0.0, None)
+    scale = np.sqrt(np.outer(variance, variance))
+    for wrong, where in (
+        ("is no finite number", ~finite),
+        ("is not that of the exchanged pair", np.abs(known - known.T) > _ALIKE * scale),
+        ("is larger than their standard deviations allow", np.abs(known) > (1.0 + _ALIKE) * scale),
+    ):
+        if where.any():
+            i, j = np.argwhere(where)[0]
+            return f"the covariance of {names[i]} and {names[j]} {wrong}"
+    free = variance > 0.0
+    if np.linalg.eigvalsh(matrix[np.ix_(free, free)] / scale[np.ix_(free, free)]).min(initial=0.0) < -_ALIKE:
+        return "the matrix gives some combinations of the camera's quantities a negative variance"
+    return ""
 
 
 def _of_camera(name: str, camera: str) -> str:

@@ -124,8 +124,8 @@ def read_project(path: Path) -> Project:
     """
     table = read_toml(path)
     objects, measure = table.table("object"), table.table("measure")
-    camera = table.text("camera")
-    patterns = table.texts("scans") if "scans" in table else None
+    camera = table.path_text("camera")
+    patterns = table.path_texts("scans") if "scans" in table else None
     named = {key: objects.path_of(key) for key in ("points", "images", "distances") if key in objects}
     antenna = _antenna(objects)
     project = Project(

@@ -1,6 +1,7 @@
 """TOML files whose every key is checked: a wrong type, a missing key or a misspelt one gives a message that helps."""
 
 import math
+import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -8,9 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
+from pipeline.files.text_file import read_bytes, shown
 from pipeline.spelling import did_you_mean, nearest
+from pipeline.wording import LISTED
 
 FREE = "free"
+MOST_MB = 4  # marks that were learned from 12,000 scans make a camera file of this size
+
+_DEEP = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){30}""")
+_LONGEST_PATH, _LONGEST_NAME = 4000, 255  # bytes, of most file systems
 
 
 def read_toml(path: Path) -> "Table":
@@ -20,17 +27,21 @@ def read_toml(path: Path) -> "Table":
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        text = read_bytes(path, MOST_MB).decode("utf-8-sig")
+        if deep := _DEEP.search(text):
+            line = text.count("\n", 0, deep.start()) + 1
+            raise InputError(f"{path}, line {line}: joins more names by points than any table here. Mend that line.")
+        return tomllib.loads(text)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a TOML file is needed here. {_toml_files_in(path)}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not text in UTF-8; a TOML file, saved as such, is needed here.") from None
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise InputError(f"{path}: is not valid TOML here: lists or tables stand in one another too deep.") from None
+    except ValueError as error:  # a syntax error, or a number of thousands of digits
         raise InputError(f"{path}: is not valid TOML: {error}. Mend that line.") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
 
 
 def _toml_files_in(folder: Path) -> str:
@@ -50,10 +61,10 @@ class Table:
         self.values = values
         self.file = file
         self.place = place
-        self._known: list[str] = []
+        self._known: set[str] = set()
 
     def __contains__(self, key: str) -> bool:
-        self._known.append(key)
+        self._known.add(key)
         return key in self.values
 
     def error(self, key: str, message: str) -> InputError:
@@ -66,14 +77,21 @@ class Table:
     def text(self, key: str, default: str | None = None, choices: Sequence[str] = ()) -> str:
         value = self._get(key, default)
         if not isinstance(value, str):
-            raise self.error(key, f'must be text in quotes, not {value!r}. Write {key} = "...".')
+            raise self.error(key, f'must be text in quotes, not {shown(value)}. Write {key} = "...".')
         if choices and value not in choices:
-            raise self.error(key, f"is {value!r}; possible are {_listed(choices)}.{did_you_mean(value, choices)}")
+            raise self.error(key, f"is {shown(value)}; possible are {_listed(choices)}.{did_you_mean(value, choices)}")
         return value
 
     def path_of(self, key: str, default: str | None = None) -> Path:
         """A file's or folder's name, relative to the folder of this file."""
-        return self.file.parent / self.text(key, default)
+        return self.file.parent / self.path_text(key, default)
+
+    def path_text(self, key: str, default: str | None = None) -> str:
+        """Text that may name a file."""
+        return self._path(key, self.text(key, default))
+
+    def path_texts(self, key: str) -> tuple[str, ...]:
+        return tuple(self._path(key, text) for text in self.texts(key))
 
     def is_flag(self, key: str) -> bool:
         """Whether a key that is there holds true or false."""
@@ -82,7 +100,7 @@ class Table:
     def flag(self, key: str, default: bool) -> bool:
         value = self._get(key, default)
         if not isinstance(value, bool):
-            raise self.error(key, f"must be true or false, not {value!r}.")
+            raise self.error(key, f"must be true or false, not {shown(value)}.")
         return value
 
     def number(
@@ -95,16 +113,17 @@ class Table:
             raise self.error(key, f"must be at least {least:g}, not {value:g}.")
         return value
 
-    def whole(self, key: str, default: int | None = None, *, least: int = 0) -> int:
+    def whole(self, key: str, default: int | None = None, *, least: int = 0, most: int = 10**9) -> int:
         value = self._get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise self.error(key, f"must be a whole number of at least {least}, not {value!r}.")
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            limits = f"at least {least}" if isinstance(value, int) and value < least else f"{least} to {most}"
+            raise self.error(key, f"must be a whole number of {limits}, not {shown(value)}.")
         return value
 
     def pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
         value = self._get(key, default)
         if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
-            raise self.error(key, f"must be two numbers, [x, y], not {value!r}.")
+            raise self.error(key, f"must be two numbers, [x, y], not {shown(value)}.")
         return (self._number(key, value[0]), self._number(key, value[1]))
 
     def number_or_pair(self, key: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
@@ -118,13 +137,13 @@ class Table:
     def triple(self, key: str, default: tuple[float, float, float] | None = None) -> tuple[float, float, float]:
         value = self._get(key, default)
         if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 3:
-            raise self.error(key, f"must be three numbers, [x, y, z], not {value!r}.")
+            raise self.error(key, f"must be three numbers, [x, y, z], not {shown(value)}.")
         return (self._number(key, value[0]), self._number(key, value[1]), self._number(key, value[2]))
 
     def pairs(self, key: str) -> tuple[tuple[float, float], ...]:
         value = self._get(key, None)
         if not isinstance(value, list) or not all(isinstance(item, list) and len(item) == 2 for item in value):
-            raise self.error(key, f"must be a list of points, [[x, y], [x, y], ...], not {value!r}.")
+            raise self.error(key, f"must be a list of points, [[x, y], [x, y], ...], not {shown(value)}.")
         return tuple((self._number(key, x), self._number(key, y)) for x, y in value)
 
     def sigma(self, key: str, default: float | None = None) -> float:
@@ -136,7 +155,7 @@ class Table:
         value = self._get(key, default)
         if isinstance(value, Sequence) and not isinstance(value, str):
             if len(value) != 2:
-                raise self.error(key, f"must be one standard deviation or two, [sx, sy], not {value!r}.")
+                raise self.error(key, f"must be one standard deviation or two, [sx, sy], not {shown(value)}.")
             return (self._sigma(key, value[0]), self._sigma(key, value[1]))
         sigma = self._sigma(key, value)
         return (sigma, sigma)
@@ -144,21 +163,22 @@ class Table:
     def texts(self, key: str) -> tuple[str, ...]:
         value = self._get(key, None)
         if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise self.error(key, f'must be a list of texts, ["...", "..."], not {value!r}.')
+            raise self.error(key, f'must be a list of texts, ["...", "..."], not {shown(value)}.')
         return tuple(value)
 
     def numbers(self, key: str) -> tuple[float, ...]:
         """A list of numbers, whole ones as they are."""
         value = self._get(key, None)
         if not isinstance(value, list) or not value:
-            raise self.error(key, f"must be a list of numbers, [1.0, 2.0, ...], not {value!r}.")
-        return tuple(item if type(item) is int else self._number(key, item) for item in value)
+            raise self.error(key, f"must be a list of numbers, [1.0, 2.0, ...], not {shown(value)}.")
+        numbers = [self._number(key, item) for item in value]
+        return tuple(item if type(item) is int else number for item, number in zip(value, numbers, strict=True))
 
     def table(self, key: str) -> "Table":
         """A table inside of this one; an empty one where it is absent."""
         value = self._get(key, {})
         if not isinstance(value, dict):
-            raise self.error(key, f"must be a table, [{self._inside(key)}], not {value!r}.")
+            raise self.error(key, f"must be a table, [{self._inside(key)}], not {shown(value)}.")
         return Table(value, self.file, self._inside(key))
 
     def tables(self, key: str) -> tuple["Table", ...]:
@@ -173,17 +193,19 @@ class Table:
 
     def done(self) -> None:
         """Refuse every key that nothing has asked for, all of them in one message."""
-        known = sorted(set(self._known))
-        strangers = [
+        known = sorted(self._known)
+        strangers = [key for key in self.values if key not in self._known]
+        messages = [
             str(self.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {_listed(known)}."))
-            for key in self.values
-            if key not in known
+            for key in strangers[:LISTED]
         ]
-        if strangers:
-            raise InputError("\n".join(strangers))
+        if len(strangers) > LISTED:
+            messages.append(f"{self.file}: {len(strangers) - LISTED} more keys are not known.")
+        if messages:
+            raise InputError("\n".join(messages))
 
     def _get(self, key: str, default: Any) -> Any:
-        self._known.append(key)
+        self._known.add(key)
         value = self.values.get(key, default)
         if value is None:
             strangers = [name for name in self.values if name not in self._known]
@@ -191,16 +213,26 @@ class Table:
             raise self.error(key, "is missing. Add it" + (f", or rename {near!r} to it." if near else "."))
         return value
 
+    def _path(self, key: str, text: str) -> str:
+        longest = max((len(os.fsencode(name)) for name in Path(text).parts), default=0)
+        if not text.isprintable() or len(os.fsencode(text)) > _LONGEST_PATH or longest > _LONGEST_NAME:
+            raise self.error(key, f"{shown(text)} can be no file's name: too long, or not all of it can be read.")
+        return text
+
     def _number(self, key: str, value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self.error(key, f"must be a number, not {value!r}.")
-        return float(value)
+        try:
+            number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            raise self.error(key, f"must be a number, not {shown(value)}.")
+        return number
 
     def _sigma(self, key: str, value: Any) -> float:
         if value == FREE or value == math.inf:
             return math.inf
         if isinstance(value, str):
-            raise self.error(key, f'must be a standard deviation, 0 (fixed) or "{FREE}", not {value!r}.')
+            raise self.error(key, f'must be a standard deviation, 0 (fixed) or "{FREE}", not {shown(value)}.')
         sigma = self._number(key, value)
         if sigma < 0.0:
             raise self.error(

@@ -11,6 +11,8 @@ from pipeline.files.tables import Table
 
 KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco")
 
+_MOST_OF_A_BOARD = 500  # columns, and rows
+
 
 @dataclass(frozen=True)
 class TargetSettings:
@@ -90,7 +92,7 @@ def _polarity(table: Table) -> Polarity:
 
 
 def _board(kind: str, table: Table) -> BoardSpec:
-    columns, rows = table.whole("columns", least=1), table.whole("rows", least=1)
+    columns, rows = (table.whole(key, least=1, most=_MOST_OF_A_BOARD) for key in ("columns", "rows"))
     if kind == "chessboard":
         return ChessboardSpec(columns, rows, table.number("square_mm", above=0.0))
     if kind == "circle-grid":

@@ -15,7 +15,7 @@ from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.files.atomic import write_atomically
-from pipeline.files.csv_table import Row, read_csv
+from pipeline.files.csv_table import Row, csv_line, read_csv
 from pipeline.files.images_file import image_name
 
 COLUMNS = (
@@ -78,12 +78,7 @@ def _line(image: str, mark: MarkMeasurement, pitch_um: tuple[float, float]) -> s
         sx, sy = np.sqrt(np.diag(covariance))
         sigma, rho = [f"{sx:.7f}", f"{sy:.7f}"], f"{covariance[0, 1] / (sx * sy):.4f}"
     cells = [image, mark.point, mark.kind, *place, *sigma, rho, *pixel, mark.status, mark.reason]
-    return ",".join(_quoted(str(cell)) for cell in cells)
-
-
-def _quoted(cell: str) -> str:
-    """The cell as CSV; in quotes, too, where a line that begins with it would be a comment."""
-    return '"' + cell.replace('"', '""') + '"' if cell.startswith("#") or any(c in cell for c in ',"\n') else cell
+    return csv_line([str(cell) for cell in cells])
 
 
 def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:

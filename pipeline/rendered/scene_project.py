@@ -1,9 +1,7 @@
 """A rendered scene as a project: what somebody would have who got the scans, with errors as the scene says."""
 
-import csv
-import io
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,6 +14,7 @@ from measure.marks import shapes
 from pipeline.files.atomic import write_atomically
 from pipeline.files.camera_file import CameraFile, GivenFiducial
 from pipeline.files.camera_text import camera_text
+from pipeline.files.csv_table import csv_line
 from pipeline.files.project_file import UNITS_MM
 from pipeline.files.template_table import saved_in
 from pipeline.rendered.design_table import DesignSettings
@@ -157,12 +156,8 @@ def _given_exterior(
     return [f"{value:.4f}" for value in (*station, *angles)]
 
 
-def _csv(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    return text.getvalue()
+def _csv(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    return "".join(f"{csv_line(cells)}\n" for cells in (columns, *rows))
 
 
 def _project_text(scene_file: SceneFile) -> str:
