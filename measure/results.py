@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
+from measure.scans.told_tone import FrameTone
 from measure.status import Status
 
 Kind = Literal["fiducial", "target", "tie"]
@@ -80,6 +81,7 @@ class FrameMeasurement:
     where there are too few.
     weights: what each channel of a colour scan counts in what its fiducials were measured in; None for its grey value.
     problems: what the user should look at, one sentence each.
+    tone: what is believed of the curve by which its light was stored; None where no frame was found.
     """
 
     image: str
@@ -88,6 +90,7 @@ class FrameMeasurement:
     pixel_from_camera: Array | None = None
     problems: tuple[str, ...] = ()
     weights: tuple[float, ...] | None = None
+    tone: FrameTone | None = None
 
     @property
     def px_per_mm(self) -> float | None:

@@ -17,6 +17,7 @@ from synthetic_images.frame import Frame, make_frame
 from synthetic_images.grain import grain, white_noise
 from synthetic_images.scene import Scene, SceneImage
 from synthetic_images.tiff import Grey, write_tiff
+from synthetic_images.tone_curve import coded
 from synthetic_images.truth import Truth, truth_json
 
 Picture = NDArray[np.float32]
@@ -91,7 +92,8 @@ def _painted(frame: Frame, background: Background, row0: int, height: int) -> Pi
 
 
 def _digitised(shares: Picture, scene: Scene, index: int, row0: int) -> Grey:
-    """Grey values: the channels, the noise of each, negative and white as zero, rounded and held within the depth."""
+    """Grey values: the channels, the noise of each, negative, the tone curve and white as zero, rounded and held within
+    the depth."""
     scanner = scene.scanner
     channels = shares[:, :, None] * np.asarray(CHANNEL_GAINS, np.float32) if scanner.colour else shares[:, :, None]
     if scanner.negative:
@@ -100,6 +102,7 @@ def _digitised(shares: Picture, scene: Scene, index: int, row0: int) -> Grey:
         height, width = shares.shape
         noise = [white_noise((scene.seed, index, 4, c), row0, height, width) for c in range(channels.shape[2])]
         channels = channels + scanner.noise * np.stack(noise, axis=2)
+    channels = coded(np.clip(channels, 0.0, 1.0), scanner.tone)
     if scanner.white_is_zero:
         channels = 1.0 - channels
     full_scale = 2**scanner.bit_depth - 1

@@ -22,6 +22,7 @@ Compression = Literal["none", "lzw", "deflate", "zstd", "jpeg"]
 Background = Literal["plain", "wall", "terrain"]
 FilmKind = Literal["similarity", "affine"]
 
+TONES = ("srgb", "s-curve")
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 PARAMETERS: Mapping[Family, tuple[str, ...]] = {
     "none": (),
@@ -245,7 +246,8 @@ class Scanner:
 
     margin_mm: how far the scan reaches beyond the frame; blur_px: Gaussian sigma of the MTF beside the pixel's own
     area; noise: rms as a share of full scale, white; tile_px: edge of the file's tiles, 0 for strips.
-    white_is_zero: only how the file stores the same picture; negative: the picture is a negative.
+    white_is_zero: only how the file stores the same picture; negative: the picture is a negative. tone: the gamma by
+    which light is coded, or one of TONES.
     """
 
     pitch_um: Point
@@ -258,6 +260,7 @@ class Scanner:
     white_is_zero: bool = False
     compression: Compression = "none"
     tile_px: int = 256
+    tone: float | str = 1.0
 
     def __post_init__(self) -> None:
         positive("pitch_um", *self.pitch_um)
@@ -270,6 +273,10 @@ class Scanner:
             raise ValueError('compression "jpeg" holds 8 bits; set bit_depth = 8 or another compression')
         if self.colour and self.white_is_zero:
             raise ValueError("a colour scan cannot be stored with white as zero; set one of them to false")
+        if isinstance(self.tone, str):
+            one_of("tone", self.tone, TONES)
+        else:
+            positive("tone", self.tone)
         if self.tile_px < 0 or self.tile_px % 16:
             raise ValueError(f"tile_px must be a multiple of 16, or 0 for strips, not {self.tile_px}")
 

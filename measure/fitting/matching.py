@@ -25,9 +25,10 @@ from measure.fitting.linear_fit import LinearFit
 from measure.fitting.own_shape import OwnShape, own_shape
 from measure.fitting.picture_fit import EDGE_BLURS, PictureFit
 from measure.fitting.picture_model import GREY, PictureModel, State, background_px
-from measure.fitting.scan_window import ScanWindow
+from measure.fitting.scan_window import Coding, ScanWindow
 from measure.fitting.second_order import second_order
 from measure.fitting.second_place import SecondPlace, edge_place, sloping_place
+from measure.fitting.tone_estimate import told_tone
 from measure.marks.rendering import extent_px, frame_beside, known
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Polygon
 from measure.match_options import MatchOptions
@@ -35,6 +36,7 @@ from measure.noise.blank_film import blank_patches, is_coloured
 from measure.noise.grain import grain_model
 from measure.noise.noise import NoiseModel, is_textured, noise_model
 from measure.noise.pixel_sums import combined, factors, products
+from measure.scans.told_tone import ToldTone
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
 
@@ -50,7 +52,8 @@ class Match:
 
     center_px (2,) with its place_covariance, pixel_from_mark (2, 3): of the scan, not of the window. covariance: of all
     unknowns of the `PictureModel` by the noise, None where another model was fitted.
-    contrast_dn: the mark's grey value less the background's, negative for a dark mark. noise_dn: standard deviation of
+    contrast_dn: the mark's light less the background's, negative for a dark mark; stored_contrast_dn: the same of the
+    grey values that the file has. noise_dn: standard deviation of
     one pixel, of a chip's picture after smoothing. damaged_fraction: share of the pixels about the mark, within
     plain_px of it, that were cut out. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
     they were taken as white where covariance_is_white. likeness: correlation of the fitted picture with the window,
@@ -59,7 +62,7 @@ class Match:
     share included, and size_sigma of the mark's size; infinite where they were not estimated, or the blur is at an end
     of its range. edges: the mark's place by another method, to compare;
     sloping: an ellipse's, if its paint may grow lighter or darker from side to side. own_shape: what the picture says
-    of rotation and scale, where the frame gave them.
+    of rotation and scale, where the frame gave them; tone: and of a tone curve that is not known.
     """
 
     converged: bool
@@ -68,6 +71,7 @@ class Match:
     place_covariance: Covariance
     pixel_from_mark: Array
     contrast_dn: float
+    stored_contrast_dn: float
     noise_dn: float
     blur_px: float
     damaged_fraction: float
@@ -81,6 +85,7 @@ class Match:
     edges: SecondPlace | None = None
     sloping: SecondPlace | None = None
     own_shape: OwnShape | None = None
+    tone: ToldTone | None = None
     covariance: Array | None = None
 
     @property
@@ -131,6 +136,7 @@ class _Given(NamedTuple):
     mark: Mark
     start: Array
     is_lossy: bool
+    coding: Coding
 
 
 def _given(window: ScanWindow, mark: Mark, pixel_from_mark: Array) -> _Given:
@@ -141,7 +147,7 @@ def _given(window: ScanWindow, mark: Mark, pixel_from_mark: Array) -> _Given:
     has_none = window.is_lossy or isinstance(mark, MarkTemplate)
     blank = np.zeros_like(usable) if has_none else usable & (sides == 0)
     grey = np.where(usable, np.asarray(window.grey, dtype=float), 0.0)
-    return _Given(grey, usable, sides, blank, mark, start, window.is_lossy)
+    return _Given(grey, usable, sides, blank, mark, start, window.is_lossy, window.coding)
 
 
 class _Part(NamedTuple):
@@ -260,7 +266,7 @@ def _begun(
         usable, ends = usable & (ends == 0), np.zeros_like(ends)
     model = kind(given.grey[rows, cols], ends, given.mark, start, options, coarse_px)
     model.state = state or model.state
-    return PictureFit(model, usable, given.is_lossy)
+    return PictureFit(model, usable, given.is_lossy, given.coding.part(rows, cols))
 
 
 def _part(given: _Given, options: MatchOptions) -> _Part:
@@ -303,6 +309,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
         place_covariance=precision.place,
         pixel_from_mark=state.pixel_from_mark,
         contrast_dn=model.contrast_dn,
+        stored_contrast_dn=fit.coding.stored_contrast_dn(model.ground_dn, model.contrast_dn),
         noise_dn=float(np.sqrt(noise.variance_dn2)),
         blur_px=model.scan_blur_px,
         damaged_fraction=fit.damaged_fraction,
@@ -316,6 +323,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
         edges=precision.edges,
         sloping=precision.sloping,
         own_shape=precision.own_shape,
+        tone=precision.tone,
         covariance=covariance,
     )
 
@@ -331,6 +339,7 @@ class _Precision(NamedTuple):
     edges: SecondPlace | None = None
     sloping: SecondPlace | None = None
     own_shape: OwnShape | None = None
+    tone: ToldTone | None = None
 
 
 def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surroundings) -> _Precision:
@@ -361,7 +370,17 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
         edges=edge_place(linear, model.blur_px),
         sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
         own_shape=own_shape(linear, model.linear, model.departures()) if tells_shape else None,
+        tone=_tone(fit, linear),
     )
+
+
+def _tone(fit: PictureFit, linear: LinearFit) -> ToldTone | None:
+    """What the picture says of the tone curve, None where that is known, or the mark is a chip, cut from scans of the
+    same curve."""
+    model, coding = fit.model, fit.coding
+    if coding.tone.is_known or isinstance(model.mark, MarkTemplate) or model.background_px is not None:
+        return None
+    return told_tone(linear, model.grey - model.residuals, coding.tone, coding.full_scale_dn)
 
 
 def _blur_sigma(model: PictureModel, covariance: Array) -> float:

@@ -12,11 +12,11 @@ from measure.fitting.rounding import (
     COARSEST_VARIANCE,
     ROUNDING_VARIANCE,
     likely_sigma,
-    rounding_step,
     unrounded,
     unrounded_variance,
 )
 from measure.fitting.sandwich_covariance import sandwich_covariance
+from measure.fitting.scan_window import Coding
 from measure.marks.rendering import chip_mask, known, picture
 from measure.marks.shapes import MarkTemplate
 from measure.noise.noise import NoiseModel, correlated, may_be_noise, robust_scale
@@ -45,10 +45,10 @@ class PictureFit:
     """The fit in progress. area: the pixels about the mark that are there; used: those of them that are undamaged;
     least_variance_dn2: what a grey value's noise is at least, by its rounding; rounding_variance_dn2: what of it that
     makes; reason: why it failed. is_lossy: whether
-    the picture was compressed with loss."""
+    the picture was compressed with loss; coding: how its light was stored."""
 
-    def __init__(self, model: PictureModel, usable: Mask, is_lossy: bool) -> None:
-        self.model, self.usable, self.is_lossy = model, usable, is_lossy
+    def __init__(self, model: PictureModel, usable: Mask, is_lossy: bool, coding: Coding) -> None:
+        self.model, self.usable, self.is_lossy, self.coding = model, usable, is_lossy, coding
         self.options = model.options
         self.area = self.used = usable
         self.far = np.zeros_like(usable)
@@ -105,17 +105,20 @@ class PictureFit:
         model, rounded = self.model, self.model.grey
         ordinary = self.used & (model.clipped == 0)
         is_whole = not self.is_lossy and model.background_px is None and not isinstance(model.mark, MarkTemplate)
-        step = 0.0 if self.reason or not is_whole else rounding_step(rounded[ordinary])
-        self.rounding_variance_dn2 = ROUNDING_VARIANCE * step**2
-        if not step or np.mean(model.residuals[ordinary] ** 2) > COARSEST_VARIANCE * step**2:
+        steps = None if self.reason or not is_whole else self.coding.steps_dn(ordinary)
+        if steps is None:
+            return
+        step2 = float(np.mean(steps[ordinary] ** 2))
+        self.rounding_variance_dn2 = ROUNDING_VARIANCE * step2
+        if np.mean(model.residuals[ordinary] ** 2) > COARSEST_VARIANCE * step2:
             return
         for _ in range(_MOST_UNROUNDED):
             drawn, before = model.grey - model.residuals, model.state.pixel_from_mark[:, 2]
-            off = (rounded - drawn) / step
+            off = (rounded - drawn) / steps
             sigma = likely_sigma(off[ordinary])
-            self.least_variance_dn2 = unrounded_variance(sigma) * step**2
-            self.rounding_variance_dn2 = self.least_variance_dn2 - (sigma * step) ** 2
-            model.take_grey(np.where(ordinary, drawn + step * unrounded(off, sigma), rounded))
+            self.least_variance_dn2 = unrounded_variance(sigma) * step2
+            self.rounding_variance_dn2 = self.least_variance_dn2 - sigma**2 * step2
+            model.take_grey(np.where(ordinary, drawn + steps * unrounded(off, sigma), rounded))
             self._adjust(robust=False, tolerance_px=_UNROUNDED_PX)
             if self.reason or np.hypot(*(model.state.pixel_from_mark[:, 2] - before)) < _UNROUNDED_PX:
                 break

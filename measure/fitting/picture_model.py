@@ -235,6 +235,11 @@ class PictureModel:
         return float(self.state.greys[0])
 
     @property
+    def ground_dn(self) -> float:
+        """The ground's, in the middle of the window."""
+        return float(self.state.greys[1])
+
+    @property
     def blur_px(self) -> float:
         return float(np.sqrt(self.state.variance_px2))
 

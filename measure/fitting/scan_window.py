@@ -1,4 +1,4 @@
-"""A window of a scan as a fit takes it: its grey values, where it lies, and what is known of its pixels."""
+"""A window of a scan as a fit takes it: its light, where it lies, and what is known of its pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,28 +7,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.clipping import Sides, clipped_sides
+from measure.fitting.rounding import rounding_step
 from measure.scans.scan import Scan
+from measure.scans.tone import LINEAR, Tone
 
+Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
+class Coding:
+    """How the light of a window was stored: by the tone curve of a scan whose largest grey value is full_scale_dn.
+    stored (height, width): the grey values themselves, None where the light is a mixture of channels."""
+
+    stored: NDArray[np.floating] | None
+    tone: Tone = LINEAR
+    full_scale_dn: float = 65535.0
+
+    def part(self, rows: slice, cols: slice) -> "Coding":
+        return self if self.stored is None else replace(self, stored=self.stored[rows, cols])
+
+    def steps_dn(self, used: Mask) -> Array | None:
+        """(height, width) the light between the limits from which each value was rounded; None where the values used
+        are no multiples of one step, or not known."""
+        step = 0.0 if self.stored is None else rounding_step(np.asarray(self.stored[used], float))
+        if self.stored is None or not step:
+            return None
+        if self.tone.is_identity:
+            return np.full(self.stored.shape, step)
+        above, below = (self.tone.light(self.stored + way * step / 2, self.full_scale_dn) for way in (1, -1))
+        return np.asarray(above - below, float)
+
+    def stored_contrast_dn(self, ground: float, contrast: float) -> float:
+        """The difference of grey values that a contrast in light is, on ground of such light."""
+        if self.tone.is_identity:
+            return contrast
+        dark, light = self.tone.code(np.array([ground, ground + contrast]), self.full_scale_dn)
+        return float(light - dark)
+
+
+@dataclass(frozen=True, eq=False)
 class ScanWindow:
-    """grey (height, width), whose top-left pixel's centre is at origin_px (col, row) of the scan; valid: which of its
+    """grey (height, width), in light; its top-left pixel's centre is at origin_px (col, row) of the scan; valid: which
     pixels are true ones, None if all; clipped: which are at an end of the scanner's range, as `clipped_sides` gives it,
-    None if none. is_lossy: whether it was compressed with loss."""
+    None if none. is_lossy: whether it was compressed with loss. coded: how the light was stored, None where grey is
+    what is stored."""
 
     grey: NDArray[np.floating]
     origin_px: tuple[float, float] = (0.0, 0.0)
     valid: Mask | None = None
     clipped: Sides | None = None
     is_lossy: bool = False
+    coded: Coding | None = None
 
     @property
     def usable(self) -> Mask:
         """(height, width): which pixels tell a grey value."""
         known = np.asarray(np.isfinite(self.grey))
         return known if self.valid is None else known & self.valid
+
+    @property
+    def coding(self) -> Coding:
+        return self.coded or Coding(self.grey)
 
     @property
     def sides(self) -> Sides:
@@ -40,13 +80,16 @@ class ScanWindow:
 
 
 def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequence[float] | None = None) -> ScanWindow:
-    """The window at col0, row0, width, height of the scan. weights: what each channel counts, as `Scan.window` takes
-    them."""
+    """The window at col0, row0, width, height of the scan, in light. weights: what each channel counts, as for
+    `Scan.window`."""
     col0, row0, _, _ = place_px
+    grey = scan.light(*place_px, weights).astype(float)
+    stored = grey if scan.tone.is_identity else scan.window(*place_px, weights) if scan.channels == 1 else None
     return ScanWindow(
-        scan.window(*place_px, weights).astype(float),
+        grey,
         (col0, row0),
         scan.inside(*place_px),
         clipped_sides(scan, *place_px, weights),
         scan.is_lossy,
+        Coding(stored, scan.tone, scan.full_scale_dn),
     )

@@ -144,13 +144,15 @@ class _Field:
         distance_px = float(np.hypot(*(place - self.predicted)))
         lines = np.abs(response.template)
         lit = lines * self.room[patch]
+        contrast_dn = self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit))
         fit = Match(
             converged=True,
             reason="",
             center_px=place,
             place_covariance=Covariance.of_noise(inverse @ slopes @ inverse),
             pixel_from_mark=np.column_stack([self.linear, place]),
-            contrast_dn=self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit)),
+            contrast_dn=contrast_dn,
+            stored_contrast_dn=contrast_dn,
             noise_dn=float(np.average(self.texture_dn[patch], weights=lit)),
             blur_px=blur_px,
             damaged_fraction=1 - float((lit > _LINE * lit.max()).sum() / (lines > _LINE * lines.max()).sum()),

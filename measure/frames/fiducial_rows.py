@@ -54,7 +54,7 @@ def present_frame(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
         )
     problems = (*problems, *_problems(frame, pitch_um))
-    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights)
+    return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, frame.tone)
 
 
 def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[str]:

@@ -1,6 +1,6 @@
 """One frame in one placement: its marks as they were seen, and those told apart that do not belong."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,8 @@ from scipy.special import chdtrc
 from measure.film import SCATTER_MM
 from measure.fitting.matching import Match
 from measure.frames.refinement import Sighting
+from measure.scans.told_tone import FrameTone
+from measure.scans.tone import LINEAR
 from measure.search.constellation import Placement
 from measure.status import Status
 
@@ -40,6 +42,7 @@ class Frame:
     scatter_mm: float
     pixel_from_camera: Array
     weights: tuple[float, ...] | None
+    tone: FrameTone = field(default_factory=lambda: FrameTone(LINEAR))
 
     @property
     def fits(self) -> list[Match | None]:

@@ -3,7 +3,7 @@
 from measure.fiducial_options import FiducialOptions
 from measure.frames.faint_sighting import faint_reach_px, look_for_faint
 from measure.frames.frame import Frame
-from measure.frames.frame_settling import compare_shapes, compare_sizes, settle, share_blur
+from measure.frames.frame_settling import compare_shapes, compare_sizes, count_tone, settle, share_blur
 from measure.frames.frame_sighter import MANY, FrameSighter
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
@@ -35,6 +35,7 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
             sighter.judge()
     settle(sighter)
     share_blur(sighter)
+    count_tone(sighter)
     compare_sizes(sighter)
     compare_shapes(sighter)
     return sighter.frame()

@@ -26,28 +26,60 @@ from measure.marks.rendering import reach_px
 from measure.marks.shapes import Disk, Mark, MarkShape, Ring
 from measure.match_options import MatchOptions
 from measure.noise.noise import may_be_noise
+from measure.scans.told_tone import FrameTone, ToldTone
 
 Array = NDArray[np.float64]
 
 _STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
+_TONE_ROUNDS, _MOVED = 5, 0.1  # of matching by a better curve; of its standard deviation that a mark may still move
 _SETTLED_PX = 1.5  # about a mark that was matched already
 
 
 def settle(sighter: FrameSighter) -> None:
     """Match marks that do not tell their own rotation and scale once more, with those of the frame; and those that the
-    frame's stretch and shear move, which no match tells."""
-    linear = sighter.pixel_from_camera[:, :2]
-    unsettled = [
-        index
-        for index, fit in _clear(sighter).items()
-        if leans_on_frame(mark := sighter.layout.marks[index].mark)
-        or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
-    ]
-    if unsettled and sighter.belongs.sum() >= 2:
+    frame's stretch and shear move, which no match tells; and as long as they say of the tone curve what moves them,
+    those by that curve."""
+    if sighter.belongs.sum() < 2:
+        return
+    unsettled = {index for index, fit in _clear(sighter).items() if _leans_or_is_strained(sighter, index, fit)}
+    for _ in range(_TONE_ROUNDS):
+        unsettled |= _moved_by_tone(sighter)
+        if not unsettled:
+            break
         frame_sigma = _frame_sigma(sighter)
-        for index in unsettled:
+        for index in sorted(unsettled):
             _match_again(sighter, index, sighter.options.match, frame_sigma)
         sighter.judge()
+        unsettled = set()
+    sighter.tone = FrameTone.of(sighter.prior_tone, _told_of_tone(sighter))
+
+
+def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: Match) -> bool:
+    mark, linear = sighter.layout.marks[index].mark, sighter.pixel_from_camera[:, :2]
+    return leans_on_frame(mark) or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
+
+
+def _moved_by_tone(sighter: FrameSighter) -> set[int]:
+    """The marks that say something of the tone curve, if what all of them say moves any; the scan is then seen through
+    that."""
+    told, before = _told_of_tone(sighter), sighter.scan.tone
+    found = FrameTone.of(sighter.prior_tone, told)
+    clear = _clear(sighter)
+    if not any(found.moves_px(one, before) > _MOVED * clear[index].sigma_px for index, one in told.items()):
+        return set()
+    sighter.scan = sighter.scan.seen_through(found.step_from(before))
+    return set(told)
+
+
+def _told_of_tone(sighter: FrameSighter) -> dict[int, ToldTone]:
+    return {index: fit.tone for index, fit in _clear(sighter).items() if fit.tone is not None}
+
+
+def count_tone(sighter: FrameSighter) -> None:
+    """What is not known of the tone curve, in the covariance of every mark that it moves."""
+    for index, fit in _clear(sighter).items():
+        if fit.tone is not None:
+            sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(fit.tone))
 
 
 def share_blur(sighter: FrameSighter) -> None:
@@ -94,7 +126,7 @@ def _count_touches(sighter: FrameSighter, index: int, size: SharedShape, fit: Ma
     """What may touch a round mark, as its size has it: in its variance, and as a doubt where it may be far off."""
     radius_px = _radius_px(sighter.layout.marks[index].mark, fit.pixel_from_mark[:, :2])
     touched = size.touched(radius_px, fit.damaged_fraction > 0)
-    sighter.widen(index, Cause.TOUCHED, touched * round_moves_px(size, radius_px) ** 2 / 2)
+    sighter.widen(index, Cause.TOUCHED, touched * round_moves_px(size, radius_px) ** 2 / 2 * np.eye(2))
     chance = touched * round_moves_beyond(WRONG_PX, size, radius_px)
     if chance > WRONG_CHANCE and not size.differs:
         reason = f"it is {size.ratio:.2f} times as large as the other marks: something may touch it and have moved it"
@@ -122,7 +154,7 @@ def compare_shapes(sighter: FrameSighter) -> None:
         middle_px = reach_px(sighter.layout.marks[index].mark, fits[index].pixel_from_mark[:, :2]) / 2
         moved_px = float(np.hypot(*(shape.on_place @ other.off)))
         touched = other.touched(middle_px, fits[index].damaged_fraction > 0)
-        sighter.widen(index, Cause.TOUCHED, touched * moved_px**2 / 2)
+        sighter.widen(index, Cause.TOUCHED, touched * moved_px**2 / 2 * np.eye(2))
 
 
 def _radius_px(mark: Mark, linear: Array) -> float:

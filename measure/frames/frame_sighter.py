@@ -17,6 +17,7 @@ from measure.frames.refinement import Sighting, sight
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
+from measure.scans.told_tone import FrameTone
 from measure.search.constellation import NARROW, Placement, sign_of
 from measure.search.correlation import CLOSE
 from measure.search.prediction import MarkPrediction
@@ -48,7 +49,8 @@ class FrameSighter:
     camera (n, 2): given places, mm; turn (2, 2): of the pose; pitch (2,): mm of a pixel. pixel_from_camera (2, 3): as
     the placement has it, or the marks that belong. sightings: None for a mark that was not looked at yet. belongs (n,):
     marks that were seen and agree; vouched (n,): those that stand out so much of their texture that they need not.
-    weights: of the channels. gate_px, first_search_px, near_px, faint_px: how far from its predicted place a mark is
+    weights: of the channels. prior_tone: what was believed of the scan's curve; tone: what its marks made of that.
+    gate_px, first_search_px, near_px, faint_px: how far from its predicted place a mark is
     looked for: where the others give it, where only the placement does, there on film that is hardly deformed, and
     where it is faint.
     """
@@ -61,6 +63,7 @@ class FrameSighter:
         options: FiducialOptions,
     ) -> None:
         self.scan, self.layout, self.placement, self.options = scan, layout, placement, options
+        self.prior_tone, self.tone = scan.tone, FrameTone(scan.tone)
         self.pitch = np.asarray(placement.pitch_mm)
         self.camera = np.array([mark.xy_mm for mark in layout.marks])
         self.turn = up_from_camera(placement.pose)
@@ -162,11 +165,11 @@ class FrameSighter:
             reasons = [each for each in (sighting.reason, reason) if each]
             self.sightings[index] = replace(sighting, reason="; ".join(reasons))
 
-    def widen(self, index: int, cause: Cause, variance_px2: float) -> None:
-        """Count a variance, along each coordinate, to a cause for the place of a mark that was seen."""
+    def widen(self, index: int, cause: Cause, px2: Array) -> None:
+        """Count a covariance (2, 2) to a cause for the place of a mark that was seen."""
         sighting = self.sightings[index]
         if sighting is not None and sighting.fit is not None:
-            covariance = sighting.fit.place_covariance.plus(cause, variance_px2 * np.eye(2))
+            covariance = sighting.fit.place_covariance.plus(cause, px2)
             self.sightings[index] = replace(sighting, fit=replace(sighting.fit, place_covariance=covariance))
 
     def clear(self, index: int) -> bool:
@@ -190,6 +193,7 @@ class FrameSighter:
             self.scatter_mm(),
             self.pixel_from_camera,
             self.weights,
+            self.tone,
         )
 
     def misfit_mm(self) -> Array:

@@ -15,6 +15,7 @@ from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplat
 from measure.noise.blank_film import BESIDE_PX
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
+from measure.scans.tone import LINEAR
 from measure.search.candidates import FAINT
 from measure.search.correlation import CLOSE
 from measure.search.prediction import MarkPrediction
@@ -66,7 +67,7 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     reason = _unlike(fit, expected, scan.full_scale_dn)
     if reason:
         return Sighting(predicted, True, None, reason)
-    loss = covariance_of_compression(scan, fit.contrast_dn)
+    loss = covariance_of_compression(scan, fit.stored_contrast_dn)
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     return Sighting(predicted, True, fit, chance=chance)
 
@@ -82,7 +83,7 @@ def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> str:
     off_px = float(np.hypot(*(fit.center_px - expected.center_px)))
     if off_px > expected.search_px + _DRIFT_PX:
         return f"what lies there is {off_px:.0f} px from its place"
-    contrast = abs(fit.contrast_dn) / full_scale_dn
+    contrast = abs(fit.stored_contrast_dn) / full_scale_dn
     if contrast < FAINT:
         return "there is no contrast at its place"
     if contrast * (1 - _SURE / max(fit.significance, _SURE)) > _MOST_CONTRAST:
@@ -108,7 +109,10 @@ def _fitted(
         return None, 1.0
     center_px, chance = look
     start = expected.moved(center_px).pixel_from_mark
-    window = read_window(scan, window_about(mark, start, options.margin_px + BESIDE_PX), weights)
+    seen_in = (
+        scan.seen_through(LINEAR) if isinstance(mark, MarkTemplate) else scan
+    )  # chips are cut as the file has them
+    window = read_window(seen_in, window_about(mark, start, options.margin_px + BESIDE_PX), weights)
     if expected.surroundings == CLOSE and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
         window = window.without(beyond_edge(window.grey, mark, inner, expected.polarity))

@@ -23,6 +23,7 @@ from measure.scans.segment_cache import SegmentCache
 from measure.scans.segments import LostPart, Segments
 from measure.scans.tiff_scan import open_tiff
 from measure.scans.tiff_segments import RawRows
+from measure.scans.tone import LINEAR, Tone
 
 Array = NDArray[np.float32]
 
@@ -45,6 +46,7 @@ class Scan:
     """An opened scan: its size, its pitch, and windows of grey values that grow with light on the scanner's sensor.
 
     width_px, height_px; channels: 1 or 3; full_scale_dn: the largest grey value that the bit depth allows;
+    tone: what is believed of the curve between light and these grey values.
     pitch_um: (x, y) from the file's resolution tags, None where it has none that can be believed, and then pitch_note
     says why.
     The pixels are those that the file stores: a tag that asks a viewer to turn the picture is not obeyed.
@@ -65,6 +67,7 @@ class Scan:
         self.full_scale_dn = segments.full_scale_dn
         self.pitch_um = pitch.um
         self.pitch_note = pitch.note
+        self.tone = LINEAR
         self._file_notes = notes
         self._segments = segments
         self._cache = SegmentCache(segments)
@@ -111,6 +114,12 @@ class Scan:
         """Height and width of what the file has in one piece."""
         return self._segments.segment_height_px, self._segments.segment_width_px
 
+    def seen_through(self, tone: Tone) -> "Scan":
+        """The same scan with another belief about its tone curve."""
+        scan = copy(self)
+        scan.tone = tone
+        return scan
+
     def green(self) -> "Scan":
         """The same scan with its green for grey value, if it has colours. A lens draws red and blue at scales of their
         own, some 1e-4 off; a mark in a mixture of all has no one place."""
@@ -127,6 +136,12 @@ class Scan:
         if width < 1 or height < 1:
             raise ValueError(f"a window has at least one pixel, not {width} x {height}")
         return weighted(self.samples(col0, row0, width, height), self._weights(weights))
+
+    def light(self, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None) -> Array:
+        """(height, width) as `window` has it, in light by the tone curve: what blurs linearly, and is fitted."""
+        samples = self.samples(col0, row0, width, height)
+        light = samples if self.tone.is_identity else self.tone.light(samples, self.full_scale_dn)
+        return weighted(light, self._weights(weights))
 
     def samples(self, col0: int, row0: int, width: int, height: int, out: Samples | None = None) -> Samples:
         """(height, width, channels) values as the file stores them; parts outside of the scan repeat its edge.

@@ -164,7 +164,7 @@ def _fit_by_margin(
 
     def fitted(margin_px: float) -> FittedDisk:
         fit = match(window, shape, start, replace(options, margin_px=margin_px))
-        loss = covariance_of_compression(scan, fit.contrast_dn)
+        loss = covariance_of_compression(scan, fit.stored_contrast_dn)
         disk = FittedDisk(
             center_px=fit.center_px,
             covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss),

@@ -72,7 +72,7 @@ class _Course:
     weights: Sequence[float] | None
 
     def profiles(self, middle: Array, offset: Array, share: float, half: float) -> tuple[Array, Mask]:
-        """(n, samples) grey values across the edge about an offset (n,), each the mean over its share of the edge, and
+        """(n, samples) light across the edge about an offset (n,), each the mean over its share of the edge, and
         which of them lie in the scan."""
         s = np.arange(-round(half / _STEP_PX), round(half / _STEP_PX) + 1) * _STEP_PX
         run = np.linspace(-0.5, 0.5, max(int(share), 2), endpoint=False) * share
@@ -84,7 +84,7 @@ class _Course:
         )
         low = np.floor(places.min(axis=(1, 2, 3))).astype(int) - 2
         size = np.ceil(places.max(axis=(1, 2, 3))).astype(int) + 3 - low
-        window = self.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
+        window = self.scan.light(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
         col, row = places - low[:, None, None, None]
         grey = map_coordinates(window, [row, col], order=1, mode="nearest").mean(axis=1)
         limit = np.array([self.scan.width_px, self.scan.height_px])[:, None, None, None] - 1
@@ -253,6 +253,7 @@ def _met(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array) -> Match:
         place_covariance=Covariance.of_noise(unit @ covariance @ unit.T),
         pixel_from_mark=np.column_stack([pixel_from_mark[:, :2], center]),
         contrast_dn=contrast,
+        stored_contrast_dn=contrast,
         noise_dn=noise,
         blur_px=max(edge.blur_px for edge in edges),
         damaged_fraction=1.0 - min(edge.share for edge in edges),
@@ -272,6 +273,7 @@ def _missed(pixel_from_mark: Array, reason: str) -> Match:
         place_covariance=Covariance.of_noise(np.full((2, 2), np.inf)),
         pixel_from_mark=pixel_from_mark,
         contrast_dn=0.0,
+        stored_contrast_dn=0.0,
         noise_dn=0.0,
         blur_px=0.0,
         damaged_fraction=1.0,

@@ -113,6 +113,12 @@ class Table:
             raise self.error(key, f"must be at least {least:g}, not {value:g}.")
         return value
 
+    def number_or_text(self, key: str, default: float | str, choices: Sequence[str], *, above: float) -> float | str:
+        """A number above a limit, or one of some words."""
+        if isinstance(self._get(key, default), str):
+            return self.text(key, default if isinstance(default, str) else None, choices)
+        return self.number(key, default if isinstance(default, float) else None, above=above)
+
     def whole(self, key: str, default: int | None = None, *, least: int = 0, most: int = 10**9) -> int:
         value = self._get(key, default)
         if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:

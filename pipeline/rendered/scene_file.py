@@ -182,6 +182,7 @@ def _scanner(table: Table) -> scene.Scanner:
         white_is_zero=table.flag("white_is_zero", False),
         compression=cast(scene.Compression, table.text("compression", "none", get_args(scene.Compression))),
         tile_px=table.whole("tile_px", 256),
+        tone=table.number_or_text("tone", 1.0, scene.TONES, above=0.0),
     )
 
 

@@ -1,0 +1,56 @@
+"""What marks say of the tone curve of their scan, and what is not known of it in their places."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.scans.tone import SaidOfTone, Tone, said_by_all
+
+Array = NDArray[np.float64]
+
+_LONGEST = 1.0  # departure that is changed at a time, in its standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class ToldTone:
+    """said: of the departures of the curve. on_place (2, k): px by which the mark moves for each departure of 1. least,
+    greatest: the codes that the mark's picture has, shares of full scale."""
+
+    said: SaidOfTone
+    on_place: Array
+    least: float
+    greatest: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTone:
+    """tone: what is believed of the curve after all marks. said: what these say of it alone, None where nothing; least,
+    greatest: the codes between which they do, shares of full scale."""
+
+    tone: Tone
+    said: SaidOfTone | None = None
+    least: float = 0.0
+    greatest: float = 1.0
+
+    @classmethod
+    def of(cls, prior: Tone, told: Mapping[int, ToldTone]) -> "FrameTone":
+        said = said_by_all([one.said for one in told.values()])
+        if said is None:
+            return cls(prior)
+        least, greatest = min(one.least for one in told.values()), max(one.greatest for one in told.values())
+        return cls(prior.told(said), said, least, greatest)
+
+    def moves_px(self, told: ToldTone, before: Tone) -> float:
+        """How far a mark lies elsewhere by this curve than by the one before."""
+        return float(np.hypot(*(told.on_place @ (self.tone.mean - before.mean))))
+
+    def covariance_px2(self, told: ToldTone) -> Array:
+        """(2, 2) of a mark's place, for what is not known of the curve."""
+        return np.asarray(told.on_place @ self.tone.covariance @ told.on_place.T)
+
+    def step_from(self, before: Tone) -> Tone:
+        """The curve to match with next: no farther from the one before than what was linearised there holds."""
+        step = self.tone.mean - before.mean
+        return self.tone.at(before.mean + step / max(float(np.abs(step).max()) / _LONGEST, 1.0))

@@ -1,0 +1,220 @@
+"""The curve through which a scanner or a converter stored light as grey values.
+
+Film, lens and scanner blur light; only then is it coded. A fit in light needs the curve from code to light, and light
+may be anything that grows linearly with it: gain and offset are in every fit. So a curve is known by the logarithm of
+its slope, up to a constant. What is believed of it is a base curve and a normal distribution of departures from it: of
+the logarithm of the slope, a power's share and a few smooth waves over the range of codes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_PIECES = 1024  # of the range of codes, in which a curve is straight
+_NODES = np.linspace(0.0, 1.0, _PIECES + 1)
+_MIDDLES = (_NODES[1:] + _NODES[:-1]) / 2
+_TOE = 0.005  # of full scale: the slope of a power has no logarithm at black
+# What is believed of a curve of which nothing is said: between linear and sRGB, and a scanner may bend it further. The
+# waves are Legendre's polynomials; their standard deviations let S-curves be that a scanner's "contrast" makes.
+_POWER, _POWER_SIGMA = 1.6, 0.6
+_WAVE_SIGMAS = (0.3, 0.5, 0.2, 0.15)
+_SIGMAS = np.array([_POWER_SIGMA, *_WAVE_SIGMAS])
+# What is believed of a curve that the file says: programs round it, and a scanner's light and dark are not exactly its.
+_DECLARED_SIGMA = 0.1  # of the standard deviations above
+_LEAST_INFORMATION = 1e-6  # of departures of one standard deviation: less is none
+_CONTRADICTED = np.log(1000.0)  # log-odds, at which a picture is believed against what its file says
+
+
+def power(exponent: float) -> Array:
+    """(nodes,) light of a code raised to a power."""
+    return np.asarray(_NODES**exponent)
+
+
+def srgb() -> Array:
+    """(nodes,) light by IEC 61966-2-1."""
+    return np.where(_NODES <= 0.04045, _NODES / 12.92, ((_NODES + 0.055) / 1.055) ** 2.4)
+
+
+def sampled(light: Array) -> Array:
+    """(nodes,) light of a curve that is given by values (n,) at evenly spaced codes; it has to grow."""
+    even = np.interp(_NODES, np.linspace(0.0, 1.0, len(light)), light)
+    low, high = float(even[0]), float(even[-1])
+    if not (high > low and np.all(np.diff(even) >= 0)):
+        raise ValueError("a tone curve grows with the code")
+    return np.asarray((even - low) / (high - low))
+
+
+@dataclass(frozen=True, eq=False)
+class SaidOfTone:
+    """What pictures say of the departures of a curve: information (k, k), right (k,), the information times the most
+    likely departures, and square, the sum of squares of departures of none in units of their standard deviations;
+    count: of independent figures."""
+
+    information: Array
+    right: Array
+    square: float
+    count: int
+
+    @classmethod
+    def by_score(cls, normal: Array, score: Array, covariance: Array) -> "SaidOfTone":
+        """Of a score (k,) of that covariance (k, k) that grows with the departures by a normal matrix (k, k)."""
+        weighted = np.linalg.solve(covariance, np.column_stack([normal, score])).T
+        information = weighted[:-1] @ normal
+        return cls((information + information.T) / 2, weighted[-1] @ normal, float(weighted[-1] @ score), len(score))
+
+    def misfit(self, departures: Array) -> float:
+        """Chi-square of departures, on `count` degrees of freedom."""
+        return float(self.square - 2 * departures @ self.right + departures @ self.information @ departures)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tone:
+    """What is believed of a scan's curve.
+
+    base (nodes,): light, 0 to 1, at evenly spaced codes. mean (k,), covariance (k, k): of the departures from it, each
+    in units of the standard deviation that it has where nothing is known. source: where the curve is from, a part of a
+    sentence; is_declared: whether the file says it, which the picture may contradict.
+    """
+
+    base: Array = field(default_factory=lambda: power(1.0))
+    mean: Array = field(default_factory=lambda: np.zeros(len(_SIGMAS)))
+    covariance: Array = field(default_factory=lambda: np.zeros((len(_SIGMAS),) * 2))
+    source: str = "grey values are taken as light"
+    is_declared: bool = False
+
+    @classmethod
+    def unknown(cls) -> "Tone":
+        return cls(power(_POWER), covariance=np.eye(len(_SIGMAS)), source="estimated from the edges of marks")
+
+    @classmethod
+    def declared(cls, base: Array, source: str) -> "Tone":
+        """A curve that the file says."""
+        return cls(base, covariance=_DECLARED_SIGMA**2 * np.eye(len(_SIGMAS)), source=source, is_declared=True)
+
+    @property
+    def is_identity(self) -> bool:
+        return not self.mean.any() and bool(np.array_equal(self.base, _NODES))
+
+    @property
+    def is_known(self) -> bool:
+        return not self.covariance.any()
+
+    def forgetting(self) -> "Tone":
+        """The same base, of whose departures nothing is known but that the curve lies between linear and sRGB."""
+        mean = np.zeros(len(_SIGMAS))
+        mean[0] = (_POWER - self._base_power) / _POWER_SIGMA
+        return replace(self, mean=mean, covariance=np.eye(len(_SIGMAS)))
+
+    def at(self, mean: Array) -> "Tone":
+        """The same with other departures."""
+        return replace(self, mean=mean)
+
+    def told(self, said: SaidOfTone) -> "Tone":
+        """What is believed when pictures have said something, too. What the file says they may contradict."""
+        if self.is_known:
+            return self
+        believed, odds = self._with(said)
+        if not self.is_declared:
+            return believed
+        free, free_odds = self.forgetting()._with(said)
+        if free_odds - odds < _CONTRADICTED:
+            return believed
+        return replace(free, source=f"{self.source}, but the pictures contradict it", is_declared=False)
+
+    def _with(self, said: SaidOfTone) -> tuple["Tone", float]:
+        """The posterior, and the logarithm of how likely the prior makes what is said."""
+        prior = np.linalg.inv(self.covariance)
+        covariance = np.linalg.inv(prior + said.information)
+        right = prior @ self.mean + said.right
+        mean = covariance @ right
+        chance = np.linalg.slogdet(prior @ covariance)[1] + right @ mean - self.mean @ prior @ self.mean
+        return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2), float(chance) / 2
+
+    def light(self, code: NDArray[np.floating] | NDArray[np.integer], full_scale: float) -> NDArray[np.float32]:
+        """Light of grey values of a file whose largest is full_scale, on the same scale: 0 stays 0, and white white."""
+        if self.is_identity:
+            return np.asarray(code, np.float32)
+        share = np.asarray(code, np.float32) * np.float32(_PIECES / full_scale)
+        whole = np.minimum(share.astype(np.int32), _PIECES - 1)
+        table, steps = self._fast
+        return np.asarray(np.float32(full_scale) * (table[whole] + steps[whole] * (share - whole)), np.float32)
+
+    def code(self, light: NDArray[np.floating], full_scale: float) -> Array:
+        """The grey value that such light is stored as."""
+        return np.asarray(full_scale * np.interp(np.asarray(light) / full_scale, self._table, _NODES))
+
+    def changes(self, light: NDArray[np.floating], full_scale: float) -> Array:
+        """(k, ...) what light becomes more of for each departure of 1, at codes that stand for this light."""
+        share = self.code(light, full_scale) / full_scale
+        return full_scale * np.stack([np.interp(share, _NODES, each) for each in self._by_departure])
+
+    def power_between(self, low: float, high: float) -> tuple[float, float]:
+        """The power that the curve is most like between two codes, shares of full scale, and its standard deviation."""
+        codes = np.linspace(max(low, 0.02), max(high, low + 0.02), 50)
+        at = np.clip((codes * _PIECES).astype(int), 0, _PIECES - 1)
+        slope = np.log(np.maximum(np.diff(self._table)[at], 1e-12))
+        design = np.column_stack([np.log(codes), np.ones_like(codes)])
+        of_slope = np.linalg.pinv(design)[0]
+        sigma2 = of_slope @ (_WAVES[:, at].T @ self.covariance @ _WAVES[:, at]) @ of_slope
+        return 1 + float(of_slope @ slope), float(np.sqrt(max(sigma2, 0.0)))
+
+    @cached_property
+    def _base_power(self) -> float:
+        return Tone(self.base).power_between(0.1, 0.9)[0]
+
+    @cached_property
+    def _steps(self) -> Array:
+        return np.asarray(np.diff(self.base) * np.exp(self.mean @ _WAVES))
+
+    @cached_property
+    def _table(self) -> Array:
+        """(nodes,) light at evenly spaced codes."""
+        if not self.mean.any():
+            return self.base
+        sums = np.concatenate([[0.0], np.cumsum(self._steps)])
+        return np.asarray(sums / sums[-1])
+
+    @cached_property
+    def _by_departure(self) -> Array:
+        """(k, nodes) derivatives of the table, but for a constant share of light: a fit's gain takes that."""
+        sums = np.cumsum(self._steps * _WAVES, axis=1) / self._steps.sum()
+        return np.concatenate([np.zeros((len(_SIGMAS), 1)), sums], axis=1)
+
+    @cached_property
+    def _fast(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return self._table.astype(np.float32), np.diff(self._table).astype(np.float32)
+
+    def __repr__(self) -> str:
+        value, sigma = self.power_between(0.1, 0.9)
+        return f"Tone(like a power of {value:.2f} +- {sigma:.2f}: {self.source})"
+
+
+def said_by_all(each: Sequence[SaidOfTone]) -> SaidOfTone | None:
+    """What several marks or scans say together; None where there are none. What contradicts one another beyond chance,
+    by drawings that are not exact, say, is told by its own scatter how little it is worth."""
+    if not each:
+        return None
+    information = np.sum([one.information for one in each], axis=0)
+    right = np.sum([one.right for one in each], axis=0)
+    count, k = sum(one.count for one in each), len(right)
+    square = sum(one.square for one in each)
+    together = SaidOfTone(information, right, square, count)
+    likeliest = np.asarray(np.linalg.solve(information + _LEAST_INFORMATION * np.eye(k), right), float)
+    worse = max(together.misfit(likeliest) / max(count - k, 1), 1.0)
+    return SaidOfTone(information / worse, right / worse, square / worse, count)
+
+
+def _waves(code: Array) -> Array:
+    """(k, n) departures of one standard deviation: what each adds to the logarithm of the slope."""
+    x = 2 * code - 1
+    waves = [np.polynomial.legendre.Legendre.basis(degree)(x) for degree in range(1, len(_WAVE_SIGMAS) + 1)]
+    return np.asarray(_SIGMAS[:, None] * np.stack([np.log(code + _TOE), *waves]))
+
+
+_WAVES = _waves(_MIDDLES)
+LINEAR = Tone()

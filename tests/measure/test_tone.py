@@ -1,0 +1,120 @@
+"""Tone curves: what is believed of them, what pictures say of them, and marks measured through them."""
+
+import numpy as np
+import pytest
+from drawn import scan_of
+from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
+
+from measure.fitting.matching import Match, match
+from measure.fitting.scan_window import read_window
+from measure.frames.refinement import options_for
+from measure.marks.shapes import MarkShape, polygon
+from measure.match_options import MatchOptions
+from measure.scans.told_tone import FrameTone
+from measure.scans.tone import LINEAR, SaidOfTone, Tone, power, sampled, srgb
+from synthetic_images.tone_curve import coded
+
+FULL = 65535.0
+DARK, LIGHT = 0.06, 0.55
+CURVES: tuple[float | str, ...] = (1.0, 2.2, "srgb", "s-curve")
+# A half-wedge that grows out of the border: its tip, and no more, holds it along its axis.
+TIP = Kind(
+    "tip", MarkShape(polygon(((0.0, 0.0), (-2.6, 6.0), (2.6, 6.0))), known_mm=((-3.0, -2.0), (3.0, 1.8))), (), 1e-4
+)
+
+
+def code_of(mark: TrueMark, curve: float | str, snr: float, rng: np.random.Generator) -> np.ndarray:
+    light = DARK + (LIGHT - DARK) * (mark.picture + rng.standard_normal(mark.picture.shape) / snr)
+    return FULL * coded(np.clip(light, 0.0, 1.0).astype(np.float32), curve)
+
+
+def fitted(mark: TrueMark, code: np.ndarray, tone: Tone) -> Match:
+    scan = scan_of(code).seen_through(tone)
+    options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
+    return match(read_window(scan, (0, 0, mark.size, mark.size)), mark.kind.shape, mark.place, options)
+
+
+def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tuple[list[Match], FrameTone]:
+    tone = prior
+    for _ in range(4):
+        fits = [fitted(mark, code, tone) for mark, code in zip(marks, codes, strict=True)]
+        found = FrameTone.of(prior, {n: fit.tone for n, fit in enumerate(fits) if fit.tone is not None})
+        tone = found.step_from(tone)
+    return fits, found
+
+
+@pytest.mark.parametrize(("tone", "code", "light"), [
+    (LINEAR, 1000.0, 1000.0),
+    (Tone(power(2.2)), FULL / 2, FULL * 0.5**2.2),
+    (Tone(srgb()), 0.5 * FULL, FULL * 0.21404),  # IEC 61966-2-1
+    (Tone(sampled(np.linspace(0, 1, 9) ** 2)), FULL * 0.5, FULL * 0.25),
+])  # fmt: skip
+def test_light_of_a_code_and_back(tone: Tone, code: float, light: float) -> None:
+    assert tone.light(np.array([code]), FULL)[0] == pytest.approx(light, rel=1e-3)
+    assert tone.code(np.array([light]), FULL)[0] == pytest.approx(code, rel=1e-3)
+
+
+def test_a_curve_that_does_not_grow_is_refused() -> None:
+    with pytest.raises(ValueError, match="grows"):
+        sampled(np.array([0.0, 0.5, 0.4, 1.0]))
+
+
+def test_departures_change_light_as_their_derivatives_say() -> None:
+    tone, codes = Tone.unknown(), np.linspace(0.1, 0.9, 9) * FULL
+    for k in range(5):
+        step = np.eye(5)[k] * 1e-3
+        more, less = (tone.at(way * step).light(codes, FULL).astype(float) for way in (1, -1))
+        by_departure = (more - less) / 2e-3
+        told = tone.changes(tone.light(codes, FULL), FULL)[k]
+        gain = np.polyfit(tone.light(codes, FULL).astype(float), by_departure - told, 1)  # but for gain and offset
+        assert np.allclose(np.polyval(gain, tone.light(codes, FULL)), by_departure - told, atol=1e-3 * np.ptp(told) + 1)
+
+
+def test_a_declared_curve_holds_until_pictures_contradict_it() -> None:
+    declared = Tone.declared(power(2.2), "the file says so")
+    assert declared.power_between(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.01)
+    linear = -1.2 / 0.6 * np.eye(5)[0]  # departures that make a power of 1 of it
+    strong, faint = (SaidOfTone(w * np.eye(5), w * linear, w * float(linear @ linear), 5) for w in (400.0, 0.1))
+    assert declared.told(faint).power_between(0.1, 0.9)[0] == pytest.approx(2.2, abs=0.05)
+    assert "contradict" not in declared.told(faint).source
+    assert declared.told(strong).power_between(0.1, 0.9)[0] == pytest.approx(1.0, abs=0.1)
+    assert "contradict" in declared.told(strong).source
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: float | str) -> None:
+    rng = np.random.default_rng(3)
+    errors, covariances, off = [], [], []
+    for _ in range(3):
+        marks = [some_mark(TIP, 1.0, rng) for _ in range(4)]
+        codes = [code_of(mark, curve, 80.0, rng) for mark in marks]
+        fits, found = settled(marks, codes, Tone.unknown())
+        for mark, fit in zip(marks, fits, strict=True):
+            assert fit.tone is not None
+            errors.append(fit.center_px - mark.place[:, 2])
+            covariances.append(fit.covariance_px2 + found.covariance_px2(fit.tone))
+            axis = mark.place[:, 1] / np.hypot(*mark.place[:, 1])
+            off.append(float(errors[-1] @ axis))
+            assert np.hypot(*errors[-1]) < 5 * np.sqrt(np.linalg.eigvalsh(covariances[-1])[-1])
+    assert abs(np.mean(off)) < 0.1
+    assert whitened_rms(errors, covariances) < 1.8  # of three curves, mostly: the tips of a scan are off together
+
+
+def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> None:
+    rng = np.random.default_rng(5)
+    mark = some_mark(TIP, 1.0, rng)
+    code, tone = code_of(mark, 2.2, 200.0, rng), Tone(power(2.2), covariance=np.eye(5))
+    told = fitted(mark, code, tone).tone
+    assert told is not None
+    for k in range(3):
+        step = 0.1 * np.eye(5)[k]
+        more, less = (fitted(mark, code, tone.at(way * step)).center_px for way in (1, -1))
+        np.testing.assert_allclose((more - less) / 0.2, told.on_place[:, k], atol=0.03)
+
+
+def test_a_cross_does_not_move_by_the_curve() -> None:
+    rng = np.random.default_rng(6)
+    mark = some_mark(KIND["cross"], 1.0, rng)
+    fit = fitted(mark, code_of(mark, 2.2, 50.0, rng), Tone.unknown())
+    assert fit.tone is not None
+    assert np.abs(fit.tone.on_place).max() < 0.02
