@@ -1,6 +1,6 @@
 """Bends of a scanner that the observations do not tell from what the films and the fiducial marks do, in words."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,18 +30,25 @@ def hardly_told(problem: Problem, state: State, free: Indices, factor: Factor, v
     """
     places = {int(position): i for i, position in enumerate(free)}
     for name, positions in problem.unknowns.scanner.items():
-        poses = poses_in(problem, state, name)
-        told: dict[tuple[str, str], list[str]] = {}
-        for position in (int(each) for each in positions if int(each) in places):
-            if np.sqrt(variances[position]) * factor.scale[places[position]] > HARDLY:
-                term = problem.unknowns.names[position].rsplit(".", 1)[1]
-                told.setdefault((_because(term, poses), _otherwise(term, poses)), []).append(term)
-        for (because, otherwise), terms in told.items():
-            yield (
-                f"The bend of scanner {name} is hardly told from the fiducial marks and the other unknowns in its "
-                f"term{'s' * (len(terms) > 1)} {', '.join(terms)}: {because}. Give a standard deviation to {GIVEN}, "
-                f"or {otherwise}."
-            )
+        terms = [
+            problem.unknowns.names[position].rsplit(".", 1)[1]
+            for position in map(int, positions)
+            if position in places and np.sqrt(variances[position]) * factor.scale[places[position]] > HARDLY
+        ]
+        yield from untold_sentences(name, terms, _poses(problem, state, name))
+
+
+def untold_sentences(scanner: str, terms: Sequence[str], poses: Sequence[Pose]) -> Iterator[str]:
+    """Sentences on some terms of a scanner's bend that are not, or hardly, told from the fiducial marks' places."""
+    told: dict[tuple[str, str], list[str]] = {}
+    for term in terms:
+        told.setdefault((_because(term, poses), _otherwise(term, poses)), []).append(term)
+    for (because, otherwise), alike in told.items():
+        yield (
+            f"The bend of scanner {scanner} is hardly told from the fiducial marks and the other unknowns in its "
+            f"term{'s' * (len(alike) > 1)} {', '.join(alike)}: {because}. Give a standard deviation to {GIVEN}, "
+            f"or {otherwise}."
+        )
 
 
 def scanner_leads(problem: Problem, state: State) -> list[Lead]:
@@ -49,7 +56,7 @@ def scanner_leads(problem: Problem, state: State) -> list[Lead]:
     return [
         _lead(problem, name, int(position), poses)
         for name, positions in problem.unknowns.scanner.items()
-        for poses in [poses_in(problem, state, name)]
+        for poses in [_poses(problem, state, name)]
         for position in positions
     ]
 
@@ -58,15 +65,8 @@ def _lead(problem: Problem, scanner: str, position: int, poses: Sequence[Pose]) 
     term = problem.unknowns.names[position].rsplit(".", 1)[1]
     functional = np.zeros(len(problem.unknowns))
     functional[position] = 1.0
-    return Lead(
-        SCANNER_RANK,
-        functional,
-        f"The term {term} of the bend of scanner {scanner} can change",
-        GIVEN,
-        _because(term, poses),
-        None,
-        _otherwise(term, poses),
-    )
+    motion = f"The term {term} of the bend of scanner {scanner} can change"
+    return Lead(SCANNER_RANK, functional, motion, GIVEN, _because(term, poses), None, _otherwise(term, poses))
 
 
 def _because(term: str, poses: Sequence[Pose]) -> str:
@@ -75,7 +75,7 @@ def _because(term: str, poses: Sequence[Pose]) -> str:
     if _are_half_turns(poses) and degree_of(term) % 2:
         return "frames turned by 180 degrees tell terms of even degree from the fiducial marks, and this is an odd one"
     listed = ", ".join(f"{turn}{' mirrored' if mirrored else ''}" for turn, mirrored in poses)
-    return f"it looks the same in all poses in which frames lie in the scanner ({listed} degrees)"
+    return f"it, or what it shares with other terms, looks the same as the frames lie in the scanner ({listed} degrees)"
 
 
 def _otherwise(term: str, poses: Sequence[Pose]) -> str:
@@ -91,19 +91,23 @@ def _are_half_turns(poses: Sequence[Pose]) -> bool:
     return all(abs((turn - first + 90) % 180 - 90) < ALIKE_DEG and m == mirrored for turn, m in poses)
 
 
-def poses_in(problem: Problem, state: State, scanner: str) -> list[Pose]:
-    """The ways in which a scanner's frames lie in it, by their film transformations."""
-    images = {image.name for image in problem.network.images if image.scanner == scanner}
-    numbers = [i for i, image in enumerate(problem.network.images) if image.name in images]
-    poses: list[Pose] = []
+def _poses(problem: Problem, state: State, scanner: str) -> list[Pose]:
+    gradients = []
     for films in problem.films:
-        gradients = films.kind.gradient(state.values[films.positions], films.center_mm)
-        for i, gradient in zip(films.images, gradients, strict=True):
-            if i in numbers:
-                mirrored = bool(np.linalg.det(gradient) < 0.0)
-                upright = gradient * [1.0, -1.0] if mirrored else gradient
-                turn = np.degrees(np.arctan2(upright[1, 0] - upright[0, 1], upright[0, 0] + upright[1, 1]))
-                pose = round(float(turn)) % 360, mirrored
-                if not any(mirrored == m and abs((pose[0] - t + 180) % 360 - 180) < ALIKE_DEG for t, m in poses):
-                    poses.append(pose)
+        of_films = films.kind.gradient(state.values[films.positions], films.center_mm)
+        own = [problem.network.images[i].scanner == scanner for i in films.images]
+        gradients += [gradient for gradient, is_own in zip(of_films, own, strict=True) if is_own]
+    return poses_of(gradients)
+
+
+def poses_of(gradients: Iterable[Array]) -> list[Pose]:
+    """The ways in which frames lie in their scans, from the derivatives (2, 2) of camera by comparator coordinates."""
+    poses: list[Pose] = []
+    for gradient in gradients:
+        mirrored = bool(np.linalg.det(gradient) < 0.0)
+        upright = gradient * [1.0, -1.0] if mirrored else gradient
+        turn = np.degrees(np.arctan2(upright[1, 0] - upright[0, 1], upright[0, 0] + upright[1, 1]))
+        pose = round(float(turn)) % 360, mirrored
+        if not any(mirrored == m and abs((pose[0] - t + 180) % 360 - 180) < ALIKE_DEG for t, m in poses):
+            poses.append(pose)
     return sorted(poses)

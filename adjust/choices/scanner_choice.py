@@ -1,0 +1,177 @@
+"""The bend of a scanner that the observations ask for: few terms, each tested, of those that can be told at all.
+
+One adjustment with all terms, held together by a weak prior, gives their normal equations with everything else
+eliminated: G = Q⁻¹ - I / sigma², g = Q⁻¹ x, Q their cofactor matrix and x their values. From these any choice of terms
+follows, x_A = G_AA⁻¹ g_A with v'Pv smaller by g_A' G_AA⁻¹ g_A. Terms are taken in one after the other, the one that
+explains most first, while its F-test is significant with all candidates counted (Bonferroni).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, fdtrc
+
+from adjust.functional_model.projection import adjusted_image
+from adjust.functional_model.scanner import carriage_terms, smooth_terms
+from adjust.network import Network, Prior, Scanner
+from adjust.quality.significance import LEVEL
+from adjust.result import Adjustment
+from adjust.undetermined.scanner_directions import HARDLY, poses_of, untold_sentences
+
+Array = NDArray[np.float64]
+
+WEAK_MM = 1.0  # prior of every term in the trial: far more than scanners bend
+
+
+@dataclass(frozen=True)
+class ScannerChoice:
+    """The network with the chosen terms of every scanner's bend; remarks: on what cannot be told."""
+
+    network: Network
+    remarks: tuple[str, ...]
+
+
+def with_bends(network: Network, terms: Sequence[str] | None = None, sigma_mm: float = np.inf) -> Network:
+    """The network with a bend of every scanner that its images name, over the extent of their observations.
+
+    terms: of the bend; None: all of degree 2 and 3, and of degree 1, that no film transformation takes. sigma_mm: of
+    every term, which is given as 0.
+    """
+    smooth = smooth_terms(_films(network))
+    return _with_terms(
+        network, {name: smooth if terms is None else tuple(terms) for name in _scanners(network)}, sigma_mm
+    )
+
+
+def choose_bends(
+    network: Network, adjusted: Callable[[Network], Adjustment], sigma_mm: float = np.inf
+) -> ScannerChoice:
+    """The network with those terms of every scanner's bend that the observations ask for.
+
+    adjusted: how a network is adjusted; once, with all candidates. sigma_mm: as in `with_bends`.
+    """
+    smooth, films = smooth_terms(_films(network)), _films(network)
+    candidates = (*smooth, *carriage_terms(films))
+    trial = adjusted(_with_terms(network, dict.fromkeys(_scanners(network), candidates), WEAK_MM))
+    if not trial.converged:
+        return ScannerChoice(_straight(network), (_no_trial(trial),))
+    chosen: dict[str, tuple[str, ...]] = {}
+    remarks: list[str] = []
+    for scanner in trial.network.scanners:
+        equations = _equations(trial, scanner)
+        chosen[scanner.name] = _needed(equations)
+        untold = [term for term in equations.untold(chosen[scanner.name]) if term in smooth]
+        images = [image.name for image in network.images if image.scanner == scanner.name]
+        center = np.array([scanner.center_mm])
+        poses = poses_of(adjusted_image(trial, name).camera_by_comparator(center)[0] for name in images)
+        remarks += untold_sentences(scanner.name, untold, poses)
+    return ScannerChoice(_with_terms(network, chosen, sigma_mm), tuple(remarks))
+
+
+def _straight(network: Network) -> Network:
+    """The network whose scanners bend nothing."""
+    return _with_terms(network, dict.fromkeys(_scanners(network), ()), np.inf)
+
+
+def _films(network: Network) -> set[str]:
+    return {image.transformation for image in network.images if image.scanner}
+
+
+def _scanners(network: Network) -> list[str]:
+    return sorted({image.scanner for image in network.images} - {""})
+
+
+def _with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float) -> Network:
+    scanners = []
+    for name, of_scanner in terms.items():
+        scanned = np.array([image.scanner == name for image in network.images])[network.image_numbers]
+        lowest, highest = (edge(network.observations.xy_mm[scanned], axis=0) for edge in (np.min, np.max))
+        x, y = (lowest + highest) / 2.0
+        half_x, half_y = np.maximum(highest - lowest, 1e-3) / 2.0
+        priors = dict.fromkeys(of_scanner, Prior(0.0, sigma_mm))
+        scanners.append(Scanner(name, priors, (float(x), float(y)), (float(half_x), float(half_y))))
+    return replace(network, scanners=tuple(scanners))
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """The normal equations of the terms of one bend, everything else eliminated.
+
+    normal (k, k), right (k,); known (k,): the diagonal of `normal` if everything else were known. vpv, redundancy: of
+    the adjustment without a term.
+    """
+
+    terms: tuple[str, ...]
+    normal: Array
+    right: Array
+    known: Array
+    vpv: float
+    redundancy: int
+
+    def untold(self, taken: Sequence[str]) -> list[str]:
+        """The terms that cannot be told, beside some that are taken, from the other unknowns."""
+        left, _ = self._reduced(taken)
+        return [term for term, told in zip(self.terms, left, strict=True) if term not in taken and not told]
+
+    def next(self, taken: Sequence[str]) -> tuple[str, float] | None:
+        """The term that explains most beside those that are taken, and the probability of so much by chance."""
+        told, explained = self._reduced(taken)
+        open_ = np.array([each not in taken for each in self.terms]) & told
+        if not open_.any():
+            return None
+        best = int(np.argmax(np.where(open_, explained, -np.inf)))
+        redundancy = self.redundancy - len(taken) - 1
+        left = self.vpv - self._explained_by(taken) - float(explained[best])
+        if redundancy > 0 and left > 0.0:
+            return self.terms[best], float(fdtrc(1, redundancy, explained[best] / left * redundancy))
+        return self.terms[best], float(chdtrc(1, explained[best]))
+
+    def _reduced(self, taken: Sequence[str]) -> tuple[NDArray[np.bool_], Array]:
+        """Of every term beside those taken: whether it is told, and by how much it makes v'Pv smaller."""
+        at = [self.terms.index(each) for each in taken]
+        solved = np.linalg.solve(self.normal[np.ix_(at, at)], np.column_stack([self.normal[at], self.right[at]]))
+        normal = np.diag(self.normal) - (self.normal[:, at] * solved[:, :-1].T).sum(axis=1)
+        right = self.right - self.normal[:, at] @ solved[:, -1]
+        told = normal > self.known / HARDLY**2
+        return told, np.where(told, right**2 / np.where(told, normal, 1.0), 0.0)
+
+    def _explained_by(self, taken: Sequence[str]) -> float:
+        at = [self.terms.index(each) for each in taken]
+        return float(self.right[at] @ np.linalg.solve(self.normal[np.ix_(at, at)], self.right[at]))
+
+
+def _equations(trial: Adjustment, scanner: Scanner) -> _Equations:
+    """Of one scanner's terms, those of others being free beside them."""
+    terms = tuple(scanner.terms)
+    names = [f"SC.{scanner.name}.{term}" for term in terms]
+    values = np.array([trial.value(name) for name in names])
+    normal = np.linalg.inv(trial.cofactor_of(names))
+    right = normal @ values
+    observations, rows = trial.network.observations, trial.network.rows_by_scanner[scanner.name]
+    weights = np.linalg.inv(observations.covariance_mm2[rows])
+    if len(trial.weights):
+        weights = weights * trial.weights[rows][:, None, None]
+    design = scanner.bend.displacement(np.zeros(len(terms)), observations.xy_mm[rows]).by_parameters
+    known = np.einsum("nik,nij,njk->k", design, weights, design)
+    without = trial.vpv + float(values @ normal @ values)
+    return _Equations(
+        terms, normal - np.eye(len(terms)) / WEAK_MM**2, right, np.asarray(known), without, trial.redundancy
+    )
+
+
+def _needed(equations: _Equations) -> tuple[str, ...]:
+    taken: list[str] = []
+    level = LEVEL / len(equations.terms)
+    while (best := equations.next(taken)) is not None and best[1] < level:
+        taken.append(best[0])
+    return tuple(term for term in equations.terms if term in taken)
+
+
+def _no_trial(trial: Adjustment) -> str:
+    causes = " ".join(each.cause for each in trial.singular)
+    return (
+        f"A bend of the scanner was not looked for: the adjustment with all of its terms ended with "
+        f"{trial.termination}.{causes and f' {causes}'}"
+    )
