@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetic_images.areas import Area
+from synthetic_images.bend import Bend
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import Scene, SceneImage
 
@@ -20,7 +21,8 @@ INVERSION_STEPS = 5  # of the smooth deformation, each a ten-thousandth of the o
 class FrameGeometry:
     """Where things of one frame come to lie in its scan.
 
-    width_px, height_px: of the scan. comparator_from_camera: (2, 3), exact where the film has no smooth deformation.
+    width_px, height_px: of the scan. comparator_from_camera: (2, 3), exact where the film has no smooth deformation and
+    the scanner no bend.
     amplitudes_mm, waves_per_mm (WAVES, 2), phases_rad (WAVES,): the smooth deformation, a sum of sines.
     """
 
@@ -37,6 +39,8 @@ class FrameGeometry:
         """(n, 2) column and row of points (n, 2) of the camera frame."""
         film = camera_mm + self.deformation_mm(camera_mm)
         comparator = film @ self.comparator_from_camera[:, :2].T + self.comparator_from_camera[:, 2]
+        if self.bend.terms_um:
+            comparator = self.bend.scan_from_bed(comparator)
         return np.asarray(comparator * self._pixel_per_mm, np.float64)
 
     def pixel_from_object(self, points: Array) -> Array:
@@ -45,6 +49,8 @@ class FrameGeometry:
 
     def camera_from_scan(self, pixels: Array) -> Array:
         """(n, 2) points of the camera frame from column and row (n, 2), the inverse of `pixel_from_camera`."""
+        if self.bend.terms_um:
+            pixels = self.bend.bed_from_scan(pixels / self._pixel_per_mm) * self._pixel_per_mm
         film = pixels @ self.camera_from_pixel[:2, :2].T + self.camera_from_pixel[:2, 2]
         camera_mm = film
         for _ in range(INVERSION_STEPS):
@@ -59,8 +65,12 @@ class FrameGeometry:
         return np.asarray(np.sin(camera_mm @ self.waves_per_mm.T + self.phases_rad) @ self.amplitudes_mm)
 
     @cached_property
+    def bend(self) -> Bend:
+        return scanner_bend(self.scene)
+
+    @cached_property
     def camera_from_pixel(self) -> Array:
-        """(3, 3) the camera frame from column, row, 1, without the smooth deformation."""
+        """(3, 3) the camera frame from column, row, 1, without the smooth deformation and the scanner's bend."""
         pixel_from_camera = np.eye(3)
         pixel_from_camera[:2] = self.comparator_from_camera * self._pixel_per_mm[:, None]
         return np.asarray(np.linalg.inv(pixel_from_camera), np.float64)
@@ -100,6 +110,11 @@ def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
         waves_per_mm=np.stack([np.cos(directions), np.sin(directions)], axis=1) * waves[:, None],
         phases_rad=generator.uniform(0, 2 * np.pi, WAVES),
     )
+
+
+def scanner_bend(scene: Scene) -> Bend:
+    """The bend of the scene's scanner, over a square bed that holds the scans of all frames, however they are laid."""
+    return Bend(scene.scanner.bend_um, max(scene.camera.frame_mm) + 2 * scene.scanner.margin_mm)
 
 
 def turn(angle_rad: float) -> Array:

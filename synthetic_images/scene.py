@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetic_images.areas import Area, Point
+from synthetic_images.bend import is_term
 from synthetic_images.checks import not_negative, one_of, positive, unique
 
 Array = NDArray[np.float64]
@@ -247,7 +248,8 @@ class Scanner:
     margin_mm: how far the scan reaches beyond the frame; blur_px: Gaussian sigma of the MTF beside the pixel's own
     area; noise: rms as a share of full scale, white; tile_px: edge of the file's tiles, 0 for strips.
     white_is_zero: only how the file stores the same picture; negative: the picture is a negative. tone: the gamma by
-    which light is coded, or one of TONES.
+    which light is coded, or one of TONES. bend_um: what the scanner bends in all scans alike, by the names of
+    `bend.Bend`.
     """
 
     pitch_um: Point
@@ -261,6 +263,7 @@ class Scanner:
     compression: Compression = "none"
     tile_px: int = 256
     tone: float | str = 1.0
+    bend_um: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         positive("pitch_um", *self.pitch_um)
@@ -277,6 +280,9 @@ class Scanner:
             one_of("tone", self.tone, TONES)
         else:
             positive("tone", self.tone)
+        for name in self.bend_um:
+            if not is_term(name):
+                raise ValueError(f"bend_um has no term {name!r}; it has a20, b11 and the like, a in x and b in y")
         if self.tile_px < 0 or self.tile_px % 16:
             raise ValueError(f"tile_px must be a multiple of 16, or 0 for strips, not {self.tile_px}")
 

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetic_images.film import FrameGeometry
+from synthetic_images.film import FrameGeometry, scanner_bend
 from synthetic_images.scene import PARAMETERS, Scene
 from synthetic_images.targets import field_targets
 from synthetic_images.terrain import scene_terrain
 
 Array = NDArray[np.float64]
+
+SCANNER = "1"  # the name of the only one, as a project has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,7 @@ def truth_json(truth: Truth) -> str:
         "pixel_origin": "(col, row) = (0, 0) is the centre of the top-left pixel; rows count downwards",
         "comparator": "x = col * pitch_x, y = -row * pitch_y, mm",
         "cameras": {camera.name: _camera(truth.scene)},
+        "scanners": {SCANNER: _scanner(truth.scene)} if truth.scene.scanner.bend_um else {},
         "terrain": _terrain(truth.scene),
         "images": {frame.geometry.image.name: _frame(frame) for frame in truth.frames},
         "points": {
@@ -80,6 +83,15 @@ def _terrain(scene: Scene) -> dict[str, Any] | None:
         "amplitude": terrain.amplitudes.tolist(),
         "wave": terrain.waves.tolist(),
         "phase_rad": terrain.phases_rad.tolist(),
+    }
+
+
+def _scanner(scene: Scene) -> dict[str, Any]:
+    bend = scanner_bend(scene)
+    return {
+        "center_mm": list(bend.center_mm),
+        "half_mm": [bend.size_mm / 2] * 2,
+        "terms": {name: {"value": value / 1000} for name, value in bend.terms_um.items()},
     }
 
 

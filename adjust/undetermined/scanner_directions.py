@@ -75,7 +75,7 @@ def _because(term: str, poses: Sequence[Pose]) -> str:
     if _are_half_turns(poses) and degree_of(term) % 2:
         return "frames turned by 180 degrees tell terms of even degree from the fiducial marks, and this is an odd one"
     listed = ", ".join(f"{turn}{' mirrored' if mirrored else ''}" for turn, mirrored in poses)
-    return f"it, or what it shares with other terms, looks the same as the frames lie in the scanner ({listed} degrees)"
+    return f"it, or its sum with others, looks the same in all poses in which the frames lie ({listed} degrees)"
 
 
 def _otherwise(term: str, poses: Sequence[Pose]) -> str:

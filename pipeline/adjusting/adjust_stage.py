@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from adjust.network import Network
 from adjust.result import Adjustment
 from adjust.undetermined.datum_choice import with_held
 from pipeline.adjusting.network import build_network, unmeasured_points
+from pipeline.adjusting.scanners import with_scanners
 from pipeline.files.project_file import Project
 from pipeline.measuring.comparator_file import ComparatorPoint
 from pipeline.measuring.perspective_disks import across, disk_normals, eccentricity_mm, plane_normal
@@ -32,12 +34,14 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     """
     network, left_out = build_network(project, marks)
     options = adjustment_options(project)
+    network, untold = with_scanners(project, network, partial(_adjusted, options=options))
     adjustment = _adjusted(network, options)
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
     warnings = (
         *left_out,
+        *untold,
         *_misnamed(project, marks),
         *_unmeasured(project, network),
         *_not_corrected(network, uncorrected),

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import adjusted_image
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior
+from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior, Scanner
 from adjust.quality.correlation import correlations
-from adjust.quality.significance import group_tests, parameter_tests
+from adjust.quality.significance import SignificanceTest, group_tests, parameter_tests, scanner_tests
 from adjust.result import Adjustment, FurtherResidual
 from pipeline.adjusting.covariance_arrays import covariance_arrays, covariance_note
 from pipeline.adjusting.reliability_json import point_tests, reliability_json, suspect_json
@@ -80,6 +80,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "suspects": [suspect_json(suspect) for suspect in adjustment.suspects],
         "reliability": reliability_json(adjustment),
         "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras if camera.name in used},
+        "scanners": {scanner.name: _scanner(adjustment, scanner) for scanner in network.scanners},
         "images": {image.name: _image(adjustment, image) for image in network.images},
         "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
         "residuals": _residuals(adjustment),
@@ -124,10 +125,7 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
             "y": quantity("y0", camera.y0_mm),
         },
         "distortion": distortion,
-        "significance": [
-            {"group": test.name, "parameters": list(test.parameters), "F": test.statistic, "p": test.p}
-            for test in group_tests(adjustment, camera)
-        ],
+        "significance": [_group_test(test) for test in group_tests(adjustment, camera)],
         "fiducials": {
             id: {
                 "x_mm": _quantity(adjustment, f"FID.{camera.name}.{id}.x", fiducial.x_mm),
@@ -137,6 +135,26 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
             for id, fiducial in camera.fiducials.items()
         },
     }
+
+
+def _scanner(adjustment: Adjustment, scanner: Scanner) -> Json:
+    """How far the scanner puts a point beside its place, in mm, as products of Legendre polynomials over an extent."""
+    tests = {test.name: test for test in scanner_tests(adjustment, scanner)}
+    together = tests.pop("all", None)
+    return {
+        "center_mm": list(scanner.center_mm),
+        "half_mm": list(scanner.half_mm),
+        "terms": {
+            name: _quantity(adjustment, f"SC.{scanner.name}.{name}", prior)
+            | ({"t": tests[name].statistic, "p": tests[name].p} if name in tests else {})
+            for name, prior in scanner.terms.items()
+        },
+        "significance": [_group_test(together)] if together else [],
+    }
+
+
+def _group_test(test: SignificanceTest) -> Json:
+    return {"group": test.name, "parameters": list(test.parameters), "F": test.statistic, "p": test.p}
 
 
 def _image(adjustment: Adjustment, image: Image) -> Json:
@@ -156,7 +174,7 @@ def _image(adjustment: Adjustment, image: Image) -> Json:
             exterior[element] = _quantity(adjustment, name, given)
     if image.name in adjustment.network.unoriented:
         exterior = {key: quantity | {"sigma": math.nan} for key, quantity in exterior.items()}
-    return {"camera": image.camera, "transformation": transformation, "exterior": exterior}
+    return {"camera": image.camera, "scanner": image.scanner, "transformation": transformation, "exterior": exterior}
 
 
 def _point(adjustment: Adjustment, point: ObjectPoint) -> Json:

@@ -156,7 +156,9 @@ def _why_nothing(images: Sequence[Image], targets: Counter[str], fiducials: Coun
 def _image(project: Project, name: str) -> Image:
     camera = project.camera_of(name)
     exterior = project.given_images.exterior.get(name) if project.given_images else None
-    return Image(name, camera.name, _transformation(project, camera), exterior)
+    transformation = _transformation(project, camera)
+    bends = project.adjust.scanner != "none" and transformation != "none"
+    return Image(name, camera.name, transformation, exterior, project.scanner_of(name) if bends else "")
 
 
 def _transformation(project: Project, camera: CameraFile) -> Transformation:

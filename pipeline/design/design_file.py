@@ -51,6 +51,10 @@ def design_json(
         ],
         "warnings": list(adjustment.warnings),
         "cameras": {expected.camera: _camera(expected)},
+        "scanners": {
+            scanner.name: {term: _quantity(expected, f"SC.{scanner.name}.{term}") for term in scanner.terms}
+            for scanner in expected.network.scanners
+        },
         "photographs_alone": dict(alone),
         "images": {image.name: _image(expected, image) for image in expected.network.images},
         "points": _points(expected),

@@ -7,7 +7,7 @@ import numpy as np
 from adjust.choices.planning import Plan
 
 UM_PER_MM = 1000.0
-IN_MM = ("target", "tie", "fiducial", "datum")
+IN_MM = ("target", "tie", "fiducial", "datum", "scanner")
 
 
 @dataclass(frozen=True)

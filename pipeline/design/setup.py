@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust import network
+from adjust.functional_model.scanner import smooth_terms
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.network import Approximations, Network, Prior, Transformation
 from pipeline.adjusting.network import FEWEST_TARGETS
@@ -15,11 +16,14 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.rendered.scene_project import SceneFile, film_transformation
+from synthetic_images.film import turn
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import SceneCamera, SceneImage
 from synthetic_images.targets import field_targets
 
 Array = NDArray[np.float64]
+
+SCANNER = "scanner"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,11 @@ class Setup:
     points: tuple[PlannedPoint, ...]
     images: tuple[SceneImage, ...]
     settings: DesignSettings
+
+    @property
+    def bends(self) -> bool:
+        """Whether the bend of the scanner is to be found."""
+        return self.settings.scanner != "none" and self.transformation != "none"
 
     def seen_by(self, image: SceneImage) -> list[int]:
         """The points that lie within an image's frame and face its camera; that one hides another is not looked for."""
@@ -96,7 +105,8 @@ def setup_of(scene_file: SceneFile) -> Setup:
 def planned_network(setup: Setup) -> tuple[Network, Approximations]:
     """The network that measuring a setup gives, with the setup itself as the values of its unknowns.
 
-    The film lies straight in the comparator, and every visible mark is measured. A point of which nothing is known and
+    The film lies straight in the comparator, or, where a scanner's bend is to be found, as its pose says, and every
+    visible mark is measured. A point of which nothing is known and
     that fewer than two images show has no part in it. Raises InputError where an image shows too few targets.
     """
     seen = {image.name: setup.seen_by(image) for image in setup.images}
@@ -113,11 +123,25 @@ def planned_network(setup: Setup) -> tuple[Network, Approximations]:
     points = [setup.points[i] for i in used]
     planned = Network(
         cameras=(camera,),
-        images=tuple(network.Image(image.name, camera.name, setup.transformation) for image in setup.images),
+        images=tuple(
+            network.Image(image.name, camera.name, setup.transformation, scanner=SCANNER if setup.bends else "")
+            for image in setup.images
+        ),
         points=tuple(_object_point(point) for point in points),
         observations=observations,
+        scanners=_scanners(setup),
     )
     return planned, _values(setup, planned, points)
+
+
+def _scanners(setup: Setup) -> tuple[network.Scanner, ...]:
+    """The scanner, where its bend is to be found: over the frame, which lies about the comparator's origin."""
+    if not setup.bends:
+        return ()
+    settings, half_mm = setup.settings, max(setup.lens.frame_mm) / 2.0
+    names = smooth_terms([setup.transformation]) if settings.scanner == "bend" else settings.scanner
+    prior = Prior(0.0, settings.scanner_sigma_um / 1000.0)
+    return (network.Scanner(SCANNER, dict.fromkeys(names, prior), half_mm=(half_mm, half_mm)),)
 
 
 def _sigmas(point: PlannedPoint) -> tuple[float, float]:
@@ -158,11 +182,23 @@ def _observations(setup: Setup, seen: dict[str, list[int]], used: set[int]) -> n
 def _values(setup: Setup, planned: Network, points: list[PlannedPoint]) -> Approximations:
     camera = planned.cameras[0]
     marks = np.array([one.xy_mm for one in setup.camera.fiducials]).reshape(-1, 2)
-    straight, _ = fit_transformation(setup.transformation, marks, marks)
+    films = {
+        image.name: fit_transformation(setup.transformation, marks @ _laid(setup, image).T, marks)
+        for image in setup.images
+    }
     point = setup.lens.principal_point_mm
     return Approximations(
         interior={camera.name: np.array([setup.lens.principal_distance_mm, *point])},
         exterior={image.name: np.array(image.exterior) for image in setup.images},
-        transformation={image.name: straight for image in setup.images},
+        transformation={name: parameters for name, (parameters, _) in films.items()},
         points={point.id: point.xyz for point in points},
+        mirrored=frozenset(name for name, (_, mirrored) in films.items() if mirrored),
     )
+
+
+def _laid(setup: Setup, image: SceneImage) -> Array:
+    """How an image's frame lies in its scan (2, 2), comparator from camera."""
+    if not setup.bends:
+        return np.eye(2)
+    pose_rad = math.radians(int(image.pose.rstrip("m")))
+    return turn(image.turn_rad + pose_rad) @ np.diag([-1.0 if image.pose.endswith("m") else 1.0, 1.0])

@@ -20,6 +20,7 @@ KINDS = {
     "datum": "given fiducial",
     "control": "given point",
     "interior": "given interior",
+    "scanner": "given scanner",
     "exterior": "given exterior",
 }
 UNIT_WORDS = {"um": " µm", "object unit": ""}
@@ -52,6 +53,8 @@ def print_design(
     console.print(_curve_table(expected))
     if expected.fiducials:
         console.print(_fiducial_table(expected, alone))
+    if expected.network.scanners:
+        console.print(_scanner_table(expected))
     console.print(_point_table(expected))
     if expected.reliability.groups:
         console.print(_reliability_table(expected))
@@ -105,6 +108,14 @@ def _fiducial_table(expected: Expected, alone: Mapping[str, float]) -> Table:
         names = [f"FID.{expected.camera}.{id}.{axis}" for axis in "xy"]
         sigmas = (*(expected.plan.sigma(name) for name in names), *(alone[name] for name in names))
         table.add_row(Text(id), *(_sigma(UM_PER_MM * sigma) for sigma in sigmas))
+    return table
+
+
+def _scanner_table(expected: Expected) -> Table:
+    table = Table("term", "sigma, µm", title="Bend of the scanner", title_justify="left")
+    for scanner in expected.network.scanners:
+        for term in scanner.terms:
+            table.add_row(term, _sigma(UM_PER_MM * expected.plan.sigma(f"SC.{scanner.name}.{term}")))
     return table
 
 

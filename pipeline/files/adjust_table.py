@@ -1,8 +1,11 @@
 """The table [adjust] of project.toml: the model of the film, the datum, the weights, the tests."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
+from adjust.functional_model.scanner import is_term
 from adjust.functional_model.transformation import film_kind
 from adjust.network import Transformation
 from adjust.options import MEASURED_KINDS
@@ -12,13 +15,17 @@ from pipeline.files.tables import Table
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]
+ScannerSetting = Literal["none", "auto", "bend"] | tuple[str, ...]
+SCANNER_WORDS = ("none", "auto", "bend")
 
 
 @dataclass(frozen=True)
 class AdjustSettings:
     """The table [adjust]: a-priori standard deviations in um at the film.
 
-    transformation None: affine for a camera with fiducials, none for one without.
+    transformation None: affine for a camera with fiducials, none for one without. scanner: the terms of the scanners'
+    bends, "bend" for all of degree 2 and 3 that the films leave, "auto" for those that tests choose; scanner_sigma_um:
+    of every term, which is given as 0, inf free.
     """
 
     transformation: Transformation | None
@@ -28,6 +35,8 @@ class AdjustSettings:
     sigma_target_um: float
     sigma_fiducial_um: float
     film_sigma_um: float
+    scanner: ScannerSetting
+    scanner_sigma_um: float
     refraction: bool
     earth_curvature: bool
     robust: bool | WeightFunction
@@ -47,6 +56,8 @@ def read_adjust(table: Table) -> AdjustSettings:
         sigma_target_um=table.number("sigma_target_um", 5.0, above=0.0),
         sigma_fiducial_um=table.number("sigma_fiducial_um", 5.0, above=0.0),
         film_sigma_um=table.number("film_sigma_um", 0.0, least=0.0),
+        scanner=read_scanner(table, SCANNER_WORDS),
+        scanner_sigma_um=read_scanner_sigma(table),
         refraction=table.flag("refraction", False),
         earth_curvature=table.flag("earth_curvature", False),
         robust=_robust(table),
@@ -58,6 +69,31 @@ def read_adjust(table: Table) -> AdjustSettings:
     if settings.robust and settings.snooping:
         raise table.error("snooping", "and robust both take out gross errors. Set one of the two to false.")
     return settings
+
+
+def read_scanner(table: Table, words: Sequence[str]) -> ScannerSetting:
+    """The key `scanner`: one of some words, or a list of terms. Raises InputError."""
+    if not table.is_list("scanner"):
+        return cast(ScannerSetting, table.text("scanner", "none", words))
+    terms = table.texts("scanner")
+    for term in terms:
+        if not is_term(term):
+            raise table.error(
+                "scanner",
+                f"names {term!r}; a bend has the terms a20, b11 and the like, with the degrees in x and y, together "
+                f"2 to 6, and stretch, shear, tilt_x, tilt_y.",
+            )
+    if len(set(terms)) < max(len(terms), 1):
+        raise table.error("scanner", 'is empty or names a term twice. Where there is to be no bend, write "none".')
+    return terms
+
+
+def read_scanner_sigma(table: Table) -> float:
+    """The key `scanner_sigma_um`, inf where it is absent. Raises InputError."""
+    sigma_um = table.sigma("scanner_sigma_um", math.inf)
+    if sigma_um == 0.0:
+        raise table.error("scanner_sigma_um", 'is 0, which would fix every term at 0: write scanner = "none" for that.')
+    return sigma_um
 
 
 def _robust(table: Table) -> bool | WeightFunction:

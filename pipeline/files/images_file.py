@@ -1,8 +1,8 @@
-"""images.csv: exterior orientations, approximate or observed, and the camera of each image where there are several."""
+"""images.csv: exterior orientations, approximate or observed, the camera and the scanner of each image."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,12 @@ SIGMAS = tuple(f"s{element}" for element in ELEMENTS)
 
 @dataclass(frozen=True)
 class GivenImages:
-    """By image name: exterior orientation (None where the line gives none), the camera file's name ("" where none)."""
+    """By image name: exterior orientation (None where the line gives none), the camera file's name and the scanner's
+    ("" where none)."""
 
     exterior: Mapping[str, Exterior | None]
     camera: Mapping[str, str]
+    scanner: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
@@ -29,14 +31,14 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
     antenna: the offset of the point whose X0, Y0, Z0 are given from the projection centre, as in `Exterior`.
     """
     exterior: dict[str, Exterior | None] = {}
-    camera = {}
-    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera")):
+    camera, scanner = {}, {}
+    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner")):
         name = image_name(row.name("image"))
         if name in exterior:
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
         exterior[name] = _exterior(row, antenna)
-        camera[name] = row.text("camera")
-    return GivenImages(exterior, camera)
+        camera[name], scanner[name] = row.text("camera"), row.text("scanner")
+    return GivenImages(exterior, camera, scanner)
 
 
 def image_name(text: str) -> str:

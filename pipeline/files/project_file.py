@@ -24,6 +24,7 @@ from pipeline.files.tie_table import TieSettings, read_ties
 
 FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
 _COARSEST_PITCH_UM = 1e4  # above it nm were meant: film of a few pixels shows no mark
+DEFAULT_SCANNER = "1"  # the name of that of all images that name none
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 
 
@@ -115,6 +116,10 @@ class Project:
     def camera_of(self, image: str) -> CameraFile:
         name = self.given_images.camera.get(image, "") if self.given_images else ""
         return self.cameras[name] if name else self.default_camera
+
+    def scanner_of(self, image: str) -> str:
+        """The name of the scanner of an image; all images that name none are of one."""
+        return (self.given_images.scanner.get(image, "") if self.given_images else "") or DEFAULT_SCANNER
 
 
 def read_project(path: Path) -> Project:

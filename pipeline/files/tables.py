@@ -97,6 +97,10 @@ class Table:
         """Whether a key that is there holds true or false."""
         return isinstance(self._get(key, None), bool)
 
+    def is_list(self, key: str) -> bool:
+        """Whether a key is there and holds a list."""
+        return isinstance(self.values.get(key), list)
+
     def flag(self, key: str, default: bool) -> bool:
         value = self._get(key, default)
         if not isinstance(value, bool):

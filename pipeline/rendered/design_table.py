@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import cast, get_args
 
 from adjust.network import Transformation
-from pipeline.files.adjust_table import Datum, read_transformation
+from pipeline.files.adjust_table import Datum, ScannerSetting, read_scanner, read_scanner_sigma, read_transformation
 from pipeline.files.tables import Table
 
 Values = tuple[float, ...] | tuple[str, ...]
@@ -32,7 +32,8 @@ class Photo:
 class DesignSettings:
     """What a plan needs beyond the scene, in the words of project.toml.
 
-    transformation None: the film's of the scene, none for a camera without fiducials. sigma_planimetry, sigma_height:
+    transformation None: the film's of the scene, none for a camera without fiducials. scanner: as in `AdjustSettings`,
+    but for "auto". sigma_planimetry, sigma_height:
     of the test field's coordinates in object units, 0 known, inf unknown. control_points: the only points of which
     these are known; empty: all. sigma0: by what the a-priori standard deviations are to be multiplied. radii_mm: where
     the distortion's precision is told; empty: quarters of the frame's half diagonal. layouts: how many random layouts
@@ -44,6 +45,8 @@ class DesignSettings:
     sigma_target_um: float
     sigma_fiducial_um: float
     film_sigma_um: float
+    scanner: ScannerSetting
+    scanner_sigma_um: float
     sigma0: float
     sigma_planimetry: float
     sigma_height: float
@@ -66,6 +69,8 @@ def read_design(table: Table, sigma_planimetry: float, sigma_height: float) -> D
         sigma_target_um=table.number("sigma_target_um", 5.0, above=0.0),
         sigma_fiducial_um=table.number("sigma_fiducial_um", 5.0, above=0.0),
         film_sigma_um=table.number("film_sigma_um", 0.0, least=0.0),
+        scanner=read_scanner(table, ("none", "bend")),
+        scanner_sigma_um=read_scanner_sigma(table),
         sigma0=table.number("sigma0", 1.0, above=0.0),
         sigma_planimetry=table.sigma("sigma_planimetry", sigma_planimetry),
         sigma_height=table.sigma("sigma_height", sigma_height),

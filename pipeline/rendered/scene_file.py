@@ -171,6 +171,8 @@ def _film(table: Table) -> scene.Film:
 
 
 def _scanner(table: Table) -> scene.Scanner:
+    bend = table.table("bend_um")
+    bend_um = {name: bend.number(name) for name in sorted(bend.values)}
     return scene.Scanner(
         pitch_um=table.number_or_pair("pitch_um"),
         margin_mm=table.number("margin_mm", 5.0),
@@ -183,6 +185,7 @@ def _scanner(table: Table) -> scene.Scanner:
         compression=cast(scene.Compression, table.text("compression", "none", get_args(scene.Compression))),
         tile_px=table.whole("tile_px", 256),
         tone=table.number_or_text("tone", 1.0, scene.TONES, above=0.0),
+        bend_um=bend_um,
     )
 
 

@@ -175,7 +175,11 @@ unit = "{scene_file.unit}"
 
 [adjust]
 transformation = "{film_transformation(scene_file)}"
-{_datum_text(scene_file)}"""
+{_datum_text(scene_file)}{_scanner_text(scene_file)}"""
+
+
+def _scanner_text(scene_file: SceneFile) -> str:
+    return 'scanner = "auto"\n' if scene_file.scene.scanner.bend_um and scene_file.camera.fiducials else ""
 
 
 def _datum_text(scene_file: SceneFile) -> str:

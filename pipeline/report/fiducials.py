@@ -70,7 +70,7 @@ def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
 
 def figure_plot(change: Figure) -> Markup:
     """The given places, the change of each mark as a stroke, and the 95 % ellipse about its end."""
-    axes, angles = _ellipse_axes(change.covariance_um2)
+    axes, angles = ellipse_axes(change.covariance_um2)
     radius = np.sqrt(chdtri(2, 0.05)) * axes
     reach = np.hypot(*change.change_um.T) + radius.max(axis=1)
     px_per_um = svg.round_step(LONGEST_PX / float(reach.max())) if reach.max() > 0.0 else 1.0
@@ -83,7 +83,7 @@ def figure_plot(change: Figure) -> Markup:
     x_corner, y_corner = (MARGIN_PX + px_per_mm * np.stack([corners[:, 0] - low[0], high[1] - corners[:, 1]], axis=1)).T
     content = [
         svg.line(x_corner, y_corner, "frame", closed=True),
-        *_ellipses(ends, px_per_um * radius, angles),
+        *ellipses(ends, px_per_um * radius, angles),
         svg.strokes(places, ends, "vector fiducial"),
         svg.strokes(places, places, "dot fiducial"),
         *(svg.words(x + 8.0, y + 16.0, id, "name") for id, (x, y) in zip(change.ids, places, strict=True)),
@@ -134,13 +134,13 @@ def _in_order(dx: Array, dy: Array, dc: float) -> Array:
     return np.concatenate([changes[:-1].ravel(), [dc], changes[-1]])
 
 
-def _ellipse_axes(covariance: Array) -> tuple[Array, Array]:
+def ellipse_axes(covariance: Array) -> tuple[Array, Array]:
     """Semi-axes (n, 2), the larger last, and its direction (n,), counter-clockwise from x in degrees."""
     variances, directions = np.linalg.eigh(covariance)
     return np.sqrt(np.maximum(variances, 0.0)), np.degrees(np.arctan2(directions[:, 1, 1], directions[:, 0, 1]))
 
 
-def _ellipses(centers: Array, radii_px: Array, angles_deg: Array) -> Iterator[Markup]:
+def ellipses(centers: Array, radii_px: Array, angles_deg: Array) -> Iterator[Markup]:
     for (x, y), (minor, major), angle in zip(centers, radii_px, angles_deg, strict=True):
         yield svg.tag(
             "ellipse",

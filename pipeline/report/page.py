@@ -18,6 +18,7 @@ from pipeline.report.frame_views import frame_views, thumbnail_scale
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.parameters import spoken_name
+from pipeline.report.scanner_views import scanner_views
 from pipeline.report.svg import round_step
 from pipeline.report.verdict import critical_w, judge, sigma0_bounds
 
@@ -64,6 +65,7 @@ def _context(data: ReportData) -> dict[str, Any]:
         "measured": bool(data.measurement),
         "has_pictures": data.thumbnail is not None,
         "cameras": camera_views(data),
+        "scanners": scanner_views(data),
         "fractions": list(_fractions(shots)),
         "least_marks": LEAST_MARKS,
         "meaning": MEANING,

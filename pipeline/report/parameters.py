@@ -54,6 +54,17 @@ def parameter_rows(name: str, camera: Json, sigma0: float, radius_mm: float) -> 
     return rows
 
 
+def term_rows(terms: Json) -> list[ParameterRow]:
+    """The terms of a scanner's bend, in um."""
+    return [_row(name, "µm", _in_um(quantity), "", _significance(quantity)) for name, quantity in terms.items()]
+
+
+def _in_um(quantity: Json) -> Json:
+    scaled = {key: None if quantity[key] is None else 1e3 * quantity[key] for key in ("value", "sigma")}
+    given = quantity["given"]
+    return scaled | {"given": {key: None if number is None else 1e3 * number for key, number in given.items()}}
+
+
 def high_correlations(name: str, camera: Json, covariance: Covariance) -> list[tuple[str, str, float]]:
     """Pairs of parameters that the observations hardly tell apart, the highest correlation first."""
     parameters = ["c", "x0", "y0", *parameter_names(camera["distortion"]["family"])]

@@ -1,0 +1,108 @@
+"""A scanner's bend apart from films and fiducial marks: claimed against realised standard deviations, and what is told.
+
+PYTHONPATH=tests/adjust python benchmarks/scanner.py [NETWORKS]
+
+Networks simulated with errors drawn anew, each adjusted with the terms of a bend beside everything else: frames in two
+poses, in four, and convergent photographs of targets. For every setup: the rms error over the rms of the claimed
+standard deviation, over all terms and of the least and most favourable term; then how often frames that lie alike are
+told, and which terms the tests choose.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from bent_scans import MIDDLE_MM, films, in_a_bent_scanner
+from numpy.typing import NDArray
+from simulated import Truth, field_points, simulated
+
+from adjust.adjustment import adjust
+from adjust.choices.scanner_choice import choose_bends
+from adjust.initial_values.approximations import approximate
+from adjust.network import Network, Prior
+from adjust.result import Adjustment
+
+Array = NDArray[np.float64]
+Made = Callable[[np.random.Generator, Mapping[str, Prior]], Network]
+
+FREE = Prior(0.0, np.inf)
+BEND_MM = {
+    "a20": 0.02, "a11": -0.015, "a02": 0.01, "b20": -0.012, "b11": 0.008, "b02": -0.02,
+    "a30": 0.006, "a21": -0.004, "a12": 0.005, "a03": 0.003, "b30": -0.005, "b21": 0.004, "b12": -0.006, "b03": 0.007,
+}  # fmt: skip
+EVEN = ("a20", "a11", "a02", "b20", "b11", "b02")
+TOLD_BY_QUARTERS = (*EVEN, "a30", "a21", "a12", "a03")
+HALVES, QUARTERS = (0.0, 180.0), (0.0, 90.0, 180.0, 270.0)
+CHOSEN = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
+
+
+def main() -> None:
+    """Print the tables."""
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 200
+    setups: tuple[tuple[str, Sequence[str], Made], ...] = (
+        ("8 frames, 8 marks each, turned by 0 and 180 degrees", EVEN, partial(laid, HALVES * 4, EVEN)),
+        (
+            "8 frames, 8 marks each, in all four quarters",
+            TOLD_BY_QUARTERS,
+            partial(laid, QUARTERS * 2, TOLD_BY_QUARTERS),
+        ),
+        ("4 convergent photographs of 40 known targets, 5 marks each", tuple(BEND_MM), photographs),
+    )
+    print(f"{count} networks a setup\n")
+    for words, terms, made in setups:
+        print(f"{words}: {len(terms)} terms free\n  {_ratios(count, terms, made)}", flush=True)
+    few = max(count // 10, 5)
+    alike = (laid((0.0,) * 8, EVEN, np.random.default_rng(seed), dict.fromkeys(EVEN, FREE)) for seed in range(few))
+    told = sum(map(_told, alike))
+    print(f"\nframes that all lie alike, 6 terms free: told in {told} of {few} networks")
+    for truth, words in ((CHOSEN, ", ".join(CHOSEN)), ({}, "none")):
+        chosen = Counter(_chosen(films(QUARTERS * 2, truth, {}, np.random.default_rng(seed))) for seed in range(few))
+        print(f"terms that bend: {words}; chosen by the tests, of {few} networks:")
+        for names, number in chosen.most_common():
+            print(f"  {number} times {', '.join(names) or 'none'}")
+
+
+def laid(turns: Sequence[float], terms: Sequence[str], rng: np.random.Generator, free: Mapping[str, Prior]) -> Network:
+    return films(turns, {name: BEND_MM[name] for name in terms}, free, rng)
+
+
+def photographs(rng: np.random.Generator, free: Mapping[str, Prior]) -> Network:
+    points = field_points(np.random.default_rng(5), 40)
+    network, _ = simulated(rng, Truth(middle_mm=MIDDLE_MM), points=points)
+    return in_a_bent_scanner(network, BEND_MM, free)
+
+
+def _adjusted(network: Network) -> Adjustment:
+    return adjust(network, approximate(network))
+
+
+def _ratios(count: int, terms: Sequence[str], made: Made) -> str:
+    errors, sigmas, sigma0 = np.empty((count, len(terms))), np.empty((count, len(terms))), np.empty(count)
+    for seed in range(count):
+        result = _adjusted(made(np.random.default_rng(seed), dict.fromkeys(terms, FREE)))
+        if not result.converged:
+            raise RuntimeError(f"network {seed} ended with {result.termination}")
+        errors[seed] = [result.value(f"SC.S.{name}") - BEND_MM[name] for name in terms]
+        sigmas[seed] = [result.sigma(f"SC.S.{name}") for name in terms]
+        sigma0[seed] = result.sigma0
+    each = np.sqrt((errors**2).mean(axis=0) / (sigmas**2).mean(axis=0))
+    together = float(np.sqrt((errors**2 / (sigmas**2).mean(axis=0)).mean()))
+    typical = 1e3 * np.sqrt((sigmas**2).mean(axis=0))
+    return (
+        f"realised over claimed {together:.3f}, by term {each.min():.2f} to {each.max():.2f}; claimed "
+        f"{typical.min():.2f} to {typical.max():.2f} um; mean sigma0 {sigma0.mean():.3f}"
+    )
+
+
+def _told(network: Network) -> bool:
+    return any("lie alike in the scanner" in text for text in _adjusted(network).warnings)
+
+
+def _chosen(network: Network) -> tuple[str, ...]:
+    return tuple(choose_bends(network, _adjusted).network.scanners[0].terms)
+
+
+if __name__ == "__main__":
+    main()

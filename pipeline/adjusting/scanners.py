@@ -1,0 +1,50 @@
+"""Which scanners bend their scans, and by which terms, as [adjust] asks for it."""
+
+from collections.abc import Callable
+
+from adjust.choices.scanner_choice import choose_bends, with_bends
+from adjust.functional_model.scanner import carriage_terms, smooth_terms
+from adjust.network import Network
+from adjust.result import Adjustment
+from pipeline.errors import InputError
+from pipeline.files.adjust_table import AdjustSettings
+from pipeline.files.project_file import Project
+
+UM_PER_MM = 1000.0
+
+
+def with_scanners(
+    project: Project, network: Network, adjusted: Callable[[Network], Adjustment]
+) -> tuple[Network, tuple[str, ...]]:
+    """The network with its scanners' bends, and what is to be said of terms that cannot be told.
+
+    adjusted: how a network is adjusted, for tests to choose by. Raises InputError where a term is asked for that the
+    film transformations take.
+    """
+    settings = project.adjust
+    if settings.scanner == "none":
+        return network, ()
+    films = {image.transformation for image in network.images if image.scanner}
+    if not films:
+        raise InputError(
+            f"{project.path}: [adjust] scanner is {_spelt(settings)}, but no image has a film transformation, and a "
+            'digital camera no scanner. Write scanner = "none".'
+        )
+    sigma_mm = settings.scanner_sigma_um / UM_PER_MM
+    if settings.scanner == "auto":
+        choice = choose_bends(network, adjusted, sigma_mm)
+        return choice.network, choice.remarks
+    if settings.scanner == "bend":
+        return with_bends(network, None, sigma_mm), ()
+    possible = (*smooth_terms(films), *carriage_terms(films))
+    for term in settings.scanner:
+        if term not in possible:
+            raise InputError(
+                f"{project.path}: [adjust] scanner names {term!r}, which the {' or '.join(sorted(films))} "
+                f"transformation of the films takes; it leaves {', '.join(possible) or 'no term'}."
+            )
+    return with_bends(network, settings.scanner, sigma_mm), ()
+
+
+def _spelt(settings: AdjustSettings) -> str:
+    return f'"{settings.scanner}"' if isinstance(settings.scanner, str) else str(list(settings.scanner))
