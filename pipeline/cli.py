@@ -18,6 +18,7 @@ from measure.errors import MeasurementError
 from pipeline import stages
 from pipeline.adjusting.adjustment_file import without_nan
 from pipeline.adjusting.choose_stage import choice_json, print_choice, run_choose
+from pipeline.adjusting.compare_stage import DRIFT, comparison_json, print_comparison, run_compare, verdict
 from pipeline.demo import run_demo
 from pipeline.design.run import run_design
 from pipeline.errors import InputError, what_to_do
@@ -136,6 +137,39 @@ def choose(project: ProjectFile, as_json: AsJson = False) -> int:
     else:
         print_choice(choice, PlainConsole(), settings.choice_path)
     return DONE if choice.chosen and choice.chosen.model == choice.given else LOOK
+
+
+@app.command()
+def compare(
+    adjustments: Annotated[
+        list[Path], typer.Argument(metavar="A/adjustment.json B/adjustment.json...", show_default=False)
+    ],
+    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which one, where a file holds several.")] = None,
+    times: Annotated[str | None, typer.Option(metavar="T,T,...", help="When they were made: 1952,1958.5.")] = None,
+    flat: Annotated[
+        bool, typer.Option("--flat", help="For use over flat ground, where height and place take up c and the point.")
+    ] = False,
+    level: Annotated[
+        float, typer.Option(min=1e-12, max=0.5, help="Drift is said where chance makes as much more rarely than this.")
+    ] = 0.01,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write compare.json and compare.png there.")] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Calibrations of a camera: where and by how much they differ over the frame; `drift` or `no drift`."""
+    when = None if times is None else _numbers(times)
+    comparison, remarks = run_compare(adjustments, camera, when, "flat" if flat else "space", level, out)
+    if as_json:
+        _echo_json(comparison_json(comparison, remarks, level))
+    else:
+        print_comparison(comparison, remarks, level, PlainConsole())
+    return LOOK if verdict(comparison, level) == DRIFT else DONE
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--times {text!r} are not numbers with commas between them, as in 1952,1958.5.") from None
 
 
 @app.command()

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.families import parameter_names
+from adjust.network import Distortion
 from pipeline.errors import InputError
 from pipeline.files.text_file import MOST_MB, read_bytes, read_json, shown
 
@@ -89,6 +91,22 @@ def _array(data: bytes, name: str, file: Path) -> NDArray[Any]:
         return np.asarray(np.lib.format.read_array(unpacked, allow_pickle=False))
     except Exception as error:  # whatever zipfile, zlib and numpy's reader of headers raise at a damaged file
         raise InputError(f"{file}: is not a covariance file ({name}: {error}). {_AGAIN}") from None
+
+
+def calibrated_lens(camera: Json) -> tuple[Distortion, Array, Array]:
+    """From a camera's entry in adjustment.json: distortion, c, x0', y0' (3,) in mm, the family's parameters (k,)."""
+    stored = camera["distortion"]
+    half = stored.get("half_mm", (0.0, 0.0))
+    distortion = Distortion(
+        stored["family"],
+        decentering=stored.get("decentering", "reduced"),
+        r0_mm=stored.get("r0_mm", 0.0),
+        half_mm=(half[0], half[1]),
+    )
+    point = camera["principal_point_mm"]
+    interior = [camera["principal_distance_mm"]["value"], point["x"]["value"], point["y"]["value"]]
+    values = [stored.get(parameter, {"value": 0.0})["value"] for parameter in parameter_names(distortion.family)]
+    return distortion, np.array(interior, dtype=float), np.array(values, dtype=float)
 
 
 _AGAIN = "Run `reseau adjust` again; it writes both files."

@@ -10,7 +10,7 @@ from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import ideal_from_observed
 from adjust.network import Distortion
-from pipeline.files.adjustment_reader import Covariance
+from pipeline.files.adjustment_reader import Covariance, calibrated_lens
 from pipeline.report import svg
 from pipeline.report.data import Json
 
@@ -67,18 +67,7 @@ class Curves:
 
 def lens(name: str, camera: Json) -> Lens:
     """From a camera's entry in adjustment.json."""
-    stored = camera["distortion"]
-    half = stored.get("half_mm", (0.0, 0.0))
-    distortion = Distortion(
-        stored["family"],
-        decentering=stored.get("decentering", "reduced"),
-        r0_mm=stored.get("r0_mm", 0.0),
-        half_mm=(half[0], half[1]),
-    )
-    point = camera["principal_point_mm"]
-    interior = [camera["principal_distance_mm"]["value"], point["x"]["value"], point["y"]["value"]]
-    values = [stored.get(parameter, {"value": 0.0})["value"] for parameter in parameter_names(distortion.family)]
-    return Lens(name, distortion, np.array(interior, dtype=float), np.array(values, dtype=float))
+    return Lens(name, *calibrated_lens(camera))
 
 
 def displacement(of: Lens, from_principal_point_mm: Array) -> Displacement:

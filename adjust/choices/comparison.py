@@ -1,0 +1,319 @@
+"""Calibrations of one camera compared: what changed in the way from a place on the film to its ray.
+
+A calibration says of every camera point which ray it belongs to, and where the fiducial marks are. Two calibrations say
+the same where some change that no user of them can see takes one to the other: a similarity of the fiducial frame,
+which the next interior orientation takes up, and a turn of the rays, which the next exterior orientation takes up.
+What is left is a field over the frame, and its covariance is known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lstsq, qr
+from scipy.special import fdtrc
+
+from adjust.errors import AdjustmentError
+from adjust.functional_model.distortion import image_equations
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.projection import ideal_from_observed
+from adjust.network import Distortion
+
+Array = NDArray[np.float64]
+Use = Literal["space", "flat"]
+
+_GRID = 7  # points a side of the field
+_UNSEEN_UM = 0.01  # what no photograph shows: differences below it, and directions known better, count as nothing
+_RANK = 1e-9
+_SIMILARITY = 4  # shift, turn and scale of a plane
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """What an adjustment found of a camera.
+
+    interior (3,): c, x0', y0' in mm; parameters (k,) of the distortion, in the order of `parameter_names`; fiducials:
+    camera coordinates (2,) in mm by id. covariance (3 + k + 2 f, 3 + k + 2 f): of all these in this order, fiducials x
+    before y, zero where something was held. redundancy: of the adjustment that it comes from.
+    """
+
+    name: str
+    distortion: Distortion
+    interior: Array
+    parameters: Array
+    fiducials: dict[str, Array]
+    covariance: Array
+    redundancy: int
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """The names of c, x0', y0' and the parameters."""
+        return ("c", "x0", "y0", *parameter_names(self.distortion.family))
+
+
+@dataclass(frozen=True)
+class Test:
+    """A hypothesis tested: its chi-square, the degrees of freedom, how probable so much is where it holds."""
+
+    chi_square: float
+    freedom: int
+    probability: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Calibrations as differences from the first of them, one entry a calibration after it.
+
+    places_mm (m, 2) of the field, in the first one's frame. field_um (n, m, 2): how far apart both see a place, along
+    the film at the first one's c, after what orientation and datum take up; field_sigma_um (n, m, 2) its standard
+    deviations. fiducials: those that all have; fiducials_um, fiducials_sigma_um (n, f, 2) after a similarity.
+    same: whether all are one calibration. trend: whether they change with time beyond being the same; None for two.
+    times (n + 1,).
+    """
+
+    calibrations: tuple[CameraCalibration, ...]
+    times: Array
+    use: Use
+    places_mm: Array
+    field_um: Array
+    field_sigma_um: Array
+    fiducials: tuple[str, ...]
+    fiducials_um: Array
+    fiducials_sigma_um: Array
+    same: Test
+    trend: Test | None
+    trend_um: Array
+    trend_sigma_um: Array
+
+
+def compare(
+    calibrations: Sequence[CameraCalibration],
+    half_mm: tuple[float, float],
+    times: Sequence[float] | Array | None = None,
+    use: Use = "space",
+) -> Comparison:
+    """Compare calibrations of a camera, two or more, in the order of time.
+
+    half_mm: half the frame in x' and y', over which the field is taken. times: of the calibrations, years say; by
+    default 0, 1, 2, ... use: what the exterior orientation takes up of a change, "space": the camera's attitude;
+    "flat": its station as well, as over flat ground, where a change of c or of the principal point is a change of
+    height and place. Raises AdjustmentError for fewer than two calibrations, or for times that do not fit them.
+    """
+    if len(calibrations) < 2:
+        raise AdjustmentError("a comparison needs two calibrations or more.")
+    if use not in get_args(Use):
+        raise AdjustmentError(f"what the use of a camera takes up is one of {', '.join(get_args(Use))}, not {use!r}.")
+    when = np.arange(len(calibrations), dtype=float) if times is None else np.asarray(times, float)
+    if len(when) != len(calibrations) or not (np.diff(when) > 0).all():
+        raise AdjustmentError(f"{len(calibrations)} calibrations need as many times, in rising order, not {when}.")
+    shared = tuple(id for id in calibrations[0].fiducials if all(id in each.fiducials for each in calibrations))
+    places = _grid(half_mm)
+    views = [_View(each, calibrations[0], places, shared) for each in calibrations]
+    system = _System(views, when, use)
+    field, sigma = system.differences()
+    count = len(places)
+    trend, trend_sigma = system.trend_field()
+    return Comparison(
+        calibrations=tuple(calibrations),
+        times=when,
+        use=use,
+        places_mm=places,
+        field_um=field[:, :count],
+        field_sigma_um=sigma[:, :count],
+        fiducials=shared,
+        fiducials_um=field[:, count:],
+        fiducials_sigma_um=sigma[:, count:],
+        same=system.same,
+        trend=system.trend if len(calibrations) > 2 else None,
+        trend_um=trend[:count],
+        trend_sigma_um=trend_sigma[:count],
+    )
+
+
+def _grid(half_mm: tuple[float, float]) -> Array:
+    """(m, 2) places over the frame."""
+    x, y = (np.linspace(-half, half, _GRID) for half in half_mm)
+    return np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
+
+
+class _View:
+    """What one calibration says of the places and of the shared fiducials, in um (m + f, 2), with the square root of
+    its covariance, and what nobody would see of a change."""
+
+    def __init__(
+        self, own: CameraCalibration, first: CameraCalibration, places_mm: Array, shared: tuple[str, ...]
+    ) -> None:
+        self.own, self.c_um = own, 1e3 * first.interior[0]
+        marks = np.array([own.fiducials[id] for id in shared]).reshape(-1, 2)
+        there = np.array([first.fiducials[id] for id in shared]).reshape(-1, 2)
+        turn, shift = _similarity(there, marks)
+        self.points_mm = places_mm @ turn.T + shift
+        ideal, found = ideal_from_observed(own.distortion, own.interior, own.parameters, self.points_mm)
+        if not found.all():
+            raise AdjustmentError(
+                f"the distortion of {own.name} folds the image over within the frame: it is not known there. "
+                "Compare over a smaller frame."
+            )
+        ray = (ideal - own.interior[1:]) / own.interior[0]
+        self.equations = image_equations(own.distortion, own.interior, own.parameters, self.points_mm, ray)
+        # In the first one's axes: what is left of a turn is small, and taken out with the orientation.
+        self.turn = turn / np.sqrt(np.linalg.det(turn))
+        self.ray = ray @ self.turn
+        self.marks_mm = marks
+        self.value = np.concatenate([self.c_um * self.ray, 1e3 * (marks - shift) @ np.linalg.inv(turn).T])
+        self.jacobian = self._jacobian(shared)
+
+    def _jacobian(self, shared: tuple[str, ...]) -> Array:
+        """(2 (m + f), n): of the value by all that the calibration knows, turns and scale of its frame left out."""
+        own, fields = self.own, 2 * len(self.ray)
+        by = np.concatenate([self.equations.by_interior, self.equations.by_parameters], axis=2)
+        rows = np.zeros((fields + 2 * len(shared), len(own.covariance)))
+        rows[:fields, : by.shape[2]] = self._by_ray(by).reshape(fields, -1)
+        names = list(own.fiducials)
+        for k, id in enumerate(shared):
+            column = by.shape[2] + 2 * names.index(id)
+            rows[fields + 2 * k, column] = rows[fields + 2 * k + 1, column + 1] = 1e3
+        return rows
+
+    def _by_ray(self, by: Array) -> Array:
+        """The change of the field (m, 2, n) in um that goes with a change of the equations (m, 2, n)."""
+        return np.asarray(-self.c_um * self.turn.T @ np.linalg.solve(self.equations.by_ray, by))
+
+    @property
+    def root(self) -> Array:
+        """A square root (2 (m + f), n) of the covariance of the value."""
+        sigmas = np.sqrt(np.diag(self.own.covariance))
+        divisors = np.where(sigmas > 0.0, sigmas, 1.0)  # k5 in mm**-4 stands beside c in mm
+        values, vectors = np.linalg.eigh(self.own.covariance / np.outer(divisors, divisors))
+        return np.asarray(self.jacobian @ (sigmas[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))))
+
+    def unseen(self, use: Use) -> Array:
+        """(2 (m + f), q): how the value changes with the similarity of the frame, and with the orientation."""
+        points = np.concatenate([self.points_mm, self.marks_mm])
+        ones, zeros = np.ones(len(points)), np.zeros(len(points))
+        x, y = points.T
+        moves = np.array([(ones, zeros), (zeros, ones), (-y, x), (x, y)]).transpose(2, 1, 0)
+        seen = self._by_ray(self.equations.by_xy @ moves[: len(self.ray)])
+        frame = np.concatenate([seen, -1e3 * self.turn.T @ moves[len(self.ray) :]])
+        u, v = self.ray.T
+        one = np.ones_like(u)
+        turns = [(u * v, one + v * v), (one + u * u, u * v), (-v, u)]
+        stations = [(one, 0 * u), (0 * u, one), (u, v)] if use == "flat" else []
+        bundle = self.c_um * np.array([*turns, *stations]).transpose(2, 1, 0)
+        orientation = np.concatenate([bundle, np.zeros((len(self.marks_mm), *bundle.shape[1:]))])
+        return np.concatenate([frame, orientation], axis=2).reshape(2 * len(points), -1)
+
+    def freeing(self, use: Use) -> Array:
+        """(2 (m + f), 2 (m + f)): takes out of a change the similarity that its marks show, then the orientation that
+        its field shows, both by plain least squares: what is left is the smallest field there can be."""
+        unseen, fields = self.unseen(use), 2 * len(self.ray)
+        marks, everything = np.arange(len(unseen)) >= fields, np.eye(len(unseen))
+        frame = unseen[:, :_SIMILARITY] if len(self.marks_mm) > 1 else unseen[:, :0]
+        by_marks = everything - frame @ np.linalg.pinv(frame * marks[:, None], rcond=_RANK)
+        rest = unseen[:, frame.shape[1] :]
+        by_field = everything - rest @ np.linalg.pinv(rest * ~marks[:, None], rcond=_RANK)
+        return np.asarray(by_field @ by_marks)
+
+
+def _similarity(first: Array, second: Array) -> tuple[Array, Array]:
+    """The similarity (2, 2), (2,) that takes points of the first frame to those of the second; none for one point."""
+    if len(first) < 2:
+        return np.eye(2), np.zeros(2)
+    middle, there = first.mean(axis=0), second.mean(axis=0)
+    a, b = (first - middle) @ np.array([1.0, 1.0j]), (second - there) @ np.array([1.0, 1.0j])
+    factor = np.vdot(a, b) / np.vdot(a, a)
+    turn = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+    return turn, there - turn @ middle
+
+
+def _range(columns: Array) -> Array:
+    """Orthonormal vectors (n, r) that span columns (n, k) of whatever size, or none."""
+    sizes = np.linalg.norm(columns, axis=0)
+    vectors, triangle, _ = qr(columns / np.where(sizes > 0, sizes, 1.0), mode="economic", pivoting=True)
+    diagonal = np.abs(np.diag(triangle))
+    return np.asarray(vectors[:, diagonal > _RANK * diagonal.max(initial=0.0)])
+
+
+class _System:
+    """All views in the directions in which anything is uncertain, whitened: each y = a (+ b t) + what is not seen."""
+
+    def __init__(self, views: Sequence[_View], times: Array, use: Use) -> None:
+        self.views, self.times, self.use = views, times, use
+        roots = [view.root for view in views]
+        left, sizes, _ = np.linalg.svd(np.concatenate(roots, axis=1), full_matrices=False)
+        known = sizes > _UNSEEN_UM * np.sqrt(len(left))
+        if not known.any():
+            raise AdjustmentError("none of the calibrations has standard deviations: there is nothing to compare with.")
+        self.basis = left[:, known]
+        self.unseen = [self._within(view.unseen(use)) for view in views]
+        self.values = [self.basis.T @ (view.value - views[0].value).ravel() for view in views]
+        self.whitening = []
+        for root in roots:
+            covariance = self.basis.T @ root @ root.T @ self.basis + _UNSEEN_UM**2 * np.eye(known.sum())
+            self.whitening.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+        self.redundancy = min(view.own.redundancy for view in views)
+
+    def _within(self, changes: Array) -> Array:
+        """Changes of the value in the basis, without those of which nothing is in it, as a turn of the whole field."""
+        inside = self.basis.T @ changes
+        return np.asarray(inside * (np.linalg.norm(inside, axis=0) > _RANK * np.linalg.norm(changes, axis=0)))
+
+    def _design(self, powers: Sequence[int]) -> tuple[Array, Array]:
+        """The whitened rows of all views, for a value that is a polynomial of time, and their right side."""
+        size, count = self.basis.shape[1], len(self.views)
+        width = self.unseen[0].shape[1]
+        rows = np.zeros((count * size, len(powers) * size + count * width))
+        for k, whitening in enumerate(self.whitening):
+            at = slice(k * size, (k + 1) * size)
+            for p, power in enumerate(powers):
+                rows[at, p * size : (p + 1) * size] = whitening * (self.times[k] - self.times[0]) ** power
+            if k:  # the first one's frame and attitude are everybody's
+                start = len(powers) * size + k * width
+                rows[at, start : start + width] = whitening @ self.unseen[k]
+        right = np.concatenate([w @ value for w, value in zip(self.whitening, self.values, strict=True)])
+        return rows, right
+
+    def _left_over(self, powers: Sequence[int]) -> tuple[float, int]:
+        rows, right = self._design(powers)
+        explained = _range(rows)
+        rest = right - explained @ (explained.T @ right)
+        return float(rest @ rest), explained.shape[1]
+
+    @cached_property
+    def same(self) -> Test:
+        chi, rank = self._left_over((0,))
+        return self._test(chi, sum(map(len, self.values)) - rank)
+
+    @cached_property
+    def trend(self) -> Test:
+        (still, fewer), (moving, more) = self._left_over((0,)), self._left_over((0, 1))
+        return self._test(still - moving, more - fewer)
+
+    def _test(self, chi: float, freedom: int) -> Test:
+        """The calibrations' own sigma0 come from few observations now and then: F and not chi-square."""
+        probability = float(fdtrc(freedom, self.redundancy, chi / freedom)) if freedom and self.redundancy else 1.0
+        return Test(chi, freedom, probability)
+
+    def differences(self) -> tuple[Array, Array]:
+        """Each view after the first less it, freed of what is not seen, and its standard deviations, (n, m + f, 2)."""
+        first, *others = self.views
+        fields, sigmas = [], []
+        for view in others:
+            freed = view.freeing(self.use)
+            root = np.concatenate([freed @ first.root, freed @ view.root], axis=1)
+            fields.append((freed @ (view.value - first.value).ravel()).reshape(-1, 2))
+            sigmas.append(np.sqrt(np.square(root).sum(axis=1)).reshape(-1, 2))
+        return np.array(fields), np.array(sigmas)
+
+    def trend_field(self) -> tuple[Array, Array]:
+        """The change in a unit of time (m + f, 2), freed of what is not seen, and its standard deviations."""
+        rows, right = self._design((0, 1))
+        scale = np.linalg.norm(rows, axis=0)
+        scale[scale == 0] = 1.0
+        inverse = lstsq(rows / scale, np.eye(len(rows)), cond=_RANK, lapack_driver="gelsy")[0] / scale[:, None]
+        size = self.basis.shape[1]
+        by = self.views[-1].freeing(self.use) @ self.basis @ inverse[size : 2 * size]
+        return (by @ right).reshape(-1, 2), np.sqrt(np.square(by).sum(axis=1)).reshape(-1, 2)

@@ -1,0 +1,64 @@
+"""How often `adjust.choices.comparison` says drift: of calibrations that are alike, and of ones that differ by 2, 3, 5
+sigmas.
+
+    python benchmarks/compare_power.py [pairs]
+"""
+
+import sys
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.choices.comparison import CameraCalibration, compare
+from adjust.network import Distortion
+
+Array = NDArray[np.float64]
+
+HALF = (110.0, 110.0)
+MARKS = np.array([(-106.0, -106.0), (106.0, -106.0), (106.0, 106.0), (-106.0, 106.0)])
+NAMES = ("c", "x0", "y0", "k3", "k5", "p1", "p2")
+AT = np.array([0, 1, 2, 3, 4, 6, 7])  # in c, x0, y0, k3, k5, k7, p1, p2, p3, p4
+TRUE = np.array([153.0, 0.010, -0.006, -6e-8, 1e-12, 2e-7, -1e-7])
+SIGMAS = np.array([0.004, 0.003, 0.003, 8e-9, 4e-13, 6e-8, 6e-8])
+MARK_SIGMA_MM = 0.002
+TIED = {(3, 4): -0.9, (1, 5): 0.6}  # k3 and k5, x0 and p1, as in most calibrations
+LEVEL = 0.05
+
+
+def covariance() -> Array:
+    correlation = np.eye(len(NAMES))
+    for (i, j), rho in TIED.items():
+        correlation[i, j] = correlation[j, i] = rho
+    whole = np.zeros((18, 18))
+    whole[np.ix_(AT, AT)] = correlation * np.outer(SIGMAS, SIGMAS)
+    whole[10:, 10:] = MARK_SIGMA_MM**2 * np.eye(8)
+    return whole
+
+
+def drawn(rng: np.random.Generator, change: Array) -> CameraCalibration:
+    error = rng.multivariate_normal(np.zeros(18), covariance())
+    values = error[:10]
+    values[AT] += TRUE + change
+    marks = {str(i): xy for i, xy in enumerate(MARKS + error[10:].reshape(-1, 2))}
+    return CameraCalibration("K", Distortion("torlegard"), values[:3], values[3:], marks, covariance(), 5000)
+
+
+def share(rng: np.random.Generator, change: Array, pairs: int) -> float:
+    same = (compare([drawn(rng, 0 * change), drawn(rng, change)], HALF).same.probability for _ in range(pairs))
+    return float(np.mean([probability < LEVEL for probability in same]))
+
+
+def main(pairs: int = 300) -> None:
+    rng = np.random.default_rng(9)
+    print(f"{pairs} pairs each, at a level of {LEVEL:.0%}")
+    print(f"alike: {share(rng, np.zeros(len(NAMES)), pairs):.3f}")
+    print("changed by | c | k5, beyond what k3 takes up")
+    alone = np.sqrt(1 - TIED[3, 4] ** 2)
+    for sigmas in (2.0, 3.0, 5.0):
+        c, k5 = np.zeros(len(NAMES)), np.zeros(len(NAMES))
+        c[0], k5[4] = sigmas * np.sqrt(2) * SIGMAS[0], sigmas * np.sqrt(2) * alone * SIGMAS[4]
+        print(f"{sigmas:g} joint sigmas | {share(rng, c, pairs):.2f} | {share(rng, k5, pairs):.2f}")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,232 @@
+"""`reseau compare`: the calibrations of a camera in several adjustment.json, compared as a field over the frame."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from adjust.choices.comparison import CameraCalibration, Comparison, Test, Use, compare
+from adjust.functional_model.families import parameter_names
+from pipeline.adjusting.adjustment_file import without_nan
+from pipeline.adjusting.compare_picture import draw_comparison
+from pipeline.errors import InputError
+from pipeline.files.adjustment_reader import calibrated_lens, read_adjustment, read_covariance
+from pipeline.files.atomic import check_writable, write_atomically
+from pipeline.spelling import did_you_mean
+from pipeline.wording import listed
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+
+DRIFT, NO_DRIFT = "drift", "no drift"
+
+
+def run_compare(
+    paths: Sequence[Path], camera: str | None, times: Sequence[float] | None, use: Use, level: float, out: Path | None
+) -> tuple[Comparison, tuple[str, ...]]:
+    """The comparison of the camera in all files, and remarks on it; compare.json and compare.png into `out`, if any.
+
+    Raises InputError or AdjustmentError for a file that holds no calibration of the camera, or for what cannot be
+    compared.
+    """
+    contents = [read_adjustment(path) for path in paths]
+    names = [_camera(path, content, camera) for path, content in zip(paths, contents, strict=True)]
+    calibrations = [_calibration(*each) for each in zip(paths, contents, names, strict=True)]
+    halves = [_half_mm(*each) for each in zip(paths, contents, names, strict=True)]
+    comparison = compare(calibrations, (min(x for x, _ in halves), min(y for _, y in halves)), times, use)
+    remarks = _remarks(paths, contents, names)
+    if out is not None:
+        check_writable(out)
+        content = json.dumps(without_nan(comparison_json(comparison, remarks, level)), indent=1, ensure_ascii=False)
+        write_atomically(out / "compare.json", content + "\n")
+        draw_comparison(comparison, out / "compare.png")
+    return comparison, remarks
+
+
+def verdict(comparison: Comparison, level: float) -> str:
+    """`drift` where calibrations that are the same would differ as much in fewer than `level` of all cases."""
+    changed = comparison.same.probability < level
+    return DRIFT if changed else NO_DRIFT
+
+
+def _camera(path: Path, content: Json, name: str | None) -> str:
+    cameras: list[str] = list(content["cameras"])
+    if name is None and len(cameras) == 1:
+        return cameras[0]
+    if name is None:
+        raise InputError(f"{path}: holds the cameras {listed(cameras)}. Say which one: --camera NAME.")
+    if name not in cameras:
+        raise InputError(f"{path}: holds no camera {name!r}{did_you_mean(name, cameras)}; it has {listed(cameras)}.")
+    return name
+
+
+def _calibration(path: Path, content: Json, name: str) -> CameraCalibration:
+    if not content["converged"]:
+        raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
+    camera = content["cameras"][name]
+    distortion, interior, parameters = calibrated_lens(camera)
+    if not np.isfinite([*interior, *parameters]).all():
+        raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
+    marks = {id: np.array([mark["x_mm"]["value"], mark["y_mm"]["value"]]) for id, mark in camera["fiducials"].items()}
+    unknowns = [f"IO.{name}.{each}" for each in ("c", "x0", "y0", *parameter_names(distortion.family))]
+    unknowns += [f"FID.{name}.{id}.{axis}" for id in marks for axis in "xy"]
+    covariance = read_covariance(path).of(unknowns)
+    return CameraCalibration(
+        path.parent.name or path.stem, distortion, interior, parameters, marks, covariance, content["redundancy"]
+    )
+
+
+def _half_mm(path: Path, content: Json, name: str) -> tuple[float, float]:
+    """As far as the camera was calibrated: where its images have observations."""
+    seen = [
+        (abs(row["camera_x_mm"]), abs(row["camera_y_mm"]))
+        for row in content["residuals"]
+        if content["images"].get(row["image"], {}).get("camera", name) == name and row["camera_x_mm"] is not None
+    ]
+    if not seen:
+        raise InputError(f"{path}: no image of {name!r} has an observation, so nothing says how large its frame is.")
+    x, y = np.max(seen, axis=0)
+    return float(x), float(y)
+
+
+def _remarks(paths: Sequence[Path], contents: Sequence[Json], names: Sequence[str]) -> tuple[str, ...]:
+    remarks = [
+        f"{path}: was adjusted with an earlier calibration as an observation. If that one is among those compared, "
+        "they are not independent, and the test is milder than it says."
+        for path, content in zip(paths, contents, strict=True)
+        if content["calibrations"]
+    ]
+    if len(set(names)) > 1:
+        remarks.append(f"the cameras have different names: {listed(names)}. Are they the same one?")
+    return tuple(remarks)
+
+
+def comparison_json(comparison: Comparison, remarks: Sequence[str], level: float) -> Json:
+    """The comparison as compare.json holds it."""
+    first, *others = comparison.calibrations
+    return {
+        "verdict": verdict(comparison, level),
+        "level": level,
+        "use": comparison.use,
+        "same": _test(comparison.same),
+        "trend": comparison.trend and _test(comparison.trend),
+        "calibrations": [
+            {"name": each.name, "time": time, "family": each.distortion.family}
+            for each, time in zip(comparison.calibrations, comparison.times.tolist(), strict=True)
+        ],
+        "places_mm": comparison.places_mm.tolist(),
+        "differences": [
+            {
+                "parameters": parameter_differences(first, other),
+                "field_um": comparison.field_um[k].tolist(),
+                "field_sigma_um": comparison.field_sigma_um[k].tolist(),
+                "fiducials": {
+                    id: {"um": um.tolist(), "sigma_um": sigma.tolist()}
+                    for id, um, sigma in zip(
+                        comparison.fiducials, comparison.fiducials_um[k], comparison.fiducials_sigma_um[k], strict=True
+                    )
+                },
+            }
+            for k, other in enumerate(others)
+        ],
+        "trend_um": comparison.trend_um.tolist() if comparison.trend else None,
+        "trend_sigma_um": comparison.trend_sigma_um.tolist() if comparison.trend else None,
+        "remarks": list(remarks),
+    }
+
+
+def _test(test: Test) -> Json:
+    return {"chi_square": test.chi_square, "freedom": test.freedom, "probability": test.probability}
+
+
+def parameter_differences(first: CameraCalibration, other: CameraCalibration) -> list[Json]:
+    """The parameters that both have, as they stand: difference and its standard deviation, mm and powers of it."""
+    if first.distortion.family != other.distortion.family:
+        shared: tuple[str, ...] = first.quantities[:3]
+    else:
+        shared = first.quantities
+    values = [np.concatenate([each.interior, each.parameters]) for each in (first, other)]
+    sigmas = [np.sqrt(np.diag(each.covariance)) for each in (first, other)]
+    rows = []
+    for k, name in enumerate(shared):
+        joint = float(np.hypot(sigmas[0][k], sigmas[1][k]))
+        difference = float(values[1][k] - values[0][k])
+        rows.append(
+            {
+                "name": name,
+                "first": float(values[0][k]),
+                "other": float(values[1][k]),
+                "difference": difference,
+                "sigma": joint,
+                "sigmas": difference / joint if joint > 0 else None,
+            }
+        )
+    return rows
+
+
+def print_comparison(comparison: Comparison, remarks: Sequence[str], level: float, console: Console) -> None:
+    """The verdict first, then a table for each calibration after the first, then remarks."""
+    told = verdict(comparison, level)
+    console.print(Text(told, style="bold red" if told == DRIFT else "bold green"))
+    console.print(Text(_why(comparison, level)))
+    first, *others = comparison.calibrations
+    for k, other in enumerate(others):
+        _print_difference(comparison, k, first, other, console)
+    for remark in remarks:
+        console.print(Text(f"Note: {remark}"))
+
+
+def _why(comparison: Comparison, level: float) -> str:
+    taken = {
+        "space": "the camera's attitude and a similarity of the fiducial marks",
+        "flat": "the camera's attitude and station over flat ground, and a similarity of the fiducial marks",
+    }[comparison.use]
+    test = comparison.same
+    sentence = (
+        f"Calibrations of an unchanged camera would differ as much with a probability of {test.probability:.2g} "
+        f"(chi-square {test.chi_square:.1f}, {test.freedom} degrees of freedom; drift is said below {level:g}), after "
+        f"{taken} have taken up what they can."
+    )
+    if comparison.trend is None:
+        return sentence
+    steady = comparison.trend.probability
+    size = float(np.sqrt(np.mean(np.square(comparison.trend_um)))) if comparison.trend_um.size else 0.0
+    return (
+        f"{sentence} A steady change with time: {size:.2f} um rms a unit of time; so much comes by chance with a "
+        f"probability of {steady:.2g}."
+    )
+
+
+def _print_difference(
+    comparison: Comparison, k: int, first: CameraCalibration, other: CameraCalibration, console: Console
+) -> None:
+    columns = ("parameter", first.name, other.name, "difference", "in joint sigmas")
+    table = Table(*columns, title=f"{other.name} less {first.name}", title_justify="left")
+    for row in parameter_differences(first, other):
+        if row["sigmas"] is None and row["difference"] == 0.0:
+            continue
+        sigmas = "both fixed" if row["sigmas"] is None else f"{row['sigmas']:+.1f}"
+        values = (f"{row[key]:.7g}" for key in ("first", "other"))
+        table.add_row(row["name"], *values, f"{row['difference']:+.3g}", sigmas)
+    console.print(table)
+    field, size = comparison.field_um[k], np.hypot(*comparison.field_um[k].T)
+    x, y = comparison.places_mm[size.argmax()]
+    largest = _largest(field, comparison.field_sigma_um[k])
+    console.print(Text(f"Over the frame {np.sqrt(np.mean(size**2)):.2f} um rms, {largest} at ({x:.0f}, {y:.0f}) mm."))
+    if comparison.fiducials:
+        marks = comparison.fiducials_um[k]
+        which = comparison.fiducials[np.hypot(*marks.T).argmax()]
+        largest = _largest(marks, comparison.fiducials_sigma_um[k])
+        console.print(Text(f"Fiducial marks after a similarity: {largest} at {which!r}."))
+
+
+def _largest(differences_um: Array, sigmas_um: Array) -> str:
+    size = np.hypot(*differences_um.T)
+    sx, sy = sigmas_um[size.argmax()]
+    return f"at most {size.max():.2f} um (sigmas {sx:.2f} and {sy:.2f} um)"

@@ -1,0 +1,66 @@
+"""`reseau compare`, from files: a camera that has not changed, one that has, and what it refuses."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.cli import run
+
+
+def moved(project: Path, name: str, change_mm: float) -> Path:
+    """A copy of the project's calibration whose principal distance is another."""
+    copy = project.parent / name / "adjustment.json"
+    copy.parent.mkdir()
+    content = json.loads((project / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    (camera,) = content["cameras"].values()
+    camera["principal_distance_mm"]["value"] += change_mm
+    copy.write_text(json.dumps(content), encoding="utf-8")
+    with np.load(project / "out" / "adjustment.npz") as arrays:
+        whole = dict(arrays)
+    whole["values"] = whole["values"] + change_mm * np.char.endswith(whole["names"], ".c")
+    np.savez(copy.with_suffix(".npz"), **whole)
+    return copy
+
+
+def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = project / "out" / "adjustment.json"
+    assert run(["compare", str(first), str(moved(project, "same", 0.0))]) == 0
+    assert capsys.readouterr().out.startswith("no drift\n")
+    out = project / "compared"
+    assert run(["compare", str(first), str(moved(project, "later", 0.5)), "--out", str(out)]) == 1
+    told = capsys.readouterr().out
+    assert told.startswith("drift\n")
+    (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) um", told)
+    assert float(largest) < 0.2  # of their 0.3 um: c and the marks are hardly tied
+    assert (out / "compare.png").stat().st_size > 10_000
+    content = json.loads((out / "compare.json").read_text(encoding="utf-8"))
+    (difference,) = content["differences"]
+    corner = np.array(difference["field_um"])[np.abs(content["places_mm"]).sum(axis=1).argmax()]
+    assert content["verdict"] == "drift"
+    # A ray at 25 mm of 60 moves by 0.5 / 60 of that, less what a change of the point or the lens would not take up.
+    assert np.hypot(*corner) == pytest.approx(np.hypot(25.0, 25.0) * 0.5 / 60.3 * 1e3, rel=0.1)
+
+
+def test_a_series_has_a_trend(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [str(moved(project, f"y{year}", 0.02 * (year - 1950))) for year in (1952, 1958, 1961, 1970)]
+    assert run(["compare", *paths, "--times", "1952,1958,1961,1970", "--json"]) == 1
+    content = json.loads(capsys.readouterr().out)
+    assert content["trend"]["probability"] < 1e-6
+    assert [each["time"] for each in content["calibrations"]] == [1952.0, 1958.0, 1961.0, 1970.0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--camera", "metric 6 x 7"], "holds no camera 'metric 6 x 7'"),
+        (["--times", "1952;1958"], "are not numbers with commas"),
+        (["--times", "1958,1952"], "in rising order"),
+    ],
+)
+def test_what_it_refuses(arguments: list[str], words: str, project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(project / "out" / "adjustment.json")
+    assert run(["compare", path, path, *arguments]) == 2
+    assert words in capsys.readouterr().err.replace("\n", " ")
