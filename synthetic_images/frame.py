@@ -8,9 +8,18 @@ from numpy.typing import NDArray
 
 from synthetic_images.areas import Area, bounds, centroid, disk, polygon, rounded_rectangle, subdivided
 from synthetic_images.damage import damage
-from synthetic_images.film import FrameGeometry, frame_geometry
+from synthetic_images.film import FrameGeometry, frame_geometry, turn
 from synthetic_images.paint import AreaPaint, ChipPaint, Paint, chip_paint
-from synthetic_images.scene import BoardField, ChipMark, CrossFigure, DiskField, DrawnMark, Scene, SceneFiducial
+from synthetic_images.scene import (
+    BoardField,
+    ChipMark,
+    CrossFigure,
+    DiskField,
+    DrawnMark,
+    Scene,
+    SceneFiducial,
+    Writing,
+)
 from synthetic_images.targets import (
     Target,
     board_sheet,
@@ -21,6 +30,7 @@ from synthetic_images.targets import (
     figure_reach,
 )
 from synthetic_images.truth import FrameTruth, Position
+from synthetic_images.writing import written_area
 
 Array = NDArray[np.float64]
 
@@ -46,6 +56,7 @@ def make_frame(scene: Scene, index: int) -> Frame:
     generator = np.random.default_rng([scene.seed, index, 2])
     defects = damage(scene.film, geometry.width_px, geometry.height_px, generator)
     paints = [*_field_paints(geometry, truth.targets), *_fiducial_paints(geometry)]
+    paints += [_written(writing, geometry) for writing in geometry.image.writing]
     paints += [AreaPaint((area,), tone) for area, tone in defects]
     return Frame(truth, exposed, tuple(paints))
 
@@ -223,6 +234,13 @@ def _fiducial_paints(geometry: FrameGeometry) -> Iterator[Paint]:
         if fiducial.id in geometry.image.covered:
             tape = geometry.pixel_area(tuple(outline + fiducial.xy_mm for outline in square))
             yield AreaPaint((tape,), scene.tones.surround)
+
+
+def _written(writing: Writing, geometry: FrameGeometry) -> AreaPaint:
+    linear = writing.height_mm * turn(np.deg2rad(writing.turn_deg)) @ np.diag([-1.0 if writing.mirrored else 1.0, 1.0])
+    letters = written_area(writing.text, writing.font)
+    area = geometry.pixel_area(tuple(outline @ linear.T + writing.xy_mm for outline in letters))
+    return AreaPaint((area,), geometry.scene.tones.mark)
 
 
 def _mark_paints(fiducial: SceneFiducial, advance: Array, geometry: FrameGeometry) -> Iterator[Paint]:

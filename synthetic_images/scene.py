@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from synthetic_images.areas import Area, Point
 from synthetic_images.bend import is_term
 from synthetic_images.checks import not_negative, one_of, positive, unique
+from synthetic_images.writing import FONTS
 
 Array = NDArray[np.float64]
 
@@ -190,13 +191,36 @@ class FilmTransformation:
             raise ValueError(f"a film's scales are near 1, not {self.scale}")
 
 
+@dataclass(frozen=True)
+class Writing:
+    """A line of text on the film, light.
+
+    xy_mm: its middle in the camera frame; height_mm: of capitals; turn_deg: counter-clockwise, 0 where x' runs along
+    the line. mirrored: whether it reads right only from the other face of the film.
+    """
+
+    text: str
+    xy_mm: Point
+    height_mm: float
+    turn_deg: float = 0.0
+    mirrored: bool = False
+    font: str = "hershey-simplex"
+
+    def __post_init__(self) -> None:
+        if not self.text.strip():
+            raise ValueError("writing without any text; leave it out")
+        positive(f"writing {self.text!r}: height_mm", self.height_mm)
+        one_of(f"writing {self.text!r}: font", self.font, FONTS)
+
+
 @dataclass(frozen=True, eq=False)
 class SceneImage:
     """One frame: where it was taken, what its film did, and how it lay on the scanner.
 
     exterior: X0, Y0, Z0 in object units, omega, phi, kappa in rad. pose: as in `measure.results.Pose`; turn_rad: the
     small turn beside it; offset_mm: of the frame's centre from the scan's centre. covered: fiducials under a piece of
-    tape; neighbour: the side of the camera frame where the next frame begins, neighbour_gap_mm away.
+    tape; neighbour: the side of the camera frame where the next frame begins, neighbour_gap_mm away. writing: what
+    stands on this frame.
     """
 
     name: str
@@ -208,6 +232,7 @@ class SceneImage:
     covered: tuple[str, ...] = ()
     neighbour: Side | None = None
     neighbour_gap_mm: float = 3.0
+    writing: tuple[Writing, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.name or set(self.name) & set("/\\:"):

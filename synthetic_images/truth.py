@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetic_images.film import FrameGeometry, scanner_bend
-from synthetic_images.scene import PARAMETERS, Scene
+from synthetic_images.scene import PARAMETERS, Scene, Writing
 from synthetic_images.targets import field_targets
 from synthetic_images.terrain import scene_terrain
 
@@ -117,6 +117,7 @@ def _frame(frame: FrameTruth) -> dict[str, Any]:
         "height_px": geometry.height_px,
         "pitch_um": list(geometry.scene.scanner.pitch_um),
         "pose": image.pose,
+        "writing": [_written(writing, geometry) for writing in image.writing],
         "transformation": {"kind": geometry.scene.film.kind}
         | _values(("a1", "a2", "a3"), geometry.camera_from_comparator[0][[2, 0, 1]])
         | _values(("b1", "b2", "b3"), geometry.camera_from_comparator[1][[2, 0, 1]]),
@@ -136,6 +137,19 @@ def _frame(frame: FrameTruth) -> dict[str, Any]:
             | _visibility(position)
             for id, position in frame.targets.items()
         },
+    }
+
+
+def _written(writing: Writing, geometry: FrameGeometry) -> dict[str, Any]:
+    """What it says, where its middle lies, and how it lies in the camera frame."""
+    col, row = geometry.pixel_from_camera(np.array([writing.xy_mm]))[0].tolist()
+    return {
+        "text": writing.text,
+        "col_px": col,
+        "row_px": row,
+        "turn_deg": writing.turn_deg,
+        "mirrored": writing.mirrored,
+        "height_mm": writing.height_mm,
     }
 
 

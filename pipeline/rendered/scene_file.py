@@ -69,7 +69,7 @@ def parse_scene(table: Table) -> SceneFile:
     film = _made(path, lambda: _film(film_table))
     scanner = _made(path, lambda: _scanner(scanner_table))
     laws = _Laws.read(film_table, scanner_table, film.kind)
-    images = table.tables("image")
+    images, on_all = table.tables("image"), _made(path, lambda: _writing(table))
     generators = [np.random.default_rng([seed, index, 0]) for index in range(len(images))]
     made = _made(
         path,
@@ -78,7 +78,7 @@ def parse_scene(table: Table) -> SceneFile:
             seed=seed,
             camera=_scene_camera(camera),
             field=field,
-            images=tuple(_image(image, laws, g) for image, g in zip(images, generators, strict=True)),
+            images=tuple(_image(image, laws, g, on_all) for image, g in zip(images, generators, strict=True)),
             scanner=scanner,
             film=film,
             tones=_tones(picture.table("tones")),
@@ -217,8 +217,11 @@ class _Laws:
         )
 
 
-def _image(table: Table, laws: _Laws, generator: np.random.Generator) -> scene.SceneImage:
-    """One frame: what the file does not say of its film and its place on the scanner is left to chance."""
+def _image(
+    table: Table, laws: _Laws, generator: np.random.Generator, on_all: tuple[scene.Writing, ...]
+) -> scene.SceneImage:
+    """One frame: what the file does not say of its film and its place on the scanner is left to chance. on_all: what is
+    written on all frames."""
     scale = 1.0 + generator.normal(0.0, laws.scale_ppm * 1e-6, 2)
     shear = float(generator.normal(0.0, laws.shear_urad * 1e-6))
     if laws.kind == "similarity":
@@ -244,10 +247,27 @@ def _image(table: Table, laws: _Laws, generator: np.random.Generator) -> scene.S
         if "neighbour" in table
         else None,
         neighbour_gap_mm=table.number("neighbour_gap_mm", 3.0, least=0.0),
+        writing=(*on_all, *_writing(table)),
     )
     film.done()
     table.done()
     return image
+
+
+def _writing(table: Table) -> tuple[scene.Writing, ...]:
+    lines = []
+    for entry in table.tables("writing"):
+        line = scene.Writing(
+            text=entry.text("text"),
+            xy_mm=entry.pair("xy_mm"),
+            height_mm=entry.number("height_mm"),
+            turn_deg=entry.number("turn_deg", 0.0),
+            mirrored=entry.flag("mirrored", False),
+            font=entry.text("font", scene.Writing.font),
+        )
+        entry.done()
+        lines.append(line)
+    return tuple(lines)
 
 
 def _exterior(table: Table) -> tuple[float, float, float, float, float, float]:
