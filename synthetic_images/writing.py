@@ -76,5 +76,5 @@ def _outlined(text: str, font: str) -> list[Array]:
 
     properties = FontProperties(family=font)
     capital = float(np.ptp(np.asarray(TextPath((0.0, 0.0), "H", prop=properties).vertices)[:, 1]))
-    polygons = TextPath((0.0, 0.0), text, prop=properties).to_polygons()
-    return [np.asarray(polygon, dtype=float)[:-1] / capital for polygon in polygons if len(polygon) > 3]
+    polygons = map(np.asarray, TextPath((0.0, 0.0), text, prop=properties).to_polygons())
+    return [polygon[:-1] / capital for polygon in polygons if len(polygon) > 3]

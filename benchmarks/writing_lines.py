@@ -1,0 +1,188 @@
+"""Lines of writing, read alone: how often the way they read best is the right one, by how much better it reads.
+
+python benchmarks/writing_lines.py [SCANS] [FIRST]
+
+Four lines a scan, one at each side, as films have them: titles, dates, heights, numbers, plates, names, words that are
+the same upside down or in a mirror; in all fonts, 8 to 30 px high, blurred, grainy, faint, compressed, light or dark,
+the scan in any pose. The table is what the log-odds of a reading are taken from.
+"""
+
+import itertools
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.marks.poses import POSES, pose_in_camera
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from measure.writing.networks import MISSING, networks
+from measure.writing.reading import read_writing
+from synthetic_images.areas import coverage
+from synthetic_images.writing import FONTS, written_area
+
+Array = NDArray[np.float64]
+Generator = np.random.Generator
+
+SEED = 61
+SIZE_PX = 700
+BINS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 40.0)
+ALIKE = [
+    "NON",
+    "808",
+    "1001",
+    "1961",
+    "6009",
+    "SOS",
+    "NOON",
+    "OXO",
+    "1881",
+    "WOW",
+    "MOM",
+    "8118",
+    "609",
+    "906",
+    "66",
+    "99",
+    "TOT",
+    "AHA",
+    "11",
+    "818",
+    "ATTA",
+    "HIOIH",
+    "0880",
+]
+NAMES = [
+    "CANBERRA",
+    "ADASTRAPHOTO",
+    "SURVEY",
+    "DEVELOPMENT",
+    "RECORD",
+    "MAPPING",
+    "OFFICE",
+    "AERIAL",
+    "CIVIL",
+    "TERRITORY",
+    "CAPITAL",
+    "ZAGREB",
+]
+
+
+def main() -> None:
+    """Print the table."""
+    scans, first = (int(text) for text in (*sys.argv[1:], "250", "0")[:2])
+    mirror, turn, short = [], [], []
+    for index in range(first, first + scans):
+        for told_mirror, told_turn, legible in told_by(index):
+            mirror.append(told_mirror)
+            turn.append(told_turn)
+            short.append(legible)
+    print(f"{len(mirror)} lines read of {4 * scans}")
+    table("mirrored or not, by how many more characters are legible", np.array(mirror))
+    table("upside down or not, likewise", np.array(turn))
+
+
+def table(title: str, lead: Array) -> None:
+    """lead: by how many characters the true way reads better than the other; negative where the other does."""
+    print(f"\n{title}\n   lead of    lines  wrong   log-odds   a character   by maximum likelihood: {slope(lead):.2f}")
+    for low, high in itertools.pairwise(BINS):
+        inside = lead[(np.abs(lead) >= low) & (np.abs(lead) < high)]
+        wrong = int((inside < 0).sum())
+        odds = np.log((len(inside) - wrong + 0.5) / (wrong + 0.5))
+        mean = float(np.abs(inside).mean()) if len(inside) else np.nan
+        print(f"{low:5.1f} to {high:4.1f}  {len(inside):5d}  {wrong:5d}   {odds:8.1f}   {odds / mean:8.2f}")
+
+
+def slope(lead: Array) -> float:
+    """The log-odds a character that make what was seen the likeliest."""
+    trials = np.linspace(0.02, 4.0, 400)
+    return float(trials[np.argmin([np.logaddexp(0.0, -each * lead).sum() for each in trials])])
+
+
+def told_by(index: int) -> list[tuple[float, float, float]]:
+    """Of each line that was found: by how many characters the truth leads, of mirror and of turn; its legible ones."""
+    rng = np.random.default_rng([SEED, index])
+    pose = str(rng.choice(POSES))
+    grey = picture(rng)
+    grey = np.rot90(grey[:, ::-1] if pose.endswith("m") else grey, int(pose.rstrip("m")) // 90)
+    nets = networks()
+    if nets is None:
+        sys.exit(MISSING)
+    scan = Scan(Path(f"{index}.tif"), WholePicture(np.ascontiguousarray(grey)[..., None]), NO_TAGS)
+    found = []
+    for line in read_writing(scan, nets):
+        legible = {pose_in_camera(each, pose): reading.legible for each, reading in line.ways.items()}
+        right, down, *mirrored = (legible.get(each, -1.0) for each in _ways_of(legible))
+        found.append((max(right, down) - max(mirrored), right - down, max(legible.values())))
+    return found
+
+
+def _ways_of(legible: dict[str, float]) -> Sequence[str]:
+    """The true way, upside down, and both mirrored: lines read upright above and below, upward at the sides."""
+    return ("0", "180", "0m", "180m") if "0" in legible else ("90", "270", "90m", "270m")
+
+
+def picture(rng: Generator) -> NDArray[np.uint8]:
+    """The scan as it would lie upright: its lines above and below read to the right, those at the sides upward."""
+    grey = np.zeros((SIZE_PX, SIZE_PX))
+    for side in range(4):
+        strip = line_picture(rng)
+        place = int(rng.integers(40, SIZE_PX - strip.shape[1] - 40))
+        away = int(rng.integers(6, 30))
+        part = grey if side < 2 else np.rot90(grey, -1)  # a view: its rows run along the scan's columns
+        row = away if side % 2 == 0 else SIZE_PX - away - strip.shape[0]
+        part[row : row + strip.shape[0], place : place + strip.shape[1]] += strip
+    contrast = float(rng.uniform(0.15, 0.9))
+    dark = float(rng.uniform(0.0, 1.0 - contrast))
+    grey = cv2.GaussianBlur(grey, (0, 0), float(rng.uniform(0.4, 1.6)))
+    grey = dark + contrast * (grey if rng.random() < 0.7 else 1.0 - grey)
+    grain = cv2.GaussianBlur(rng.normal(0.0, 1.0, grey.shape), (0, 0), 0.8) / 0.35
+    grey += contrast * float(rng.uniform(0.0, 0.15)) * grain
+    stored = np.asarray(np.rint(255 * grey.clip(0, 1)), np.uint8)
+    if rng.random() < 0.5:
+        _, packed = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 90))])
+        stored = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
+    return stored
+
+
+def line_picture(rng: Generator) -> Array:
+    """A line, light on dark, on a sheet that is just large enough."""
+    text, font, height = line_text(rng), str(rng.choice(FONTS)), float(rng.uniform(8.0, 30.0))
+    area = written_area(text, font)
+    width = min(float(np.ptp(np.concatenate(area)[:, 0])), 0.75 * SIZE_PX / height)
+    pixels = np.array([width * height + 8, 1.6 * height + 8]).astype(int)
+    tilt = float(rng.normal(0.0, 0.015))
+    turn = height * np.array([[np.cos(tilt), np.sin(tilt)], [np.sin(tilt), -np.cos(tilt)]])
+    outlines = tuple(outline @ turn.T + pixels / 2 for outline in area)
+    return np.asarray(coverage((outlines,), 0, 0, int(pixels[0]), int(pixels[1])), float)
+
+
+def line_text(rng: Generator) -> str:
+    """What films have on them."""
+    number = int(rng.integers(1, 10 ** int(rng.integers(1, 6))))
+    day, month, year = int(rng.integers(1, 32)), int(rng.integers(1, 13)), int(rng.integers(1940, 2000))
+    choices = (
+        f"RUN {number}",
+        f"{number}",
+        f"{number:04d}-{number + 20:04d}",
+        f"{day}.{month}.{year}",
+        f"{day}/{month}/{year % 100}",
+        f"{100 * int(rng.integers(10, 200))}' ASL",
+        f"1:{1000 * int(rng.integers(5, 60))}",
+        f"Nr {number} {float(rng.uniform(150, 155)):.2f}",
+        "WILD 15/4 UAG",
+        str(rng.choice(ALIKE)),
+        " ".join(rng.choice(ALIKE, 2)),
+        str(rng.choice(NAMES)),
+        " ".join(rng.choice(NAMES, 2)).title(),
+        "".join(rng.choice(list("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789.-/"), int(rng.integers(1, 14)))),
+    )
+    return choices[int(rng.integers(len(choices)))]
+
+
+if __name__ == "__main__":
+    main()
