@@ -64,7 +64,8 @@ class Kind:
 
     cones_mm: nominal focal lengths. gate_mm: farther from the median is another kind of mark, or a typing error.
     separated: take the marks' places from their separations. sigma_mm: of coordinates with too few reports for a
-    spread. strip: the reports are of the form that has the data strip to the left. drawn: places whose marks are drawn,
+    spread. writing: the line that says where the camera writes, as
+    far as anybody knows. drawn: places whose marks are drawn,
     by the drawing `mark`, which `shape` tells about.
     """
 
@@ -81,7 +82,7 @@ class Kind:
     drawn: tuple[str, ...] = ()
     mark: str = ""
     notes: tuple[str, ...] = field(default=())
-    strip: bool = False
+    writing: str = ""
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,12 @@ class TypicalMark:
         ]
 
 
-DATA_STRIP = 'data_strip = "left"                     # as the form of the reports has it (OSL/1785)'
+BY_FORM = 'writing = ["left"]                       # as the form of the reports has it (OSL/1785)'
+OF_WILD = (
+    'writing = ["left: reads upward", "right: plate reads downward"]   '
+    "# side: the reports' form (OSL/1785); direction: frames of 1968 to 1997"
+)
+OF_ZEISS = 'writing = ["left: reads upward"]         # side: the reports\' form (OSL/1785); direction: a frame of 1979'
 LEARNED_NOTE = (
     " They are learned from the scans, from what recurs in all of them or from clicks in one; or\n"
     "# draw them. A learned mark lies off the reported one by as much as its template does, and its sigma grows by\n"
@@ -150,14 +156,14 @@ NEW_WILD = "the corners: from three Wild frames of 1985 to 1997 that do not name
 UNKNOWN = "not known"
 KINDS = (
     Kind("wild-rc5", "Wild RC5", ("RC5", "RC5A", "RC5/8"), (153,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False,
-         CORNERS, PLAIN_CROSS, strip=True),
+         CORNERS, PLAIN_CROSS, writing=OF_WILD),
     Kind("wild-rc8", "Wild RC8", ("RC8",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, OLD_WILD, False,
-         CORNERS, PLAIN_CROSS, strip=True),
+         CORNERS, PLAIN_CROSS, writing=OF_WILD),
     Kind("wild-rc9", "Wild RC9", ("RC9",), (88,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False, CORNERS, PLAIN_CROSS,
-         strip=True),
+         writing=BY_FORM),
     Kind("wild-rc10", "Wild RC10", ("RC10", "RC10A", "RC10A*"), (88, 153, 214, 305), 228.0, CORNERS + SIDES, 0.3,
          0.01, NEW_WILD, False, CORNERS, RING_CROSS,
-         ("Eleven reports, rejected here, have the side marks at 112.5 mm.",), strip=True),
+         ("Eleven reports, rejected here, have the side marks at 112.5 mm.",), writing=OF_WILD),
     Kind("wild-rc30", "Wild RC30", ("RC30",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, NEW_WILD, False,
          CORNERS, RING_CROSS),
     Kind("zeiss-rmk-a", "Zeiss RMK A",
@@ -165,9 +171,9 @@ KINDS = (
           "RMK AR 30/23"), (86, 153, 209, 305), 234.0, CORNERS + SIDES, 0.5, 0.02,
          "the sides: from a frame of 1978 with four notches 226 mm apart", False, SIDES, RMK_NOTCH,
          ("Many cameras have no corner marks; seven reports, rejected here, have them at 105.0 mm.",
-          "The frame of 1978 ends 117 mm from the middle, 4 mm beyond its notches."), strip=True),
+          "The frame of 1978 ends 117 mm from the middle, 4 mm beyond its notches."), writing=OF_ZEISS),
     Kind("zeiss-rmk-top", "Zeiss RMK TOP", ("RMK TOP",), (153, 305), 230.0, CORNERS + SIDES, 0.3, 0.02, UNKNOWN),
-    Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, UNKNOWN, strip=True),
+    Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, UNKNOWN, writing=BY_FORM),
     Kind("fairchild-k17", "Fairchild K-17", ("K-17", "K-17 (modified)", "K-17B", "K-17B (modified)",
          "K-17C (modified)"), (153, 210, 305), 228.6, SIDES, 2.0, 0.2, UNKNOWN, True),
     Kind("fairchild-t11", "Fairchild T-11", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, UNKNOWN),
@@ -264,14 +270,14 @@ def _camera(
     lines = [
         f"# {kind.title}, the {cone_mm} mm cone. From the library of reseau: typical values, not those of one camera.",
         "# Sigmas are the spread over the reports about their median."
-        + (" Seen with the data strip to the left." if kind.strip else ""),
+        + (" Seen with the data strip to the left." if kind.writing else ""),
         *(f"# {note}" for note in kind.notes),
         *_separation_lines(kind, own),
         f"# Shape of the marks: {kind.shape}." + ("" if kind.mark else LEARNED_NOTE),
         "",
         f'name = "{kind.title}, {cone_mm} mm"',
         f"frame_mm = [{kind.frame_mm}, {kind.frame_mm}]",
-        *([DATA_STRIP] if kind.strip else []),
+        *([kind.writing] if kind.writing else []),
         f"principal_distance_mm = {c_mm:.3f}",
         "principal_point_mm = [0.0, 0.0]         # the reports count from it",
         "",

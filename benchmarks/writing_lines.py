@@ -31,45 +31,14 @@ Generator = np.random.Generator
 SEED = 61
 SIZE_PX = 700
 BINS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 40.0)
-ALIKE = [
-    "NON",
-    "808",
-    "1001",
-    "1961",
-    "6009",
-    "SOS",
-    "NOON",
-    "OXO",
-    "1881",
-    "WOW",
-    "MOM",
-    "8118",
-    "609",
-    "906",
-    "66",
-    "99",
-    "TOT",
-    "AHA",
-    "11",
-    "818",
-    "ATTA",
-    "HIOIH",
-    "0880",
-]
-NAMES = [
-    "CANBERRA",
-    "ADASTRAPHOTO",
-    "SURVEY",
-    "DEVELOPMENT",
-    "RECORD",
-    "MAPPING",
-    "OFFICE",
-    "AERIAL",
-    "CIVIL",
-    "TERRITORY",
-    "CAPITAL",
-    "ZAGREB",
-]
+ALIKE = (
+    *("NON", "808", "1001", "1961", "6009", "SOS", "NOON", "OXO", "1881", "WOW", "MOM", "8118", "609", "906", "66"),
+    *("99", "TOT", "AHA", "11", "818", "ATTA", "HIOIH", "0880"),
+)
+NAMES = (
+    *("CANBERRA", "ADASTRAPHOTO", "SURVEY", "DEVELOPMENT", "RECORD", "MAPPING", "OFFICE", "AERIAL", "CIVIL"),
+    *("TERRITORY", "CAPITAL", "ZAGREB"),
+)
 
 
 def main() -> None:
@@ -138,9 +107,9 @@ def picture(rng: Generator) -> NDArray[np.uint8]:
         part[row : row + strip.shape[0], place : place + strip.shape[1]] += strip
     contrast = float(rng.uniform(0.15, 0.9))
     dark = float(rng.uniform(0.0, 1.0 - contrast))
-    grey = cv2.GaussianBlur(grey, (0, 0), float(rng.uniform(0.4, 1.6)))
-    grey = dark + contrast * (grey if rng.random() < 0.7 else 1.0 - grey)
-    grain = cv2.GaussianBlur(rng.normal(0.0, 1.0, grey.shape), (0, 0), 0.8) / 0.35
+    grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), float(rng.uniform(0.4, 1.6))), float)
+    grey = np.asarray(dark + contrast * (grey if rng.random() < 0.7 else 1.0 - grey), float)
+    grain = np.asarray(cv2.GaussianBlur(rng.normal(0.0, 1.0, grey.shape), (0, 0), 0.8), float) / 0.35
     grey += contrast * float(rng.uniform(0.0, 0.15)) * grain
     stored = np.asarray(np.rint(255 * grey.clip(0, 1)), np.uint8)
     if rng.random() < 0.5:

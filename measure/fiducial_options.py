@@ -1,6 +1,7 @@
 """What a user may set about the measurement of fiducial marks."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -8,6 +9,8 @@ from measure.film import SCATTER_MM
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.match_options import MatchOptions
+
+Reads = Literal["none", "pose", "all"]
 
 
 @dataclass(frozen=True)
@@ -19,8 +22,9 @@ class FiducialOptions:
     for sure; else the frame may also fill the scan. misfit_mm, affinity: how far a mark may lie from its given place
     when it is searched, plus what share of the constellation's span. gate_mm: how far a measured mark may lie from
     where the others put it. film_sigma_mm: scatter of marks by film and scanner. match: of the fit at full resolution;
-    a polygon is matched with the rotation and scale of the frame. Raises ValueError, naming the option, for a value
-    that is none.
+    a polygon is matched with the rotation and scale of the frame. writing: what is written about the frame is read in
+    "none", where nothing else decides the "pose", or in "all". Raises ValueError, naming the option, for a value that
+    is none.
     """
 
     pose: str = "auto"
@@ -32,6 +36,7 @@ class FiducialOptions:
     gate_mm: float = 0.3
     film_sigma_mm: float = SCATTER_MM
     match: MatchOptions = field(default_factory=lambda: MatchOptions(linear_sigma=0.05))
+    writing: Reads = "none"
 
     def __post_init__(self) -> None:
         if self.pose != "auto" and self.pose not in POSES:

@@ -23,6 +23,9 @@ from measure.search.constellation import Placement
 from measure.search.correlation import CLOSE
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.writing.line import Line
+from measure.writing.networks import networks
+from measure.writing.reading import read_writing
 
 Array = NDArray[np.float64]
 
@@ -62,21 +65,39 @@ def measure_fiducials(
         found, frame = _at_a_closer_look(search, closer)
     if frame is None:
         reason = f"{reason}; {scan.damage.rstrip('.')}" if scan.damage else reason
-        return absent_frame(scan, layout, reason, options.rotation_deg)
+        absent = absent_frame(scan, layout, reason, options.rotation_deg)
+        return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
     found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
+    lines = _read(scan, layout, frame) if options.writing == "all" else None
     pose, against = Pose(options.pose, True, _SET), ""
     if options.pose == "auto":
-        pose, placement = _named(search, found, frame)
+        pose, placement = _named(search, found, frame, lines or ())
+        if options.writing == "pose" and not pose.decided and frame.accepted:
+            lines = _read(scan, layout, frame)
+            pose, placement = _named(search, found, frame, lines or ())
         if pose.name != frame.placement.pose:
             frame = measure_frame(scan, layout, placement, options)
     else:
-        against = _against_the_set_pose(search, found, frame)
+        against = _against_the_set_pose(search, found, frame, lines or ())
     chance = doubt(search, frame)
     problems = [f"{sentence}." for sentence in (*_rivals(search, found, frame), chance, against) if sentence]
     doubts = problems if frame.measured else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
-        pose = Pose(pose.name, False, (*pose.evidence, *doubts))
-    return present_frame(scan, layout, frame, pose, pitch_um, problems, chance)
+        pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
+    return replace(present_frame(scan, layout, frame, pose, pitch_um, problems, chance), writing=lines)
+
+
+def _read(scan: Scan, layout: FiducialLayout, frame: Frame | None) -> tuple[Line, ...] | None:
+    """What is written about the frame, or along the scan's edges; None where nothing is there that reads."""
+    nets = networks()
+    if nets is None:
+        return None
+    if frame is None:
+        return read_writing(scan, nets)
+    half = np.asarray(layout.frame_mm) / 2
+    corners_mm = half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+    matrix = frame.pixel_from_camera
+    return read_writing(scan, nets, corners_mm @ matrix[:, :2].T + matrix[:, 2])
 
 
 def _at_first_look(
@@ -230,19 +251,21 @@ def _others(found: Sequence[Placement]) -> list[Placement]:
     return others
 
 
-def _named(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> tuple[Pose, Placement]:
-    """The pose that what is seen of the frame speaks for, and the frame's placement in it."""
+def _named(
+    search: FrameSearch, found: Sequence[Placement], frame: Frame, lines: Sequence[Line] = ()
+) -> tuple[Pose, Placement]:
+    """The pose that what is seen of the frame speaks for, and the frame's placement in it. lines: of writing."""
     posed = [_posed(found, frame.placement, pose) for pose in POSES]
-    pose = decide_pose(search.scan, search.layout, posed, frame, search.options)
+    pose = decide_pose(search.scan, search.layout, posed, frame, search.options, lines)
     return pose, posed[POSES.index(pose.name)]
 
 
-def _against_the_set_pose(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> str:
+def _against_the_set_pose(search: FrameSearch, found: Sequence[Placement], frame: Frame, lines: Sequence[Line]) -> str:
     """A sentence where what is seen decides for another pose than the one that the project sets."""
-    likeliest, placement = _named(search, found, frame)
+    likeliest, placement = _named(search, found, frame, lines)
     if likeliest.name == frame.placement.pose or not frame.measured:
         return ""
-    pose = decide_pose(search.scan, search.layout, [frame.placement, placement], frame, search.options)
+    pose = decide_pose(search.scan, search.layout, [frame.placement, placement], frame, search.options, lines)
     if not pose.decided or pose.name == frame.placement.pose:
         return ""
     evidence = " ".join(pose.evidence).rstrip(".")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from measure.covariance import Covariance
 from measure.scans.told_tone import FrameTone
 from measure.status import Status
+from measure.writing.line import Line
 
 Kind = Literal["fiducial", "target", "tie"]
 Array = NDArray[np.float64]
@@ -66,11 +67,15 @@ class Pose:
     counter-clockwise, and so seen in the scan.
     decided: whether something in the picture (or the user) decides it; otherwise it is assumed.
     evidence: what speaks for it, and by how much, one sentence each.
+    likelihoods: the logarithms of all poses', by name, as far as they were compared. writing: the pose in which most of
+    the writing lies, as far as any was read; "" where that is not clear.
     """
 
     name: str
     decided: bool
     evidence: tuple[str, ...] = ()
+    likelihoods: Mapping[str, float] = field(default_factory=dict)
+    writing: str = ""
 
 
 @dataclass(frozen=True, repr=False)
@@ -82,6 +87,7 @@ class FrameMeasurement:
     weights: what each channel of a colour scan counts in what its fiducials were measured in; None for its grey value.
     problems: what the user should look at, one sentence each.
     tone: what is believed of the curve by which its light was stored; None where no frame was found.
+    writing: the lines read about the frame; None where none was looked for.
     """
 
     image: str
@@ -91,6 +97,7 @@ class FrameMeasurement:
     problems: tuple[str, ...] = ()
     weights: tuple[float, ...] | None = None
     tone: FrameTone | None = None
+    writing: tuple[Line, ...] | None = None
 
     @property
     def px_per_mm(self) -> float | None:

@@ -140,13 +140,24 @@ class LayoutMark:
 
 
 @dataclass(frozen=True)
+class WrittenPlace:
+    """Where a camera writes on its film: beside which side of the frame, x' to the right and y' up. pose: how the
+    writing lies in the drawing, "90" where it reads upward; None where nobody says. plate: whether it is the camera's
+    own plate, with its type, number and principal distance, or titles."""
+
+    side: Side
+    pose: str | None = None
+    plate: bool = False
+
+
+@dataclass(frozen=True)
 class FiducialLayout:
-    """The camera's marks and the size of its exposed frame (width, height). data_strip: the side of the frame, x' to
-    the right and y' up, beside which its instruments and text stand; None where nobody says."""
+    """The camera's marks, the size of its exposed frame (width, height), and where it writes on its film, as far as
+    anybody says."""
 
     marks: tuple[LayoutMark, ...]
     frame_mm: Point
-    data_strip: Side | None = None
+    writing: tuple[WrittenPlace, ...] = ()
 
 
 def cross(arm_mm: float, line_mm: float, gap_mm: float = 0.0, angle_deg: float = 0.0) -> tuple[Part, ...]:

@@ -2,11 +2,11 @@
 
 Every pose gives the marks found other names. Under the right one their pictures fit (identification dots, unlike
 marks), their coordinates fit (asymmetries larger than their standard deviations), and what is written beside the frame
-stands on the side of the camera's data strip. All are summed as log-likelihoods; a pose is decided only where it beats
-every other by odds of a thousand to one.
+reads as it should, where the camera has it. All are summed as log-likelihoods; a pose is decided only where it beats
+every other by odds of a thousand to one. Of poses that nothing tells apart an unmirrored one is the likelier.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,53 +17,59 @@ from measure.fitting.matching import Match
 from measure.frames.frame import Frame
 from measure.frames.frame_fit import FrameFit, fit_frame
 from measure.frames.frame_sighter import first_search_px
-from measure.marks.poses import up_from_camera
-from measure.marks.shapes import (
-    LEARNED_ORIGIN,
-    Disk,
-    FiducialLayout,
-    LayoutMark,
-    Mark,
-    MarkShape,
-    MarkTemplate,
-    Side,
-)
-from measure.pose.data_strip import Beside, beside_frame, side_in_scan, strip_likelihoods
-from measure.pose.pose_pictures import SPOILT, Drawings, Shown, Site
+from measure.marks.poses import pose_in_camera, up_from_camera
+from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
+from measure.pose.pose_pictures import Drawings, Shown, Site
+from measure.pose.written_pose import line_score, main_pose, writing_likelihoods
 from measure.results import Pose
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
+from measure.writing.line import Line
 
 Array = NDArray[np.float64]
 
 _DECIDED = 7.0  # log-odds: a thousand to one
 _TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence
 _NAMED = 4.0  # times the gate: how far from where a pose's placement puts a mark it still has its name
+_UNMIRRORED = 2.3  # log-odds before anything is seen: ten to one; of 16 scans of archives none was mirrored
+_QUOTED = 3  # lines of writing that are told
 _FREE_MM = 1e3  # the standard deviation of a place that is not given
 _FILM_DEGREES = 4.0  # of freedom that the standard deviations of film and given places are known with: to a third
 
 
 @dataclass(frozen=True, eq=False)
 class _Verdict:
-    """One pose's log-likelihoods, of the pictures (sites,), of the coordinates and of the data strip's side; names: of
-    each site's mark, -1 for none; chi_square: of the coordinates."""
+    """One pose's log-likelihoods, of the pictures (sites,), of the coordinates and of the writing; names: of each
+    site's mark, -1 for none; chi_square: of the coordinates."""
 
     pose: str
     names: tuple[int, ...]
     pictures: Array
     coordinates: float
     chi_square: float
-    strip: float = 0.0
+    writing: float = 0.0
+
+    @property
+    def seen(self) -> float:
+        """What is seen of it."""
+        return float(self.pictures.sum()) + self.coordinates + self.writing
 
     @property
     def total(self) -> float:
-        return float(self.pictures.sum()) + self.coordinates + self.strip
+        """And what was to be expected before, which tells what is assumed, and never decides."""
+        return self.seen + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
 
 
 def decide_pose(
-    scan: Scan, layout: FiducialLayout, placements: Sequence[Placement], frame: Frame, options: FiducialOptions
+    scan: Scan,
+    layout: FiducialLayout,
+    placements: Sequence[Placement],
+    frame: Frame,
+    options: FiducialOptions,
+    lines: Sequence[Line] = (),
 ) -> Pose:
-    """The pose, from a placement for each (at the place of the frame that was measured in one of them)."""
+    """The pose, from a placement for each (at the place of the frame that was measured in one of them). lines: what is
+    written about the frame, as far as it was read."""
     seen = [fit for fit in frame.fits if fit is not None]
     missed = frame.missed_px
     named = [
@@ -87,29 +93,11 @@ def decide_pose(
 
     pictures = np.array(scan.each(of_site, range(len(sites)))).reshape(len(sites), len(named))
     verdicts = [each.verdict(pictures[:, index]) for index, each in enumerate(named)]
-    if layout.data_strip is None or not frame.accepted:
+    if not lines or not frame.accepted:
         return _decision(verdicts, layout, len(seen))
-    beside = beside_frame(scan, layout, frame.pixel_from_camera, frame.placement.pose)
-    likelihoods = strip_likelihoods(beside, layout.data_strip, [verdict.pose for verdict in verdicts], SPOILT)
-    verdicts = [replace(each, strip=own) for each, own in zip(verdicts, likelihoods.tolist(), strict=True)]
-    pose = _decision(verdicts, layout, len(seen))
-    return replace(pose, evidence=(*pose.evidence, *_of_strip(verdicts, pose.name, beside, layout.data_strip)))
-
-
-def _of_strip(verdicts: Sequence[_Verdict], pose: str, beside: Mapping[Side, Beside], strip: Side) -> tuple[str, ...]:
-    """What the data strip says of the pose."""
-    own = next(verdict.strip for verdict in verdicts if verdict.pose == pose)
-    others = [verdict.strip for verdict in verdicts]
-    lead = max(own - min(others), own - max(others), key=abs)
-    if abs(lead) <= _TOLD:
-        return ()
-    side = side_in_scan(strip, pose)
-    counts = ", ".join(f"{name} {each.written} of {each.seen}" for name, each in beside.items() if each.seen)
-    return (
-        f"the camera's data strip would lie on the {side} of the scan, where film is written on in so many places "
-        f"beside the frame: {counts}. That speaks {'for' if lead > 0 else 'against'} the pose with log-odds "
-        f"{abs(lead):.1f}.",
-    )
+    written = writing_likelihoods(lines, layout.writing, [verdict.pose for verdict in verdicts])
+    verdicts = [replace(each, writing=own) for each, own in zip(verdicts, written.tolist(), strict=True)]
+    return _decision(verdicts, layout, len(seen), lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,42 +159,44 @@ def _given_sigma_mm(mark: LayoutMark) -> float:
     return float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm))
 
 
-def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int) -> Pose:
-    """The likeliest pose, and what speaks for it. found: marks, beside which the places of missed ones count too."""
+def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, lines: Sequence[Line] = ()) -> Pose:
+    """The likeliest pose, and what speaks for it; of those that are as likely the one in which most of the writing is
+    upright, so that a roll's frames are named alike. found: marks, beside which the places of missed ones count too."""
     if not verdicts:
         return Pose("0", False, ("no pose names the marks that were found.",))
-    best = max(verdicts, key=lambda verdict: verdict.total)
-    alike = [verdict for verdict in verdicts if best.total - verdict.total < _DECIDED]
+    seen = max(verdict.seen for verdict in verdicts)
+    alike = [verdict for verdict in verdicts if seen - verdict.seen < _DECIDED]
+    best = max(alike, key=lambda verdict: verdict.total)
     others = sorted((v for v in verdicts if v not in alike), key=lambda verdict: -verdict.total)
-    against = _against(best, others[0], layout) if others else ()
+    against = _against(best, others[0], layout, lines) if others else ()
+    of_all = {verdict.pose: verdict.seen for verdict in verdicts}
+    main = main_pose(lines)
     if len(alike) == 1:
-        return Pose(best.pose, True, against or (f"no other pose explains the {found} marks found.",))
+        reasons = against or (f"no other pose explains the {found} marks found.",)
+        return Pose(best.pose, True, reasons, of_all, main)
     names = ", ".join(verdict.pose for verdict in alike)
     lead = best.total - alike[0].total
+    near = [verdict for verdict in alike if best.total - verdict.total < _TOLD]
+    upright = next((verdict.pose for verdict in near if main and pose_in_camera(main, verdict.pose) == "0"), "")
+    like_writing = ", in which most of what is written is upright" if upright else ""
     if lead > _TOLD:
-        equal = [verdict.pose for verdict in alike if verdict is not best and best.total - verdict.total < _TOLD]
+        assumed = upright or best.pose
+        equal = [verdict.pose for verdict in near if verdict.pose != assumed]
         as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
-        return Pose(
-            best.pose,
-            False,
-            (
-                f"the {found} marks found do not tell the poses {names} apart with certainty: {best.pose} is assumed, "
-                f"{as_likely}likelier than {alike[0].pose} by log-odds of only {lead:.1f}.",
-                *against,
-            ),
+        told = (
+            f"the {found} marks found do not tell the poses {names} apart with certainty: {assumed} is assumed"
+            f"{like_writing}, {as_likely}likelier than {alike[0].pose} by log-odds of only {lead:.1f}."
         )
-    return Pose(
-        alike[0].pose,
-        False,
-        (
-            f"nothing in the {found} marks found tells the poses {names} apart: "
-            f"their pictures and given coordinates are alike; {alike[0].pose} is assumed.",
-            *against,
-        ),
-    )
+    else:
+        assumed = upright or alike[0].pose
+        told = (
+            f"nothing in the {found} marks found tells the poses {names} apart: their pictures and given coordinates "
+            f"are alike; {assumed} is assumed{like_writing}."
+        )
+    return Pose(assumed, False, (told, *against), of_all, main)
 
 
-def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout) -> tuple[str, ...]:
+def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:
     """What speaks for the best pose against the likeliest of those that it rules out, a sentence each."""
     sentences = []
     by_site = best.pictures - rival.pictures
@@ -224,7 +214,22 @@ def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout) -> tuple[s
             f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, speaks {word} pose {rival.pose} "
             f"with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
         )
+    if abs(best.writing - rival.writing) > _TOLD:
+        sentences.append(_of_writing(best, rival, layout, lines))
     return tuple(sentences)
+
+
+def _of_writing(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> str:
+    """What the writing says of two poses, and the lines that say most of it."""
+    lead = best.writing - rival.writing
+    by_line = [
+        (line_score(line, layout.writing, best.pose) - line_score(line, layout.writing, rival.pose)) * np.sign(lead)
+        for line in lines
+    ]
+    telling = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
+    quoted = ", ".join(f'"{lines[index].text}"' for index in telling[:_QUOTED])
+    word = "against" if lead > 0 else "for"
+    return f"of {len(lines)} lines of writing {quoted} speak most {word} pose {rival.pose}: log-odds {abs(lead):.1f}."
 
 
 def _difference(one: int, other: int, layout: FiducialLayout) -> str:

@@ -1,6 +1,7 @@
 """camera.toml: the camera as it is given, for the measurement (its marks) and for the adjustment (its priors)."""
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,6 +50,12 @@ class GivenFiducial:
         return self.mark.size_mm if isinstance(self.mark, shapes.LearnedMark) else 0.0
 
 
+READS: Mapping[str, str] = {"rightward": "0", "upward": "90", "leftward": "180", "downward": "270"}  # by the pose
+_WRITTEN = re.compile(
+    rf"(?P<side>{'|'.join(get_args(shapes.Side))})(?::(?P<plate> plate)?(?: reads (?P<reads>{'|'.join(READS)}))?)?"
+)
+
+
 @dataclass(frozen=True)
 class Source:
     """Where the numbers of a camera file come from, and from how many calibration reports."""
@@ -61,8 +68,8 @@ class Source:
 class CameraFile:
     """A camera file as read: mm, a standard deviation of 0 fixes, inf frees.
 
-    principal_distance_mm and principal_point_mm are None where the file leaves them to the points. data_strip: beside
-    which side of the frame instruments and text stand, None where the file does not say. calibration: an earlier one,
+    principal_distance_mm and principal_point_mm are None where the file leaves them to the points. writing:
+    where the camera writes on its film, as far as the file says. calibration: an earlier one,
     which takes the place of the standard deviations of all that it gives. clicks: None where nobody has shown the
     learned marks; learned_from: None before they are learned.
     """
@@ -76,7 +83,7 @@ class CameraFile:
     principal_point_sigma_mm: tuple[float, float]
     distortion: network.Distortion
     fiducials: tuple[GivenFiducial, ...]
-    data_strip: shapes.Side | None = None
+    writing: tuple[shapes.WrittenPlace, ...] = ()
     calibration: EarlierCalibration | None = None
     source: Source | None = None
     clicks: Clicks | None = None
@@ -108,7 +115,7 @@ class CameraFile:
                     'Add mark = "NAME" to it and a table [mark.NAME] that draws it, or mark = "none" to pass it over; '
                     "a camera of the library is copied with `reseau cameras NAME` for that."
                 )
-        return shapes.FiducialLayout(self.drawn, self.frame_mm, self.data_strip)
+        return shapes.FiducialLayout(self.drawn, self.frame_mm, self.writing)
 
     def camera(self, center_mm: tuple[float, float] = (0.0, 0.0)) -> network.Camera:
         """The camera for the adjustment. center_mm: where the principal point is sought when the file has none."""
@@ -164,7 +171,7 @@ def parse_camera(table: Table) -> CameraFile:
         principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (default_sigma, default_sigma)),
         distortion=_distortion(table.table("distortion"), frame),
         fiducials=fiducials,
-        data_strip=_side(table, "data_strip"),
+        writing=_writing(table),
         source=_source(table.table("source")) if "source" in table else None,
         clicks=read_clicks(table.table("clicks"), learned) if "clicks" in table else None,
         learned_from=read_learned_from(table.table("learned_from")) if "learned_from" in table else None,
@@ -174,8 +181,32 @@ def parse_camera(table: Table) -> CameraFile:
     return camera
 
 
-def _side(table: Table, key: str) -> shapes.Side | None:
-    return cast(shapes.Side, table.text(key, choices=get_args(shapes.Side))) if key in table else None
+def _writing(table: Table) -> tuple[shapes.WrittenPlace, ...]:
+    """Places as "left: reads upward", "right: plate reads downward", or "left" where the direction is not known."""
+    if "data_strip" in table:
+        raise table.error(
+            "data_strip",
+            'has become writing, which also says how it reads: writing = ["left: reads upward"], or "left".',
+        )
+    places = []
+    for text in table.texts("writing") if "writing" in table else ():
+        match = _WRITTEN.fullmatch(text.strip())
+        if match is None:
+            raise table.error(
+                "writing",
+                f"has {text!r}. A place is a side of the frame (left, right, top, bottom), or one with the direction "
+                '(rightward, upward, leftward, downward), as "left: reads upward", or "right: plate reads downward".',
+            )
+        pose = READS[match["reads"]] if match["reads"] else None
+        places.append(shapes.WrittenPlace(cast(shapes.Side, match["side"]), pose, bool(match["plate"])))
+    return tuple(places)
+
+
+def written_place_text(place: shapes.WrittenPlace) -> str:
+    """A place as a camera file has it."""
+    direction = [word for word, pose in READS.items() if pose == place.pose]
+    told = [*(["plate"] if place.plate else []), *(f"reads {word}" for word in direction)]
+    return f"{place.side}: {' '.join(told)}" if told else place.side
 
 
 def _source(table: Table) -> Source:

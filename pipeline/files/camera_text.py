@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from adjust.functional_model.families import family
 from adjust.network import Prior
 from measure.marks import shapes
-from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial
+from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial, written_place_text
 from pipeline.files.learned_table import LearnedFrom
 from pipeline.files.template_table import SavePicture, template_lines
 from pipeline.files.toml_text import numbers, quoted, sigma, sigmas
@@ -19,8 +19,8 @@ def camera_text(camera: CameraFile, save: SavePicture) -> str:
     lines = [f"name = {quoted(camera.name)}"]
     if camera.frame_mm is not None:
         lines.append(f"frame_mm = {numbers(camera.frame_mm)}")
-    if camera.data_strip is not None:
-        lines.append(f"data_strip = {quoted(camera.data_strip)}")
+    if camera.writing:
+        lines.append(f"writing = [{', '.join(quoted(written_place_text(place)) for place in camera.writing)}]")
     if camera.principal_distance_mm is not None:
         lines.append(f"principal_distance_mm = {camera.principal_distance_mm!r}")
     if camera.principal_point_mm is not None:

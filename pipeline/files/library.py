@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.errors import InputError
-from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.camera_file import CameraFile, read_camera, written_place_text
 from pipeline.spelling import did_you_mean
 
 PREFIX = "library:"
@@ -84,7 +84,7 @@ def _entry(name: str, camera: CameraFile) -> Json:
         "name": name,
         "title": camera.name,
         "frame_mm": list(camera.frame_mm or ()),
-        "data_strip": camera.data_strip,
+        "writing": [written_place_text(place) for place in camera.writing],
         "principal_distance_mm": {
             "value": camera.principal_distance_mm,
             "sigma": camera.principal_distance_sigma_mm,

@@ -1,0 +1,64 @@
+"""What the writing on a frame says of its pose.
+
+A line tells itself which way it lies in the scan: it reads better so than in a mirror or upside down, by so many
+characters. Under the right pose all lines read right from the film's own face. Where the camera is known to write
+beside its frames, under the right pose its titles and its own plate stand and read there as the camera has them.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.marks.poses import pose_in_camera, up_from_camera
+from measure.marks.shapes import Side, WrittenPlace
+from measure.writing.fields import is_of_film, is_plate, is_title
+from measure.writing.line import Line
+
+Array = NDArray[np.float64]
+
+_A_CHARACTER = 0.6  # log-odds of a way to lie, a character that is legible in it beyond those of another way
+_ELSEWHERE = 4.6  # the most that a line says by where it stands if nothing in it shows a title or a plate: of a hundred
+_FEIGNED = 1 / 3000  # probability that a frame's writing reads as none of it should
+_PLAINLY = 1.5  # times as many characters as in any other way
+_DIRECTIONS: Mapping[Side, tuple[int, int]] = {"left": (-1, 0), "right": (1, 0), "top": (0, 1), "bottom": (0, -1)}
+
+
+def writing_likelihoods(lines: Sequence[Line], places: Sequence[WrittenPlace], poses: Sequence[str]) -> Array:
+    """(n,) log-likelihoods of the poses: 0 for the best, and no less than the probability that writing misleads."""
+    scores = np.array([sum((line_score(line, places, pose) for line in lines), 0.0) for pose in poses])
+    return np.asarray(np.log((1 - _FEIGNED) * np.exp(scores - scores.max(initial=-np.inf)) + _FEIGNED))
+
+
+def line_score(line: Line, places: Sequence[WrittenPlace], pose: str) -> float:
+    """The log-likelihood of one line in a pose, up to a constant of the line."""
+    own = {pose_in_camera(way, pose): reading.legible for way, reading in line.ways.items()}
+    upright = {way: legible for way, legible in own.items() if not way.endswith("m")}
+    anyhow, longest = _A_CHARACTER * max(upright.values()), _A_CHARACTER * max(own.values())
+    plate = is_plate(line)
+    expected = [] if is_of_film(line) else [place for place in places if place.plate == plate]
+    if not expected:
+        return anyhow
+    elsewhere = anyhow - (longest if plate or is_title(line) else min(longest, _ELSEWHERE))
+    side = side_in_camera(line.side, pose)
+    there = [max(upright.values()) if place.pose is None else upright.get(place.pose, 0.0)
+             for place in expected if place.side == side]  # fmt: skip
+    return max([elsewhere, *(_A_CHARACTER * legible for legible in there)])
+
+
+def side_in_camera(side: Side, pose: str) -> Side:
+    """Which side of the camera's drawing lies at a side of a scan of that pose."""
+    direction = up_from_camera(pose).T @ _DIRECTIONS[side]
+    return next(name for name, other in _DIRECTIONS.items() if np.allclose(direction, other))
+
+
+def main_pose(lines: Sequence[Line]) -> str:
+    """The way in which most of the writing lies in the scan; "" where another has nearly as many
+    characters."""
+    if not lines:
+        return ""
+    ways: dict[str, float] = {}
+    for line in lines:
+        ways[line.pose] = ways.get(line.pose, 0.0) + line.legible
+    best, *others = sorted(ways, key=lambda way: -ways[way])
+    return best if not others or ways[best] > _PLAINLY * ways[others[0]] else ""

@@ -1,0 +1,157 @@
+"""The pose by what is written: mirrored or not by any writing, the turn by that of which the place is known."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from brute_marks import Array, written_scan
+from drawn_frames import PITCH_UM, RING_CROSS, frame_picture, layout_of, pixel_from_camera
+
+from measure.fiducial_options import FiducialOptions, Reads
+from measure.fiducials import measure_fiducials
+from measure.marks.poses import POSES, pose_in_camera, up_from_camera
+from measure.marks.shapes import MarkShape, Side, WrittenPlace
+from measure.pose.written_pose import main_pose, side_in_camera, writing_likelihoods
+from measure.results import FrameMeasurement
+from measure.writing.line import Line, Reading, of_one_face
+
+WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
+DECIDED = 7.0
+SIZE_PX = 640
+CORNERS = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))
+LAYOUT = layout_of([MarkShape(RING_CROSS)] * 4, CORNERS, (23.0, 23.0))
+
+
+def line(text: str, pose: str, side: Side, share: float = 0.2) -> Line:
+    """A line that lies in a pose in the scan, and reads to a share of its characters in the three others along it."""
+    turn = int(pose.removesuffix("m")) % 180
+    ways = [way for way in POSES if int(way.removesuffix("m")) % 180 == turn]
+    legible = {way: len(text) * (1.0 if way == pose else share) for way in ways}
+    return Line({way: Reading(text, 0.9, value) for way, value in legible.items()}, pose, ((0.0, 0.0),) * 4, side)
+
+
+def seen(pose: str, *camera: tuple[str, str, Side]) -> list[Line]:
+    """Lines as a scan of that pose shows them, given as they lie in the camera's frame."""
+    lines = []
+    for text, own, camera_side in camera:
+        scan_pose = next(each for each in POSES if pose_in_camera(each, pose) == own)
+        sides: Sequence[Side] = ("left", "right", "top", "bottom")
+        side = next(each for each in sides if side_in_camera(each, pose) == camera_side)
+        lines.append(line(text, scan_pose, side))
+    return lines
+
+
+def lead(lines: Sequence[Line], pose: str, places: Sequence[WrittenPlace] = WILD) -> float:
+    """The log-odds of a pose against the likeliest other one."""
+    of_all = dict(zip(POSES, writing_likelihoods(lines, places, POSES), strict=True))
+    return of_all[pose] - max(value for name, value in of_all.items() if name != pose)
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_titles_that_stand_and_read_as_the_camera_has_them_decide_every_pose(pose: str) -> None:
+    assert lead(seen(pose, ("RUN 20 CANBERRA 7/7/89", "90", "left")), pose) > DECIDED
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_titles_and_plate_that_read_alike_on_opposite_sides_are_told_by_what_they_say(pose: str) -> None:
+    plate, title = ("WILD 15/4 Nr 13043 152.75", "270", "right"), ("RUN 20 CANBERRA 7/7/89", "90", "left")
+    assert lead(seen(pose, plate), pose) > DECIDED
+    assert lead(seen(pose, plate, title), pose) > DECIDED
+
+
+def test_a_line_that_may_be_anybodys_does_not_decide_by_its_place() -> None:
+    """Handwriting on the plate's side: upside down it would be a title on its own side."""
+    lines = seen("0", ("CHECKED BY MILLER", "270", "right"))
+    of_all = dict(zip(POSES, writing_likelihoods(lines, WILD, POSES), strict=True))
+    assert of_all["180"] - of_all["0"] < DECIDED
+    assert of_all["180"] - of_all["180m"] > DECIDED  # but it is not mirrored
+
+
+def test_the_films_own_name_tells_the_mirror_alone() -> None:
+    of_all = dict(
+        zip(POSES, writing_likelihoods(seen("90m", ("KODAK SAFETY FILM", "0", "top")), WILD, POSES), strict=True)
+    )
+    mirrored = [of_all[pose] for pose in POSES if pose.endswith("m")]
+    assert mirrored == pytest.approx([0.0] * 4, abs=1e-3)
+    assert max(of_all[pose] for pose in POSES if not pose.endswith("m")) < -DECIDED
+
+
+def test_without_a_known_place_only_the_mirror_is_told() -> None:
+    of_all = writing_likelihoods(seen("90", ("RUN 20 CANBERRA 7/7/89", "90", "left")), (), POSES)
+    assert of_all[:4] == pytest.approx([0.0] * 4, abs=1e-3)
+    assert of_all[4:].max() < -DECIDED
+
+
+def test_what_reads_the_same_in_all_ways_says_nothing() -> None:
+    assert writing_likelihoods([line("808808808808", "0", "top", share=1.0)], (), POSES) == pytest.approx([0.0] * 8)
+    assert writing_likelihoods([], WILD, POSES) == pytest.approx([0.0] * 8)
+
+
+def test_sides_follow_the_poses_own_definition() -> None:
+    towards: dict[Side, tuple[int, int]] = {"left": (-1, 0), "right": (1, 0), "top": (0, 1), "bottom": (0, -1)}
+    for pose in POSES:
+        for side, direction in towards.items():
+            assert np.allclose(up_from_camera(pose) @ towards[side_in_camera(side, pose)], direction)
+
+
+def test_most_of_the_writing_lies_one_way_or_there_is_none() -> None:
+    assert main_pose([line("DEVELOPMENT", "90", "left"), line("5804", "0", "top")]) == "90"
+    assert main_pose([line("ABCDE", "90", "left"), line("5804", "0", "top")]) == ""
+    assert main_pose([]) == ""
+
+
+def test_lines_are_read_from_the_face_that_most_reads_from() -> None:
+    odd = line("E.S.T.", "180m", "top", share=0.95)
+    right = line("DEVELOPMENT", "180", "top")
+    assert odd.pose == "180m"
+    assert not any(each.pose.endswith("m") for each in of_one_face([odd, right]))
+    assert [each.text for each in of_one_face([odd, right])] == ["DEVELOPMENT", "E.S.T."]
+
+
+def written_frame() -> Array:
+    """Pose "0": four marks alike; titles beside the left, reading upward, a plate to the right, reading downward."""
+    grey = frame_picture(LAYOUT, pixel_from_camera("0", 0.004, ((SIZE_PX - 1) / 2,) * 2), size=SIZE_PX)
+    border = np.ones(grey.shape, dtype=bool)
+    border[90:-90, 90:-90] = False
+    grey[border] = 3000 + np.random.default_rng(7).normal(0, 200, int(border.sum()))
+    letters = np.zeros(grey.shape, np.uint8)
+    cv2.putText(letters, "Nr 13043 152.75", (220, 55), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 255, 1, cv2.LINE_AA)
+    letters = np.ascontiguousarray(letters[::-1, ::-1])
+    cv2.putText(letters, "RUN 20  CANBERRA  16.5.68", (130, 55), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 255, 1, cv2.LINE_AA)
+    return np.asarray(grey + 40.0 * np.rot90(letters))
+
+
+def measured(pose: str, folder: Path, places: tuple[WrittenPlace, ...], reads: Reads = "pose") -> FrameMeasurement:
+    grey = written_frame()
+    grey = np.rot90(grey[:, ::-1] if pose.endswith("m") else grey, int(pose.rstrip("m")) // 90)
+    with written_scan(np.ascontiguousarray(grey), folder) as scan:
+        options = FiducialOptions(writing=reads)
+        return measure_fiducials(scan, replace(LAYOUT, writing=places), (PITCH_UM, PITCH_UM), options)
+
+
+@pytest.mark.parametrize("pose", ["270", "90m"])
+def test_the_pose_of_a_frame_with_marks_alike_is_decided_by_its_writing(pose: str, tmp_path: Path) -> None:
+    found = measured(pose, tmp_path, WILD).pose
+    assert found is not None
+    assert (found.name, found.decided) == (pose, True)
+    assert "RUN20CANBERRA" in found.evidence[-1].replace(" ", "")
+    assert "log-odds 8.0" in found.evidence[-1]
+
+
+def test_where_no_place_is_known_frames_are_named_so_that_their_writing_is_upright(tmp_path: Path) -> None:
+    found = measured("180m", tmp_path, ()).pose
+    assert found is not None
+    assert not found.decided
+    assert pose_in_camera(found.writing, found.name) == "0"
+    assert "in which most of what is written is upright" in found.evidence[0]
+    assert "speak most against pose" in found.evidence[1]
+
+
+def test_nothing_is_read_where_nobody_asks_and_a_mirror_is_not_assumed(tmp_path: Path) -> None:
+    silent = measured("90m", tmp_path, WILD, "none")
+    assert silent.writing is None
+    assert silent.pose is not None
+    assert (silent.pose.name, silent.pose.decided) == ("0", False)
