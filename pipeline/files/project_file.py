@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import cast, get_args
 
 from adjust.network import ObjectPoint, Prior
+from measure.fiducial_options import Reads
 from measure.film import SCATTER_MM
 from measure.marks.poses import POSES
 from measure.scans.scan import Scan, open_scan
@@ -34,6 +36,7 @@ class Project:
 
     cameras: by file name; the first one serves where images.csv names none. scans: by image name, in their order.
     unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
+    writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
     """
 
     path: Path
@@ -51,6 +54,7 @@ class Project:
     unit_mm: float
     adjust: AdjustSettings
     max_pixels: int | None = None
+    writing: Reads = "pose"
 
     def open_scan(self, name: str) -> Scan:
         """The scan of an image. Raises MeasurementError where it cannot be read."""
@@ -148,6 +152,7 @@ def read_project(path: Path) -> Project:
         given_distances=(),
         unit_mm=UNITS_MM[objects.text("unit", "m", tuple(UNITS_MM))],
         adjust=read_adjust(table.table("adjust")),
+        writing=cast(Reads, measure.text("writing", "pose", get_args(Reads))),
     )
     for each in (table, measure, objects):
         each.done()

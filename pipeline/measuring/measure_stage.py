@@ -19,6 +19,7 @@ from measure.fiducials import measure_fiducials
 from measure.marks.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
+from measure.writing.networks import MISSING, networks
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.learned_table import LearnedFrom
@@ -155,7 +156,7 @@ def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
     frame = _fiducials(project, name, scan, camera)
     pitch, problems, notes = _pitch(project, scan, camera, frame)
     frame = replace(frame, problems=(*frame.problems, *problems))
-    notes = (*(f"{_sentence(note)}." for note in scan.notes), *notes)
+    notes = (*(f"{_sentence(note)}." for note in scan.notes), *notes, *_missed_reading(project, frame))
     measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(camera, measured):
         measured = replace(measured, frame=replace(frame, problems=(*frame.problems, misplaced)))
@@ -180,7 +181,7 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
         return FrameMeasurement(name, ())
     pitch = project.pitch_um or scan.pitch_um
     pose = pose_of(project, camera, scan.name)
-    layout, options = camera.layout(), FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm)
+    layout, options = camera.layout(), _options(project, pose)
     measured = measure_fiducials(scan, layout, pitch, options)
     if pitch is not None:
         source = "the project" if project.pitch_um is not None else "the scan's file"
@@ -190,6 +191,17 @@ def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> F
     if learned is not None and project.pose == "auto" and scan.name in learned.alike and measured.pose is not None:
         measured = replace(measured, pose=_as_learned(learned, scan))
     return replace(measured, image=name, marks=_with_sizes(measured, camera, scan, pitch))
+
+
+def _options(project: Project, pose: str) -> FiducialOptions:
+    return FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm, writing=project.writing)
+
+
+def _missed_reading(project: Project, frame: FrameMeasurement) -> tuple[str, ...]:
+    """A note where something would have been read, but nothing is there that reads."""
+    undecided = project.writing == "pose" and frame.pose is not None and not frame.pose.decided
+    asked = project.writing == "all" or undecided
+    return (f"{_sentence(MISSING)}.",) if asked and networks() is None else ()
 
 
 def _as_learned(learned: LearnedFrom, scan: Scan) -> Pose:

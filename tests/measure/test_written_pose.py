@@ -33,7 +33,10 @@ def line(text: str, pose: str, side: Side, share: float = 0.2) -> Line:
     return Line({way: Reading(text, 0.9, value) for way, value in legible.items()}, pose, ((0.0, 0.0),) * 4, side)
 
 
-def seen(pose: str, *camera: tuple[str, str, Side]) -> list[Line]:
+Written = tuple[str, str, Side]
+
+
+def seen(pose: str, *camera: Written) -> list[Line]:
     """Lines as a scan of that pose shows them, given as they lie in the camera's frame."""
     lines = []
     for text, own, camera_side in camera:
@@ -47,7 +50,7 @@ def seen(pose: str, *camera: tuple[str, str, Side]) -> list[Line]:
 def lead(lines: Sequence[Line], pose: str, places: Sequence[WrittenPlace] = WILD) -> float:
     """The log-odds of a pose against the likeliest other one."""
     of_all = dict(zip(POSES, writing_likelihoods(lines, places, POSES), strict=True))
-    return of_all[pose] - max(value for name, value in of_all.items() if name != pose)
+    return float(of_all[pose] - max(value for name, value in of_all.items() if name != pose))
 
 
 @pytest.mark.parametrize("pose", POSES)
@@ -57,7 +60,8 @@ def test_titles_that_stand_and_read_as_the_camera_has_them_decide_every_pose(pos
 
 @pytest.mark.parametrize("pose", POSES)
 def test_titles_and_plate_that_read_alike_on_opposite_sides_are_told_by_what_they_say(pose: str) -> None:
-    plate, title = ("WILD 15/4 Nr 13043 152.75", "270", "right"), ("RUN 20 CANBERRA 7/7/89", "90", "left")
+    plate: Written = ("WILD 15/4 Nr 13043 152.75", "270", "right")
+    title: Written = ("RUN 20 CANBERRA 7/7/89", "90", "left")
     assert lead(seen(pose, plate), pose) > DECIDED
     assert lead(seen(pose, plate, title), pose) > DECIDED
 
