@@ -26,6 +26,7 @@ from pipeline.files.library import PREFIX, library_json, library_path, print_lib
 from pipeline.files.project_file import FINEST_PITCH_UM, Project, read_project
 from pipeline.measuring.camera_answer import print_identification
 from pipeline.measuring.camera_trials import identify
+from pipeline.measuring.scan_kinds import identify_kinds, print_kinds, scan_files
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 from pipeline.summary import Summary, print_summary
@@ -220,11 +221,19 @@ def template(
 
 @app.command()
 def cameras(
-    name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="Print this camera's file, to start from.")
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME]", help="Print this camera's file, to start from. After --scan: more scans."),
     ] = None,
     scan: Annotated[
-        Path | None, typer.Option("--scan", metavar="FILE", help="Try the cameras on this scan, name the best ones.")
+        list[Path] | None,
+        typer.Option(
+            "--scan", metavar="PATH", help="Try the cameras on a scan, or on some of a folder's, of each kind."
+        ),
+    ] = None,
+    own: Annotated[
+        Path | None,
+        typer.Option("--project", metavar="PROJECT.toml", help="Try its camera files, too; its scans without --scan."),
     ] = None,
     pitch_um: Annotated[
         float | None,
@@ -233,24 +242,41 @@ def cameras(
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
-    """The camera library: its list, one of its files, or which of its cameras a scan is of."""
-    if (name is not None and (scan is not None or as_json)) or (pitch_um is not None and scan is None):
+    """The camera library: its list, one of its files, or which of its cameras scans are of."""
+    if own is not None or scan is not None:
+        project = None if own is None else read_project(own)
+        given = [*(scan or ()), *(Path(name) for name in names or ())] or (project.scans.values() if project else ())
+        return _name_cameras(list(given), project, pitch_um, max_pixels, as_json)
+    if (names and (as_json or len(names) > 1)) or pitch_um is not None:
         raise InputError("give NAME alone, or --scan with or without --pitch, or neither for the list.")
-    if name is not None:
-        typer.echo(library_path(name.removeprefix(PREFIX)).read_text(encoding="utf-8"), nl=False)
-        return DONE
-    if scan is None:
-        if as_json:
-            _echo_json(library_json())
-        else:
-            print_library(PlainConsole())
-        return DONE
-    identification = identify(scan, read_library(), pitch_um, Reporter(), max_pixels)
-    if as_json:
-        _echo_json(identification.as_json())
+    if names:
+        typer.echo(library_path(names[0].removeprefix(PREFIX)).read_text(encoding="utf-8"), nl=False)
+    elif as_json:
+        _echo_json(library_json())
     else:
-        print_identification(identification, PlainConsole())
-    return DONE if identification.best else LOOK
+        print_library(PlainConsole())
+    return DONE
+
+
+def _name_cameras(
+    given: Sequence[Path], project: Project | None, pitch_um: float | None, max_pixels: int | None, as_json: bool
+) -> int:
+    """One scan with all that was tried on it; of many some of each kind."""
+    own = {name: camera for name, camera in project.cameras.items() if PREFIX not in name} if project else {}
+    tried, reporter = {**own, **read_library()}, Reporter()
+    if len(given) == 1 and not given[0].is_dir():
+        identification = identify(given[0], tried, pitch_um, reporter, max_pixels)
+        if as_json:
+            _echo_json(identification.as_json())
+        else:
+            print_identification(identification, PlainConsole())
+        return DONE if identification.best else LOOK
+    many = identify_kinds(scan_files(given), lambda path: identify(path, tried, pitch_um, reporter, max_pixels))
+    if as_json:
+        _echo_json(many.as_json())
+    else:
+        print_kinds(many, PlainConsole())
+    return DONE if many.all_named else LOOK
 
 
 def _with_project(

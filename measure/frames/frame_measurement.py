@@ -13,7 +13,23 @@ _ROUNDS = 2  # of looking for faint marks: the first ones tell where the others 
 
 
 def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Sight all marks from the placement, fit the frame to those that agree, and look again for the others."""
+    """Sight all marks from the placement, fit the frame to those that agree, look again for the others, and settle
+    all of them by what the frame and the other marks say."""
+    sighter = _sighted(scan, layout, placement, options)
+    settle(sighter)
+    share_blur(sighter)
+    count_tone(sighter)
+    compare_sizes(sighter)
+    compare_shapes(sighter)
+    return sighter.frame()
+
+
+def look_at_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
+    """The same before its marks are settled: which of them are there, and how they look."""
+    return _sighted(scan, layout, placement, options).frame()
+
+
+def _sighted(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> FrameSighter:
     sighter = FrameSighter(scan, layout, placement, options)
     sighter.choose_channels()
     everything = range(len(layout.marks))
@@ -33,9 +49,4 @@ def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, opti
         if sighter.sure():
             look_for_faint(sighter, faint_reach_px(sighter))
             sighter.judge()
-    settle(sighter)
-    share_blur(sighter)
-    count_tone(sighter)
-    compare_sizes(sighter)
-    compare_shapes(sighter)
-    return sighter.frame()
+    return sighter

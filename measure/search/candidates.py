@@ -83,6 +83,18 @@ class Responses:
         return Responses(maps, self.reduction, first, self.surroundings), index
 
 
+@dataclass(frozen=True)
+class Effort:
+    """How much a search takes. held_bytes: of correlations, at a time. half_px: how far about a mark's point its
+    picture reaches at most, in the reduced scan: of a cross with one arm far longer the middle tells enough."""
+
+    held_bytes: int
+    half_px: int
+
+
+FULL = Effort(held_bytes=768 << 20, half_px=1000)  # sixteen looks, of four marks that differ, in a large scan
+
+
 @dataclass(frozen=True, eq=False)
 class Look:
     """A mark as one pose shows it: linear is the (2, 2) part of pixel_from_mark in the scan."""
@@ -92,12 +104,18 @@ class Look:
 
 
 def respond(
-    scan: Scan, looks: Sequence[Look], signs: Collection[int], surroundings: Surroundings, held: Held[Map]
+    scan: Scan,
+    looks: Sequence[Look],
+    signs: Collection[int],
+    surroundings: Surroundings,
+    held: Held[Map],
+    most_px: int = FULL.half_px,
 ) -> tuple[Responses, tuple[int, ...]]:
     """The responses to the looks that differ, lighter (+1) and darker (-1) than their surroundings as signs says, and
-    for every look which of the kinds is its own. held: what there is of these maps, and of others of the scan."""
+    for every look which of the kinds is its own. held: what there is of these maps, and of others of the scan. most_px:
+    of the reduced scan, how far about its point a mark's picture reaches."""
     reduction = _reduction(scan, looks)
-    kinds, index = _distinct(_templates(looks, reduction))
+    kinds, index = _distinct(_templates(looks, reduction, most_px))
     details = [_reduced_detail_px(looks[index.index(kind)], reduction) for kind in range(len(kinds))]
     sought = Sought(kinds, details, signs, surroundings, scan.full_scale_dn * FAINT)
     maps = ScanMaps(scan, reduction, _channel_weights(scan), sought, held)
@@ -157,7 +175,7 @@ def _reduced_detail_px(look: Look, reduction: int) -> float:
     return max(wide * detail_px(look.mark, look.linear) / reduction, 1.0)
 
 
-def _templates(looks: Sequence[Look], reduction: int) -> list[Array]:
+def _templates(looks: Sequence[Look], reduction: int, most_px: int = FULL.half_px) -> list[Array]:
     """The picture of every look; the same mark in the same direction shares its own, and one turned by quarters or
     mirrored has its picture turned."""
     drawn: dict[Mark, tuple[Array, Array]] = {}
@@ -167,10 +185,10 @@ def _templates(looks: Sequence[Look], reduction: int) -> list[Array]:
         if key in shown:
             continue
         if look.mark not in drawn:
-            drawn[look.mark] = look.linear, _template(look, reduction)
+            drawn[look.mark] = look.linear, _template(look, reduction, most_px)
         linear, template = drawn[look.mark]
         turn = look.linear @ np.linalg.inv(linear)
-        shown[key] = quarter_turned(template, turn) if _is_quarter(turn) else _template(look, reduction)
+        shown[key] = quarter_turned(template, turn) if _is_quarter(turn) else _template(look, reduction, most_px)
     return [shown[look.mark, look.linear.tobytes()] for look in looks]
 
 
@@ -187,10 +205,10 @@ def _is_quarter(turn: Array) -> bool:
     return bool(np.allclose(turn, whole, atol=1e-9) and np.array_equal(np.abs(whole).sum(axis=0), [1, 1]))
 
 
-def _template(look: Look, reduction: int) -> Array:
+def _template(look: Look, reduction: int, most_px: int) -> Array:
     linear = _centred(look.linear) / reduction
     least, greatest = extent_px(look.mark, linear)
-    half = int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + _RIM_PX
+    half = min(int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + _RIM_PX, most_px)
     linear[:, 2] = half
     return known_picture(look.mark, linear, 2 * half + 1, 2 * half + 1, _BLUR_PX)
 

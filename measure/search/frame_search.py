@@ -13,24 +13,21 @@ from measure.marks.poses import POSES, up_from_camera
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
-from measure.search.candidates import Look, Responses, detail_px, respond, respond_about
+from measure.search.candidates import FULL, Effort, Look, Responses, detail_px, respond, respond_about
 from measure.search.centred_frame import centred_places_px, reach_mm
 from measure.search.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
 from measure.search.correlation import WIDE, Map, Surroundings
 from measure.search.exposed_frame import ExposedFrame, exposed_frame
 from measure.search.held import Held
-from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.search.pitches import PitchHypothesis
 from measure.search.response_layers import Layer, Reach, layers_of
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
-_COMPARED = 8  # best placements: the one that chance makes least is among them
 _TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
 # Of the marks' middle from that of the exposed frame: one body carries both, but a gate is no datum.
 _OFF_MIDDLE_MM = 0.5
-_MAPS_BYTES = 512 << 20  # held: sixteen looks, of four marks that differ, in a large scan
-_REACHES_BYTES = 256 << 20  # the same: two for each of the looks of one pose
 _TURNED_RAD = 0.01  # of the marks against the exposed frame's edges, and what these leave open
 
 
@@ -80,31 +77,25 @@ class _Searched:
         return max(everywhere, reach.share_elsewhere(place, reach.height(place)))
 
 
-def expected_alike(
-    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> float:
-    """How many constellations that answer as well as the scan's best one chance would find in a scan like it without
-    any frame of this camera: the marks are looked for at reduced size only, so that cameras can be compared quickly."""
-    search, expected, tried = FrameSearch(scan, layout, options), np.inf, 0
-    for hypotheses in pitch_hypotheses(scan, layout, pitch_um, replace(options, pitch_is_right=True)):
-        tried += len(hypotheses)
-        found = search.anywhere(hypotheses)[:_COMPARED]
-        expected = min([expected, *(tried * search.expected_alike(placement) for placement in found)])
-    return expected
-
-
 class FrameSearch:
     """The search in one scan; it draws and correlates the marks once for hypotheses that share a drawing."""
 
     def __init__(
-        self, scan: Scan, layout: FiducialLayout, options: FiducialOptions, surroundings: Surroundings = WIDE
+        self,
+        scan: Scan,
+        layout: FiducialLayout,
+        options: FiducialOptions,
+        surroundings: Surroundings = WIDE,
+        effort: Effort = FULL,
     ) -> None:
         self.scan, self.layout, self.options, self.surroundings = scan, layout, options, surroundings
         self.poses = POSES if options.pose == "auto" else (options.pose,)
         self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
         self._drawn: tuple[Pair, _Answers] | None = None
         self._searched: dict[Pair, _Searched] = {}
-        self._maps, self._reaches = Held[Map](_MAPS_BYTES), Held[Reach](_REACHES_BYTES)
+        # Of reaches there are two for each of the looks of one pose.
+        self._maps, self._reaches = Held[Map](2 * effort.held_bytes // 3), Held[Reach](effort.held_bytes // 3)
+        self._most_px = effort.half_px
 
     def anywhere(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements in the whole scan, of all poses asked for, best first."""
@@ -112,7 +103,7 @@ class FrameSearch:
         for drawn_mm, alike in groupby(hypotheses, key=lambda hypothesis: hypothesis.drawn_mm):
             if self._drawn is None or self._drawn[0] != drawn_mm:
                 looks = self._looks(drawn_mm, self.poses)
-                answers = respond(self.scan, looks, self._signs, self.surroundings, self._maps)
+                answers = respond(self.scan, looks, self._signs, self.surroundings, self._maps, self._most_px)
                 self._drawn = drawn_mm, self._answers(*answers)
             found += self._everywhere(list(alike), self._drawn[1])
         return _best_first(found)

@@ -1,4 +1,4 @@
-"""Which camera a scan is of: every camera of the library whose marks are drawn is tried on it."""
+"""Which camera a scan is of: every camera whose marks are drawn is tried on it, at reduced size."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -11,18 +11,23 @@ from numpy.typing import NDArray
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
-from measure.film import SCATTER_MM
+from measure.frames.camera_recognition import answer, likeness, seen
+from measure.frames.frame import Frame
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.results import FrameMeasurement
 from measure.scans.scan import Scan, open_scan
-from measure.search.frame_search import expected_alike
+from measure.scans.thumbnail import thumbnail
+from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.progress import Count, Reporter
 
 Array = NDArray[np.float64]
+Names = tuple[str, ...]
 
+_LARGEST_PX = 1600  # of what is looked at: a tenth of a millimetre of aerial film, as wide as the finest lines of marks
+_COARSEST_PX = 1024  # the same while the pitch is sought: lines are half a pixel wide then, and marks a dozen long
+_FEW = 3  # layouts that answer best while the pitch is sought, and are tried at the pitch that each comes to
+_PITCH_TOLERANCE = 0.02  # of that pitch
 _ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
 _STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is so deformed
 _CERTAIN = 0.01  # constellations expected by chance: no mark need be matched in wrong places to know better
@@ -42,40 +47,95 @@ def identify(
 
     Raises MeasurementError for a scan that cannot be read.
     """
-    with open_scan(path, max_pixels) as scan, reporter.stage("trying") as count:
-        pitch = scan.pitch_um if pitch_um is None else (pitch_um, pitch_um)
-        trials = _trials(scan, cameras, pitch, FiducialOptions(pitch_is_right=True), count)
-        if pitch is not None and not any(trial.stands_out for trial in trials):
-            trials = _trials(scan, cameras, pitch, FiducialOptions(), count)
+    with open_scan(path, max_pixels) as whole, reporter.stage("trying") as count:
+        given = whole.pitch_um if pitch_um is None else (pitch_um, pitch_um)
+        layouts = {names: cameras[names[0]].layout() for names in _alike(cameras)}
+        trials = list[Trial]()
+        if given is not None:
+            trials = _as_given(whole, layouts, given, count)
+        if not any(trial.stands_out for trial in trials):
+            trials = _at_any_pitch(whole, layouts, count)
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
     ranked = tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected)))
-    return Identification(path, ranked, unreported, pitch)
+    return Identification(path, ranked, unreported, given)
 
 
-def _trials(
-    scan: Scan,
-    cameras: Mapping[str, CameraFile],
-    pitch_um: tuple[float, float] | None,
-    options: FiducialOptions,
-    count: Count,
+class _Try:
+    """A layout that is tried on a scan, as it answers in a thumbnail of it under hypotheses about the pitch there;
+    tried: how many others were tried before."""
+
+    def __init__(
+        self,
+        whole: Scan,
+        small: Scan,
+        layout: FiducialLayout,
+        hypotheses: Sequence[Sequence[PitchHypothesis]],
+        tried: int = 0,
+    ) -> None:
+        start = time.perf_counter()
+        self.whole, self.small, self.layout, self.hypotheses, self.tried = whole, small, layout, hypotheses, tried
+        self.answer = answer(small, layout, hypotheses, tried)
+        self.seconds = time.perf_counter() - start
+
+    def seen(self) -> Frame | None:
+        """The frame as its marks look in the scan itself."""
+        return seen(self.whole, self.layout, self.answer, self.whole.width_px / self.small.width_px)
+
+    def stretched(self) -> "_Try":
+        """The same with marks in wrong places."""
+        x, y = _STRETCH
+        marks = tuple(replace(mark, xy_mm=(x * mark.xy_mm[0], y * mark.xy_mm[1])) for mark in self.layout.marks)
+        return _Try(self.whole, self.small, replace(self.layout, marks=marks), self.hypotheses, self.tried)
+
+    def refined(self, fine: Scan) -> "_Try":
+        """The same at the pitch that the best answer came to, in a larger thumbnail."""
+        if not self.answer.placements:
+            return self
+        linear = self.answer.placements[0].pixel_from_camera[:, :2]
+        pitch_mm = self.small.width_px / fine.width_px / float(np.sqrt(abs(np.linalg.det(linear))))
+        hypothesis = PitchHypothesis((pitch_mm, pitch_mm), _PITCH_TOLERANCE, (pitch_mm, pitch_mm))
+        return _Try(self.whole, fine, self.layout, [[hypothesis]], sum(map(len, self.hypotheses)))
+
+
+def _as_given(
+    whole: Scan, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float], count: Count
 ) -> list[Trial]:
-    """Of every layout, those first that answer better than chance. Once one of these stands out, another is measured
-    only where it answers better than chance too, and may be more than a part of what was found."""
-    expected: dict[tuple[str, ...], float] = {}
-    groups = _alike(cameras)
-    for done, names in enumerate(groups):
-        count(f"the marks of {', '.join(names)}", done, 2 * len(groups))
-        expected[names] = expected_alike(scan, cameras[names[0]].layout(), pitch_um, options)
+    """The trials at the given pitch, or with pixels that are longer one way."""
+    small, options, tries = thumbnail(whole, _LARGEST_PX), FiducialOptions(pitch_is_right=True), dict[Names, _Try]()
+    times = whole.width_px / small.width_px
+    for done, (names, layout) in enumerate(layouts.items()):
+        count(f"the marks of {', '.join(names)}", done, 2 * len(layouts))
+        hypotheses = pitch_hypotheses(small, layout, (times * pitch_um[0], times * pitch_um[1]), options)
+        tries[names] = _Try(whole, small, layout, hypotheses)
+    return _trials(tries, count)
+
+
+def _at_any_pitch(whole: Scan, layouts: Mapping[Names, FiducialLayout], count: Count) -> list[Trial]:
+    """The trials of a scan that the frame may fill: what its pixels then measure each layout says for itself, in a
+    picture of half the size, and those that answer best are tried at that pitch."""
+    fine = thumbnail(whole, _LARGEST_PX)
+    small, tries = thumbnail(fine, _COARSEST_PX), dict[Names, _Try]()
+    for done, (names, layout) in enumerate(layouts.items()):
+        count(f"at any pitch the marks of {', '.join(names)}", done, 2 * len(layouts))
+        tries[names] = _Try(whole, small, layout, pitch_hypotheses(small, layout, None, FiducialOptions()))
+    best = sorted(tries, key=lambda names: tries[names].answer.expected)[:_FEW]
+    return _trials(tries | {names: tries[names].refined(fine) for names in best}, count)
+
+
+def _trials(tries: Mapping[Names, _Try], count: Count) -> list[Trial]:
+    """Of every layout, those first that answer better than chance. Once one of these stands out, the marks of another
+    are looked at only where it answers better than chance too, and may be more than a part of what was found."""
     trials: list[Trial] = []
-    for done, names in enumerate(sorted(groups, key=lambda names: expected[names]), len(groups)):
-        layout = cameras[names[0]].layout()
-        limits = [_expected_at_most(trial, len(layout.marks)) for trial in trials if trial.stands_out]
-        if limits and expected[names] > min(limits):
-            trials.append(_not_measured(names, len(layout.marks), expected[names]))
+    ranked = sorted(tries, key=lambda names: tries[names].answer.expected)
+    for done, names in enumerate(ranked, len(ranked)):
+        each = tries[names]
+        limits = [_expected_at_most(trial, len(each.layout.marks)) for trial in trials if trial.stands_out]
+        if limits and each.answer.expected > min(limits):
+            trials.append(_not_looked_at(names, each))
         else:
-            count(", ".join(names), done, 2 * len(groups))
-            trials.append(_trial(scan, names, layout, pitch_um, options, expected[names]))
+            count(", ".join(names), done, 2 * len(ranked))
+            trials.append(_trial(names, each))
     return trials
 
 
@@ -86,15 +146,16 @@ def _expected_at_most(seen: Trial, marks: int) -> float:
     return min(_BY_CHANCE, _ODDS * seen.expected) if seen.found > marks else _BY_CHANCE
 
 
-def _not_measured(names: tuple[str, ...], drawn: int, expected: float) -> Trial:
+def _not_looked_at(names: Names, each: _Try) -> Trial:
+    expected = each.answer.expected
     if np.isfinite(expected):
         reason = f"not measured: chance makes {expected:.1g} constellations in such a scan that answer as well"
     else:
         reason = "not measured: nowhere in the scan do its marks answer together"
-    return Trial(names, 0, drawn, 0.0, 0.0, 0.0, None, None, None, reason, 0.0, expected)
+    return Trial(names, 0, len(each.layout.marks), 0.0, 0.0, 0.0, None, None, None, reason, each.seconds, expected)
 
 
-def _alike(cameras: Mapping[str, CameraFile]) -> list[tuple[str, ...]]:
+def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
     """The names of cameras with drawn marks, those together whose marks a scan cannot tell apart."""
     groups: list[list[str]] = []
     for name, camera in cameras.items():
@@ -117,79 +178,60 @@ def _kind(mark: LayoutMark) -> str:
     return repr(mark.mark)
 
 
-def _trial(
-    scan: Scan,
-    names: tuple[str, ...],
-    layout: FiducialLayout,
-    pitch_um: tuple[float, float] | None,
-    options: FiducialOptions,
-    expected: float,
-) -> Trial:
-    start = time.perf_counter()
-    frame = measure_fiducials(scan, layout, pitch_um, options)
-    seen = [mark for mark in frame.marks if mark.status.is_observation]
-    score = _score(frame)
-    doubtful = score > 0.0 and expected > _CERTAIN
-    chance = _score(measure_fiducials(scan, _stretched(layout), pitch_um, options)) if doubtful else None
-    residual = _residual(frame, layout)
+def _trial(names: Names, each: _Try) -> Trial:
+    start, expected = time.perf_counter(), each.answer.expected
+    frame = each.seen()
+    fits = [fit for fit in frame.fits if fit] if frame else []
+    residual = _residual(frame, each.layout) if frame else None
     return Trial(
         cameras=names,
-        found=len(seen),
-        drawn=len(layout.marks),
-        likeness=float(np.mean([mark.quality["likeness"] for mark in seen])) if seen else 0.0,
-        snr=float(np.median([mark.quality["snr"] for mark in seen])) if seen else 0.0,
-        score=score,
-        chance=chance,
+        found=len(fits),
+        drawn=len(each.layout.marks),
+        likeness=float(np.mean([fit.likeness for fit in fits])) if fits else 0.0,
+        snr=float(np.median([fit.snr for fit in fits])) if fits else 0.0,
+        score=likeness(frame) if frame else 0.0,
+        chance=_score_by_chance(each) if frame and expected > _CERTAIN else None,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
-        reason="" if seen else frame.marks[0].reason,
-        seconds=time.perf_counter() - start,
+        reason="" if frame else "no three of its marks are seen where its constellation answers best",
+        seconds=each.seconds + time.perf_counter() - start,
         expected=expected,
-        pixel_um=None if frame.px_per_mm is None else 1000 / frame.px_per_mm,
+        pixel_um=1000 / _px_per_mm(frame) if frame else None,
     )
 
 
-def _score(frame: FrameMeasurement) -> float:
-    """The mean, over all marks, of likeness times the share of the mark that is undamaged. What belongs to another
-    mark, the ring about a cross that is drawn without one, counts as damage; a mark that is not found counts 0."""
-    return float(
-        np.mean(
-            [
-                mark.quality["likeness"] * (1.0 - mark.quality["damaged_fraction"])
-                if mark.status.is_observation
-                else 0.0
-                for mark in frame.marks
-            ]
-        )
-    )
+def _score_by_chance(each: _Try) -> float:
+    """Of the same marks in wrong places. What answers there so much less that the marks themselves are seen, none."""
+    wrong = each.stretched()
+    if wrong.answer.expected > _ODDS * each.answer.expected:
+        return 0.0
+    frame = wrong.seen()
+    return likeness(frame) if frame else 0.0
 
 
-def _stretched(layout: FiducialLayout) -> FiducialLayout:
-    x, y = _STRETCH
-    return replace(
-        layout, marks=tuple(replace(mark, xy_mm=(x * mark.xy_mm[0], y * mark.xy_mm[1])) for mark in layout.marks)
-    )
+def _px_per_mm(frame: Frame) -> float:
+    return float(np.sqrt(abs(np.linalg.det(frame.pixel_from_camera[:, :2]))))
 
 
-def _residual(frame: FrameMeasurement, layout: FiducialLayout) -> tuple[float, float] | None:
+def _residual(frame: Frame, layout: FiducialLayout) -> tuple[float, float] | None:
     """Per axis, in standard deviations and in mm, what an affine transformation of the marks leaves."""
-    pairs = [(m, given) for m, given in zip(frame.marks, layout.marks, strict=True) if m.status.is_observation]
+    pairs = [(fit, given) for fit, given in zip(frame.fits, layout.marks, strict=True) if fit]
     redundancy = 2 * len(pairs) - _AFFINE
-    px_per_mm = frame.px_per_mm
-    if redundancy <= 0 or px_per_mm is None:
+    if redundancy <= 0:
         return None
+    px_per_mm = _px_per_mm(frame)
     given_mm = np.array([given.xy_mm for _, given in pairs])
-    comparator_mm = np.array([mark.center_px for mark, _ in pairs]) * (1.0, -1.0) / px_per_mm
+    comparator_mm = np.array([fit.center_px for fit, _ in pairs]) * (1.0, -1.0) / px_per_mm
     parameters, mirrored = fit_transformation("affine", comparator_mm, given_mm)
     residuals_mm = film_kind("affine", mirrored).apply(parameters, comparator_mm) - given_mm
-    sigma_mm = np.array([_sigma_mm(mark.covariance_px2, given, px_per_mm) for mark, given in pairs])
+    sigma_mm = np.array([_sigma_mm(fit.covariance_px2, given, px_per_mm) for fit, given in pairs])
     return (
         float(np.sqrt(((residuals_mm / sigma_mm) ** 2).sum() / redundancy)),
         float(np.sqrt((residuals_mm**2).sum() / redundancy)),
     )
 
 
-def _sigma_mm(covariance_px2: Array | None, given: LayoutMark, px_per_mm: float) -> Array:
+def _sigma_mm(covariance_px2: Array, given: LayoutMark, px_per_mm: float) -> Array:
     """Of mark, given place and film in x' and y'; the mark's own is small and nearly round, so its turn is left out."""
-    own = 0.0 if covariance_px2 is None else float(np.trace(covariance_px2)) / 2 / px_per_mm**2
-    return np.asarray(np.sqrt(np.square(given.sigma_mm) + own + SCATTER_MM**2))
+    own, film = float(np.trace(covariance_px2)) / 2 / px_per_mm**2, FiducialOptions().film_sigma_mm
+    return np.asarray(np.sqrt(np.square(given.sigma_mm) + own + film**2))

@@ -7,10 +7,15 @@ from dataclasses import replace
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 
+from measure.frames.camera_recognition import Answer, answer
+from measure.marks.shapes import FiducialLayout
+from measure.scans.scan import Scan
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera
@@ -122,7 +127,7 @@ def test_a_name_like_no_other_is_told_where_they_stand() -> None:
         library_path("xyz")
 
 
-@pytest.mark.parametrize("words", [["wild-rc9-88", "--scan", "a.tif"], ["wild-rc9-88", "--json"], ["--pitch", "20"]])
+@pytest.mark.parametrize("words", [["wild-rc9-88", "wild-rc8-153"], ["wild-rc9-88", "--json"], ["--pitch", "20"]])
 def test_options_that_do_not_go_together(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["cameras", *words]) == 2
     assert "give NAME alone" in capsys.readouterr().err
@@ -186,6 +191,39 @@ def trial(cameras: tuple[str, ...], score: float, chance: float | None = 0.0) ->
 
 
 @one_frame
+def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras(
+    frame: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four scans of one size and one of another, in a folder and below it: three and one are tried. A scan that cannot
+    be read costs no other, and the project's camera, which the library has not, is named beside its twins."""
+    (scan,) = (frame.parent / "scans").glob("*.tif")
+    folder = tmp_path / "scans"
+    (folder / "b").mkdir(parents=True)
+    for name in ("a1", "a2", "a3", "b/a4"):
+        (folder / f"{name}.tif").symlink_to(scan)
+    grey = tifffile.imread(scan)
+    tifffile.imwrite(folder / "cut.tif", grey[200:-200, 200:-200], resolution=(100, 100), resolutionunit=3)
+    (folder / "broken.tif").write_bytes(b"II*\0")
+    own = library_path(RENDERED).read_text(encoding="utf-8").replace('name = "Wild RC10', 'name = "Our own RC10')
+    (tmp_path / "ours.toml").write_text(own, encoding="utf-8")
+    (tmp_path / "project.toml").write_text('camera = "ours.toml"\nscans = ["scans/a1.tif"]\n', encoding="utf-8")
+    monkeypatch.setattr(
+        "pipeline.cli.read_library", lambda: {name: LIBRARY[name] for name in ("wild-rc5-153", RENDERED)}
+    )
+    assert run(["cameras", "--scan", str(folder), "--project", str(tmp_path / "project.toml"), "--json"]) == 1
+    said = json.loads(capsys.readouterr().out)
+    assert [len(kind["scans"]) for kind in said["kinds"]] == [4, 1]
+    assert [len(kind["samples"]) for kind in said["kinds"]] == [3, 1]
+    assert [kind["best"] for kind in said["kinds"]] == [sorted(["ours.toml", RENDERED]), []]
+    assert [Path(each["scan"]).name for each in said["unread"]] == ["broken.tif"]
+
+
+def test_a_folder_without_scans_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["cameras", "--scan", str(tmp_path)]) == 2
+    assert "the folder holds no scan" in capsys.readouterr().err
+
+
+@one_frame
 @pytest.mark.parametrize(("found", "measured"), [(25, 1), (9, 2)])
 def test_a_part_of_a_lattice_is_no_other_camera(
     frame: Path, monkeypatch: pytest.MonkeyPatch, found: int, measured: int
@@ -193,7 +231,9 @@ def test_a_part_of_a_lattice_is_no_other_camera(
     """Unless no more of the lattice was found than the other camera has marks."""
     (scan,) = (frame.parent / "scans").glob("*.tif")
     two = {name: LIBRARY[name] for name in ("hasselblad-reseau-60", "register-glass-262")}
-    monkeypatch.setattr(camera_trials, "expected_alike", lambda _, layout, *__: 10.0 ** -len(layout.marks))
+    monkeypatch.setattr(
+        "pipeline.measuring.camera_trials.answer", lambda _, layout, *__: Answer(10.0 ** -len(layout.marks), ())
+    )
     monkeypatch.setattr(
         camera_trials, "_trial", lambda *_: replace(trial(("lattice",), 0.5), found=found, expected=1e-25)
     )
@@ -208,12 +248,16 @@ def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     (scan,) = (frame.parent / "scans").glob("*.tif")
     few = {name: LIBRARY[name] for name in (RENDERED, "hasselblad-reseau-60")}
     monkeypatch.setattr("pipeline.cli.read_library", lambda: few)
-    monkeypatch.setattr(
-        camera_trials, "expected_alike", lambda _, layout, *__: 1e-9 if len(layout.marks) == 4 else math.inf
-    )
+    answered = answer
+
+    def small_only(scan: Scan, layout: FiducialLayout, *given: Any) -> Answer:
+        return answered(scan, layout, *given) if len(layout.marks) == 4 else Answer(math.inf, ())
+
+    monkeypatch.setattr("pipeline.measuring.camera_trials.answer", small_only)
     assert run(["cameras", "--scan", str(scan), "--json"]) == 0
     trials = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["trials"]
-    assert [each["expected"] for each in trials] == [1e-9, None]
+    assert trials[0]["expected"] < 1e-4
+    assert trials[1]["expected"] is None
     assert trials[1]["reason"] == "not measured: nowhere in the scan do its marks answer together"
 
 

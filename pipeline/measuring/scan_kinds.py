@@ -1,0 +1,152 @@
+"""The kinds of scans among many: those of one shape and pitch, of which a few tell for all which camera they are of."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from measure.errors import MeasurementError
+from measure.scans.jpeg_stream import picture_size
+from measure.scans.scan import open_scan
+from pipeline.errors import InputError
+from pipeline.measuring.camera_answer import Identification
+
+Json = dict[str, Any]
+
+_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".png")
+_ALIKE = 0.03  # of their sides: scans of one roll are cut by hand
+_SAMPLES = 3  # scans of each kind
+_HEADERS_BYTES = 1 << 18
+
+
+@dataclass(frozen=True)
+class ScanKind:
+    """Scans (paths) of about width_px x height_px, of one file format; samples: what those say that were tried."""
+
+    paths: tuple[Path, ...]
+    width_px: int
+    height_px: int
+    samples: tuple[Identification, ...] = ()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those that most samples name, and no sample with a camera contradicts."""
+        named = [frozenset(name for trial in sample.best for name in trial.cameras) for sample in self.samples]
+        common = [names for names in named if names]
+        return tuple(sorted(frozenset.intersection(*common))) if 2 * len(common) > len(named) else ()
+
+    def sentence(self) -> str:
+        scans = f"{len(self.paths)} scan{'s' * (len(self.paths) > 1)} of about {self.width_px} x {self.height_px} px"
+        if self.cameras:
+            return f"{scans}: {' or '.join(self.cameras)}, by {len(self.samples)} of them."
+        counts = Counter(name for sample in self.samples for trial in sample.best for name in trial.cameras)
+        if not counts:
+            return f"{scans}: no camera stands out in {len(self.samples)} of them."
+        told = ", ".join(f"{name} in {count}" for name, count in counts.most_common())
+        return f"{scans}: of {len(self.samples)} samples not all show the same camera ({told})."
+
+    def as_json(self) -> Json:
+        return {
+            "scans": [str(path) for path in self.paths],
+            "size_px": [self.width_px, self.height_px],
+            "best": list(self.cameras),
+            "sentence": self.sentence(),
+            "samples": [sample.as_json() for sample in self.samples],
+        }
+
+
+@dataclass(frozen=True)
+class ManyScans:
+    """unread: by path, why a scan could not be tried."""
+
+    kinds: tuple[ScanKind, ...]
+    unread: Mapping[Path, str]
+
+    @property
+    def all_named(self) -> bool:
+        return not self.unread and all(kind.cameras for kind in self.kinds)
+
+    def as_json(self) -> Json:
+        unread = [{"scan": str(path), "reason": reason} for path, reason in self.unread.items()]
+        return {"kinds": [kind.as_json() for kind in self.kinds], "unread": unread}
+
+
+def scan_files(given: Sequence[Path]) -> list[Path]:
+    """The files, and all scans in and below the folders, in order of their names. Raises InputError where a folder
+    holds none."""
+    files = list[Path]()
+    for path in given:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        found = sorted(file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file())
+        if not found:
+            raise InputError(
+                f"{path}: the folder holds no scan. Files that end in {', '.join(_ENDINGS)} are looked for."
+            )
+        files += found
+    return list(dict.fromkeys(files))
+
+
+def identify_kinds(paths: Sequence[Path], identify: Callable[[Path], Identification]) -> ManyScans:
+    """Some scans of each kind, tried one by one."""
+    kinds, unread = list[ScanKind](), dict[Path, str]()
+    for (width, height), own in _alike(paths, unread):
+        samples = list[Identification]()
+        for path in _spread(own):
+            try:
+                samples.append(identify(path))
+            except MeasurementError as error:
+                unread[path] = str(error)
+        kinds.append(ScanKind(own, width, height, tuple(samples)))
+    return ManyScans(tuple(kinds), unread)
+
+
+def print_kinds(many: ManyScans, console: Console) -> None:
+    for kind in many.kinds:
+        console.print(kind.sentence(), style="bold", highlight=False, soft_wrap=True)
+        for sample in kind.samples:
+            console.print(f"    {sample.sentence()}", highlight=False, soft_wrap=True)
+    for reason in many.unread.values():
+        console.print(f"not tried: {reason}", highlight=False, soft_wrap=True)
+
+
+def _alike(paths: Sequence[Path], unread: dict[Path, str]) -> list[tuple[tuple[int, int], tuple[Path, ...]]]:
+    """Sizes, each with the scans of it and of one format; those that cannot be opened go to unread."""
+    kinds: list[tuple[str, tuple[int, int], list[Path]]] = []
+    for path in paths:
+        try:
+            size, ending = _size_px(path), path.suffix.lower()
+        except MeasurementError as error:
+            unread[path] = str(error)
+            continue
+        alike = (own for other, known, own in kinds if other == ending and np.allclose(size, known, rtol=_ALIKE))
+        own = next(alike, None)
+        if own is None:
+            kinds.append((ending, size, [path]))
+        else:
+            own.append(path)
+    if not kinds:
+        raise InputError("\n".join(unread.values()))
+    return [(size, tuple(own)) for _, size, own in kinds]
+
+
+def _size_px(path: Path) -> tuple[int, int]:
+    """Width and height. A JPEG picture is not decoded for it."""
+    if path.is_file():
+        with path.open("rb") as file:
+            size = picture_size(file.read(_HEADERS_BYTES))
+        if size is not None:
+            return size
+    with open_scan(path) as scan:
+        return scan.width_px, scan.height_px
+
+
+def _spread(paths: Sequence[Path]) -> list[Path]:
+    """A few of them, from the first to the last."""
+    chosen = np.unique(np.linspace(0, len(paths) - 1, _SAMPLES).round().astype(int))
+    return [paths[index] for index in chosen]
