@@ -54,6 +54,8 @@ def measure_fiducials(
     """
     options = options or FiducialOptions()
     layout = at_border(layout)
+    if scan.is_lost:
+        return absent_frame(scan, layout, scan.damage.rstrip("."), options.rotation_deg)
     search = FrameSearch(scan, layout, options)
     hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
     found, frame = _at_first_look(search, hypotheses, pitch_um is not None)

@@ -5,12 +5,18 @@ blocks that belong elsewhere. At the end there are then blocks too many or too f
 were taller. Of an intact stream the first block below its end is what the bits that fill its last byte make, and no
 others are there: a decoder leaves them grey (ITU-T T.81, B.1.1.5 and F.1.2.3; libjpeg's `insufficient_data`). The rows
 of the picture itself come out as they would without.
+
+Streams of several scans, as progressive ones are, and streams with restart markers have many such ends, of which this
+shows the last. There a second decoder is asked, libjpeg-turbo by simplejpeg, which tells what libjpeg warns of: codes
+that are missing or left over before a marker.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 
 from measure.scans.quantisation import jpeg_headers
@@ -18,6 +24,12 @@ from measure.scans.quantisation import jpeg_headers
 Decode = Callable[[bytes], NDArray[np.generic]]
 
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # sequential and progressive: others than lossless and arithmetic ones
+_END = b"\xff\xd9"
+_SCAN_OR_RESTART = re.compile(
+    rb"\xff[\xda\xd0-\xd7]"
+)  # as markers, for in a scan's data a byte 0 follows such a byte 255
+_MORE = "its stream holds more blocks than the picture"
+_OF_DAMAGE = ("Corrupt JPEG data", "Premature end")  # how libjpeg's warnings of it begin
 _BLEED_PX = 2  # that the decoder's interpolation of colour takes from the blocks beside
 _BELOW = 2  # rows of blocks added: a picture of one block a row has further ones below its first, too
 _TAIL = bytes(range(64, 192)) * 2  # codes of some blocks, none of them a marker
@@ -37,17 +49,38 @@ class _Frame:
     interpolates_rows: bool
 
 
-def decoded(data: bytes, decode: Decode) -> tuple[NDArray[np.generic], str]:
+def decoded(data: bytes, decode: Decode, tables: bytes | None = None) -> tuple[NDArray[np.generic], str]:
     """The samples (height, width) or (height, width, channels) that a stream holds, and why they are not to be trusted;
-    empty where they are. decode: a decoder of whole streams, which may raise what it will."""
+    empty where they are. decode: a decoder of streams, which may raise what it will. tables: a stream of those tables
+    that the other leaves to its file."""
     frame = _frame(data)
     if frame is None:
         return decode(data), ""
     rows = -(-frame.height_px // frame.unit_height_px) * frame.unit_height_px
     taller = decode(_of_height(data, frame, rows + _BELOW * frame.unit_height_px))
-    why = _why_damaged(data, frame, taller, rows, decode)
+    if _has_one_end(data):
+        why = _why_damaged(data, frame, taller, rows, decode)
+    else:
+        why = _what_libjpeg_warns_of(data, tables) or (_MORE if _goes_on(taller, frame, rows) else "")
     samples = decode(data) if frame.interpolates_rows else taller[: frame.height_px]
     return samples, why
+
+
+def _has_one_end(data: bytes) -> bool:
+    """Whether it is of one scan, without restart markers."""
+    start = 2 + sum(4 + len(body) for _, body in jpeg_headers(data))
+    return len(_SCAN_OR_RESTART.findall(data, start, data.find(_END, start))) == 1
+
+
+def _what_libjpeg_warns_of(data: bytes, tables: bytes | None) -> str:
+    whole = data if tables is None else data[:2] + tables[2 : tables.rfind(_END)] + data[2:]
+    try:
+        simplejpeg.decode_jpeg(whole, "GRAY", min_factor=8, strict=True)
+    except ValueError as error:
+        # What else it raises is of streams that it does not know: CMYK, say.
+        told = str(error)
+        return f"its decoder says: {told}" if told.startswith(_OF_DAMAGE) else ""
+    return ""
 
 
 def picture_size(data: bytes) -> tuple[int, int] | None:
@@ -81,15 +114,21 @@ def _of_height(data: bytes, frame: _Frame, height_px: int) -> bytes:
 
 def _why_damaged(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: int, decode: Decode) -> str:
     """What the blocks below the picture say of the stream: nothing, or a part of a sentence."""
+    if _goes_on(taller, frame, rows):
+        return _MORE
     grey = 2 ** (frame.bits - 1)
-    below = taller[rows + _BLEED_PX :] == grey
-    first = below[: frame.unit_height_px - 2 * _BLEED_PX, : frame.unit_width_px - _BLEED_PX].all()
-    beside = below[:, frame.unit_width_px + _BLEED_PX :].all() and below[frame.unit_height_px :].all()
-    if not beside:
-        return "its stream holds more blocks than the picture"
-    if first and not (_ends_grey(taller[:rows], frame, grey) and _ends_whole(data, frame, taller, rows, decode)):
+    first = taller[rows + _BLEED_PX :][: frame.unit_height_px - 2 * _BLEED_PX, : frame.unit_width_px - _BLEED_PX]
+    if (first == grey).all() and not (
+        _ends_grey(taller[:rows], frame, grey) and _ends_whole(data, frame, taller, rows, decode)
+    ):
         return "its stream ends before the picture does"
     return ""
+
+
+def _goes_on(taller: NDArray[np.generic], frame: _Frame, rows: int) -> bool:
+    """Whether there are further blocks below the picture than the first."""
+    below = taller[rows + _BLEED_PX :] != 2 ** (frame.bits - 1)
+    return bool(below[:, frame.unit_width_px + _BLEED_PX :].any() or below[frame.unit_height_px :].any())
 
 
 def _ends_grey(samples: NDArray[np.generic], frame: _Frame, grey: int) -> bool:
@@ -102,7 +141,7 @@ def _ends_grey(samples: NDArray[np.generic], frame: _Frame, grey: int) -> bool:
 def _ends_whole(data: bytes, frame: _Frame, taller: NDArray[np.generic], rows: int, decode: Decode) -> bool:
     """Whether further codes at the end of the stream leave the picture as it is: where blocks are missing, they would
     be taken for these."""
-    end = data.rfind(b"\xff\xd9")
+    end = data.rfind(_END)
     longer = data[:end] + _TAIL + data[end:]
     again = decode(_of_height(longer, frame, rows + _BELOW * frame.unit_height_px))
     above = rows - _BLEED_PX

@@ -175,16 +175,22 @@ class Scan:
         return next((part.why for part in self._lost_of(col0, row0, width, height)), "")
 
     @property
+    def is_lost(self) -> bool:
+        """Whether the file was found to give none of its pixels."""
+        return sum(part.width * part.height for part in self._segments.lost) == self.width_px * self.height_px
+
+    @property
     def damage(self) -> str:
         """What of the file was found to be damaged so far, and what to do, a sentence; empty where nothing was."""
         lost = self._segments.lost
         if not lost:
             return ""
-        is_all = sum(part.width * part.height for part in lost) == self.width_px * self.height_px
         places = "; ".join(f"rows {part.row0} to {part.row0 + part.height - 1}, {part.why}" for part in lost[:_NAMED])
         more = f"; and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
         what = (
-            f"nothing of it can be trusted ({lost[0].why})" if is_all else f"parts cannot be trusted ({places}{more})"
+            f"nothing of it can be trusted ({lost[0].why})"
+            if self.is_lost
+            else f"parts cannot be trusted ({places}{more})"
         )
         return f"the scan's file is damaged: {what}. No mark is measured there: copy the file anew, or rescan."
 

@@ -1,9 +1,9 @@
 """TIFF and BigTIFF files by tiles and strips: every compression that tifffile and imagecodecs know."""
 
 import logging
-from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 from tifffile import TiffFile, TiffPage
 
 from measure.scans.broken import DECODING_ERRORS, broken, unsupported
@@ -12,18 +12,16 @@ from measure.scans.radiometry import Radiometry
 from measure.scans.resolution import NO_TAGS, TIFF_UNIT, Pitch, pitch_from_density
 from measure.scans.segments import Segments
 from measure.scans.size_limit import check_size
-from measure.scans.tiff_directory import BadDirectory, check_directories
+from measure.scans.tiff_directory import BadDirectory, Extent, check_directories
 from measure.scans.tiff_segments import JPEG_COMPRESSIONS, RawRows, TiffSegments
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
 
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _UNCOMPRESSED = 1
-_HEADER_BYTES = 8  # before anything else
+_LOOKED_AT_BYTES = 1 << 16  # after the last that a file accounts for
 _JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
 _REDUCED_IMAGE, _TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
-
-Extent = tuple[int, int]
 
 
 def open_tiff(path: Path, max_pixels: int | None = None) -> tuple[Segments, Pitch, tuple[str, ...]]:
@@ -33,7 +31,7 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> tuple[Segments, Pitc
     16 bits a sample, and for those that claim more than such a file can hold.
     """
     try:
-        directories = check_directories(path)
+        taken = check_directories(path)
         file = TiffFile(path)
     except (BadDirectory, *DECODING_ERRORS) as error:
         raise broken(path, str(error)) from error
@@ -41,7 +39,7 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> tuple[Segments, Pitc
         page, notes = _main_page(file, path)
         radiometry = _page_radiometry(page, path)
         _check_sizes(page, path, max_pixels)
-        _check_extent(page, path, directories)
+        _check_extent(page, path, taken)
         kind = RawRows if _is_raw(page) else TiffSegments
         segments: Segments = kind(file, page, path, radiometry, _page_rounding_step_dn(file, page))
         return segments, tag_pitch(page), notes
@@ -87,9 +85,12 @@ def _check_sizes(page: TiffPage, path: Path, max_pixels: int | None) -> None:
         check_size(path, "a tile", side, side[0] * side[1] * pixel_bytes, largest, max_pixels)
 
 
-def _check_extent(page: TiffPage, path: Path, directories: list[Extent]) -> None:
-    """A file whose tiles or strips lie beyond its end is truncated: better said now than at the last window. So are
-    places said wrong where nothing but the pixels is stored."""
+def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
+    """A file whose tiles or strips lie beyond its end is truncated: better said now than at the last window. Where
+    nothing but the pixels is stored, wrong places show nowhere else: by what is taken twice, and what by nothing.
+
+    taken: what lies where, by all tags of the file.
+    """
     size = path.stat().st_size
     stored = [
         (offset, offset + count)
@@ -104,9 +105,18 @@ def _check_extent(page: TiffPage, path: Path, directories: list[Extent]) -> None
         raise broken(path, f"{missing} of {len(stored)} {part} lie beyond its end of {size} bytes")
     if page.compression != _UNCOMPRESSED:
         return
-    taken = sorted({(0, _HEADER_BYTES), *directories, *stored})
-    if any(end > start for (_, end), (start, _) in pairwise(taken)):
+    starts, ends = np.array(sorted(set(stored))).T
+    lies_over = (starts[1:] < ends[:-1]).any()
+    for first, after in set(taken) - set(stored):
+        beyond = int(np.searchsorted(ends, first, "right"))
+        lies_over |= beyond < len(starts) and starts[beyond] < after
+    if lies_over:
         raise broken(path, f"its {part} lie over one another or over its tags")
+    with path.open("rb") as file:
+        last = max(end for _, end in taken)
+        file.seek(last)
+        if any(file.read(_LOOKED_AT_BYTES)):
+            raise broken(path, f"its last {size - last} bytes belong to nothing, as if some had been put in before")
 
 
 def _is_raw(page: TiffPage) -> bool:

@@ -121,7 +121,7 @@ class TiffSegments:
                 )
             )
 
-        samples, damage = decoded(data, decode)
+        samples, damage = decoded(data, decode, page.jpegtables)
         if damage:
             raise ValueError(damage)
         right = (height_px, width_px), (self.segment_height_px, self.segment_width_px)
