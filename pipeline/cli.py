@@ -34,6 +34,7 @@ from pipeline.terminal import PlainConsole, plain, spell_out_missing_letters
 
 DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 TEMPLATES = ("project", "camera", "scene")
+LONGEST_LINE = 2000  # of a message: what a file has of any length may stand in it
 
 app = typer.Typer(
     help="From scanned film photographs to comparator coordinates and a calibrated camera.",
@@ -299,5 +300,6 @@ def _echo_json(content: Any) -> None:
 
 
 def _message(text: str, code: int) -> int:
-    typer.echo(plain(f"reseau: {text}"), err=True)
+    lines = (line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}..." for line in plain(text).split("\n"))
+    typer.echo("reseau: " + "\n".join(lines), err=True)
     return code

@@ -15,6 +15,10 @@ class InputError(Exception):
     """A file or an argument is not as it should be: the message says what, where, what would be right, what to do."""
 
 
+class WriteError(InputError):
+    """A file cannot be written: what stood there is as it was."""
+
+
 def what_to_do(error: OSError) -> str:
     """The next step after what the operating system refused."""
     return _ADVICE.get(error.errno or 0, "Check the path, and that the drive is there.")

@@ -1,19 +1,18 @@
 """The stages of the chain, each from files to files, so that any of them can be run alone and looked at."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from importlib.metadata import version
 
 from adjust.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.adjustment_file import write_adjustment
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.adjusting.second_visit import measure_again
-from pipeline.errors import InputError
-from pipeline.files.adjustment_reader import covariance_path, read_adjustment, read_covariance
-from pipeline.files.atomic import check_writable, write_atomically
+from pipeline.errors import InputError, WriteError
+from pipeline.files.adjustment_reader import covariance_path
+from pipeline.files.atomic import write_atomically
 from pipeline.files.project_file import Project
 from pipeline.measuring.comparator_file import ComparatorPoint, read_comparator, write_comparator
 from pipeline.measuring.measure_stage import measure_scans
@@ -22,141 +21,144 @@ from pipeline.opencv_check.check import check_against_opencv
 from pipeline.progress import Reporter
 from pipeline.report.data import ReportData
 from pipeline.report.page import write_report
+from pipeline.report_data import adjusted, measured
+from pipeline.results.fingerprints import of_file
+from pipeline.results.made_from import MadeFrom, adjusted_from, measured_from
+from pipeline.results.publishing import Unpublished, unpublished
 from pipeline.summary import Summary, summarise
 from pipeline.thumbnails import Thumbnails
 
-Json = dict[str, Any]
-
 
 def run_all(project: Project, reporter: Reporter) -> Summary:
-    """Measure (where there are scans), adjust, visit the scans again, check, report."""
-    scans: tuple[MeasuredScan, ...] = ()
-    _check_writable(project)
+    """Measure (where there are scans), adjust, visit the scans again, check, report. The results take the places of
+    earlier ones together, at the end; where no adjustment is possible, the marks do."""
     check_transformation(project)
-    if project.scans:
-        scans = measure_scans(project, reporter)
-        _write_marks(project, scans)
-        if not anything_to_adjust(project, read_comparator(project.comparator)):
-            return _reported(project, _measured(project))
-    adjustment = adjust_marks(project, read_comparator(project.comparator))
-    again = measure_again(project, scans, adjustment, reporter)
-    if again is not None:
-        _write_marks(project, again)
-        adjustment = adjust_marks(project, read_comparator(project.comparator))
-    write_adjustment(adjustment, project.adjustment_path)
-    _write_check(project, adjustment)
-    return _reported(project, _adjusted(project))
+    with unpublished(project) as new:
+        made_from = measured_from(project)
+        scans = _measured_marks(project, made_from, new, reporter) if project.scans else ()
+        try:
+            adjustment = _adjusted_marks(project, scans, made_from, new, reporter)
+            if adjustment is None:
+                for path in (project.adjustment_path, covariance_path(project.adjustment_path), project.check_path):
+                    new.remove(path)  # of an earlier run
+            else:
+                _write_adjustment(project, adjustment, new)
+                _write_check(project, adjustment, new)
+            summary = _reported(project, adjusted(project, new.at), new)
+        except WriteError:
+            raise
+        except Exception:
+            new.publish()  # hours of measuring are not lost for a wrong point number
+            raise
+        new.publish()
+        return summary
 
 
 def run_measure(project: Project, reporter: Reporter) -> Summary:
     """Scans to comparator.csv."""
-    _check_writable(project)
-    _write_marks(project, measure_scans(project, reporter))
-    return summarise(
-        _measured(project), {"comparator coordinates": project.comparator, "measurement": project.measurement_path}
-    )
+    with unpublished(project) as new:
+        _measured_marks(project, measured_from(project), new, reporter)
+        data = measured(project, new.at)
+        new.publish()
+    return summarise(data, {"comparator coordinates": project.comparator, "measurement": project.measurement_path})
 
 
 def run_adjust(project: Project, reporter: Reporter) -> Summary:
     """comparator.csv to adjustment.json."""
-    with reporter.stage("adjusting") as count:
-        count(project.comparator.name, 0, 1)
-        adjustment = adjust_marks(project, _given_marks(project))
-    write_adjustment(adjustment, project.adjustment_path)
-    project.check_path.unlink(missing_ok=True)  # it belongs to an earlier adjustment
+    with unpublished(project) as new:
+        with reporter.stage("adjusting") as count:
+            count(project.comparator.name, 0, 1)
+            adjustment = adjust_marks(project, _given_marks(project, new))
+        _write_adjustment(project, adjustment, new)
+        earlier = project.adjustment_path
+        if earlier.exists() and of_file(earlier) != of_file(new.at(earlier)):
+            new.remove(project.check_path)  # it belongs to the earlier one
+        data = adjusted(project, new.at)
+        new.publish()
     covariance = covariance_path(project.adjustment_path)
-    return summarise(_adjusted(project), {"adjustment": project.adjustment_path, "covariance": covariance})
+    return summarise(data, {"adjustment": project.adjustment_path, "covariance": covariance})
 
 
 def run_check(project: Project, reporter: Reporter) -> Summary:
     """The adjustment, made anew from comparator.csv, against OpenCV's calibration."""
-    with reporter.stage("checking") as count:
-        count(project.comparator.name, 0, 1)
-        adjustment = adjust_marks(project, _given_marks(project))
-        write_adjustment(adjustment, project.adjustment_path)
-        _write_check(project, adjustment)
-    return summarise(_adjusted(project), {"check": project.check_path})
+    with unpublished(project) as new:
+        with reporter.stage("checking") as count:
+            count(project.comparator.name, 0, 1)
+            adjustment = adjust_marks(project, _given_marks(project, new))
+            _write_adjustment(project, adjustment, new)
+            _write_check(project, adjustment, new)
+        data = adjusted(project, new.at)
+        new.publish()
+    return summarise(data, {"check": project.check_path})
 
 
 def run_report(project: Project, reporter: Reporter) -> Summary:
     """What the earlier stages left, in report.html."""
-    _given_marks(project)
-    with reporter.stage("reporting") as count:
-        count(project.report_path.name, 0, 1)
-        return _reported(project, _adjusted(project))
+    with unpublished(project) as new:
+        _given_marks(project, new)
+        with reporter.stage("reporting") as count:
+            count(project.report_path.name, 0, 1)
+            summary = _reported(project, adjusted(project, new.at), new)
+        new.publish()
+        return summary
 
 
-def _check_writable(project: Project) -> None:
-    for folder in (project.output, project.comparator.parent):
-        check_writable(folder)
+def _measured_marks(
+    project: Project, made_from: MadeFrom, new: Unpublished, reporter: Reporter
+) -> tuple[MeasuredScan, ...]:
+    scans = measure_scans(project, reporter, new.place(project.output / "learned"))
+    _write_marks(project, scans, made_from, new)
+    return scans
 
 
-def _given_marks(project: Project) -> tuple[ComparatorPoint, ...]:
-    """The marks that an earlier stage, or the user, has left. Raises InputError where there are none."""
-    if not project.comparator.exists():
+def _adjusted_marks(
+    project: Project, scans: Sequence[MeasuredScan], made_from: MadeFrom, new: Unpublished, reporter: Reporter
+) -> Adjustment | None:
+    """The adjustment, after a second visit to the scans where that found more; None where nothing is to be adjusted."""
+    marks = _given_marks(project, new)
+    if scans and not anything_to_adjust(project, marks):
+        return None
+    adjustment = adjust_marks(project, marks)
+    again = measure_again(project, scans, adjustment, reporter)
+    if again is None:
+        return adjustment
+    _write_marks(project, again, made_from, new)
+    return adjust_marks(project, _given_marks(project, new))
+
+
+def _given_marks(project: Project, new: Unpublished) -> tuple[ComparatorPoint, ...]:
+    """The marks that this command, an earlier one or the user has left. Raises InputError where there are none."""
+    path = new.at(project.comparator)
+    if not path.exists():
         raise InputError(
             f"{project.comparator}: there is no such file. Run `reseau measure` first, or put the coordinates there."
         )
-    return read_comparator(project.comparator)
+    return read_comparator(path)
 
 
-def _write_marks(project: Project, scans: Sequence[MeasuredScan]) -> None:
-    write_measurement(project.measurement_path, scans)
-    write_comparator(project.comparator, [s.frame for s in scans], {s.frame.image: s.pitch_um for s in scans})
+def _write_marks(project: Project, scans: Sequence[MeasuredScan], made_from: MadeFrom, new: Unpublished) -> None:
+    measurement = new.place(project.measurement_path)
+    write_measurement(measurement, scans, project.output, made_from)
+    pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
+    write_comparator(new.place(project.comparator), [scan.frame for scan in scans], pitch_um, of_file(measurement))
 
 
-def _write_check(project: Project, adjustment: Adjustment) -> None:
-    check = check_against_opencv(adjustment).to_json()
-    write_atomically(project.check_path, json.dumps(check, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished) -> None:
+    made_from = adjusted_from(project, _given_marks(project, new))
+    write_adjustment(adjustment, new.place(project.adjustment_path), made_from)
 
 
-def _reported(project: Project, data: ReportData) -> Summary:
-    scans = read_measurement(project.measurement_path) if data.measurement else ()
+def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> None:
+    made_from = {project.adjustment_path.name: of_file(new.at(project.adjustment_path))}
+    check = {"reseau": version("reseau"), "made_from": made_from, **check_against_opencv(adjustment).to_json()}
+    text = json.dumps(check, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    write_atomically(new.place(project.check_path), text)
+
+
+def _reported(project: Project, data: ReportData, new: Unpublished) -> Summary:
+    scans = read_measurement(new.at(project.measurement_path), project.output) if data.measurement else ()
     with Thumbnails(scans, project.max_pixels) as pictures:
-        write_report(replace(data, thumbnail=pictures.of), project.report_path)
+        write_report(replace(data, thumbnail=pictures.of), new.place(project.report_path))
     files = {"comparator coordinates": project.comparator, "adjustment": project.adjustment_path}
-    return summarise(data, {**{w: p for w, p in files.items() if p.exists()}, "report": project.report_path})
-
-
-def _measured(project: Project) -> ReportData:
-    """What the measurement left in the project's files."""
-    return ReportData(
-        project=_title(project),
-        comparator=read_comparator(project.comparator),
-        measurement=_json(project.measurement_path),
-        frame_mm=_frame_sizes(project),
-        unit=project.unit,
-    )
-
-
-def _adjusted(project: Project) -> ReportData:
-    """The same with the adjustment and its check, as far as there are any."""
-    path = project.adjustment_path
-    if not path.exists():
-        return _measured(project)
-    return replace(
-        _measured(project),
-        adjustment=read_adjustment(path),
-        covariance=read_covariance(path),
-        check=_json(project.check_path),
-    )
-
-
-def _title(project: Project) -> str:
-    """The project's folder, unless the project file has a name of its own."""
-    stem = project.path.stem
-    return project.path.resolve().parent.name if stem == "project" else stem
-
-
-def _json(path: Path) -> Json | None:
-    try:
-        content: Json = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except ValueError as error:
-        raise InputError(f"{path}: is not valid JSON ({error}). Delete it and run the stage again.") from None
-    return content
-
-
-def _frame_sizes(project: Project) -> Mapping[str, tuple[float, float]]:
-    return {camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None}
+    written = {word: path for word, path in files.items() if word != "adjustment" or data.adjustment}
+    return summarise(data, {**written, "report": project.report_path})

@@ -22,6 +22,7 @@ from pipeline.adjusting.covariance_arrays import covariance_arrays, covariance_n
 from pipeline.adjusting.reliability_json import point_tests, reliability_json, suspect_json
 from pipeline.files.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.files.atomic import atomic_path
+from pipeline.results.fingerprints import of_content
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -30,22 +31,25 @@ ANGLES = ("omega", "phi", "kappa", "angle")
 DEG_PER_RAD = 180.0 / math.pi
 
 
-def write_adjustment(adjustment: Adjustment, path: Path) -> None:
+def write_adjustment(adjustment: Adjustment, path: Path, made_from: Mapping[str, str] | None = None) -> None:
     """Write the result to `path` and its covariance beside it, each by way of a temporary file.
 
     Angles are in degrees in the JSON file and in rad in the covariance. Beyond the keys of the format every quantity
     has `given`, what was known of it beforehand, and every residual its place in the camera. A camera without an image
     and a point that nobody saw are not in it. Where no object point is seen, there is no exterior orientation (null)
-    and no calibration (a camera's values are those given, their sigmas null). Raises InputError where a file cannot be
-    written.
+    and no calibration (a camera's values are those given, their sigmas null). made_from: fingerprints of all that was
+    adjusted; the covariance has that of the JSON file. Raises InputError where a file cannot be written.
     """
-    text = json.dumps(without_nan(adjustment_json(adjustment)), indent=1, ensure_ascii=False, allow_nan=False)
+    content = adjustment_json(adjustment)
+    content = {"reseau": content.pop("reseau"), "made_from": dict(made_from or {}), **content}
+    text = json.dumps(without_nan(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     arrays = io.BytesIO()
-    np.savez_compressed(arrays, allow_pickle=False, **covariance_arrays(adjustment))
+    belongs_to = np.array(of_content(text.encode("utf-8")))
+    np.savez_compressed(arrays, allow_pickle=False, fingerprint=belongs_to, **covariance_arrays(adjustment))
     # Both are whole before either takes its place: a covariance belongs to its adjustment.
     with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
         covariance.write_bytes(arrays.getvalue())
-        result.write_text(text + "\n", encoding="utf-8")
+        result.write_bytes(text.encode("utf-8"))
 
 
 def adjustment_json(adjustment: Adjustment) -> Json:

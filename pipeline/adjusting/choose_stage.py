@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,12 @@ from adjust.choices.model_choice import Choice, choose
 from adjust.choices.models import Model
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.adjusting.adjustment_file import without_nan
-from pipeline.files.atomic import check_writable, write_atomically
+from pipeline.files.atomic import write_atomically
 from pipeline.files.project_file import Project
 from pipeline.measuring.comparator_file import read_comparator
 from pipeline.progress import Reporter
+from pipeline.results.made_from import adjusted_from
+from pipeline.results.publishing import unpublished
 
 Json = dict[str, Any]
 
@@ -28,15 +31,20 @@ def run_choose(project: Project, reporter: Reporter) -> Choice:
 
     Raises InputError or AdjustmentError where the project cannot be adjusted at all.
     """
-    check_writable(project.output)
-    with reporter.stage("comparing") as count:
-        adjustment = adjust_marks(project, read_comparator(project.comparator))
-        half_mm = {camera.name: _half(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm}
-        choice = choose(
-            adjustment, adjustment_options(project), half_mm, lambda name, done: count(name, done, done + 1)
-        )
-    text = json.dumps(without_nan(choice_json(choice)), indent=1, ensure_ascii=False, allow_nan=False)
-    write_atomically(project.choice_path, text + "\n")
+    with unpublished(project) as new:
+        with reporter.stage("comparing") as count:
+            marks = read_comparator(project.comparator)
+            half_mm = {camera.name: _half(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm}
+            choice = choose(
+                adjust_marks(project, marks),
+                adjustment_options(project),
+                half_mm,
+                lambda name, done: count(name, done, done + 1),
+            )
+        made_from = {"reseau": version("reseau"), "made_from": adjusted_from(project, marks)}
+        text = json.dumps(made_from | without_nan(choice_json(choice)), indent=1, ensure_ascii=False, allow_nan=False)
+        write_atomically(new.place(project.choice_path), text + "\n")
+        new.publish()
     return choice
 
 

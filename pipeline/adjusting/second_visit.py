@@ -1,6 +1,6 @@
 """The second visit to the scans: targets that were missed, sought where the adjustment says they are."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from adjust.functional_model.projection import adjusted_image
 from adjust.result import Adjustment
 from measure.checks.lost_pixels import without_lost
+from measure.errors import MeasurementError
 from measure.results import MarkMeasurement
 from measure.scans.scan import open_scan
 from measure.status import Status
@@ -37,8 +38,17 @@ def measure_again(
     with reporter.stage("looking again at") as count:
         for done, scan in enumerate(scans):
             count(scan.frame.image, done, len(scans))
-            visited.append(_visit(field, scan, adjustment, settings, project.max_pixels))
+            visited.append(_visited(scan, lambda one: _visit(field, one, adjustment, settings, project.max_pixels)))
     return tuple(visited) if any(new is not old for new, old in zip(visited, scans, strict=True)) else None
+
+
+def _visited(scan: MeasuredScan, visit: Callable[[MeasuredScan], MeasuredScan]) -> MeasuredScan:
+    """What the first visit gave stays where a second one is not possible any more, and the frame says so."""
+    try:
+        return visit(scan)
+    except MeasurementError as error:
+        problem = f"It could not be looked at again: {error}"
+        return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
 
 
 def _with_adjusted_points(field: Field, adjustment: Adjustment) -> Field:

@@ -24,11 +24,15 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True)
 class Covariance:
-    """The a-posteriori covariance of all unknowns: names (n), values (n,), matrix (n, n); mm, object units, rad."""
+    """The a-posteriori covariance of all unknowns: names (n), values (n,), matrix (n, n); mm, object units, rad.
+
+    adjustment: the fingerprint of the adjustment.json that it belongs to; "" where the file does not say it.
+    """
 
     names: tuple[str, ...]
     values: Array
     matrix: Array
+    adjustment: str = ""
 
     def of(self, names: Iterable[str]) -> Array:
         """The covariance (k, k) of some unknowns; one that is not listed was fixed, its row is zero."""
@@ -80,7 +84,8 @@ def read_covariance(path: Path) -> Covariance:
     twice = next((name for name, count in Counter(texts).items() if count > 1), None)
     if twice is not None:
         raise InputError(f"{file}: {twice!r} is named twice. {_AGAIN}")
-    return Covariance(texts, values.astype(np.float64), matrix.astype(np.float64))
+    adjustment = str(_array(data, "fingerprint", file)) if b"fingerprint.npy" in data else ""
+    return Covariance(texts, values.astype(np.float64), matrix.astype(np.float64), adjustment)
 
 
 def _array(data: bytes, name: str, file: Path) -> NDArray[Any]:

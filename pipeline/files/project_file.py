@@ -15,6 +15,7 @@ from measure.marks.poses import POSES
 from measure.scans.scan import Scan, open_scan
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
+from pipeline.files.adjustment_reader import covariance_path
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.distances_file import GivenDistance, read_distances
 from pipeline.files.images_file import GivenImages, image_name, read_images
@@ -84,6 +85,13 @@ class Project:
     @property
     def report_path(self) -> Path:
         return self.output / "report.html"
+
+    @property
+    def results(self) -> tuple[Path, ...]:
+        """What the program may write: an earlier result at most may stand there."""
+        measured = (self.comparator, self.measurement_path) if self.scans else ()
+        adjusted = (self.adjustment_path, covariance_path(self.adjustment_path), self.check_path, self.choice_path)
+        return (*measured, *adjusted, self.report_path)
 
     @property
     def unit(self) -> str:
@@ -199,29 +207,26 @@ def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, 
 
 
 def _check_written(table: Table, project: Project, named: Mapping[str, Path]) -> None:
-    """Refuse to write results over a file that the project is made from."""
-    for camera in project.cameras.values():
-        earlier = camera.calibration
-        if earlier is not None and earlier.path.resolve() == project.adjustment_path.resolve():
-            raise table.error(
-                "output",
-                f"the adjustment would be written over the earlier calibration that it starts from, {earlier.path}. "
-                "Name another folder.",
-            )
-    if not project.scans:
-        return
-    if project.comparator.is_dir():
+    """Refuse to write results over a file that the project is made from, or over one another."""
+    if project.scans and project.comparator.is_dir():
         raise table.error("comparator", f"{project.comparator} is a folder. Name a file to be written there.")
-    cameras = {f"the camera of {camera.name}": camera.path for camera in project.cameras.values()}
-    scans = {f"the scan {name}": path for name, path in project.scans.items()}
     given = {"the project itself": project.path, **{f"[object] {key}": path for key, path in named.items()}}
-    for what, path in (given | cameras | scans).items():
-        if project.comparator.resolve() == path.resolve():
-            raise table.error(
-                "comparator",
-                f"the measured coordinates would be written over {what}, {path}. Name another file, such as "
-                '"comparator.csv".',
-            )
+    for camera in project.cameras.values():
+        given[f"the camera of {camera.name}"] = camera.path
+        if camera.calibration is not None:
+            given[f"the earlier calibration of {camera.name}"] = camera.calibration.path
+            given[f"the covariance of {camera.name}'s earlier calibration"] = covariance_path(camera.calibration.path)
+    given |= {f"the scan {name}": path for name, path in project.scans.items()}
+    if not project.scans:
+        given["the comparator coordinates"] = project.comparator
+    places = {path.resolve(): f"{what}, {path}" for what, path in given.items()}
+    for path in project.results:
+        what = places.get(path.resolve())
+        if what is not None:
+            key = "comparator" if path == project.comparator else "output"
+            other = 'file, such as "comparator.csv"' if key == "comparator" else "folder"
+            raise table.error(key, f"{path.name} would be written over {what}. Name another {other}.")
+        places[path.resolve()] = f"another result, {path}"
 
 
 def _cameras(table: Table, default: str, images: GivenImages | None) -> Mapping[str, CameraFile]:

@@ -31,7 +31,7 @@ def saved_in(folder: Path, prefix: str = "") -> SavePicture:
     def save(name: str, picture: Picture) -> str:
         file = f"{prefix}{name}.tif"
         with atomic_path(folder / file) as temporary:
-            tifffile.imwrite(temporary, picture, metadata=None)
+            tifffile.imwrite(temporary, picture, metadata=None, software="reseau")
         return file
 
     return save

@@ -1,6 +1,7 @@
 """comparator.csv: comparator coordinates of every mark, also of those that were not found."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -24,6 +25,8 @@ COLUMNS = (
 _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 Array = NDArray[np.float64]
 
+_HEAD = 4096
+
 
 @dataclass(frozen=True)
 class ComparatorPoint:
@@ -41,11 +44,15 @@ class ComparatorPoint:
 
 
 def write_comparator(
-    path: Path, frames: Sequence[FrameMeasurement], pitch_um: Mapping[str, tuple[float, float]]
+    path: Path, frames: Sequence[FrameMeasurement], pitch_um: Mapping[str, tuple[float, float]], measurement: str = ""
 ) -> None:
-    """Write every mark of every frame; pitch_um by image. Raises InputError where the file cannot be written."""
+    """Write every mark of every frame; pitch_um by image. Raises InputError where the file cannot be written.
+
+    measurement: the fingerprint of the measurement.json that holds the same marks.
+    """
     lines = [
         f"# comparator coordinates, reseau {version('reseau')}",
+        *([f"# measurement {measurement}"] if measurement else []),
         "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
         "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)",
         *(f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down" for image, (x, y) in sorted(pitch_um.items())),
@@ -79,6 +86,14 @@ def _line(image: str, mark: MarkMeasurement, pitch_um: tuple[float, float]) -> s
         sigma, rho = [f"{sx:.7f}", f"{sy:.7f}"], f"{covariance[0, 1] / (sx * sy):.4f}"
     cells = [image, mark.point, mark.kind, *place, *sigma, rho, *pixel, mark.status, mark.reason]
     return csv_line([str(cell) for cell in cells])
+
+
+def measurement_of(path: Path) -> str:
+    """The fingerprint of the measurement that a comparator file was written from; "" of one that does not say so, as
+    one that a user made."""
+    with path.open("rb") as file:
+        found = re.search(rb"^\W*# measurement ([0-9a-f]{64})\b", file.read(_HEAD), re.MULTILINE)
+    return found[1].decode() if found else ""
 
 
 def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:

@@ -6,6 +6,7 @@ One scan's pictures, its first ones, find the marks in every other, and the mean
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from importlib.metadata import version
 from itertools import count
 from pathlib import Path
 
@@ -23,13 +24,16 @@ from pipeline.files.template_table import saved_in
 from pipeline.measuring.first_pictures import digest, first_pictures
 from pipeline.progress import Reporter
 
+_BY = f"# Marks learned by reseau {version('reseau')}"
 
-def learn_marks(project: Project, reporter: Reporter, workers: Executor) -> Project:
-    """The project with templates in the place of marks that are to be learned; out/learned then holds the templates
-    and a camera file that names them. Raises InputError or MeasurementError where they cannot be learned."""
-    files = _file_names([camera.path for camera in project.cameras.values()])
+
+def learn_marks(project: Project, reporter: Reporter, workers: Executor, folder: Path) -> Project:
+    """The project with templates in the place of marks that are to be learned; the folder then holds the templates
+    and a camera file that names them, as they are to stand in out/learned. Raises InputError or MeasurementError where
+    they cannot be learned."""
+    files = _file_names([camera.path for camera in project.cameras.values()], _learned_folder(project))
     cameras = {
-        name: _learned(project, camera, files[camera.path], reporter, workers)
+        name: _learned(project, camera, folder / f"{files[camera.path]}.toml", reporter, workers)
         if camera.learned
         else _known(project, camera)
         for name, camera in project.cameras.items()
@@ -37,15 +41,20 @@ def learn_marks(project: Project, reporter: Reporter, workers: Executor) -> Proj
     return replace(project, cameras=cameras)
 
 
-def _file_names(cameras: Sequence[Path]) -> Mapping[Path, str]:
+def _learned_folder(project: Project) -> Path:
+    return project.output / "learned"
+
+
+def _file_names(cameras: Sequence[Path], learned: Path) -> Mapping[Path, str]:
     """Under which name in out/learned each camera's files stand: that of its own file, with a number where several
-    folders hold one of that name."""
+    folders hold one of that name, or where it would be that very file."""
     names: dict[Path, str] = {}
     stems = {path.stem for path in cameras}
     for path in dict.fromkeys(cameras):
         taken = set(names.values())
         numbered = (f"{path.stem}-{number}" for number in count(2))
-        names[path] = next(name for name in numbered if name not in taken | stems) if path.stem in taken else path.stem
+        is_there = path.stem in taken or path.parent.resolve() == learned.resolve()
+        names[path] = next(name for name in numbered if name not in taken | stems) if is_there else path.stem
     return names
 
 
@@ -58,7 +67,7 @@ def _known(project: Project, camera: CameraFile) -> CameraFile:
     return replace(camera, learned_from=None)
 
 
-def _learned(project: Project, camera: CameraFile, file: str, reporter: Reporter, workers: Executor) -> CameraFile:
+def _learned(project: Project, camera: CameraFile, place: Path, reporter: Reporter, workers: Executor) -> CameraFile:
     names = [name for name in project.scans if project.camera_of(name).path == camera.path]
     if not names:
         return camera
@@ -69,7 +78,7 @@ def _learned(project: Project, camera: CameraFile, file: str, reporter: Reporter
         chips = _chips(project, camera.learned, names, start, workers)
         tell(f"{camera.name}: averaged", 2, 3)
         mean = _averaged(start, camera.learned, chips, workers)
-    return _stored(project, mean, file)
+    return _stored(mean, place, _learned_folder(project))
 
 
 def _chips(
@@ -124,9 +133,11 @@ def _averaged(
     return replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
 
 
-def _stored(project: Project, camera: CameraFile, file: str) -> CameraFile:
+def _stored(camera: CameraFile, place: Path, folder: Path) -> CameraFile:
     """The camera with its templates written as a file that can be used instead, and as that file has them: so what is
-    measured with it is what is measured now."""
-    path = project.output / "learned" / f"{file}.toml"
-    write_atomically(path, camera_text(replace(camera, path=path), saved_in(path.parent, f"{file}-")))
-    return replace(camera, fiducials=read_camera(path).fiducials)
+    measured with it is what is measured now. place: of the file for now; folder: where it is to stand."""
+    save = saved_in(place.parent, f"{place.stem}-")
+    write_atomically(place, camera_text(replace(camera, path=place), save))
+    stored = replace(camera, fiducials=read_camera(place).fiducials)
+    write_atomically(place, f"{_BY}\n{camera_text(replace(camera, path=folder / place.name), save)}")
+    return stored

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -34,11 +35,12 @@ from pipeline.progress import Reporter
 from pipeline.workers import processes, worker_pool
 
 
-def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, ...]:
+def measure_scans(project: Project, reporter: Reporter, learned_folder: Path) -> tuple[MeasuredScan, ...]:
     """Measure every scan of the project, in the order of their names.
 
     All are opened before the first is measured, so that a broken file is known at once. Raises InputError or
-    MeasurementError for scans that cannot be read; a mark that cannot be measured is no error.
+    MeasurementError for scans that cannot be read; a mark that cannot be measured is no error. learned_folder: where
+    what is learned of marks is written.
     """
     if not project.scans:
         raise InputError(f'{project.path}: scans is missing: which pictures to measure, such as ["scans/*.tif"].')
@@ -48,7 +50,7 @@ def measure_scans(project: Project, reporter: Reporter) -> tuple[MeasuredScan, .
     _check_marks(project)
     _check_readable(project)
     with worker_pool(len(project.scans)) as workers:
-        learned = learn_marks(project, reporter, workers)
+        learned = learn_marks(project, reporter, workers, learned_folder)
         scans = _measured_scans(learned, reporter, workers)
         scans = _of_each_camera(project, scans, _at_one_definition)
         checked = with_checked_sheet(project, _of_each_camera(learned, scans, partial(_cross_checked, learned)))

@@ -15,6 +15,7 @@ from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.files.atomic import write_atomically
+from pipeline.files.text_file import read_json
 
 
 @dataclass(frozen=True)
@@ -29,19 +30,24 @@ class MeasuredScan:
     notes: tuple[str, ...] = ()
 
 
-def write_measurement(path: Path, scans: Sequence[MeasuredScan]) -> None:
-    """Write measurement.json. Raises InputError where it cannot be written."""
-    images = {scan.frame.image: _image(scan, path.parent) for scan in scans}
-    content = {"reseau": version("reseau"), "images": images}
+def write_measurement(
+    path: Path, scans: Sequence[MeasuredScan], folder: Path | None = None, made_from: Mapping[str, str] | None = None
+) -> None:
+    """Write measurement.json. Raises InputError where it cannot be written.
+
+    folder: where it is to stand, if not at `path`. made_from: fingerprints of what was measured and how.
+    """
+    images = {scan.frame.image: _image(scan, folder or path.parent) for scan in scans}
+    content = {"reseau": version("reseau"), "made_from": dict(made_from or {}), "images": images}
     write_atomically(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def read_measurement(path: Path) -> tuple[MeasuredScan, ...]:
-    """Read it back. Raises InputError for a file that is broken."""
+def read_measurement(path: Path, folder: Path | None = None) -> tuple[MeasuredScan, ...]:
+    """Read it back. Raises InputError for a file that is broken. folder: as above."""
     try:
-        images = json.loads(path.read_text(encoding="utf-8"))["images"]
-        return tuple(_measured(name, image, path.parent) for name, image in images.items())
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        images = read_json(path)["images"]
+        return tuple(_measured(name, image, folder or path.parent) for name, image in images.items())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: cannot be read as a measurement ({error}). Run `reseau measure` again.") from error
 
 

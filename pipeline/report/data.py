@@ -47,7 +47,8 @@ class ReportData:
     comparator: the rows of comparator.csv. measurement, adjustment, check: the contents of measurement.json,
     adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed frame by
     camera name. thumbnail: from image, point and kind (a fiducial and a target may share a name) to the mark's picture.
-    problems: what the caller has to say beyond the files. unit: of the object coordinates.
+    problems, notes: what the caller has to say beyond the files. made_from: their fingerprints by name. unit:
+    of the object coordinates.
     """
 
     project: str
@@ -59,4 +60,6 @@ class ReportData:
     frame_mm: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     thumbnail: Callable[[str, str, str], Thumbnail | None] | None = None
     problems: tuple[Problem, ...] = ()
+    notes: tuple[str, ...] = ()
+    made_from: Mapping[str, str] = field(default_factory=dict)
     unit: str = "m"

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,8 @@ def _context(data: ReportData) -> dict[str, Any]:
     adjustment = data.adjustment
     return {
         "project": data.project,
+        "version": version("reseau"),
+        "made_from": ", ".join(f"{name} {fingerprint}" for name, fingerprint in data.made_from.items()) or "memory",
         "unit": data.unit,
         "verdict": judge(data),
         "adjustment": adjustment,

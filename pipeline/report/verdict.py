@@ -18,9 +18,6 @@ Level = Literal["good", "look", "failed"]
 
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
 
-_SAME_MM = 1e-6  # digits that comparator.csv leaves out
-_ECCENTRIC = 1e-3  # of the coordinates: by more the adjustment does not move a disk's centre
-
 # Observations other than marks, by their key in adjustment.json: what is said of one and of many, and what to do.
 FURTHER = (
     (
@@ -66,7 +63,6 @@ def judge(data: ReportData) -> Verdict:
     problems = (
         *fatal,
         *data.problems,
-        *_outdated(data),
         *frame_problems(shots),
         *pixel_locking(shots),
         *(Problem(warning) for warning in (data.adjustment["warnings"] if data.adjustment else ())),
@@ -108,26 +104,6 @@ def _no_solution(adjustment: Json) -> Iterator[Problem]:
             f"The iteration did not come to rest ({adjustment['termination']}, {adjustment['iterations']} iterations).",
             "Look for wrong point numbers and gross errors among the largest residuals, at the approximate "
             "orientations, and at the units: [object] unit of points and stations, mm in the camera's file.",
-        )
-
-
-def _outdated(data: ReportData) -> Iterator[Problem]:
-    """Where the adjustment is of other coordinates than comparator.csv has now: measured anew, or edited."""
-    marks = {(mark.image, mark.kind, mark.point): mark for mark in data.comparator}
-    size_mm = max((float(np.abs(mark.xy_mm).max()) for mark in data.comparator if mark.xy_mm is not None), default=0.0)
-    others = []
-    for row in data.adjustment["residuals"] if data.adjustment and marks else ():
-        mark, adjusted_mm = marks.get((row["image"], row["kind"], row["point"])), (row.get("x_mm"), row.get("y_mm"))
-        if mark is None or not mark.status.is_observation or mark.xy_mm is None:
-            others.append(row)
-        elif None not in adjusted_mm:
-            moved_mm = np.abs(mark.xy_mm - np.array(adjusted_mm, dtype=float)).max()
-            if moved_mm > (_SAME_MM if row["kind"] == "fiducial" else _ECCENTRIC * size_mm):
-                others.append(row)
-    if others:
-        names = listed([f"{row['point']} in {row['image']}" for row in others])
-        yield Problem(
-            f"The adjustment is of other coordinates than comparator.csv has now: {names}.", "Run `reseau adjust`."
         )
 
 
@@ -218,6 +194,7 @@ def _check_problems(check: Json) -> Iterator[Problem]:
 
 def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     """What is worth knowing and needs no action."""
+    yield from data.notes
     if not data.comparator and not data.measurement:
         yield "No measurement was handed to this report."
     if not data.adjustment:

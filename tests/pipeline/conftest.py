@@ -12,11 +12,10 @@ from typing import Any
 
 import cv2
 import pytest
+from demonstration import FRAMES
 
 from pipeline.cli import run
 from pipeline.rendered.scene_file import render_project
-
-FRAMES = 3  # of the demonstration's five: one upright, one turned, one mirrored; a run of all five is slow
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from conftest import FRAMES
+from demonstration import FRAMES
 
 from pipeline.cli import DONE, run
 from pipeline.rendered.against_truth import compare_with_truth

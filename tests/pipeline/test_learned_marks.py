@@ -93,7 +93,7 @@ def clicks(folder: Path) -> str:
 
 def learned(project: Project) -> Project:
     with ThreadPoolExecutor(1) as workers:
-        return learn_marks(project, Reporter(Console(quiet=True)), workers)
+        return learn_marks(project, Reporter(Console(quiet=True)), workers, project.output / "learned")
 
 
 def measured(project: Project, *scans: str) -> list[FrameMeasurement]:

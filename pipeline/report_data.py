@@ -1,0 +1,120 @@
+"""What the stages left, as far as it is of what there is now: what was made from something else is named, not shown."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import InputError
+from pipeline.files.adjustment_reader import read_adjustment, read_covariance
+from pipeline.files.project_file import Project
+from pipeline.files.text_file import read_json
+from pipeline.measuring.comparator_file import measurement_of, read_comparator
+from pipeline.report.data import Problem, ReportData
+from pipeline.results.fingerprints import of_file
+from pipeline.results.made_from import CAMERAS, PLACES, SCAN, SETTINGS, adjusted_from, differing, measured_from
+from pipeline.results.publishing import outside_note
+from pipeline.wording import listed
+
+Json = dict[str, Any]
+At = Callable[[Path], Path]
+
+
+def measured(project: Project, at: At) -> ReportData:
+    """The marks, and what measurement.json says of them where it is theirs. at: where each result stands now."""
+    comparator = at(project.comparator)
+    data = ReportData(
+        project=_title(project),
+        comparator=read_comparator(comparator),
+        frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
+        unit=project.unit,
+        notes=tuple(filter(None, [outside_note(project)])),
+        made_from={project.comparator.name: of_file(comparator)},
+    )
+    fingerprint, path = measurement_of(comparator), at(project.measurement_path)
+    measurement = _json(path)
+    if measurement is None:
+        return data
+    if of_file(path) != fingerprint:
+        if not fingerprint:
+            return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
+        return _with_problem(
+            data,
+            f"{path.name} is of other marks than {project.comparator.name}: it is not shown.",
+            "Run `reseau measure`.",
+        )
+    made, now = measurement.get("made_from", {}), measured_from(project) if project.scans else {}
+    data = replace(data, measurement=measurement, made_from={**data.made_from, path.name: fingerprint})
+    if project.scans and made.get(PLACES) != now[PLACES]:
+        note = f"The marks were looked for with other {PLACES} than there are now; `reseau measure` looks again."
+        data = replace(data, notes=(*data.notes, note))
+    return replace(data, problems=(*data.problems, *(_unlike(made, now) if project.scans else ())))
+
+
+def adjusted(project: Project, at: At) -> ReportData:
+    """The same with the adjustment, where it is of these marks, and its check, where it is of that adjustment."""
+    data, path = measured(project, at), at(project.adjustment_path)
+    if not path.exists():
+        return data
+    adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), of_file(path)
+    made = adjustment.get("made_from") or {}
+    others = differing(made, adjusted_from(project, data.comparator))
+    if others:
+        what = f"of other {' and '.join(others)} than there are now" if made else "of what it does not say"
+        return _with_problem(data, f"{path.name} is {what}: it is not shown.", "Run `reseau adjust`.")
+    if covariance.adjustment != fingerprint:
+        return _with_problem(
+            data, f"adjustment.npz belongs to another {path.name}: both are not shown.", "Run `reseau adjust`."
+        )
+    made_from = {**data.made_from, path.name: fingerprint}
+    data = replace(data, adjustment=adjustment, covariance=covariance, made_from=made_from)
+    check_path = at(project.check_path)
+    check = _json(check_path)
+    if check is None:
+        return data
+    if check.get("made_from") != {path.name: fingerprint}:
+        return _with_problem(
+            data, f"{check_path.name} is of another adjustment: it is not shown.", "Run `reseau check`."
+        )
+    return replace(data, check=check, made_from={**data.made_from, check_path.name: of_file(check_path)})
+
+
+def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem]:
+    """Where what was measured is not what the project has now."""
+    others = differing(made, now)
+    scans = [name.removeprefix(SCAN) for name in others if name.startswith(SCAN)]
+    kinds = {
+        "Not measured yet": [name for name in scans if SCAN + name not in made],
+        "Changed since it was measured": [name for name in scans if SCAN + name in made and SCAN + name in now],
+        "Measured, but no scan of the project any more": [name for name in scans if SCAN + name not in now],
+    }
+    for what, names in kinds.items():
+        if names:
+            yield Problem(f"{what}: {listed(names)}.", "Run `reseau measure`; what is shown is of the earlier scans.")
+    kinds_of_files = [name for name in (CAMERAS, SETTINGS) if name in others]
+    if kinds_of_files:
+        yield Problem(
+            f"The marks were measured with other {' and '.join(kinds_of_files)} than there are now.",
+            "Run `reseau measure`; what is shown is of the earlier ones.",
+        )
+
+
+def _with_problem(data: ReportData, what: str, next_step: str) -> ReportData:
+    return replace(data, problems=(*data.problems, Problem(what, next_step)))
+
+
+def _title(project: Project) -> str:
+    """The project's folder, unless the project file has a name of its own."""
+    stem = project.path.stem
+    name = project.path.resolve().parent.name if stem == "project" else stem
+    return name.encode("utf-8", "replace").decode("utf-8")
+
+
+def _json(path: Path) -> Json | None:
+    try:
+        content = read_json(path)
+    except FileNotFoundError:
+        return None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: is a JSON file of another kind. Delete it and run the stage again.")
+    return content

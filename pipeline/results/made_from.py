@@ -1,0 +1,87 @@
+"""What a result was made from, as fingerprints by name: a later stage compares them with what there is now."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.project_file import Project
+from pipeline.measuring.comparator_file import ComparatorPoint
+from pipeline.results.fingerprints import fingerprint, of_scan
+
+MadeFrom = dict[str, str]
+
+# The names of the parts are words of messages: "is of other ... than there are now".
+CAMERAS, SETTINGS, SCAN = "cameras", "settings", "scan "
+MARKS, POINTS, IMAGES, DISTANCES = "marks", "points", "images", "distances"
+PLACES = "points, orientations or lenses"
+
+# Of a project; all else of it is a setting, and so is what may be added.
+_FILES = {"path", "cameras", "scans", "comparator", "output", "given_points", "given_images", "given_distances"}
+_NO_MATTER = {"max_pixels"}
+# Of a camera: what tells where its targets are, but not what its marks are.
+_LENS = {
+    "principal_distance_mm", "principal_point_mm", "principal_distance_sigma_mm", "principal_point_sigma_mm",
+    "distortion", "calibration", "source", "path",
+}  # fmt: skip
+
+
+def measured_from(project: Project) -> MadeFrom:
+    """Of a measurement: every scan, what is sought in it, and what tells where to look. The last changes no mark that
+    was measured, but which are found, and what they are named."""
+    sought = [{name: value for name, value in _of(camera).items() if name not in _LENS} for camera in _used(project)]
+    coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
+    places = [
+        coordinates,
+        project.given_points and project.given_points.normals,
+        project.given_images and project.given_images.exterior,
+        [
+            {name: value for name, value in _of(camera).items() if name in _LENS - {"source"}}
+            for camera in _used(project)
+        ],
+        project.film_sigma_mm,
+    ]
+    return {
+        CAMERAS: fingerprint([sought, {image: project.camera_of(image).name for image in project.scans}]),
+        SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
+        PLACES: fingerprint(places),
+        **{f"{SCAN}{image}": of_scan(path) for image, path in project.scans.items()},
+    }
+
+
+def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFrom:
+    """Of an adjustment: the marks that are observations, all that is given with them, and the settings."""
+    observations = sorted(
+        (mark.image, mark.kind, mark.point, *_numbers(mark)) for mark in marks if mark.status.is_observation
+    )
+    cameras = {name: [camera.camera(), camera.calibration, camera.frame_mm] for name, camera in project.cameras.items()}
+    return {
+        MARKS: fingerprint(observations),
+        CAMERAS: fingerprint(cameras),
+        POINTS: fingerprint([project.object_points, project.given_points and project.given_points.normals]),
+        IMAGES: fingerprint(project.given_images),
+        DISTANCES: fingerprint({fingerprint(given.distance) for given in project.given_distances}),
+        SETTINGS: fingerprint(_settings(project)),
+    }
+
+
+def differing(made: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """The names of the parts that are not the same in both, or only in one of them."""
+    return sorted(name for name in made.keys() | now.keys() if made.get(name) != now.get(name))
+
+
+def _numbers(mark: ComparatorPoint) -> tuple[Any, ...]:
+    assert mark.xy_mm is not None  # an observation has a place
+    return (*mark.xy_mm.tolist(), *(() if mark.sigma_mm is None else mark.sigma_mm.tolist()), mark.rho)
+
+
+def _settings(project: Project) -> dict[str, Any]:
+    return {name: value for name, value in _of(project).items() if name not in _FILES | _NO_MATTER}
+
+
+def _used(project: Project) -> list[CameraFile]:
+    return list(project.cameras.values())
+
+
+def _of(value: Any) -> dict[str, Any]:
+    return {field.name: getattr(value, field.name) for field in fields(value)}

@@ -1,0 +1,177 @@
+"""Results of one command that take the places of earlier ones together, when all are complete, or not at all."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+
+from pipeline.errors import InputError, WriteError
+from pipeline.files.atomic import writing
+from pipeline.files.project_file import Project
+
+_HEAD = 4096
+_JSON = rb'\s*\{\s*("reseau"|"verdict": "[a-z ]+",\s*"reason"|"chosen": (null|\{\s*"transformation"))'
+_HEADS = {
+    ".json": _JSON,
+    ".npz": rb"PK\x03\x04.{26}(fingerprint|names)\.npy",
+    ".html": rb"<!DOCTYPE html>.*<title>.*: calibration report</title>",
+    ".toml": rb"# Marks learned by reseau",
+    ".tif": rb"(II|MM).*reseau",
+}
+_COMPARATOR = rb'(\xef\xbb\xbf)?"?# comparator coordinates, reseau'
+
+
+class Unpublished:
+    """Files of a command that are not yet where they belong: in a folder of their own beside the earlier results."""
+
+    def __init__(self, project: Project) -> None:
+        self._project = project
+        self.folder = project.output / f".unfinished.{socket.gethostname()}.{os.getpid()}"
+        self._removed: list[Path] = []
+
+    def place(self, path: Path) -> Path:
+        """Where a result is to be written that belongs to `path`."""
+        if path == self._project.comparator:
+            return path.with_name(f".{path.stem}{self.folder.name}{path.suffix}")
+        return self.folder / path.relative_to(self._project.output)
+
+    def at(self, path: Path) -> Path:
+        """Where the result of `path` stands now, if there is one: not yet published, or an earlier one."""
+        place = self.place(path)
+        return place if place.exists() or path in self._removed else path
+
+    def remove(self, path: Path) -> None:
+        """An earlier result of which nothing is true any more."""
+        self._removed.append(path)
+
+    def publish(self) -> None:
+        """Every file to where it belongs. Raises WriteError where that cannot be, before anything was changed."""
+        comparator = self._project.comparator
+        files = {self.place(comparator): comparator} if self.place(comparator).exists() else {}
+        for file in sorted(self.folder.rglob("*")):
+            if file.is_file():
+                files[file] = self._project.output / file.relative_to(self.folder)
+        for path in (*files.values(), *self._removed):
+            check_replaceable(self._project, path)
+        done: list[str] = []
+        with _undisturbed():
+            try:
+                for place, path in files.items():
+                    with writing(path):
+                        path.parent.mkdir(parents=True, exist_ok=True)
+                        os.replace(place, path)
+                    done.append(path.name)
+                for path in self._removed:
+                    with writing(path):
+                        path.unlink(missing_ok=True)
+            except WriteError as error:
+                raise WriteError(f"{error} New are: {', '.join(done) or 'none'}. Run it again.") from error
+
+    def spoken(self, text: str) -> str:
+        """A message with the places where results are to stand, in place of those where they stand before."""
+        comparator = self._project.comparator
+        return text.replace(str(self.place(comparator)), str(comparator)).replace(f"{self.folder.name}{os.sep}", "")
+
+    def discard(self) -> None:
+        """What was not published, and what processes left that were ended before they could."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        with suppress(OSError):
+            self.place(self._project.comparator).unlink(missing_ok=True)
+
+
+@contextmanager
+def unpublished(project: Project) -> Iterator[Unpublished]:
+    """For the results of one command. What is not published when the block ends is gone.
+
+    Raises InputError where they could not be written, before any work is done for them.
+    """
+    for path in project.results:
+        check_replaceable(project, path)
+    _clear(project)
+    new = Unpublished(project)
+    try:
+        with writing(project.output):
+            new.folder.mkdir(parents=True, exist_ok=True)
+        if project.scans:
+            with writing(project.comparator):
+                new.place(project.comparator).touch()
+                new.place(project.comparator).unlink()
+        yield new
+    except WriteError as error:
+        raise WriteError(new.spoken(str(error))) from error
+    finally:
+        new.discard()
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """An interrupt waits until the block ends: it is short, and half of it would be worse than either end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[tuple[int, FrameType | None]] = []
+    handlers = {each: signal.signal(each, lambda *what: came.append(what)) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
+    for sign, frame in came:
+        if callable(handler := handlers[signal.Signals(sign)]):
+            handler(sign, frame)
+        else:
+            signal.raise_signal(sign)
+
+
+def check_replaceable(project: Project, path: Path) -> None:
+    """Raises InputError for a path where something stands that is no result of this kind: a device, somebody's file."""
+    if path.is_dir() or (path.exists() and not path.is_file()):
+        raise InputError(f"{path}: a result is to be written there, but it is no regular file. Name another place.")
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    form = _COMPARATOR if path == project.comparator else _HEADS.get(path.suffix, rb"(?!)")
+    if head and not re.match(form, head, re.DOTALL):
+        raise InputError(
+            f"{path}: a result is to be written there, but the file that stands there was not written by reseau. Move "
+            f"it away, or name another {'comparator' if path == project.comparator else 'output'} in the project."
+        )
+
+
+def outside_note(project: Project) -> str:
+    """Which folders outside that of the project are written to; "" where none is."""
+    home = project.path.resolve().parent
+    folders = {project.output.resolve(), *({project.comparator.resolve().parent} if project.scans else ())}
+    outside = sorted(str(folder) for folder in folders if not folder.is_relative_to(home))
+    return f"Results are written outside the project's folder: to {', '.join(outside)}." if outside else ""
+
+
+def _clear(project: Project) -> None:
+    """Away with what a process left that was ended before it could do that itself."""
+    pattern = re.compile(rf".*\.unfinished\.{re.escape(socket.gethostname())}\.(\d+)(\..*)?")
+    for folder in {project.output, project.comparator.parent}:
+        for path in folder.glob(".*unfinished.*") if folder.is_dir() else ():
+            found = pattern.fullmatch(path.name)
+            if found is None or _is_alive(int(found[1])):
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True

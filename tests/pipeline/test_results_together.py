@@ -1,0 +1,369 @@
+"""Results say what they were made from, take their places together, and never that of somebody's file."""
+
+import errno
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_command_line import replaced, results, rewritten_scans
+
+from adjust.errors import AdjustmentError
+from measure.errors import MeasurementError
+from pipeline import stages
+from pipeline.cli import run
+from pipeline.files.project_file import read_project
+from pipeline.measuring.comparator_file import read_comparator, write_comparator
+from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
+from pipeline.report_data import adjusted
+from pipeline.results.fingerprints import of_file
+from pipeline.results.made_from import measured_from
+from pipeline.summary import summarise
+
+SAID = pytest.CaptureFixture[str]
+pytestmark = [pytest.mark.xdist_group("demonstration"), pytest.mark.usefixtures("in_one_process")]
+
+
+def shown(folder: Path) -> tuple[int, dict[str, Any]]:
+    """Exit code and summary that `reseau report` has of what stands in the folder."""
+    data = adjusted(read_project(folder / "project.toml"), lambda path: path)
+    told = summarise(data, {})
+    return told.verdict.exit_code, told.as_json()
+
+
+def summary(folder: Path, capsys: SAID, command: str) -> tuple[int, dict[str, Any]]:
+    capsys.readouterr()
+    code = run([command, str(folder / "project.toml"), "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def said(told: dict[str, Any]) -> str:
+    return " ".join(problem["what"] for problem in told["problems"])
+
+
+def measured_as(folder: Path, scans: tuple[MeasuredScan, ...]) -> None:
+    """The files that `reseau measure` would leave if it had measured this."""
+    project = read_project(folder / "project.toml")
+    write_measurement(project.measurement_path, scans, made_from=measured_from(project))
+    frames, pitch_um = [scan.frame for scan in scans], {scan.frame.image: scan.pitch_um for scan in scans}
+    write_comparator(project.comparator, frames, pitch_um, of_file(project.measurement_path))
+
+
+def one_scan_more(folder: Path) -> MeasuredScan:
+    """A fourth scan of the project, and what measuring it gives."""
+    (folder / "scans" / "frame4.tif").write_bytes((folder / "scans" / "frame1.tif").read_bytes() + b"\0")
+    rewritten_scans(folder, "scans/frame*.tif")
+    first = read_measurement(folder / "out" / "measurement.json")[0]
+    return replace(first, scan=folder / "scans" / "frame4.tif", frame=replace(first.frame, image="frame4"))
+
+
+@pytest.fixture
+def measured_before(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What measuring gives is known, and given at once."""
+    scans = read_measurement(project / "out" / "measurement.json")
+    monkeypatch.setattr(stages, "measure_scans", lambda *_: scans)
+
+
+def test_a_finished_project_is_current(finished: tuple[Path, int]) -> None:
+    project, code = finished
+    after, told = shown(project)
+    assert after == code
+    assert told["adjustment"] is not None
+    assert told["check"] is not None
+    assert not [name for name in os.listdir(project / "out") if name.startswith(".")]
+
+
+def test_an_adjustment_of_one_scan_less_is_not_shown(project: Path, capsys: SAID) -> None:
+    more = one_scan_more(project)
+    measured_as(project, (*read_measurement(project / "out" / "measurement.json"), more))
+    code, told = summary(project, capsys, "report")
+    assert code == 1
+    assert told["sentence"].startswith("Measured: ")
+    assert told["adjustment"] is told["check"] is None
+    assert "adjustment.json is of other marks than there are now: it is not shown." in said(told)
+    assert "Calibrated" not in (project / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_scan_that_is_not_measured_yet_is_named(project: Path, capsys: SAID) -> None:
+    one_scan_more(project)
+    for code, told in (shown(project), summary(project, capsys, "adjust")):
+        assert code == 1
+        assert told["adjustment"] is not None  # it is of these marks
+        assert "Not measured yet: frame4." in said(told)
+
+
+def another_scan(folder: Path) -> None:
+    file = folder / "scans" / "frame2.tif"
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 1
+    file.write_bytes(data)
+
+
+def scan_gone(folder: Path) -> None:
+    (folder / "scans" / "frame2.tif").unlink()
+    rewritten_scans(folder, "scans/frame*.tif")
+
+
+def another_mark(folder: Path) -> None:
+    replaced(folder / "camera.toml", "[[fiducial]]", '[[fiducial]]\nid = "99"\nxy_mm = [1.0, 2.0]\n\n[[fiducial]]')
+
+
+def surer_camera(folder: Path) -> None:
+    replaced(folder / "camera.toml", "principal_distance_mm = 1.0", "principal_distance_mm = 1.1")
+
+
+def robust(folder: Path) -> None:
+    replaced(folder / "project.toml", "[adjust]", "[adjust]\nrobust = true")
+
+
+def old_check(folder: Path) -> None:
+    check = folder / "out" / "check.json"
+    text = check.read_text(encoding="utf-8")
+    surer_camera(folder)
+    assert run(["adjust", str(folder / "project.toml")]) in (0, 1)
+    check.write_text(text, encoding="utf-8")
+
+
+def old_covariance(folder: Path) -> None:
+    covariance = folder / "out" / "adjustment.npz"
+    data = covariance.read_bytes()
+    surer_camera(folder)
+    assert run(["adjust", str(folder / "project.toml")]) in (0, 1)
+    covariance.write_bytes(data)
+
+
+def old_measurement(folder: Path) -> None:
+    scans = read_measurement(folder / "out" / "measurement.json")
+    write_measurement(folder / "out" / "measurement.json", scans[:2])
+
+
+def of_an_earlier_version(folder: Path) -> None:
+    path = folder / "out" / "adjustment.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    del content["made_from"]
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def moved_mark(folder: Path) -> None:
+    path = folder / "comparator.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    row = next(i for i, line in enumerate(lines) if ",target," in line and ",measured," in line)
+    cells = lines[row].split(",")
+    cells[3] = f"{float(cells[3]) + 0.001:.7f}"
+    path.write_text("\n".join([*lines[:row], ",".join(cells), *lines[row + 1 :]]) + "\n", encoding="utf-8")
+
+
+def moved_point(folder: Path) -> None:
+    path = folder / "points.csv"
+    head, first, *rest = path.read_text(encoding="utf-8").splitlines()
+    id, x, *others = first.split(",")
+    path.write_text("\n".join([head, ",".join([id, f"{float(x) + 0.01}", *others]), *rest]), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "kept"),
+    [
+        (another_scan, "Changed since it was measured: frame2.", {"adjustment", "check"}),
+        (scan_gone, "Measured, but no scan of the project any more: frame2.", {"adjustment", "check"}),
+        (another_mark, "The marks were measured with other cameras than there are now.", set()),
+        (moved_mark, "adjustment.json is of other marks than there are now", set()),
+        (moved_point, "adjustment.json is of other points than there are now", set()),
+        (robust, "adjustment.json is of other settings than there are now", set()),
+        (surer_camera, "adjustment.json is of other cameras than there are now", set()),
+        (old_check, "check.json is of another adjustment: it is not shown.", {"adjustment"}),
+        (old_covariance, "adjustment.npz belongs to another adjustment.json: both are not shown.", set()),
+        (of_an_earlier_version, "adjustment.json is of what it does not say: it is not shown.", set()),
+        (old_measurement, "measurement.json is of other marks than comparator.csv", {"adjustment", "check"}),
+    ],
+)  # fmt: skip
+def test_what_was_made_from_something_else_is_said_and_not_shown(
+    project: Path, change: Callable[[Path], None], words: str, kept: set[str]
+) -> None:
+    change(project)
+    code, told = shown(project)
+    assert code == 1
+    assert words in said(told)
+    assert {name for name in ("adjustment", "check") if told[name] is not None} == kept
+
+
+def test_files_that_say_the_same_in_other_letters_are_the_same(project: Path, tmp_path: Path) -> None:
+    """Moved, saved by an editor with other line ends, lines exchanged and commented: nothing is new."""
+    code, _ = shown(project)
+    moved = tmp_path / "elsewhere"
+    shutil.move(project, moved)
+    for name in ("points.csv", "camera.toml", "project.toml", "comparator.csv"):
+        path = moved / name
+        lines = path.read_text(encoding="utf-8").splitlines()
+        if name == "points.csv":
+            lines[1:] = reversed(lines[1:])
+        path.write_bytes("\r\n".join([*lines, "# saved"]).encode())
+    os.utime(moved / "scans" / "frame1.tif", (1, 1))
+    after, told = shown(moved)
+    assert after == code
+    assert told["adjustment"] is not None
+    assert told["check"] is not None
+    assert told["poses"]
+
+
+def fails_with(error: BaseException) -> Callable[..., Any]:
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.usefixtures("measured_before")
+def test_an_end_after_measuring_leaves_all_as_it_was(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = results(project)
+    monkeypatch.setattr(stages, "adjust_marks", fails_with(KeyboardInterrupt()))
+    assert run(["run", str(project / "project.toml")]) == 130
+    assert results(project) == before
+
+
+@pytest.mark.usefixtures("measured_before")
+def test_marks_that_cannot_be_adjusted_are_kept_and_the_earlier_adjustment_is_not_shown(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = (*read_measurement(project / "out" / "measurement.json"), one_scan_more(project))
+    monkeypatch.setattr(stages, "measure_scans", lambda *_: more)
+    monkeypatch.setattr(stages, "adjust_marks", fails_with(AdjustmentError("a wrong point number")))
+    assert run(["run", str(project / "project.toml")]) == 2
+    assert "frame4" in {point.image for point in read_comparator(project / "comparator.csv")}
+    code, told = shown(project)
+    assert code == 1
+    assert told["adjustment"] is None
+    assert "it is not shown" in said(told)
+
+
+@pytest.mark.usefixtures("measured_before")
+def test_a_scan_that_vanishes_before_the_second_visit_keeps_what_the_first_gave(
+    project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (project / "comparator.csv").unlink()  # what is shown is new
+    gone = MeasurementError("frame2.tif: there is no scan any more.")
+    monkeypatch.setattr("pipeline.adjusting.second_visit._is_missed", lambda *_: True)
+    monkeypatch.setattr("pipeline.adjusting.second_visit.open_scan", fails_with(gone))
+    code, told = summary(project, capsys, "run")
+    assert code == 1
+    assert told["adjustment"] is not None
+    assert "It could not be looked at again: frame2.tif: there is no scan any more." in said(told)
+
+
+def test_a_disk_that_fills_up_while_results_are_written_changes_none(
+    project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = results(project)
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr("pipeline.stages.write_report", fails_with(full))
+    surer_camera(project)
+    assert run(["report", str(project / "project.toml")]) == 2
+    assert "Make room" in capsys.readouterr().err
+    assert results(project) == before
+
+
+def test_a_place_that_cannot_be_taken_is_named_with_those_that_were(
+    project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = os.replace
+
+    def held(source: Path, target: Path) -> None:
+        if target == project / "out" / "adjustment.npz":
+            raise PermissionError(errno.EACCES, "held by another program")
+        whole(source, target)
+
+    monkeypatch.setattr("pipeline.results.publishing.os.replace", held)
+    assert run(["adjust", str(project / "project.toml")]) == 2
+    message = capsys.readouterr().err
+    assert "adjustment.npz: cannot be written (held by another program)" in message
+    assert "New are: adjustment.json." in message
+    assert ".unfinished" not in message
+
+
+def marks_over_notes(folder: Path) -> Path:
+    (folder / "notes.csv").write_text("# my comparator notes\na,b\n", encoding="utf-8")
+    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "notes.csv"')
+    return folder / "notes.csv"
+
+
+def marks_over_a_device(folder: Path) -> Path:
+    (folder / "null.csv").symlink_to("/dev/null")
+    replaced(folder / "project.toml", 'comparator = "comparator.csv"', 'comparator = "null.csv"')
+    return folder / "null.csv"
+
+
+def report_over_a_letter(folder: Path) -> Path:
+    (folder / "out" / "report.html").write_text("<!DOCTYPE html><title>A letter</title>", encoding="utf-8")
+    return folder / "out" / "report.html"
+
+
+def adjustment_over_data(folder: Path) -> Path:
+    (folder / "out" / "adjustment.json").write_text('{"name": "reseau"}', encoding="utf-8")
+    return folder / "out" / "adjustment.json"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (marks_over_notes, "was not written by reseau"),
+        (marks_over_a_device, "is no regular file"),
+        (report_over_a_letter, "was not written by reseau"),
+        (adjustment_over_data, "was not written by reseau"),
+    ],
+)
+def test_nothing_is_written_over_what_is_no_result(
+    project: Path, capsys: SAID, spoil: Callable[[Path], Path], words: str
+) -> None:
+    path = spoil(project)
+    before = path.read_bytes()
+    assert run(["run", str(project / "project.toml")]) == 2
+    assert words in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+def calibration(folder: Path) -> None:
+    shutil.copytree(folder / "out", folder / "earlier")
+    replaced(folder / "camera.toml", "[sigma]", '[sigma]\ncalibration = "earlier/adjustment.json"')
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            'output = "out"',
+            'output = "earlier"',
+            "line 5: output: adjustment.json would be written over the earlier",
+        ),
+        ('comparator = "comparator.csv"', 'comparator = "earlier/adjustment.npz"', "over the covariance of"),
+        ('comparator = "comparator.csv"', 'comparator = "out/adjustment.json"', "over another result"),
+        ('comparator = "comparator.csv"', 'comparator = "camera.toml"', "over the camera of"),
+    ],
+)
+def test_the_projects_own_inputs_are_never_outputs(project: Path, capsys: SAID, old: str, new: str, words: str) -> None:
+    calibration(project)
+    replaced(project / "project.toml", old, new)
+    assert run(["run", str(project / "project.toml")]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_folder_outside_the_projects_is_named(project: Path, tmp_path: Path, capsys: SAID) -> None:
+    replaced(project / "project.toml", 'output = "out"', 'output = "../elsewhere"')
+    _, told = summary(project, capsys, "adjust")
+    assert any(f"outside the project's folder: to {tmp_path.resolve() / 'elsewhere'}" in note for note in told["notes"])
+
+
+def test_what_an_ended_process_left_is_cleared(project: Path) -> None:
+    host = os.uname().nodename
+    left = project / "out" / f".unfinished.{host}.999999999"
+    left.mkdir()
+    (left / "adjustment.json").write_text("half", encoding="utf-8")
+    (project / f".comparator.unfinished.{host}.999999999.csv").touch()
+    mine = project / "out" / f".unfinished.{host}.{os.getppid()}"
+    mine.mkdir()
+    assert run(["adjust", str(project / "project.toml")]) in (0, 1)
+    assert not left.exists()
+    assert not list(project.glob(".comparator*"))
+    assert mine.exists()
