@@ -119,15 +119,29 @@ def _candidates(problem: Problem, state: State) -> list[int]:
 
 
 def centered(problem: Problem, state: State, members: Indices) -> State:
-    """The state after the similarity transformation that brings some coordinates nearest to their approximations."""
+    """The state after the similarity transformation that brings some coordinates nearest to those given of them; what
+    these leave open brings the others nearest to their approximations.
+    """
+    given = problem.unknowns.given[members]
+    is_given = ~np.isnan(given)
+    wanted = np.where(is_given, given, problem.unknowns.start[members])
     for _ in range(CENTERINGS):
         datum = object_datum(problem, state, FLAT)
-        motion = datum.generators[members] @ datum.free
-        amount = np.linalg.lstsq(motion, problem.unknowns.start[members] - state.values[members])[0]
+        amount = _nearest(datum.generators[members] @ datum.free, wanted - state.values[members], is_given)
         state = _transformed(problem, state, datum, datum.free @ amount)
         if np.abs(amount).max(initial=0.0) <= EXACT * datum.extent:
             break
     return state
+
+
+def _nearest(motion: Array, off: Array, first: NDArray[np.bool_]) -> Array:
+    """Amounts (d,) of motions (n, d) nearest to off (n,): by the rows `first`, then as far as these leave it open."""
+    count = motion.shape[1]
+    _, seen, right = np.linalg.svd(np.vstack([motion[first], np.zeros((count, count))]), full_matrices=False)
+    left_open = right[seen <= FLAT * seen.max(initial=0.0)].T
+    amount = np.linalg.lstsq(motion[first], off[first], rcond=FLAT)[0]
+    rest = off[~first] - motion[~first] @ amount
+    return np.asarray(amount + left_open @ np.linalg.lstsq(motion[~first] @ left_open, rest)[0])
 
 
 def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:
@@ -138,11 +152,14 @@ def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:
 
 
 def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Array) -> State:
-    shift, turn, growth = amounts[:3], amounts[3:6] / datum.extent, amounts[6] / datum.extent
+    shift, turn, scale = amounts[:3], amounts[3:6] / datum.extent, 1.0 + amounts[6] / datum.extent
+    if datum.free.shape[1] == len(amounts):  # all free: a large turn is not mistaken for one with a loss of scale
+        sine = float(np.linalg.norm(turn))
+        turn, scale = turn * (np.arctan2(sine, scale) / sine if sine else 1.0), float(np.hypot(sine, scale))
     rotation = rotation_from_vector(turn)
     values = state.values.copy()
     placed = np.concatenate([_point_positions(problem), problem.exterior[:, :3]])
-    moved = datum.center + shift + (1.0 + growth) * (values[placed] - datum.center) @ rotation.T
+    moved = datum.center + shift + scale * (values[placed] - datum.center) @ rotation.T
     values[placed] = np.where(problem.unknowns.sigma[placed] == 0.0, values[placed], moved)
     rotations = state.rotations @ rotation.T
     for i, positions in enumerate(problem.exterior[:, 3:]):

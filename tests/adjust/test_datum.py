@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from reference_cases import approximations_of, load, network_of
-from simulated import Truth, simulated
+from simulated import Truth, rotation, simulated
 
 from adjust.adjustment import Datum, Options, adjust
 from adjust.errors import AdjustmentError
+from adjust.functional_model.rotation import angles_from_rotation
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, Prior
+from adjust.initial_values.approximations import approximate
+from adjust.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, ObjectPoint, Prior
 from adjust.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -87,6 +89,47 @@ def test_inner_constraints_over_chosen_points() -> None:
     np.testing.assert_allclose(change.mean(axis=0), 0.0, atol=1e-8)
     np.testing.assert_allclose(np.cross(lever, change).sum(axis=0), 0.0, atol=1e-5 * np.abs(lever).max())
     assert abs((lever * change).sum()) < 1e-5 * np.abs(lever).max()
+
+
+def best_rms(model: Array, given: Array) -> float:
+    """The rms of points from where the best similarity transformation in closed form (Umeyama 1991) brings others."""
+    left, right = model - model.mean(axis=0), given - given.mean(axis=0)
+    u, singular, vt = np.linalg.svd(right.T @ left)
+    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    scale = (singular * sign).sum() / (left**2).sum()
+    off = right - scale * left @ (u * sign @ vt).T
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize("turn", [None, 0.0, 2.8])
+@pytest.mark.parametrize("unknown", [0, 4])
+def test_a_free_network_lies_nearest_to_the_given_coordinates(turn: float | None, unknown: int) -> None:
+    """Coordinates known to some metres: not to intersections that orientations, turned by so much or none, give."""
+    rng = np.random.default_rng(21)
+    truth = Truth()
+    network, start = simulated(rng, truth, point_sigma=np.inf, free={"k3": np.inf})
+    rough = np.array([start.points[point.id] for point in network.points]) + rng.normal(0.0, 3.0, (12, 3))
+    points = tuple(
+        ObjectPoint(point.id, *(Prior(float(value), np.inf) if row >= unknown else None for value in xyz))
+        for row, (point, xyz) in enumerate(zip(network.points, rough, strict=True))
+    )
+    images = network.images
+    if turn is not None:
+        turned = rotation(0.0, 0.0, turn)  # of the ground, in which stations and attitudes are given
+        values = [
+            np.array([*(turned.T @ station) + 30.0, *angles_from_rotation(rotation(*attitude) @ turned)])
+            for station, attitude in zip(np.array(truth.stations), truth.attitudes, strict=True)
+        ]
+        images = tuple(replace(image, exterior=Exterior(each)) for image, each in zip(images, values, strict=True))
+    network = replace(network, points=points, images=images)
+    begun = approximate(network)
+    free, minimal = (adjust(network, begun, Options(datum=datum)) for datum in ("free", "minimal"))
+    model = np.array([[free.value(f"PT.{point.id}.{axis}") for axis in "XYZ"] for point in points[unknown:]])
+    rms = np.sqrt(((model - rough[unknown:]) ** 2).sum(axis=1).mean())
+    assert rms == pytest.approx(best_rms(model, rough[unknown:]), rel=1e-9)
+    values, sigmas = camera_part(minimal)
+    np.testing.assert_allclose((camera_part(free)[0] - values) / np.where(sigmas > 0, sigmas, 1.0), 0.0, atol=1e-8)
+    np.testing.assert_allclose(camera_part(free)[1], sigmas, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
