@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import NoImageError
+from adjust.functional_model.families import family
 from adjust.functional_model.functions import blind_mark
 from adjust.least_squares.factor import Factor
 from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
@@ -171,24 +172,48 @@ def _snooped(last: Run, options: Options) -> Run:
 
 
 def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
+    """The run from a state; where the network is singular there and nowhere else, from where it ends with some of its
+    cameras' parameters held. As it is from the state where that, too, ends where the network is singular.
+    """
     last = _adjusted(problem, weighting, state, limit)
-    return _from_held_cameras(last, limit) if last.singular and not last.solution.history else last
+    alike = [at for positions in _alike_at_zero(problem, state).values() for at in positions]
+    for held in (alike, _free_of_cameras(problem)):
+        if held and last.singular and not last.solution.history:
+            begun = _run(replace(problem, unknowns=problem.unknowns.fixed(held)), weighting, state, limit)
+            if begun.converged:
+                freed = _adjusted(problem, weighting, _apart(problem, begun.end.state), limit)
+                last = last if freed.singular else freed
+    return last
 
 
-def _from_held_cameras(stuck: Run, limit: int) -> Run:
-    """The run of a network that was singular where it started from where it ends with the cameras held; as it was where
-    that brings no solution.
+def _alike_at_zero(problem: Problem, state: State) -> dict[str, list[int]]:
+    """By camera, the free parameters of its distortion that are 0, where they do the same as others of the family."""
+    unknowns, found = problem.unknowns, {}
+    for camera, positions in unknowns.camera.items():
+        of = family(problem.network.camera_by_name[camera].distortion.family)
+        alike = [int(positions[3 + of.parameters.index(each)]) for each in of.alike_at_zero]
+        found[camera] = [at for at in alike if np.isinf(unknowns.sigma[at]) and state.values[at] == 0.0]
+    return found
+
+
+def _apart(problem: Problem, state: State) -> State:
+    """A state of nearly the same images in which no free parameters of a distortion do the same."""
+    values, unknowns = state.values.copy(), problem.unknowns
+    for camera in (name for name, alike in _alike_at_zero(problem, state).items() if alike):
+        at = unknowns.camera[camera][3:]
+        apart = family(problem.network.camera_by_name[camera].distortion.family).apart(values[at])
+        values[at] = np.where(np.isinf(unknowns.sigma[at]), apart, values[at])
+    return State(values, state.rotations)
+
+
+def _free_of_cameras(problem: Problem) -> list[int]:
+    """All free parameters of cameras.
 
     Approximations without known planimetry look straight down: from parallel axes heights never tell a principal
     distance, but from those of tilted images they do.
     """
-    problem, unknowns = stuck.problem, stuck.problem.unknowns
-    free = [at for positions in unknowns.camera.values() for at in positions if np.isinf(unknowns.sigma[at])]
-    held = _adjusted(replace(problem, unknowns=unknowns.fixed(free)), stuck.weighting, stuck.end.state, limit)
-    if not held.converged:
-        return stuck
-    last = _adjusted(problem, stuck.weighting, held.end.state, limit)
-    return last if last.converged else stuck
+    unknowns = problem.unknowns
+    return [int(at) for positions in unknowns.camera.values() for at in positions if np.isinf(unknowns.sigma[at])]
 
 
 def _adjusted(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
@@ -196,11 +221,8 @@ def _adjusted(problem: Problem, weighting: Weighting, state: State, limit: int) 
     numbering = Numbering(weighted)
     start = linearise(numbering, covariance, state)
     if start is None:
-        raise NoImageError(
-            f"The adjustment cannot start: with the approximations, {blind_mark(problem, state)}. Check the "
-            f"approximate orientation of the image, and the sign of W: M rotates from object to camera, which looks "
-            f"along its negative z axis."
-        )
+        told, check = blind_mark(problem, state)
+        raise NoImageError(f"The adjustment cannot start: with the approximations, {told}. {check}")
     singular = singular_directions(weighted, state, numbering.free, start.factor)
     if singular:
         solution = Solution(start, None, "singular", ())

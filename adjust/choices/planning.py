@@ -121,6 +121,6 @@ def _factor(numbering: Numbering) -> Factor:
 
 def _blind(problem: Problem) -> str:
     return (
-        f"The network cannot be planned: {blind_mark(problem, problem.start())}. Turn the camera towards the field, "
+        f"The network cannot be planned: {blind_mark(problem, problem.start())[0]}. Turn the camera towards the field, "
         f"or leave the point out of that image."
     )

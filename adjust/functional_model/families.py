@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from adjust.functional_model.correction import Correction, Imaged, Settings, no_correction, undistorted
 from adjust.functional_model.fourier_sets import by_order, fourier, fourier_names
 from adjust.functional_model.juhl import JUHL_GROUPS, JUHL_NAMES, juhl
-from adjust.functional_model.opencv_family import OPENCV_GROUPS, OPENCV_NAMES, opencv
+from adjust.functional_model.opencv_family import (
+    OPENCV_DENOMINATOR,
+    OPENCV_GROUPS,
+    OPENCV_NAMES,
+    expanded,
+    opencv,
+)
 from adjust.functional_model.physical import (
     BROWN_GROUPS,
     BROWN_NAMES,
@@ -37,7 +43,8 @@ class Family:
 
     parameters: their names. image(ray, parameters): what it does to the ray. correct(settings, xy, principal point,
     parameters): what is subtracted from the observed point. needs: the setting that it cannot do without. groups: the
-    parameters that are one cause, or of one degree, by its name.
+    parameters that are one cause, or of one degree, by its name. alike_at_zero: parameters that do the same as others
+    while they are 0; apart(parameters): others, of nearly the same distortion, with which they do not.
     """
 
     parameters: tuple[str, ...] = ()
@@ -45,6 +52,8 @@ class Family:
     correct: Callable[[Settings, Array, Array, Array], Correction] = no_correction
     needs: str = ""
     groups: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    alike_at_zero: tuple[str, ...] = ()
+    apart: Callable[[Array], Array] = np.copy
 
 
 def _polynomials(of: PolynomialSet) -> Family:
@@ -63,7 +72,9 @@ _FAMILIES = {
     "none": Family(),
     "torlegard": Family(TORLEGARD_NAMES, correct=torlegard, groups=TORLEGARD_GROUPS),
     "brown": Family(BROWN_NAMES, correct=brown, groups=BROWN_GROUPS),
-    "opencv": Family(OPENCV_NAMES, image=opencv, groups=OPENCV_GROUPS),
+    "opencv": Family(
+        OPENCV_NAMES, image=opencv, groups=OPENCV_GROUPS, alike_at_zero=OPENCV_DENOMINATOR, apart=expanded
+    ),
     "juhl": Family(JUHL_NAMES, correct=juhl, needs="r0_mm", groups=JUHL_GROUPS),
     "ebner": _polynomials(EBNER),
     "gruen": _polynomials(GRUEN),

@@ -251,30 +251,40 @@ def _in_order(rows: Indices) -> Rows:
     return slice(int(rows[0]), int(rows[-1]) + 1) if whole else rows
 
 
-def blind_mark(problem: Problem, state: State) -> str:
-    """The first mark that has no image in a state, and why; empty where all have one."""
+def blind_mark(problem: Problem, state: State) -> tuple[str, str]:
+    """The first mark that has no image in a state and why, and what to check; empty where all have one."""
     observations = problem.network.observations
     for name, rows in problem.targets_by_camera.items():
         interior, parameters, distortion = _camera(problem, state, name)
         if interior[0] <= 0.0:
-            return f"the principal distance of camera {name} is {interior[0]:.6g} mm and must be positive"
+            told = f"the principal distance of camera {name} is {interior[0]:.6g} mm and must be positive"
+            return told, "Give a positive one."
         seen = _seen(problem, state, name, rows)
+        behind = seen.in_camera[:, 2] >= 0.0
         _, found = camera_from_image(distortion, interior, parameters, seen.imaged)
-        for bad, why in (
-            (seen.in_camera[:, 2] >= 0.0, "lies behind the camera"),
-            (~found, "is where the distortion folds over"),
-        ):
-            if bad.any():
-                row = rows[int(np.argmax(bad))]
-                return f"point {observations.point[row]} {why} in image {observations.image[row]}"
+        if behind.any() or not found.all():
+            row = int(np.argmax(behind if behind.any() else ~found))
+            return _blind_target(problem, int(rows[row]), bool(behind.any()))
     targets = [_seen(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
     camera_xy = _computed_in_camera(problem, state, targets)
-    if camera_xy is not None:
-        _, found = _computed_in_comparator(problem, state, camera_xy)
-        row = int(np.argmin(found))
-        image = problem.network.images[problem.image_numbers[row]]
-        return (
-            f"{observations.kind[row]} {observations.point[row]} is where the {image.transformation} transformation of "
-            f"image {image.name} folds over"
-        )
-    return ""
+    if camera_xy is None:
+        return "", ""
+    _, found = _computed_in_comparator(problem, state, camera_xy)
+    row = int(np.argmin(found))
+    image = problem.network.images[problem.image_numbers[row]]
+    told = (
+        f"{observations.kind[row]} {observations.point[row]} is where the {image.transformation} transformation of "
+        f"image {image.name} folds over"
+    )
+    return told, "Check its number and those of the fiducial marks, or choose a transformation of a lower order."
+
+
+def _blind_target(problem: Problem, row: int, is_behind: bool) -> tuple[str, str]:
+    image = problem.network.images[problem.image_numbers[row]]
+    placed = "the number and the coordinates of the point" if image.exterior is None else "the given orientation"
+    why, check = "is where the distortion folds over", "the values from which the distortion starts"
+    if is_behind:
+        why = "lies behind the camera"
+        check = "the sign of W: M rotates from object to camera, which looks along its negative z axis"
+    told = f"point {problem.network.observations.point[row]} {why} in image {image.name}"
+    return told, f"Check {placed}, and {check}."

@@ -9,9 +9,10 @@ from adjust.small_matrices import applied, matrices, product, vectors
 Array = NDArray[np.float64]
 
 OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1")
+OPENCV_DENOMINATOR = ("k4", "k5", "k6")  # at 0 their derivatives are those of k1, k2, k3 with the other sign
 OPENCV_GROUPS = (
     ("radial", ("k1", "k2", "k3", "k4", "k5", "k6")),
-    ("radial, denominator", ("k4", "k5", "k6")),
+    ("radial, denominator", OPENCV_DENOMINATOR),
     ("decentering", ("p1", "p2")),
     ("thin prism", ("s1", "s2", "s3", "s4")),
     ("tilt", ("tau_x", "tau_y")),
@@ -44,6 +45,16 @@ def opencv(ray: Array, parameters: Array) -> Imaged:
 
     by_ray = product(tilted.by_ray, straight.by_ray) if is_tilted else straight.by_ray
     return Imaged(tilted.value * scale, by_ray * scale[:, None] * mirror, by_parameter)
+
+
+def expanded(parameters: Array) -> Array:
+    """The parameters after numerator and denominator of the radial distortion are both multiplied by 1 + r²; what then
+    stands above the sixth power is left out."""
+    k = dict(zip(OPENCV_NAMES, parameters, strict=True))
+    for names in (("k1", "k2", "k3"), OPENCV_DENOMINATOR):
+        lower = [1.0, *(k[name] for name in names[:-1])]
+        k |= {name: k[name] + each for name, each in zip(names, lower, strict=True)}
+    return np.array([k[name] for name in OPENCV_NAMES])
 
 
 def _lens(ray: Array, parameters: Array) -> Imaged:

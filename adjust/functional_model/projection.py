@@ -190,6 +190,15 @@ def ideal_from_observed(distortion: Distortion, interior: Array, parameters: Arr
     return interior[1:] + interior[0] * ray, found
 
 
+def folded_over(distortion: Distortion, interior: Array, parameters: Array, xy_mm: Array) -> Mask:
+    """Which observed camera points (n, 2) in mm lie beyond where the distortion turns the image back on itself."""
+    ideal_mm, found = ideal_from_observed(distortion, interior, parameters, xy_mm)
+    with np.errstate(over="ignore", invalid="ignore"):
+        at = image_equations(distortion, interior, parameters, xy_mm, (ideal_mm - interior[1:]) / interior[0])
+        sides = determinant(at.by_xy), determinant(at.imaged.by_ray)
+    return ~(found & _unfolded(sides[0]) & _unfolded(sides[1]))
+
+
 def _newton_step(by_unknown: Array, value: Array) -> tuple[Array, Mask]:
     """Steps (n, 2), and which points (n,) have neighbours that are imaged on the right side of them."""
     side = determinant(by_unknown)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.projection import folded_over
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
 from adjust.functional_model.sight import Sight, freed_sight
 from adjust.functional_model.transformation import film_kind
@@ -19,6 +20,8 @@ from adjust.network import Approximations, Camera, Image, Network
 from adjust.validation import validate
 
 Array = NDArray[np.float64]
+
+MOST_FOLDED = 0.05  # part of an image's points that gross errors may put where the distortion has no image
 
 
 def approximate(network: Network) -> Approximations:
@@ -131,10 +134,20 @@ def _known_field(network: Network, frame: _Frame, x0: float, y0: float) -> Known
 
 
 def _sight(camera: Camera, frame: _Frame, interior: Array) -> Sight:
-    """Freed of the distortion as it is known beforehand."""
+    """Freed of the distortion as it is known beforehand. Raises AdjustmentError where that folds the image over."""
     known = camera.distortion.parameters
     names = parameter_names(camera.distortion.family)
     parameters = np.array([known[name].value if name in known else 0.0 for name in names])
+    folded = folded_over(camera.distortion, interior, parameters, frame.xy_mm)
+    if folded.mean() > MOST_FOLDED:
+        radius_mm = float(np.linalg.norm(frame.xy_mm[folded] - interior[1:], axis=1).min())
+        values = ", ".join(f"{name} = {known[name].value:g}" for name in names if name in known and known[name].value)
+        raise AdjustmentError(
+            f"camera {camera.name}: the distortion that is given ({values}) folds the image over: from {radius_mm:.3g} "
+            f"mm off the principal point on, what lies farther out would appear farther in, and {folded.sum()} of the "
+            f"{len(folded)} points of an image were measured there. Correct the signs, the units or the family of "
+            "these values, or begin with 0."
+        )
     return freed_sight(frame.points, frame.xy_mm, frame.sigma_mm, interior, camera.distortion, parameters)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.families import parameter_names
+from adjust.functional_model.families import family
 from adjust.functional_model.transformation import follows_tilts
 from adjust.problem import Problem, State
 
@@ -229,18 +229,24 @@ def _interior_leads(problem: Problem, camera: str, positions: Indices, field: Fi
 
 def _distortion_leads(problem: Problem, camera: str, positions: Indices) -> list[Lead]:
     """The distortion parameters of a camera."""
-    names = parameter_names(problem.network.camera_by_name[camera].distortion.family)
+    of = family(problem.network.camera_by_name[camera].distortion.family)
+    named = dict(zip(of.parameters, positions, strict=True))
+    free = [each for each in of.alike_at_zero if np.isinf(problem.unknowns.sigma[named[each]])]
+    because, remedy = "the targets do not tell it from the other unknowns", "spread the targets better over the frame"
+    if free:
+        because = f"with {', '.join(free)} free the radial numerator and denominator do the same over this image"
+        remedy = f"fix some of {', '.join(free)} at 0"
     return [
         Lead(
             3,
             _unit(problem, position),
             f"The distortion parameter {name} of camera {camera} can change",
             name,
-            "the targets do not tell it from the other unknowns",
+            because,
             None,
-            "fix it, or spread the targets better over the frame",
+            f"fix it, or {remedy}",
         )
-        for name, position in zip(names, positions, strict=True)
+        for name, position in named.items()
     ]
 
 

@@ -1,5 +1,7 @@
 """The `opencv` family against OpenCV itself, and the corrections inverted."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from simulated import Truth, camera_point, field_points, simulated
 
 from adjust.adjustment import adjust
+from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import (
     ImageModel,
@@ -18,6 +21,7 @@ from adjust.functional_model.projection import (
 )
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.functional_model.transformation import Film
+from adjust.initial_values.approximations import approximate
 from adjust.network import Approximations, Camera, Distortion, Image, Network, ObjectPoint, Observations, Prior
 
 Array = NDArray[np.float64]
@@ -196,3 +200,68 @@ def test_adjusted_image_predicts_its_observations() -> None:
     rows = [row for row, key in enumerate(keys) if key == ("f2", "target")]
     assert visible.all()
     np.testing.assert_allclose(predicted, observations.xy_mm[rows], atol=1e-8)
+
+
+RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+WIDE = np.array([8.0, 3.0, 0.0002, -0.0001, 0.1, 8.4, 5.0, 0.6])
+WIDE_FX = 2500.0
+
+
+def wide_network(seed: int, lens: Array = WIDE) -> Network:
+    """A board in five images of a wide lens, distorted by OpenCV's rational model, all of which begins at 0."""
+    noise_mm = 0.0002
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(-6.0, 7.0), np.arange(-6.0, 7.0))
+    xyz = np.stack([x.ravel() * 160, y.ravel() * 160, np.zeros(x.size)], axis=1)
+    matrix = np.array([[WIDE_FX, 0, CX], [0, WIDE_FX, CY], [0, 0, 1]])
+    rows = []
+    for i in range(5):
+        to_camera = rotation_from_angles(np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-3.0, 3.0)]))
+        station = to_camera.T @ np.array([*rng.uniform(-150.0, 150.0, 2), rng.uniform(900.0, 1200.0)])
+        rvec, _ = cv2.Rodrigues(FLIP @ to_camera)
+        pixels, _ = cv2.projectPoints(xyz, rvec, -FLIP @ to_camera @ station, matrix, lens)
+        pixels = pixels.reshape(-1, 2)
+        shown = np.flatnonzero(((pixels > 0.0) & (pixels < SIZE_PX)).all(axis=1))
+        rows += [(f"i{i}", str(j), mm(pixels[j]) + rng.normal(0.0, noise_mm, 2)) for j in shown]
+    observations = Observations(
+        tuple(row[0] for row in rows),
+        tuple(row[1] for row in rows),
+        ("target",) * len(rows),
+        np.array([row[2] for row in rows]),
+        np.array([noise_mm**2 * np.eye(2)] * len(rows)),
+    )
+    wide = Camera(
+        "D",
+        *(Prior(value, np.inf) for value in (WIDE_FX * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM)),
+        Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}),
+    )
+    seen = {row[1] for row in rows}
+    points = tuple(ObjectPoint(str(j), *map(Prior, each.tolist())) for j, each in enumerate(xyz) if str(j) in seen)
+    return Network((wide,), tuple(Image(f"i{i}", "D", "none") for i in range(5)), points, observations)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_rational_distortion_begins_at_zero(seed: int) -> None:
+    """Where its numerator and its denominator do the same: the solution is regular, and it is found."""
+    network = wide_network(seed)
+    result = adjust(network, approximate(network))
+    assert result.converged
+    assert result.sigma0 == pytest.approx(1.0, abs=0.05)
+    for name, true in zip(("c", "x0", "y0"), (WIDE_FX, CX, -CY), strict=True):
+        assert abs(result.value(f"IO.D.{name}") - true * PIXEL_MM) < 4.0 * result.sigma(f"IO.D.{name}")
+
+
+def test_a_denominator_that_nothing_asks_for_is_told() -> None:
+    network = wide_network(0, 0.0 * WIDE)
+    (*_, singular) = adjust(network, approximate(network)).singular
+    assert "with k4, k5, k6 free the radial numerator and denominator do the same" in singular.cause
+    assert "fix some of k4, k5, k6 at 0" in singular.remedy
+
+
+@pytest.mark.parametrize(("family", "parameters"), [("torlegard", {"k3": 1e-4}), ("opencv", {"k1": -4.0})])
+def test_a_distortion_that_folds_the_image_over_is_named(family: str, parameters: dict[str, float]) -> None:
+    network, _ = simulated(np.random.default_rng(5), points=field_points(np.random.default_rng(6), 15))
+    folding = Distortion(family, {name: Prior(value, np.inf) for name, value in parameters.items()})
+    folded = replace(network, cameras=(replace(network.cameras[0], distortion=folding),))
+    with pytest.raises(AdjustmentError, match=r"camera K: the distortion that is given \(k. = \S+\) folds the image"):
+        approximate(folded)
