@@ -116,11 +116,11 @@ def test_a_free_network_lies_nearest_to_the_given_coordinates(turn: float | None
     images = network.images
     if turn is not None:
         turned = rotation(0.0, 0.0, turn)  # of the ground, in which stations and attitudes are given
-        values = [
+        exteriors = [
             np.array([*(turned.T @ station) + 30.0, *angles_from_rotation(rotation(*attitude) @ turned)])
             for station, attitude in zip(np.array(truth.stations), truth.attitudes, strict=True)
         ]
-        images = tuple(replace(image, exterior=Exterior(each)) for image, each in zip(images, values, strict=True))
+        images = tuple(replace(image, exterior=Exterior(each)) for image, each in zip(images, exteriors, strict=True))
     network = replace(network, points=points, images=images)
     begun = approximate(network)
     free, minimal = (adjust(network, begun, Options(datum=datum)) for datum in ("free", "minimal"))

@@ -226,13 +226,16 @@ def wide_network(seed: int, lens: Array = WIDE) -> Network:
     observations = Observations(
         tuple(row[0] for row in rows),
         tuple(row[1] for row in rows),
-        ("target",) * len(rows),
+        tuple("target" for _ in rows),
         np.array([row[2] for row in rows]),
         np.array([noise_mm**2 * np.eye(2)] * len(rows)),
     )
+    c, x0, y0 = (Prior(value * PIXEL_MM, np.inf) for value in (WIDE_FX, CX, -CY))
     wide = Camera(
         "D",
-        *(Prior(value, np.inf) for value in (WIDE_FX * PIXEL_MM, CX * PIXEL_MM, -CY * PIXEL_MM)),
+        c,
+        x0,
+        y0,
         Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}),
     )
     seen = {row[1] for row in rows}
