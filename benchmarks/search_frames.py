@@ -83,9 +83,17 @@ def draw_case(seed: int, index: int) -> Case:
     """The index-th frame of the study of that seed."""
     rng = np.random.default_rng([seed, index])
     kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
-    layout = _layout(rng, kind, symmetry)
-    tones, picture = _tones(rng)
+    return case_of(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif")
+
+
+def case_of(
+    rng: Generator, kind: str, symmetry: str, layout: FiducialLayout, name: str, tones: Tones | None = None
+) -> Case:
+    """A frame with the marks of the layout, all else drawn by chance. tones: of marks that grow out of the frame's
+    border, with no pads behind them; else by chance, too."""
+    of_border, (tones, picture) = tones is not None, (tones, "solid marks") if tones else _tones(rng)
     scene = _scene(rng, layout, tones)
+    scene = replace(scene, pad_mm=0.0) if of_border else scene
     truth = frame_truth(scene, 0)
     clutter = _clutter(rng, layout, truth.geometry, tones)
     uncovered = tuple(replace(image, covered=()) for image in scene.images)
@@ -98,7 +106,7 @@ def draw_case(seed: int, index: int) -> Case:
         layout=layout,
         pose=scene.images[0].pose,
         pitch_um=PITCH_UM * float(rng.uniform(0.99, 1.01)) if rng.random() < 0.9 else None,
-        scan=Scan(Path(f"{index}.tif"), WholePicture(grey[..., None]), NO_TAGS),
+        scan=Scan(Path(name), WholePicture(grey[..., None]), NO_TAGS),
         centers_px={id: position.center_px for id, position in positions.items()},
         hidden=frozenset(id for id, position in positions.items() if position.hidden),
         without_marks=lambda: _painted(bare, clutter).astype(float),
