@@ -14,12 +14,11 @@ from measure.frames.frame import WRONG_CHANCE, WRONG_PX
 from measure.frames.frame_sighter import FrameSighter
 from measure.frames.mark_comparison import (
     SharedBlur,
-    SharedShape,
-    round_moves_beyond,
-    round_moves_px,
     shared_blurs,
     shared_shapes,
     shared_sizes,
+    touch_of_edges,
+    touch_of_round,
 )
 from measure.frames.refinement import leans_on_frame, sight, strained_px
 from measure.marks.rendering import reach_px
@@ -105,7 +104,8 @@ def share_blur(sighter: FrameSighter) -> None:
 
 def compare_sizes(sighter: FrameSighter) -> None:
     """Doubt marks of another size than the others that are drawn alike: dust, say, that covers one. A round mark is
-    known no better than its size says, and doubted where what touches it may well have moved it far."""
+    known no better than its size says, and doubted where something was cut out beside it that may well have moved
+    it far."""
     alike: dict[Mark, list[int]] = defaultdict(list)
     fits = _adjusted(sighter)
     for index in fits:
@@ -119,18 +119,13 @@ def compare_sizes(sighter: FrameSighter) -> None:
                 reason = f"it is {size.ratio:.2f} times as large as the other marks: something may cover or touch it"
                 sighter.doubt(index, reason)
             if size is not None and is_round(mark):
-                _count_touches(sighter, index, size, fits[index])
-
-
-def _count_touches(sighter: FrameSighter, index: int, size: SharedShape, fit: Match) -> None:
-    """What may touch a round mark, as its size has it: in its variance, and as a doubt where it may be far off."""
-    radius_px = _radius_px(sighter.layout.marks[index].mark, fit.pixel_from_mark[:, :2])
-    touched = size.touched(radius_px, fit.damaged_fraction > 0)
-    sighter.widen(index, Cause.TOUCHED, touched * round_moves_px(size, radius_px) ** 2 / 2 * np.eye(2))
-    chance = touched * round_moves_beyond(WRONG_PX, size, radius_px)
-    if chance > WRONG_CHANCE and not size.differs:
-        reason = f"it is {size.ratio:.2f} times as large as the other marks: something may touch it and have moved it"
-        sighter.doubt(index, f"{reason} by more than {WRONG_PX} px, with a probability of {chance:.1%}")
+                linear, is_damaged = fits[index].pixel_from_mark[:, :2], fits[index].damaged_fraction > 0
+                px_per_mm = float(np.sqrt(abs(np.linalg.det(linear))))
+                touch = touch_of_round(size, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
+                sighter.widen(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))
+                if is_damaged and not size.differs and touch.beyond(WRONG_PX) > WRONG_CHANCE:
+                    reason = f"it is {size.ratio:.2f} times as large as the other marks and damaged beside it: something"
+                    sighter.doubt(index, f"{reason} may touch it and have moved it by more than {WRONG_PX} px")
 
 
 def compare_shapes(sighter: FrameSighter) -> None:
@@ -152,16 +147,14 @@ def compare_shapes(sighter: FrameSighter) -> None:
             )
             sighter.doubt(index, f"{reason} degrees: something may cover or touch it")
         middle_px = reach_px(sighter.layout.marks[index].mark, fits[index].pixel_from_mark[:, :2]) / 2
-        moved_px = float(np.hypot(*(shape.on_place @ other.off)))
-        touched = other.touched(middle_px, fits[index].damaged_fraction > 0)
-        sighter.widen(index, Cause.TOUCHED, touched * moved_px**2 / 2 * np.eye(2))
+        touch = touch_of_edges(other, shape.on_place, middle_px, fits[index].damaged_fraction > 0)
+        sighter.widen(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))
 
 
-def _radius_px(mark: Mark, linear: Array) -> float:
-    """Of a round mark's outline; linear: (2, 2) px per mm."""
+def _radius_mm(mark: Mark) -> float:
+    """Of a round mark's outline."""
     parts = mark.parts if isinstance(mark, MarkShape) else ()
-    radius_mm = max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
-    return float(radius_mm * np.sqrt(abs(np.linalg.det(linear))))
+    return max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
 
 
 def _clear(sighter: FrameSighter) -> dict[int, Match]:

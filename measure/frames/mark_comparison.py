@@ -31,9 +31,12 @@ _TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no
 # rotation, as if two marks had shown it before. In three frames of ring-crosses it was 0.005 to 0.008, in four of a
 # réseau 0.014 to 0.021: this is their root mean square.
 _SIZE_SPREAD, _BEFORE = 0.014, 2
-# What touches a mark on one side moves its mean outline by so much, rms, and the share of marks that something touches:
-# of those with nothing cut out beside them, and with something.
-_TOUCHED_PX, _WHOLE, _DAMAGED = 0.3, 0.01, 0.03
+# The share of marks that something touches on one side: of those with nothing cut out beside them, and with something.
+_WHOLE, _DAMAGED = 0.01, 0.03
+# A speck is as large beside a large mark as beside a small one: it moves a round mark's mean outline by so much, rms,
+# over its radius. Five dots of 0.15 mm that were touched had it moved by 8 um.
+_SPECK_MM2 = 0.00125
+_TOUCHED_PX = 0.3  # the same along the edges of wedges and notches, which landscape touches
 # What moves one place of an outline by d moves the mean radius by a share of d, and the centre by twice that share.
 _AS_MUCH = 2.0
 
@@ -85,13 +88,14 @@ class SharedShape:
         """How many times the others' size it has."""
         return float(np.exp(self.off[0]))
 
-    def touched(self, reach_px: float, is_damaged: bool) -> float:
-        """The probability that something touches the mark on one side. reach_px: from its middle to its outline;
-        is_damaged: whether something was cut out beside it."""
+    def touched(self, spread: float, is_damaged: bool) -> float:
+        """The probability that something touches the mark on one side, by as much as its shape speaks for it more than
+        for what may happen to any mark. spread: of the figures of marks that are touched; is_damaged: whether something
+        was cut out beside it."""
         share = _DAMAGED if is_damaged else _WHOLE
-        touched = share * _density(self.off, np.hypot(self.sigma, _TOUCHED_PX / reach_px))
+        touched = share * _density(self.off, np.hypot(self.sigma, spread))
         untouched = (1 - share) * _density(self.off, self.sigma)
-        return touched / max(touched + untouched, 1e-300)
+        return max(touched / max(touched + untouched, 1e-300) - share, 0.0)
 
 
 def _density(off: Array, sigma: Array) -> float:
@@ -99,18 +103,38 @@ def _density(off: Array, sigma: Array) -> float:
     return float(np.prod(np.exp(-0.5 * (off / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)))
 
 
-def round_moves_px(shape: SharedShape, radius_px: float) -> float:
-    """How far what touches one side of a round mark moves it, where it gives it such a size."""
-    return _AS_MUCH * radius_px * abs(float(shape.off[0]))
+@dataclass(frozen=True)
+class Touch:
+    """What may touch a mark: with which probability, and how far, px, it has then moved it: a normal distribution."""
+
+    probability: float
+    moved_px: float
+    sigma_px: float
+
+    @property
+    def variance_px2(self) -> float:
+        """Of a coordinate, whichever way it was moved."""
+        return self.probability * (self.moved_px**2 + self.sigma_px**2) / 2
+
+    def beyond(self, px: float) -> float:
+        """The probability that it was moved farther."""
+        ends = (np.array([self.moved_px, -self.moved_px]) - px) / max(self.sigma_px, 1e-12)
+        return self.probability * float(ndtr(ends).sum())
 
 
-def round_moves_beyond(px: float, shape: SharedShape, radius_px: float) -> float:
-    """The probability that what touches one side of a round mark moves it farther than px, of marks that are touched
-    and have such a size."""
-    prior, said = (_TOUCHED_PX / radius_px) ** 2, shape.sigma[0] ** 2
-    sigma = _AS_MUCH * radius_px * np.sqrt(prior * said / (prior + said))
-    moved_px = round_moves_px(shape, radius_px) * prior / (prior + said)
-    return float(ndtr((moved_px - px) / sigma) + ndtr((-moved_px - px) / sigma))
+def touch_of_round(shape: SharedShape, radius_px: float, px_per_mm: float, is_damaged: bool) -> Touch:
+    """Of a round mark, by its size."""
+    spread = _SPECK_MM2 * px_per_mm**2 / radius_px**2
+    prior, said = spread**2, float(shape.sigma[0]) ** 2
+    moved = _AS_MUCH * radius_px * abs(float(shape.off[0])) * prior / (prior + said)
+    sigma = _AS_MUCH * radius_px * float(np.sqrt(prior * said / (prior + said)))
+    return Touch(shape.touched(spread, is_damaged), moved, sigma)
+
+
+def touch_of_edges(shape: SharedShape, on_place: Array, middle_px: float, is_damaged: bool) -> Touch:
+    """Of a wedge or a notch, whose place follows its own rotation and scale by on_place (2, k); middle_px: how far its
+    edges are from its point, on average."""
+    return Touch(shape.touched(_TOUCHED_PX / middle_px, is_damaged), float(np.hypot(*(on_place @ shape.off))), 0.0)
 
 
 def shared_sizes(fits: Sequence[Match], linear: Array) -> list[SharedShape | None]:

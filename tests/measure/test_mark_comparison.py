@@ -10,11 +10,11 @@ from measure.fitting.own_shape import OwnShape
 from measure.frames.mark_comparison import (
     SharedBlur,
     SharedShape,
-    round_moves_beyond,
-    round_moves_px,
+    Touch,
     shared_blurs,
     shared_shapes,
     shared_sizes,
+    touch_of_round,
 )
 
 PIXEL = 1 / 12
@@ -91,26 +91,35 @@ def test_what_touches_one_side_of_a_dot_widens_its_variance_and_chance_hardly_do
         moved = np.where(angle < rng.uniform(0.5, 2.0), rng.normal(0.0, 2.0), 0.0)
         size, *place = np.linalg.lstsq(outline, moved, rcond=None)[0] + rng.normal(0.0, known_px, 3)
         off.append(np.hypot(*place))
-        widened.append(touched(1 + size / radius_px, known_px / radius_px, radius_px))
-        chance.append(touched(np.exp(rng.normal(0.0, known_px / radius_px)), known_px / radius_px, radius_px))
+        widened.append(touch(1 + size / radius_px, known_px / radius_px, radius_px).variance_px2)
+        chance.append(touch(np.exp(rng.normal(0.0, known_px / radius_px)), known_px / radius_px, radius_px))
     sigmas = np.array(off) / np.hypot(known_px, np.sqrt(widened))
     assert np.mean(np.array(off) > 0.5) > 0.2
     assert sigmas[np.array(off) > 0.5].max() < 5.0
-    assert np.mean(chance) < 0.05 * known_px**2
+    assert np.mean([each.variance_px2 for each in chance]) < 0.05 * known_px**2
 
 
-def touched(ratio: float, sigma: float, radius_px: float) -> float:
+def touch(ratio: float, sigma: float, radius_px: float, px_per_mm: float = 36.0) -> Touch:
     shape = SharedShape(np.log([ratio]), np.array([sigma]), differs=False)
-    return shape.touched(radius_px, is_damaged=False) * round_moves_px(shape, radius_px) ** 2 / 2
+    return touch_of_round(shape, radius_px, px_per_mm, is_damaged=False)
+
+
+@pytest.mark.parametrize(("radius_px", "pitch_um"), [(5.0, 60.0), (50.0, 20.0), (150.0, 7.0)])
+def test_a_speck_is_no_larger_beside_a_large_mark(radius_px: float, pitch_um: float) -> None:
+    """A mark of a fine scan, as large as all others, is known no worse for what might touch it."""
+    for off in (-1.0, 0.0, 1.0):
+        one = touch(1 + 0.007 * off, 0.007, radius_px, 1000 / pitch_um)
+        assert one.variance_px2 < 1e-4
+        assert one.beyond(0.5) < 0.0015
 
 
 def test_how_likely_a_touched_dot_is_far_off_is_what_drawing_at_random_finds() -> None:
     rng, radius_px, sigma = np.random.default_rng(4), 5.3, 0.022
-    changes = rng.normal(0.0, 0.3 / radius_px, 400_000)
+    changes = rng.normal(0.0, 0.00125 * 36.0**2 / radius_px**2, 400_000)
     alike = np.abs(changes + rng.normal(0.0, sigma, len(changes)) + 0.054) < 0.002  # of those that look so small
-    shape = SharedShape(np.array([-0.054]), np.array([sigma]), differs=False)
+    one = touch(np.exp(-0.054), sigma, radius_px)
     expected = float(np.mean(np.abs(2 * radius_px * changes[alike]) > 0.5))
-    assert round_moves_beyond(0.5, shape, radius_px) == pytest.approx(expected, abs=0.02)
+    assert one.beyond(0.5) / one.probability == pytest.approx(expected, abs=0.02)
 
 
 def test_two_other_marks_tell_a_size_and_an_odd_one_does_not_spoil_the_others() -> None:
