@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from search import lines
 from true_marks import Kind, TrueMark
 
-from measure.checks.cross_checks import cross_checked
+from measure.checks.judgement import judged
 from measure.fiducial_options import FiducialOptions
 from measure.frames.fiducial_rows import present_frame
 from measure.frames.frame_measurement import measure_frame
@@ -60,7 +60,7 @@ def main() -> None:
             rng = np.random.default_rng([given.seed, number])
             line = {"frame": number, "kind": kind, "snr": snr, "radius": radius_px, "pitch": pitch_um}
             with given.out.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({**line, **judged(rng, kind, snr, radius_px, pitch_um / 1000)}) + "\n")
+                file.write(json.dumps({**line, **compared(rng, kind, snr, radius_px, pitch_um / 1000)}) + "\n")
     print_tables(lines(given.out))
 
 
@@ -82,7 +82,7 @@ def shape_of(kind: str, radius_px: float, mm: float) -> MarkShape:
     return MarkShape(polygon(tuple((2 * radius * x, 2 * radius * y) for x, y in corners)))
 
 
-def judged(rng: np.random.Generator, kind: str, snr: float, radius_px: float, mm: float) -> Json:
+def compared(rng: np.random.Generator, kind: str, snr: float, radius_px: float, mm: float) -> Json:
     """How many marks of a pair of frames are good, and why how many of these are doubted."""
     shape = shape_of(kind, radius_px, mm)
     apart_px = max(5.0 * radius_px, 100.0)
@@ -93,7 +93,7 @@ def judged(rng: np.random.Generator, kind: str, snr: float, radius_px: float, mm
     layout = FiducialLayout(marks, (4 * apart_px * mm,) * 2)
     made = [place + rng.normal(0, GIVEN_MM, 2) for place in given]
     pairs = [drawn_and_measured(rng, layout, made, snr, mm, apart_px) for _ in range(2)]
-    checked = cross_checked([frame for frame, _ in pairs], layout, [(1000 * mm, 1000 * mm)] * 2)
+    checked = judged([frame for frame, _ in pairs], layout, [(1000 * mm, 1000 * mm)] * 2).frames
     good, lost, reasons = 0, 0, Counter[str]()
     for frame, (_, truth_px) in zip(checked, pairs, strict=True):
         for mark, true in zip(frame.marks, truth_px, strict=True):
@@ -151,8 +151,8 @@ def print_tables(rows: list[Json]) -> None:
         for value in sorted({row[name] for row in rows}, key=str):
             own = [row for row in rows if row[name] == value]
             good, doubted = sum(row["good"] for row in own), sum(sum(row["doubted"].values()) for row in own)
-            print(f"{name:>7} {value!s:>10}: {good:5} good marks, {doubted:4} doubted, {doubted / max(good, 1):6.2%}; ", end="")
-            print(f"{sum(row['lost'] for row in own)} not found")
+            lost, share = sum(row["lost"] for row in own), doubted / max(good, 1)
+            print(f"{name:>7} {value!s:>10}: {good:5} good marks, {doubted:4} doubted, {share:6.2%}; {lost} not found")
     for reason, count in sum((Counter(row["doubted"]) for row in rows), Counter[str]()).most_common():
         print(f"{count:5}  {reason}")
 

@@ -1,5 +1,5 @@
-"""Frames measured with their pose left open and with it set, of every kind of mark: whatever is found with the true pose
-set must be found with `pose = "auto"`.
+"""Frames measured with their pose left open and with it set: whatever is found with the true pose set must be found
+with `pose = "auto"`, of every kind of mark.
 
 python benchmarks/pose_left_open.py OUT.jsonl [--frames 300] [--first 0] [--seed 1]
 
@@ -133,7 +133,10 @@ def print_table(rows: list[Json]) -> None:
         own = [row for row in rows if kind in (row["kind"], "all")]
         sums = [sum(row[name] for row in own) for name in ("visible", "true", "taken", "auto", "lost", "lost of taken")]
         losing = [row["frame"] for row in own if row["lost"] or row["lost of taken"]]
-        print(f"{kind:>16} {len(own):6} {sums[0]:7} {sums[1]:5} {sums[2]:5} {sums[3]:5} {sums[4]:5} {sums[5]:5}    ", losing)
+        print(
+            f"{kind:>16} {len(own):6} {sums[0]:7} {sums[1]:5} {sums[2]:5} {sums[3]:5} {sums[4]:5} {sums[5]:5}    ",
+            losing,
+        )
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ from measure.scans.scan import Scan
 from measure.search.constellation import sign_of
 from measure.search.frame_search import FrameSearch
 from measure.search.prediction import MarkPrediction
-from measure.status import Status
 
 Array = NDArray[np.float64]
 
@@ -51,15 +50,8 @@ def doubt(search: FrameSearch, frame: Frame) -> str:
 
 def expected_as_good(search: FrameSearch, frame: Frame) -> float:
     """How many frames as good chance would make in the scan, only marks without blemish counting as seen."""
-    return expected_where_seen(
-        search,
-        frame,
-        {
-            index: fit.center_px
-            for index, fit in enumerate(frame.fits)
-            if fit and frame.verdict(index)[0] is Status.MEASURED
-        },
-    )
+    seen = {index: frame.fits[index] for index in frame.unblemished}
+    return expected_where_seen(search, frame, {index: fit.center_px for index, fit in seen.items() if fit})
 
 
 def expected_where_seen(search: FrameSearch, frame: Frame, seen_px: dict[int, Array]) -> float:

@@ -78,9 +78,15 @@ class Frame:
         return self.agrees and clear >= self._least
 
     @property
+    def unblemished(self) -> list[int]:
+        """The marks that are measured, where the others have them."""
+        near = self.belongs & (self.misfit_mm <= _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM))
+        return [index for index in np.flatnonzero(near).tolist() if self.verdict(index)[0] is Status.MEASURED]
+
+    @property
     def measured(self) -> int:
         """How many marks are measured without blemish."""
-        return sum(self.verdict(int(index))[0] is Status.MEASURED for index in np.flatnonzero(self.belongs))
+        return len(self.unblemished)
 
     @property
     def is_sure(self) -> bool:
@@ -114,7 +120,7 @@ class Frame:
         )
 
     def verdict(self, index: int) -> tuple[Status, str]:
-        """What became of a mark that was fitted."""
+        """What became of a mark that was fitted, by its picture: where it lies beside the others tells of the frame."""
         fit = self.sightings[index].fit
         if fit is None or not self.belongs[index]:
             off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.belongs.sum())} marks put it"
@@ -129,6 +135,4 @@ class Frame:
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
         if chdtrc(2, (WRONG_PX / sigma_px) ** 2) > WRONG_CHANCE:
             reasons.append(f"its standard deviation is {sigma_px:.2f} px")
-        if self.misfit_mm[index] > _FAR * max(self.scatter_mm, _LEAST_SCATTER_MM):
-            reasons.append(f"it lies {self.misfit_mm[index]:.2f} mm from where the others put it: the film is deformed")
         return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")

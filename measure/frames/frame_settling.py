@@ -124,7 +124,9 @@ def compare_sizes(sighter: FrameSighter) -> None:
                 touch = touch_of_round(size, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
                 sighter.widen(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))
                 if is_damaged and not size.differs and touch.beyond(WRONG_PX) > WRONG_CHANCE:
-                    reason = f"it is {size.ratio:.2f} times as large as the other marks and damaged beside it: something"
+                    reason = (
+                        f"it is {size.ratio:.2f} times as large as the other marks and damaged beside it: something"
+                    )
                     sighter.doubt(index, f"{reason} may touch it and have moved it by more than {WRONG_PX} px")
 
 

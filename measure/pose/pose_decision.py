@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fiducial_options import FiducialOptions
+from measure.film import SCATTER_DEGREES
 from measure.fitting.matching import Match
 from measure.frames.frame import Frame
 from measure.frames.frame_fit import FrameFit, fit_frame
@@ -34,7 +35,6 @@ _NAMED = 4.0  # times the gate: how far from where a pose's placement puts a mar
 _UNMIRRORED = 2.3  # log-odds before anything is seen: ten to one; of 16 scans of archives none was mirrored
 _QUOTED = 3  # lines of writing that are told
 _FREE_MM = 1e3  # the standard deviation of a place that is not given
-_FILM_DEGREES = 4.0  # of freedom that the standard deviations of film and given places are known with: to a third
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +148,8 @@ class _Named:
         """The coordinates' likelihood is Student's: nobody knows the film's standard deviation well."""
         if self.fit is None:
             return _Verdict(self.pose, self.names, pictures, 0.0, 0.0)
-        degrees = _FILM_DEGREES + max(self.fit.redundancy, 0)
-        coordinates = -degrees / 2 * float(np.log1p(self.fit.chi_square / _FILM_DEGREES))
+        degrees = SCATTER_DEGREES + max(self.fit.redundancy, 0)
+        coordinates = -degrees / 2 * float(np.log1p(self.fit.chi_square / SCATTER_DEGREES))
         return _Verdict(self.pose, self.names, pictures, coordinates, self.fit.chi_square)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from measure.checks.cross_checks import cross_checked
+from measure.checks.judgement import judged
 from measure.checks.lost_pixels import without_lost
 from measure.checks.pitch_check import pitch_problem
 from measure.codes_and_boards.coma import one_definition
@@ -53,7 +53,7 @@ def measure_scans(project: Project, reporter: Reporter, learned_folder: Path) ->
         learned = learn_marks(project, reporter, workers, learned_folder)
         scans = _measured_scans(learned, reporter, workers)
         scans = _of_each_camera(project, scans, _at_one_definition)
-        checked = with_checked_sheet(project, _of_each_camera(learned, scans, partial(_cross_checked, learned)))
+        checked = with_checked_sheet(project, _of_each_camera(learned, scans, partial(_judged, learned)))
         if project.ties is None:
             return checked
         with reporter.stage("natural points sought in") as count:
@@ -106,12 +106,12 @@ def _at_one_definition(_: CameraFile, scans: Sequence[MeasuredScan]) -> list[Fra
     return [replace(frame, marks=own) for frame, own in zip(frames, marks, strict=True)]
 
 
-def _cross_checked(project: Project, camera: CameraFile, scans: Sequence[MeasuredScan]) -> Sequence[FrameMeasurement]:
-    """The fiducials checked against one another, if the camera has any."""
+def _judged(project: Project, camera: CameraFile, scans: Sequence[MeasuredScan]) -> Sequence[FrameMeasurement]:
+    """The fiducials judged together, if the camera has any."""
     frames = [scan.frame for scan in scans]
     if not camera.drawn:
         return frames
-    return cross_checked(frames, camera.layout(), [scan.pitch_um for scan in scans], project.film_sigma_mm)
+    return judged(frames, camera.layout(), [scan.pitch_um for scan in scans], project.film_sigma_mm).frames
 
 
 def _check_anything_to_measure(project: Project) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from measure.checks.cross_checks import cross_checked
+from measure.checks.judgement import judged
 from measure.covariance import Covariance
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement, MarkMeasurement
@@ -48,7 +48,7 @@ def frame_of(
 
 def weak(frames: list[FrameMeasurement], sigma_mm: float = 0.02, pitch_mm: float = MM) -> dict[str, set[str]]:
     """The weak marks by frame, checked as scans of pitch_mm."""
-    checked = cross_checked(frames, layout_of(THREE, sigma_mm), [(1000 * pitch_mm, 1000 * pitch_mm)] * len(frames))
+    checked = judged(frames, layout_of(THREE, sigma_mm), [(1000 * pitch_mm, 1000 * pitch_mm)] * len(frames)).frames
     found = {frame.image: {mark.point for mark in frame.marks if mark.status is Status.WEAK} for frame in checked}
     return {image: points for image, points in found.items() if points}
 
@@ -67,7 +67,7 @@ def test_a_triangle_of_another_form_than_given_is_weak(mirror: bool) -> None:
     the mark may be off, and its covariance says so."""
     frame = frame_of(np.random.default_rng(2), off_mm={"1": (1.0, 0.0)}, mirror=mirror)
     layout = layout_of(THREE)
-    (checked,) = cross_checked([frame], layout, [(1000 * MM, 1000 * MM)])
+    (checked,) = judged([frame], layout, [(1000 * MM, 1000 * MM)]).frames
     first = checked.marks[0]
     assert first.status is Status.WEAK
     assert "three marks have no other check" in first.reason

@@ -1,0 +1,124 @@
+"""What judging a camera's frames together finds, by simulated places: good marks doubted and frames that are told without
+need, marks that are off, bent frames, given coordinates and scanners that are.
+
+PYTHONPATH=tests/measure python benchmarks/judged_cameras.py [CAMERAS] [--seed 1]
+"""
+
+import argparse
+from collections.abc import Callable
+
+import numpy as np
+from test_judgement import EIGHT, FILM_MM, FOUR, PX_PER_MM, SIGMA_PX, frames_of, layout_of, moved, weak
+
+from measure.checks.judgement import Judgement, judged
+from measure.marks.shapes import FiducialLayout
+from measure.results import FrameMeasurement
+
+PITCH_UM = 1000 / PX_PER_MM
+POSES = ("0", "90", "180", "270m")
+COUNTS = (1, 2, 3, 6, 12)
+Frames = list[FrameMeasurement]
+Made = Callable[[FiducialLayout, int, np.random.Generator], tuple[Frames, str]]
+
+
+def main() -> None:
+    """Print a line a kind of cameras, a column a number of frames."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("cameras", type=int, nargs="?", default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    print(f"{'of ' + str(given.cameras) + ' cameras':>58} " + "".join(f"{count:>5} frames" for count in COUNTS))
+    for name, places, sigma_mm, made in kinds():
+        rng, cells = np.random.default_rng(given.seed), []
+        for count in COUNTS:
+            told = [outcome(made, layout_of(places, sigma_mm), count, rng) for _ in range(given.cameras)]
+            cells.append(f"{sum(right for right, _ in told):5}/{sum(wrong for _, wrong in told):<5}")
+        print(f"{name:>58} " + " ".join(cells))
+    print("as it should be / a good mark is weak, or another frame, or another cause, is told")
+
+
+def kinds() -> list[tuple[str, list[tuple[float, float]], float, Made]]:
+    """What the cameras have, their marks, the standard deviation of these, and how the frames are made."""
+    return [
+        ("four marks, given to 5 um, film 3 um", FOUR, 0.005, good),
+        ("eight marks, given to 5 um, film 3 um", EIGHT, 0.005, good),
+        ("eight marks, given to 5 um, film 10 um", EIGHT, 0.005, scattering),
+        ("eight marks of unknown places, film 3 um", EIGHT, 1.0, good),
+        (
+            "eight: a mark 10 sigmas off, places unknown",
+            EIGHT,
+            1.0,
+            one_mark(10 * np.hypot(SIGMA_PX, FILM_MM * PX_PER_MM)),
+        ),
+        ("eight: a mark 0.05 mm off", EIGHT, 0.005, one_mark(0.05 * PX_PER_MM)),
+        ("eight: a frame's film bent by 0.03 mm", EIGHT, 0.005, bent),
+        ("four: a frame's film bent by 0.1 mm", FOUR, 0.005, strongly_bent),
+        ("four: given coordinates wrong by 0.4 mm", FOUR, 0.005, wrong_places),
+        ("eight: given coordinates wrong by 0.05 mm", EIGHT, 0.005, slightly_wrong_places),
+        ("eight: a scanner that bends by 0.05 mm, four poses", EIGHT, 0.005, scanner),
+    ]
+
+
+def outcome(made: Made, layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[bool, bool]:
+    """Whether what there is was told, and whether anything else was."""
+    frames, expected = made(layout, count, rng)
+    result = judged(frames, layout, [(PITCH_UM, PITCH_UM)] * count)
+    told = said(result)
+    if count == 1 and expected not in ("", "mark"):
+        expected = "frame"  # of one frame nobody can tell which it is
+    return told == {expected} - {""}, bool(told - {expected})
+
+
+def said(result: Judgement) -> set[str]:
+    """The causes that are told, the first frame being the one that may be another."""
+    causes = {"mark" if where == ("0", "2") else "another mark" for where in weak(result.frames)}
+    for number, frame in enumerate(result.frames):
+        for problem in frame.problems:
+            if "no affine" in problem:
+                causes.add("another frame" if number else "frame")
+            else:
+                causes.add("scanner" if "scanner's axes" in problem else "places")
+    return causes
+
+
+def good(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
+    return frames_of(layout, count, rng, camera_mm=0.005, poses=POSES), ""
+
+
+def scattering(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
+    return frames_of(layout, count, rng, camera_mm=0.005, film_mm=0.01, poses=POSES), ""
+
+
+def one_mark(off_px: float) -> Made:
+    def made(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
+        frames, angle = good(layout, count, rng)[0], rng.uniform(0, 2 * np.pi)
+        frames[0] = moved(frames[0], 2, (off_px * np.cos(angle), off_px * np.sin(angle)))
+        return frames, "mark"
+
+    return made
+
+
+def bent(layout: FiducialLayout, count: int, rng: np.random.Generator, film_mm: float = 0.03) -> tuple[Frames, str]:
+    frames = good(layout, count, rng)[0]
+    frames[0] = frames_of(layout, 1, rng, film_mm=film_mm)[0]
+    return frames, "frame"
+
+
+def strongly_bent(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
+    return bent(layout, count, rng, 0.1)
+
+
+def wrong_places(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
+    return frames_of(layout, count, rng, camera_mm=0.4, poses=POSES), "places"
+
+
+def slightly_wrong_places(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
+    return frames_of(layout, count, rng, camera_mm=0.05, poses=POSES), "places"
+
+
+def scanner(layout: FiducialLayout, count: int, rng: np.random.Generator) -> tuple[Frames, str]:
+    return frames_of(layout, count, rng, camera_mm=0.005, scanner_mm=0.05, poses=POSES), "scanner"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,208 @@
+"""The frames of a camera judged together: what their marks' misfits speak of.
+
+A mark's picture says how well the mark was measured. That marks do not fit the given places under an affine
+transformation says something of the given places, of the scanner, of a frame's film, or of one mark, and often only the
+other frames can tell. The same misfit in all frames in the camera's axes speaks of the given places, in the axes of the
+scan of the scanner, in one frame of its film, at one mark alone of that mark. These are compared as hypotheses, each of
+them a covariance of the misfits. Film is a problem of its frame and a variance of the frame's marks; only what speaks
+of a mark alone makes that mark weak.
+
+Judging changes nothing that was measured: it is made anew from all frames of a camera whenever one comes to them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from measure.checks.doubts import CHANCE, TOLD, Doubt, doubted, from_others, observed
+from measure.checks.explanation import Explanation, explained
+from measure.checks.misfits import Misfit, scan_sites
+from measure.checks.triangles import by_given_triangles, by_other_triangles
+from measure.covariance import Cause
+from measure.film import SCATTER_MM
+from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.results import FrameMeasurement
+
+Array = NDArray[np.float64]
+
+_UNKNOWN_MM = 1.0  # of a pattern of which nothing is believed beforehand
+_TOLD_MARKS = 4  # in a sentence
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """frames: with the statuses, covariances and problems that all frames together give. film_sigma_mm: of each frame,
+    along an axis; what is believed beforehand where the frames do not contradict it."""
+
+    frames: tuple[FrameMeasurement, ...]
+    film_sigma_mm: tuple[float, ...]
+
+
+def judged(
+    frames: Sequence[FrameMeasurement],
+    layout: FiducialLayout,
+    pitches_um: Sequence[tuple[float, float]],
+    film_sigma_mm: float = SCATTER_MM,
+) -> Judgement:
+    """All measured frames of one camera, judged. pitches_um: of each scan, in x and y; film_sigma_mm: what is believed
+    beforehand of the scatter of marks by film and scanner."""
+    checked = _doubted(frames, _by_other_method(frames))
+    checked, films = _by_misfits(checked, layout, film_sigma_mm)
+    checked = _doubted(checked, list(by_other_triangles(checked, layout, pitches_um, film_sigma_mm)))
+    checked = _doubted(checked, list(by_given_triangles(checked, layout, pitches_um)))
+    return Judgement(tuple(checked), tuple(films))
+
+
+def _doubted(frames: Sequence[FrameMeasurement], doubts: Sequence[Mapping[str, Doubt]]) -> list[FrameMeasurement]:
+    return [doubted(frame, own) for frame, own in zip(frames, doubts, strict=True)]
+
+
+def _by_other_method(frames: Sequence[FrameMeasurement]) -> list[dict[str, Doubt]]:
+    """The place by the mark's edges must not differ from the matched one by more than noise explains."""
+    name = "second_method_sigmas"
+    tests = sum(name in mark.quality for frame in frames for mark in observed(frame))
+    doubts = []
+    for frame in frames:
+        own = {}
+        for mark in observed(frame):
+            sigmas = mark.quality.get(name)
+            if sigmas is not None and chdtrc(2, sigmas**2) * tests < CHANCE:
+                off = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
+                own[mark.point] = Doubt(
+                    f"its edges put it {off:#.2g} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
+                    "it is damaged or unlike its drawing",
+                    off,
+                    Cause.SECOND_METHOD,
+                )
+        doubts.append(own)
+    return doubts
+
+
+def _by_misfits(
+    frames: Sequence[FrameMeasurement], layout: FiducialLayout, film_mm: float
+) -> tuple[list[FrameMeasurement], list[float]]:
+    """The frames with what their misfits say, and the film's standard deviation in each."""
+    found = {place: Misfit.of(frame, layout) for place, frame in enumerate(frames)}
+    misfits = {place: each for place, each in found.items() if each is not None}
+    if not misfits:
+        return list(frames), [film_mm] * len(frames)
+    given = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
+    shared, problem = _shared(misfits, {place: frames[place] for place in misfits}, layout, given, film_mm)
+    result, films = [], []
+    for place, frame in enumerate(frames):
+        own_mm, own_problems = _film_of(shared, place, layout, film_mm)
+        doubts, extra_mm2 = _doubts(shared, place, layout), own_mm**2 - film_mm**2
+        problems = (*frame.problems, *own_problems, *([problem] if problem and place in misfits else []))
+        result.append(replace(_with_film(doubted(frame, doubts), extra_mm2), problems=problems))
+        films.append(own_mm)
+    return result, films
+
+
+def _shared(
+    misfits: Mapping[int, Misfit],
+    frames: Mapping[int, FrameMeasurement],
+    layout: FiducialLayout,
+    given_mm: Array,
+    film_mm: float,
+) -> tuple[Explanation, str]:
+    """What explains the misfits best: the given places being right, or wrong, or the scanner bending all scans; and a
+    sentence where it is not the first."""
+    if len(misfits) == 1:
+        return explained(misfits, given_mm, 0.0, film_mm), ""
+    by_places = explained(misfits, given_mm, _UNKNOWN_MM, film_mm)
+    poses = [pose.name if (pose := frame.pose) else "0" for frame in frames.values()]
+    is_clear = by_places.chance_of_pattern >= CHANCE
+    is_quiet = not any(each.film_mm is not None or each.off_mm for each in by_places.frames.values())
+    if is_clear and (is_quiet or len(set(poses)) == 1):
+        return explained(misfits, given_mm, 0.0, film_mm), ""
+    if len(set(poses)) == 1:
+        return by_places, _of_places(by_places, layout, " The scanner may do the same: all frames lie alike in it.")
+    sites = scan_sites(list(misfits.values()), poses)
+    turned = {
+        place: each.widened(given_mm[each.index] ** 2).in_scan_axes(pose, sites)
+        for (place, each), pose in zip(misfits.items(), poses, strict=True)
+    }
+    by_scanner = explained(turned, np.zeros(len(sites)), _UNKNOWN_MM, film_mm)
+    lead = by_scanner.log_evidence - by_places.log_evidence
+    if lead > TOLD and by_scanner.chance_of_pattern < CHANCE:
+        return by_scanner, _of_scanner(by_scanner)
+    if is_clear:
+        return explained(misfits, given_mm, 0.0, film_mm), ""
+    return by_places, _of_places(by_places, layout, "" if lead < -TOLD else " The scanner may do the same.")
+
+
+def _of_places(shared: Explanation, layout: FiducialLayout, rest: str) -> str:
+    off = {mark.id: float(np.hypot(*xy)) for mark, xy in zip(layout.marks, shared.pattern.mm, strict=True)}
+    return (
+        f"in all frames of the camera the marks lie beside the given coordinates in the same way, "
+        f"{_told(off)}, under an affine transformation: their standard deviations allow that with a probability of "
+        f"{shared.chance_of_pattern:.1g}. Look whether these are the coordinates of this camera.{rest}"
+    )
+
+
+def _of_scanner(shared: Explanation) -> str:
+    most = float(np.hypot(*shared.pattern.mm.T).max())
+    return (
+        f"all scans are bent in the same way in the scanner's axes, by up to {most:.3f} mm beside an affine "
+        f"transformation (probability of chance {shared.chance_of_pattern:.1g}): the scanner does it."
+    )
+
+
+def _told(off_mm: Mapping[str, float]) -> str:
+    """Those marks farthest off, with their distances."""
+    worst = sorted(off_mm, key=lambda name: -off_mm[name])[:_TOLD_MARKS]
+    rest = f", {len(off_mm) - len(worst)} others by less" if len(off_mm) > len(worst) else ""
+    return ", ".join(f"{name} by {off_mm[name]:.3f} mm" for name in worst) + rest
+
+
+def _film_of(shared: Explanation, place: int, layout: FiducialLayout, believed_mm: float) -> tuple[float, list[str]]:
+    """The film's standard deviation in a frame, and sentences where it stands out."""
+    frame = shared.frames.get(place)
+    if frame is None or frame.film_mm is None:
+        return (shared.film.sigma_mm if shared.film.is_more else believed_mm), []
+    alone = len(shared.frames) == 1
+    off = frame.misfit.distances_mm(shared.expected_mm(place)[0])
+    names = [layout.marks[index].id for index in frame.misfit.index]
+    told = _told(dict(zip(names, off.tolist(), strict=True)))
+    than = "the given coordinates" if alone else "what the camera's frames have in common"
+    cause = (
+        "Film or scanner bent it, or the coordinates are not those of this camera; one frame does not tell."
+        if alone
+        else "Its film is bent, or was moved while it was scanned."
+    )
+    return frame.film_mm, [
+        f"no affine transformation takes {than} to its marks, which lie off, {told}; film makes as much with a "
+        f"probability of {frame.chance:.1g}. {cause} Its marks count as known to {1000 * frame.film_mm:.0f} um."
+    ]
+
+
+def _doubts(shared: Explanation, place: int, layout: FiducialLayout) -> dict[str, Doubt]:
+    """The marks of a frame that alone are off."""
+    frame = shared.frames.get(place)
+    if frame is None:
+        return {}
+    alone = len(shared.frames) == 1
+    doubts = {}
+    for number, off in frame.off_mm.items():
+        name = layout.marks[frame.misfit.index[number]].id
+        from_given = f"it lies {off:.3f} mm from where the other marks have it, more than film and given places explain"
+        reason = from_given if alone else from_others(off, [name])
+        doubts[name] = Doubt(reason, off / frame.misfit.mm, Cause.GIVEN_PLACES if alone else Cause.OTHER_FRAMES)
+    return doubts
+
+
+def _with_film(frame: FrameMeasurement, variance_mm2: float) -> FrameMeasurement:
+    """With what the film adds to the covariance of each of its fiducials."""
+    if variance_mm2 <= 0 or frame.px_per_mm is None:
+        return frame
+    added = variance_mm2 * frame.px_per_mm**2 * np.eye(2)
+    marks = tuple(
+        replace(mark, covariance=mark.covariance.plus(Cause.FILM, added))
+        if mark.kind == "fiducial" and mark.status.is_observation and mark.covariance is not None
+        else mark
+        for mark in frame.marks
+    )
+    return replace(frame, marks=marks)
