@@ -1,5 +1,5 @@
-"""What judging a camera's frames together finds, by simulated places: good marks doubted and frames that are told without
-need, marks that are off, bent frames, given coordinates and scanners that are.
+"""What judging a camera's frames together finds, by simulated places: marks that are off, bent frames, given
+coordinates and scanners that are; and how often it tells what is not.
 
 PYTHONPATH=tests/measure python benchmarks/judged_cameras.py [CAMERAS] [--seed 1]
 """

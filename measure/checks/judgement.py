@@ -112,10 +112,10 @@ def _shared(
     sentence where it is not the first."""
     if len(misfits) == 1:
         return explained(misfits, given_mm, 0.0, film_mm), ""
-    by_places = explained(misfits, given_mm, _UNKNOWN_MM, film_mm)
+    by_places = _with_pattern(misfits, given_mm, film_mm)
     poses = [pose.name if (pose := frame.pose) else "0" for frame in frames.values()]
     is_clear = by_places.chance_of_pattern >= CHANCE
-    is_quiet = not any(each.film_mm is not None or each.off_mm for each in by_places.frames.values())
+    is_quiet = not (by_places.film.is_more or any(each.film_mm or each.off_mm for each in by_places.frames.values()))
     if is_clear and (is_quiet or len(set(poses)) == 1):
         return explained(misfits, given_mm, 0.0, film_mm), ""
     if len(set(poses)) == 1:
@@ -125,13 +125,21 @@ def _shared(
         place: each.widened(given_mm[each.index] ** 2).in_scan_axes(pose, sites)
         for (place, each), pose in zip(misfits.items(), poses, strict=True)
     }
-    by_scanner = explained(turned, np.zeros(len(sites)), _UNKNOWN_MM, film_mm)
+    by_scanner = _with_pattern(turned, np.zeros(len(sites)), film_mm)
     lead = by_scanner.log_evidence - by_places.log_evidence
     if lead > TOLD and by_scanner.chance_of_pattern < CHANCE:
         return by_scanner, _of_scanner(by_scanner)
     if is_clear:
         return explained(misfits, given_mm, 0.0, film_mm), ""
     return by_places, _of_places(by_places, layout, "" if lead < -TOLD else " The scanner may do the same.")
+
+
+def _with_pattern(misfits: Mapping[int, Misfit], sigma_mm: Array, film_mm: float) -> Explanation:
+    """With a pattern beyond its sites' standard deviations, as large as it is: what is not believed beforehand speaks
+    against a hypothesis by how much room it takes."""
+    wide = explained(misfits, sigma_mm, _UNKNOWN_MM, film_mm)
+    size_mm = float(np.sqrt(np.mean(wide.pattern.mm**2)))
+    return explained(misfits, sigma_mm, max(size_mm, film_mm), film_mm)
 
 
 def _of_places(shared: Explanation, layout: FiducialLayout, rest: str) -> str:
