@@ -29,6 +29,7 @@ from pipeline.measuring.camera_trials import identify
 from pipeline.measuring.scan_kinds import identify_kinds, print_kinds, scan_files
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
+from pipeline.resampling.resample_stage import resample, resampled_json
 from pipeline.summary import Summary, print_summary
 from pipeline.terminal import PlainConsole, plain, spell_out_missing_letters
 
@@ -139,6 +140,30 @@ def choose(project: ProjectFile, as_json: AsJson = False) -> int:
     else:
         print_choice(choice, PlainConsole(), settings.choice_path)
     return DONE if choice.chosen and choice.chosen.model == choice.given else LOOK
+
+
+@app.command("resample")
+def resample_scans(
+    project: ProjectFile,
+    out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the frames go.", show_default=False)],
+    pitch_um: Annotated[
+        float | None,
+        typer.Option("--pitch-um", metavar="UM", min=FINEST_PITCH_UM, help="The frames' pixel; by default the scan's."),
+    ] = None,
+    lens: Annotated[bool, typer.Option("--lens", help="Take the distortion out, too.")] = False,
+    fast: Annotated[bool, typer.Option("--fast", help="Splines of degree 3 in place of 5: a tenth as true.")] = False,
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """The scans in their camera's frame: film transformation and pose taken out."""
+    results = resample(_read(project, max_pixels), out_dir, pitch_um, lens, fast, Reporter())
+    if as_json:
+        _echo_json(resampled_json(results))
+    for result in results if not as_json else ():
+        told = result.problem or f"{result.width_px} x {result.height_px} px{', as it was' if result.kept else ''}"
+        clamped = f", {result.clamped} samples clamped to what can be stored" if result.clamped else ""
+        typer.echo(f"{plain(result.image)}: {plain(told)}{clamped}")
+    return LOOK if any(result.problem for result in results) else DONE
 
 
 @app.command()
@@ -283,7 +308,11 @@ def _name_cameras(
 def _with_project(
     path: Path, stage: Callable[[Project, Reporter], Summary], as_json: bool, max_pixels: int | None = None
 ) -> int:
-    return _finish(stage(replace(read_project(path), max_pixels=max_pixels), Reporter()), as_json)
+    return _finish(stage(_read(path, max_pixels), Reporter()), as_json)
+
+
+def _read(path: Path, max_pixels: int | None) -> Project:
+    return replace(read_project(path), max_pixels=max_pixels)
 
 
 def _finish(summary: Summary, as_json: bool) -> int:

@@ -1,11 +1,13 @@
 """TIFF and BigTIFF files by tiles and strips: every compression that tifffile and imagecodecs know."""
 
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
 from tifffile import TiffFile, TiffPage
 
+from measure.errors import MeasurementError
 from measure.scans.broken import DECODING_ERRORS, broken, unsupported
 from measure.scans.quantisation import rounding_step_dn
 from measure.scans.radiometry import Radiometry
@@ -37,6 +39,7 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> tuple[Segments, Pitc
         raise broken(path, str(error)) from error
     try:
         page, notes = _main_page(file, path)
+        _check_original(page, path)
         radiometry = _page_radiometry(page, path)
         _check_sizes(page, path, max_pixels)
         _check_extent(page, path, taken)
@@ -62,6 +65,15 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     if len(full) > 1:
         notes.append(f"the file holds {len(full)} pictures: the first was taken")
     return full[0], (*notes, *orientation_notes(full[0]))
+
+
+def _check_original(page: TiffPage, path: Path) -> None:
+    """Marks are measured where the scanner saw them: in a resampled frame the film is gone from their places, and the
+    noise from their standard deviations."""
+    if re.match(r'\s*\{"reseau": .*"pitch_mm": ', page.description):
+        raise MeasurementError(
+            f"{path}: is a frame that reseau has resampled, and no scan. Measure the scan that it was made of."
+        )
 
 
 def orientation_notes(page: TiffPage) -> tuple[str, ...]:

@@ -1,0 +1,142 @@
+"""What resampling does to a picture: marks shifted, noise and sharpness lost, beside other programs' interpolations.
+
+    python benchmarks/resampling.py [side_px] [--large]
+
+The picture is of known formula, turned by 0.37 degrees at a scale of 0.9985. --large: time and peak memory of a scan of
+11,500 px, 16 bit, in strips, that lies turned by 90 degrees.
+"""
+
+import multiprocessing
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from adjust.functional_model.transformation import Film
+from pipeline.resampling.frame_chain import FrameChain
+from pipeline.resampling.interpolation import Degree
+from pipeline.resampling.resample_stage import BEST, ResampleTask, resampled
+
+Array = NDArray[np.float64]
+Method = Callable[[Array, Array, Array], Array]
+
+TURN, SCALE = np.radians(0.37), 0.9985
+BLUR_PX, PEAK = 1.4, 20000.0
+SPACING_PX, WINDOW_PX = 40, 8
+HALF_NYQUIST = 0.25  # cycles a pixel
+
+
+def by_opencv(kind: int) -> Method:
+    def method(picture: Array, cols: Array, rows: Array) -> Array:
+        maps = cols.astype(np.float32), rows.astype(np.float32)
+        return np.asarray(cv2.remap(picture.astype(np.float32), *maps, kind, borderMode=cv2.BORDER_REFLECT), float)
+
+    return method
+
+
+def by_spline(degree: Degree) -> Method:
+    return lambda picture, cols, rows: np.asarray(map_coordinates(picture, [rows, cols], order=degree, mode="mirror"))
+
+
+METHODS: dict[str, Method] = {
+    "reseau (spline 5)": by_spline(5),
+    "reseau --fast (spline 3)": by_spline(3),
+    "OpenCV linear": by_opencv(cv2.INTER_LINEAR),
+    "OpenCV cubic": by_opencv(cv2.INTER_CUBIC),
+    "OpenCV Lanczos4": by_opencv(cv2.INTER_LANCZOS4),
+}
+
+
+def source_places(side: int) -> tuple[Array, Array]:
+    """Where the result's pixels lie in the picture."""
+    col, row = np.meshgrid(np.arange(side, dtype=float), np.arange(side, dtype=float))
+    u, v = col - side / 2, row - side / 2
+    return (
+        SCALE * (np.cos(TURN) * u - np.sin(TURN) * v) + side / 2,
+        SCALE * (np.sin(TURN) * u + np.cos(TURN) * v) + side / 2,
+    )
+
+
+def marks(side: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """A picture of Gaussian marks, and their middles (n, 2)."""
+    grid = np.arange(SPACING_PX, side - SPACING_PX, SPACING_PX, dtype=float)
+    middles = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) + rng.uniform(0, 1, (grid.size**2, 2))
+    picture = np.full((side, side), 8000.0)
+    at = np.arange(-WINDOW_PX, WINDOW_PX + 1)
+    for x, y in middles:
+        col, row = int(x), int(y)
+        gx, gy = (np.exp(-((at + i - z) ** 2) / (2 * BLUR_PX**2)) for i, z in ((col, x), (row, y)))
+        picture[row - WINDOW_PX : row + WINDOW_PX + 1, col - WINDOW_PX : col + WINDOW_PX + 1] += PEAK * np.outer(gy, gx)
+    return picture, middles
+
+
+def shifts(result: Array, middles: Array) -> Array:
+    """How far (n, 2) marks lie from where the transformation puts them, by least squares with their true form."""
+    side = len(result)
+    u, v = (middles - side / 2).T / SCALE
+    places = np.stack([np.cos(TURN) * u + np.sin(TURN) * v, -np.sin(TURN) * u + np.cos(TURN) * v], axis=1) + side / 2
+    at, blur, off = np.arange(-WINDOW_PX, WINDOW_PX + 1), BLUR_PX / SCALE, []
+    for x, y in places[((places > 2 * WINDOW_PX) & (places < side - 2 * WINDOW_PX)).all(axis=1)]:
+        col, row = round(x), round(y)
+        dx, dy = at + col - x, at + row - y
+        form = np.outer(np.exp(-(dy**2) / (2 * blur**2)), np.exp(-(dx**2) / (2 * blur**2)))
+        slopes = [form * dx / blur**2, form * dy[:, None] / blur**2]
+        design = np.stack([form, np.ones_like(form), *(PEAK * slope for slope in slopes)], axis=-1).reshape(-1, 4)
+        seen = result[row - WINDOW_PX : row + WINDOW_PX + 1, col - WINDOW_PX : col + WINDOW_PX + 1]
+        off.append(np.linalg.lstsq(design, seen.ravel(), rcond=None)[0][2:])
+    return np.array(off)
+
+
+def compare(side: int) -> None:
+    rng = np.random.default_rng(5)
+    cols, rows = source_places(side)
+    inner = slice(side // 8, -side // 8)
+    picture, middles = marks(side, rng)
+    noise = rng.normal(0, 100.0, (side, side))
+    wave = 1000.0 * np.cos(2 * np.pi * HALF_NYQUIST * np.arange(side))[None, :] * np.ones((side, 1))
+    print("| interpolation | marks shifted, rms px | noise left | contrast at half Nyquist | CPU s |")
+    print("|---|---|---|---|---|")
+    for name, method in METHODS.items():
+        start = time.process_time()
+        result = method(picture, cols, rows)
+        seconds = time.process_time() - start
+        off = np.sqrt(np.mean(shifts(result, middles) ** 2))
+        left = method(noise, cols, rows)[inner, inner].std() / 100.0
+        contrast = method(wave, cols, rows)[inner, inner].std() / (1000.0 / np.sqrt(2))
+        print(f"| {name} | {off:.4f} | {left:.3f} | {contrast:.3f} | {seconds:.2f} |")
+
+
+def make_scan(path: Path, side: int) -> None:
+    picture = np.random.default_rng(5).integers(9000, 20000, (side, side), dtype=np.uint16)
+    tifffile.imwrite(path, picture, rowsperstrip=64, compression="lzw")
+
+
+def large(side: int = 11500) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        maker = multiprocessing.get_context("spawn").Process(target=make_scan, args=(folder / "scan.tif", side))
+        maker.start()  # whose memory is not that of the resampling
+        maker.join()
+        turned = np.array([1.0, 0.002, -1.0, -1.0, 1.0, 0.002])
+        chain = FrameChain((20.0, 20.0), Film("affine", turned, np.zeros(2)))
+        task = ResampleTask("a", "K", folder / "scan.tif", chain, "90", 0.02, BEST, None, folder / "a.tif")
+        before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, time.process_time()
+        done = resampled(task)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(f"{done.width_px} x {done.height_px} px: {time.process_time() - start:.1f} s of CPU, peak {peak:.0f} MiB")
+        print(f"(the process had {before:.0f} MiB before)")
+
+
+if __name__ == "__main__":
+    if "--large" in sys.argv:
+        large()
+    else:
+        compare(int(sys.argv[1]) if len(sys.argv) > 1 else 1600)

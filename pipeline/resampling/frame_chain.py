@@ -1,0 +1,99 @@
+"""The way from a place in the camera's frame to a pixel of the scan: lens, film transformation, scanner, pitch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.projection import camera_from_ray, ideal_from_observed
+from adjust.functional_model.scanner import NO_BEND, Bend
+from adjust.functional_model.transformation import Film, film_parameter_names
+from adjust.network import Distortion
+from pipeline.files.adjustment_reader import calibrated_lens
+from pipeline.measuring.comparator_file import comparator_from_pixel, pixel_from_comparator
+from pipeline.measuring.measurement_file import MeasuredScan
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Json = Mapping[str, Any]
+
+_RAD_PER_DEG = np.pi / 180.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """An interior orientation c, x0', y0' (3,) in mm and its distortion with parameters (k,)."""
+
+    distortion: Distortion
+    interior: Array
+    parameters: Array
+
+
+@dataclass(frozen=True)
+class FrameChain:
+    """What takes a scan to its camera's frame and back; lens None: to the observed points of the frame, distortion
+    left in. Its transformations, in the order from the scan: pitch, bend of the scanner, film, lens."""
+
+    pitch_um: tuple[float, float]
+    film: Film
+    bend: Bend = NO_BEND
+    bend_parameters: Array = field(default_factory=lambda: np.empty(0))
+    lens: Lens | None = None
+
+    def scan_from_frame(self, xy_mm: Array) -> tuple[Array, Mask]:
+        """Pixels (n, 2), column and row, of camera coordinates (n, 2) in mm; which of them the scan can have."""
+        observed, seen = xy_mm, np.ones(len(xy_mm), dtype=bool)
+        if self.lens is not None:
+            ray = (xy_mm - self.lens.interior[1:]) / self.lens.interior[0]
+            observed, seen = camera_from_ray(self.lens.distortion, self.lens.interior, self.lens.parameters, ray)
+        comparator, on_film = self.film.comparator_from_camera(observed)
+        place, on_glass = self.bend.inverse(self.bend_parameters, comparator)
+        return pixel_from_comparator(place, self.pitch_um), seen & on_film & on_glass
+
+    def frame_from_scan(self, col_row: Array) -> tuple[Array, Mask]:
+        """Camera coordinates (n, 2) in mm of pixels (n, 2); which of them the camera can have."""
+        comparator = self.bend.apply(self.bend_parameters, comparator_from_pixel(col_row, self.pitch_um))
+        observed = self.film.camera_from_comparator(comparator)
+        if self.lens is None:
+            return observed, np.ones(len(observed), dtype=bool)
+        return ideal_from_observed(self.lens.distortion, self.lens.interior, self.lens.parameters, observed)
+
+
+def adjusted_chain(measured: MeasuredScan, adjustment: Json, with_lens: bool) -> FrameChain:
+    """The chain of an image of adjustment.json, with the film transformation and the scanner that were adjusted."""
+    image = adjustment["images"][measured.frame.image]
+    stored = image["transformation"]
+    names = film_parameter_names(stored["kind"])
+    values = [
+        stored[name]["value"] if name in stored else stored[f"{name}_deg"]["value"] * _RAD_PER_DEG for name in names
+    ]
+    film = Film(stored["kind"], np.array(values, float), _middle_mm(measured), bool(stored.get("mirrored", False)))
+    scanner = adjustment.get("scanners", {}).get(image.get("scanner"))
+    bend, bend_parameters = NO_BEND, np.empty(0)
+    if scanner is not None:
+        terms = scanner["terms"]
+        bend = Bend(tuple(terms), tuple(scanner["center_mm"]), tuple(scanner["half_mm"]))
+        bend_parameters = np.array([term["value"] for term in terms.values()], float)
+    lens = Lens(*calibrated_lens(adjustment["cameras"][image["camera"]])) if with_lens else None
+    return FrameChain(measured.pitch_um, film, bend, bend_parameters, lens)
+
+
+def measured_chain(measured: MeasuredScan) -> FrameChain | None:
+    """The chain by the fiducials of a scan alone, None where too few were found."""
+    matrix = measured.frame.pixel_from_camera
+    if matrix is None:
+        return None
+    by_camera = comparator_from_pixel(matrix.T, measured.pitch_um)  # rows: of x', y' and 1
+    inverse = np.linalg.inv(by_camera[:2].T)
+    shift = -inverse @ by_camera[2]
+    a, b = ([shift[axis], *inverse[axis]] for axis in (0, 1))
+    order = {"a1": a[0], "a2": a[1], "a3": a[2], "b1": b[0], "b2": b[1], "b3": b[2]}
+    parameters = np.array([order[name] for name in film_parameter_names("affine")])
+    return FrameChain(measured.pitch_um, Film("affine", parameters, _middle_mm(measured)))
+
+
+def _middle_mm(measured: MeasuredScan) -> Array:
+    middle_px = np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0
+    return comparator_from_pixel(middle_px, measured.pitch_um)

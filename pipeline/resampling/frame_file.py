@@ -1,0 +1,156 @@
+"""A resampled frame as a TIFF file: tiles, reduced pages, a mask, and a description of where its pixels lie."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tifffile import TiffFile, TiffFileError, TiffWriter
+
+from pipeline.files.atomic import atomic_path
+from pipeline.resampling.canvas import Canvas
+from pipeline.resampling.interpolation import Tile
+
+Samples = NDArray[np.uint8 | np.uint16]
+
+TILE_PX = 512
+_REDUCTION = 4  # between a page and the next smaller one
+_SMALLEST_PX = 512
+_LARGEST_REDUCED_BYTES = 64 << 20  # of the first reduced page, which is held in memory
+_CLASSIC_BYTES = 3_900_000_000  # TIFF counts bytes in 32 bits
+_REDUCED, _MASK = 1, 4  # TIFF 6.0, NewSubfileType
+
+
+@dataclass(frozen=True)
+class Description:
+    """What the file says of itself; `pose` and `lens` are those taken out."""
+
+    image: str
+    camera: str
+    canvas: Canvas
+    pose: str
+    lens: bool
+    fingerprint: str
+
+    def text(self) -> str:
+        """One JSON object: x_mm, y_mm are camera coordinates of the centre of the first pixel."""
+        content = {
+            "reseau": version("reseau"),
+            "image": self.image,
+            "camera": self.camera,
+            "x_mm": self.canvas.x_mm,
+            "y_mm": self.canvas.y_mm,
+            "pitch_mm": self.canvas.pitch_mm,
+            "pose": self.pose,
+            "lens": self.lens,
+            "fingerprint": self.fingerprint,
+        }
+        return json.dumps(content, ensure_ascii=True)
+
+
+def read_description(path: Path) -> dict[str, Any] | None:
+    """The description of a resampled frame; None for any other file, and for one that is not there."""
+    try:
+        with TiffFile(path) as file:
+            content = json.loads(file.pages.first.description)
+    except (OSError, ValueError, TiffFileError, IndexError):
+        return None
+    return content if isinstance(content, dict) and {"reseau", "x_mm", "y_mm", "pitch_mm"} <= content.keys() else None
+
+
+def write_frame(
+    path: Path, described: Description, channels: int, dtype: type, tile_at: Callable[[int, int], Tile]
+) -> int:
+    """Write the frame, tile by tile as `tile_at(col0, row0)` gives them; how many samples were clamped.
+
+    Memory holds a tile, the first reduced page and the mask. Raises InputError where the file cannot be written.
+    """
+    canvas = described.canvas
+    reduced = _Reduced(canvas, channels, dtype)
+    mask = np.zeros((canvas.height_px, -(-canvas.width_px // 8)), np.uint8)
+    clamped = 0
+
+    def tiles() -> Iterator[Samples]:
+        nonlocal clamped
+        for row0 in range(0, canvas.height_px, TILE_PX):
+            for col0 in range(0, canvas.width_px, TILE_PX):
+                tile = tile_at(col0, row0)
+                clamped += tile.clamped
+                reduced.take(tile.samples, col0, row0)
+                packed = np.packbits(tile.is_inside, axis=1)
+                part = mask[row0 : row0 + TILE_PX, col0 // 8 : (col0 + TILE_PX) // 8]
+                part[:] = packed[: part.shape[0], : part.shape[1]]
+                yield tile.samples if channels > 1 else tile.samples[..., 0]
+
+    def masked() -> Iterator[NDArray[np.bool_]]:
+        for row0 in range(0, canvas.height_px, TILE_PX):
+            rows = np.unpackbits(mask[row0 : row0 + TILE_PX], axis=1, count=canvas.width_px).astype(bool)
+            for col0 in range(0, canvas.width_px, TILE_PX):
+                yield _filled(rows[:, col0 : col0 + TILE_PX], TILE_PX)
+
+    pages = reduced.count
+    size = canvas.width_px * canvas.height_px * channels * np.dtype(dtype).itemsize
+    shape = (canvas.height_px, canvas.width_px, *([channels] if channels > 1 else []))
+    per_cm = 10.0 / canvas.pitch_mm
+    options: dict[str, Any] = {"compression": "zlib", "photometric": "rgb" if channels > 1 else "minisblack"}
+    options |= {"tile": (TILE_PX, TILE_PX), "metadata": None, "resolutionunit": "CENTIMETER"}
+    with atomic_path(path) as temporary, TiffWriter(temporary, bigtiff=size > _CLASSIC_BYTES) as file:
+        file.write(
+            tiles(),
+            shape=shape,
+            dtype=dtype,
+            predictor=True,
+            subifds=pages,
+            resolution=(per_cm, per_cm),
+            description=described.text(),
+            **options,
+        )
+        for factor, page in reduced.pages():
+            scale = (per_cm / factor, per_cm / factor)
+            file.write(page, predictor=True, subfiletype=_REDUCED, resolution=scale, **options)
+        options["photometric"] = "minisblack"
+        file.write(masked(), shape=shape[:2], dtype=bool, subfiletype=_MASK, resolution=(per_cm, per_cm), **options)
+    return clamped
+
+
+class _Reduced:
+    """The reduced pages, area-averaged: the first one filled from the tiles, the others from the one before them."""
+
+    def __init__(self, canvas: Canvas, channels: int, dtype: type) -> None:
+        self.factor = _REDUCTION
+        pixel_bytes = channels * np.dtype(dtype).itemsize
+        while canvas.width_px * canvas.height_px * pixel_bytes / self.factor**2 > _LARGEST_REDUCED_BYTES:
+            self.factor *= 2
+        shape = (-(-canvas.height_px // self.factor), -(-canvas.width_px // self.factor), channels)
+        self.first: Samples = np.zeros(shape, dtype)
+        larger = max(canvas.width_px, canvas.height_px)
+        self.count = 0
+        while larger / (self.factor * _REDUCTION**self.count) >= _SMALLEST_PX or self.count == 0:
+            self.count += 1
+
+    def take(self, samples: Samples, col0: int, row0: int) -> None:
+        small = _averaged(samples, self.factor)
+        part = self.first[row0 // self.factor :, col0 // self.factor :][: small.shape[0], : small.shape[1]]
+        part[:] = small[: part.shape[0], : part.shape[1]]
+
+    def pages(self) -> Iterator[tuple[int, Samples]]:
+        page: Samples = self.first
+        for level in range(self.count):
+            yield self.factor * _REDUCTION**level, page if page.shape[2] > 1 else page[..., 0]
+            page = _averaged(page, _REDUCTION)
+
+
+def _averaged(samples: Samples, factor: int) -> Samples:
+    height, width = (-(-side // factor) * factor for side in samples.shape[:2])
+    whole = np.pad(samples, ((0, height - samples.shape[0]), (0, width - samples.shape[1]), (0, 0)), mode="edge")
+    means = whole.reshape(height // factor, factor, width // factor, factor, -1).mean(axis=(1, 3))
+    return np.asarray(np.rint(means).astype(samples.dtype))
+
+
+def _filled(part: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+    """A tile at the frame's end, filled up."""
+    return np.pad(part, ((0, side - part.shape[0]), (0, side - part.shape[1])))

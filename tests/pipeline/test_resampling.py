@@ -1,0 +1,193 @@
+"""Scans in their camera's frame: a picture of known formula through every pose, through a lens, and as a file."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.transformation import Film
+from adjust.network import Distortion
+from measure.errors import MeasurementError
+from measure.scans.scan import open_scan
+from pipeline.cli import run
+from pipeline.resampling.frame_chain import FrameChain, Lens
+from pipeline.resampling.resample_stage import BEST, FAST, ResampleTask, resampled
+from pipeline.resampling.source import source_of
+
+Array = NDArray[np.float64]
+
+PITCH_UM = (21.0, 20.0)
+WIDTH, HEIGHT = 620, 540
+BUMPS = 40
+BLUR_PX = 1.6
+
+
+def light(col: Array, row: Array) -> Array:
+    """The picture's formula: Gaussians of 1.6 px, on a slope."""
+    rng = np.random.default_rng(3)
+    middles = rng.uniform((40, 40), (WIDTH - 40, HEIGHT - 40), (BUMPS, 2))
+    value = 9000.0 + 4.0 * col - 3.0 * row
+    for x, y in middles:
+        value = value + 20000.0 * np.exp(-((col - x) ** 2 + (row - y) ** 2) / (2 * BLUR_PX**2))
+    return np.asarray(value)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scan") / "a.tif"
+    col, row = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
+    tifffile.imwrite(path, np.rint(light(col, row)).astype(np.uint16), compression="lzw", rowsperstrip=32)
+    return path
+
+
+def film(turn_deg: float, mirrored: bool) -> tuple[Film, Array, Array]:
+    """A film transformation, and its matrix and shift: a turn, 0.2 % of affinity, the camera's origin in the middle."""
+    turn = np.radians(turn_deg)
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ np.diag(
+        [-1.001 if mirrored else 1.001, 0.999]
+    )
+    middle = np.array([WIDTH * PITCH_UM[0], -HEIGHT * PITCH_UM[1]]) / 2000.0
+    shift = np.array([0.3, -0.2]) - matrix @ middle
+    a, b = ([shift[i], *matrix[i]] for i in (0, 1))
+    return Film("affine", np.array([*a, *b]), middle), matrix, shift
+
+
+def task(scan: Path, folder: Path, chain: FrameChain, degree: int = BEST) -> ResampleTask:
+    return ResampleTask("a", "K", scan, chain, "0", 0.02, BEST if degree == BEST else FAST, None, folder / "a.tif")
+
+
+def described(path: Path) -> dict[str, Any]:
+    with tifffile.TiffFile(path) as file:
+        content: dict[str, Any] = json.loads(file.pages.first.description)
+    return content
+
+
+def place_of(description: dict[str, float], shape: tuple[int, ...]) -> Array:
+    """Camera coordinates of all pixels, as the file's description says."""
+    col, row = np.meshgrid(np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float))
+    x = description["x_mm"] + description["pitch_mm"] * col
+    return np.stack([x, description["y_mm"] - description["pitch_mm"] * row], axis=-1)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("turn_deg", [0.4, 90.4, 180.3, 269.7])
+def test_every_pose_shows_the_formula_where_it_should(
+    turn_deg: float, mirrored: bool, scan: Path, tmp_path: Path
+) -> None:
+    """Each pixel against the formula at the place that the test computes itself; the scan's outline is all there."""
+    transformation, matrix, shift = film(turn_deg, mirrored)
+    done = resampled(task(scan, tmp_path, FrameChain(PITCH_UM, transformation)))
+    assert done.problem == ""
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        pixels, mask = file.pages[0].asarray(), file.pages[1].asarray().astype(bool)
+        description = json.loads(file.pages.first.description)
+        assert pixels.dtype == np.uint16
+        assert len(file.pages.first.pages or ()) >= 1
+    comparator = (place_of(description, pixels.shape) - shift) @ np.linalg.inv(matrix).T
+    col, row = comparator[..., 0] * 1000 / PITCH_UM[0], -comparator[..., 1] * 1000 / PITCH_UM[1]
+    inside = (col >= -0.5) & (col <= WIDTH - 0.5) & (row >= -0.5) & (row <= HEIGHT - 0.5)
+    unsure = (np.abs(col + 0.5) < 1e-6) | (np.abs(row + 0.5) < 1e-6)
+    assert (mask == inside)[~unsure].all()
+    assert inside.sum() == pytest.approx(WIDTH * HEIGHT * PITCH_UM[0] * PITCH_UM[1] / 400.0, rel=0.01)
+    assert not pixels[~mask].any()
+    off = pixels[inside] - light(col[inside], row[inside])
+    steepest = 20000.0 / BLUR_PX * np.exp(-0.5)  # grey values a pixel
+    assert np.abs(off).max() < 0.002 * steepest
+
+
+def test_fast_is_less_true_and_linear_would_not_do(scan: Path, tmp_path: Path) -> None:
+    transformation, matrix, shift = film(0.4, False)
+    off = {}
+    for degree in (BEST, FAST):
+        resampled(task(scan, tmp_path, FrameChain(PITCH_UM, transformation), degree))
+        pixels = tifffile.imread(tmp_path / "a.tif", key=0)
+        description = described(tmp_path / "a.tif")
+        comparator = (place_of(description, pixels.shape) - shift) @ np.linalg.inv(matrix).T
+        col, row = comparator[..., 0] * 1000 / PITCH_UM[0], -comparator[..., 1] * 1000 / PITCH_UM[1]
+        inside = (col > 10) & (col < WIDTH - 10) & (row > 10) & (row < HEIGHT - 10)
+        off[degree] = np.sqrt(np.mean(np.square(pixels[inside] - light(col[inside], row[inside]))))
+    assert off[BEST] < 0.5  # rounding is 0.29
+    assert off[BEST] < off[FAST] < 20.0
+
+
+def test_a_lens_is_taken_out_as_opencv_has_it(scan: Path, tmp_path: Path) -> None:
+    transformation, matrix, shift = film(0.4, False)
+    c, x0, y0, k1 = 12.0, 0.05, -0.04, -0.06
+    lens = Lens(
+        Distortion("opencv"),
+        np.array([c, x0, y0]),
+        np.array([k1 * (name == "k1") for name in parameter_names("opencv")]),
+    )
+    done = resampled(task(scan, tmp_path, FrameChain(PITCH_UM, transformation, lens=lens)))
+    assert done.problem == ""
+    pixels = tifffile.imread(tmp_path / "a.tif", key=0)
+    description = described(tmp_path / "a.tif")
+    assert description["lens"] is True
+    ray = (place_of(description, pixels.shape) - (x0, y0)) / c
+    rays = np.concatenate([ray.reshape(-1, 2) * (1, -1), np.ones((ray.size // 2, 1))], axis=1)
+    seen = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.diag([c, c, 1.0]), np.array([k1, 0.0, 0.0, 0.0]))[0]
+    observed = seen.reshape(ray.shape) * (1, -1) + (x0, y0)
+    comparator = (observed - shift) @ np.linalg.inv(matrix).T
+    col, row = comparator[..., 0] * 1000 / PITCH_UM[0], -comparator[..., 1] * 1000 / PITCH_UM[1]
+    inside = (col > 8) & (col < WIDTH - 8) & (row > 8) & (row < HEIGHT - 8)
+    assert inside.sum() > 0.8 * WIDTH * HEIGHT
+    assert np.abs(pixels[inside] - light(col[inside], row[inside])).max() < 20.0
+
+
+def test_a_frame_is_kept_until_something_changes(scan: Path, tmp_path: Path) -> None:
+    chain = FrameChain(PITCH_UM, film(0.4, False)[0])
+    assert not resampled(task(scan, tmp_path, chain)).kept
+    assert resampled(task(scan, tmp_path, chain)).kept
+    assert not resampled(task(scan, tmp_path, chain, FAST)).kept
+    moved = replace(chain, film=replace(chain.film, parameters=1.000000001 * chain.film.parameters))
+    assert not resampled(task(scan, tmp_path, moved, FAST)).kept
+
+
+def test_what_is_resampled_is_not_measured(scan: Path, tmp_path: Path) -> None:
+    resampled(task(scan, tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])))
+    with pytest.raises(MeasurementError, match="has resampled, and no scan"):
+        open_scan(tmp_path / "a.tif")
+
+
+def test_a_scan_in_strips_that_lies_across_is_decoded_once(scan: Path, tmp_path: Path) -> None:
+    with open_scan(scan) as opened, source_of(opened, 10**9, tmp_path) as decoded:
+        for place in ((-20, -30, 100, 90), (WIDTH - 50, 100, 90, 60), (100, HEIGHT - 5, 40, 30), (300, 200, 50, 40)):
+            assert (decoded.window(*place) == opened.samples(*place)).all()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:
+    done = resampled(task(tmp_path / "gone.tif", tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])))
+    assert done.path is None
+    assert "gone.tif" in done.problem
+    assert not list(tmp_path.glob("*.tif"))
+
+
+def test_a_project_through_the_command(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], in_one_process: None
+) -> None:
+    """The fiducials of the demonstration, each in all frames at the pixel that its camera coordinates say."""
+    out = tmp_path / "frames"
+    assert run(["resample", str(project / "project.toml"), str(out), "--json"]) == 0
+    results = json.loads(capsys.readouterr().out)
+    assert [result["image"] for result in results] == ["frame1", "frame2", "frame3"]
+    truth = json.loads((project / "truth.json").read_text(encoding="utf-8"))
+    (camera,) = truth["cameras"].values()
+    for result in results:
+        with tifffile.TiffFile(result["path"]) as file:
+            pixels, description = file.pages[0].asarray(), json.loads(file.pages.first.description)
+        for mark in camera["fiducials"].values():
+            col = (mark["x_mm"]["value"] - description["x_mm"]) / description["pitch_mm"]
+            row = (description["y_mm"] - mark["y_mm"]["value"]) / description["pitch_mm"]
+            near = pixels[round(row) - 4 : round(row) + 5, round(col) - 4 : round(col) + 5].astype(float)
+            far = pixels[round(row) - 12 : round(row) + 13, round(col) - 12 : round(col) + 13].astype(float)
+            assert abs(near.mean() - np.median(far)) > 0.02 * far.max()  # a mark is there
+    assert run(["resample", str(project / "project.toml"), str(out)]) == 0
+    assert capsys.readouterr().out.count("as it was") == 3
