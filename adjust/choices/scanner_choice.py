@@ -2,11 +2,12 @@
 
 One adjustment with all terms, held together by a weak prior, gives their normal equations with everything else
 eliminated: G = Q⁻¹ - I / sigma², g = Q⁻¹ x, Q their cofactor matrix and x their values. From these any choice of terms
-follows, x_A = G_AA⁻¹ g_A with v'Pv smaller by g_A' G_AA⁻¹ g_A. Terms are taken in one after the other, the one that
-explains most first, while its F-test is significant with all candidates counted (Bonferroni).
+follows, x_A = G_AA⁻¹ g_A with v'Pv smaller by g_A' G_AA⁻¹ g_A. Terms are taken in one after the other, smooth ones
+before those of the carriage and of these the one that explains most first, while its F-test is significant with all
+candidates counted (Bonferroni).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,12 +62,13 @@ def choose_bends(
     remarks: list[str] = []
     for scanner in trial.network.scanners:
         equations = _equations(trial, scanner)
-        chosen[scanner.name] = _needed(equations)
+        chosen[scanner.name] = _needed(equations, smooth)
         untold = [term for term in equations.untold(chosen[scanner.name]) if term in smooth]
         images = [image.name for image in network.images if image.scanner == scanner.name]
         center = np.array([scanner.center_mm])
         poses = poses_of(adjusted_image(trial, name).camera_by_comparator(center)[0] for name in images)
-        remarks += untold_sentences(scanner.name, untold, poses)
+        with_lens = _equations(trial, scanner, _free_distortion(trial)).untold(chosen[scanner.name])
+        remarks += untold_sentences(scanner.name, untold, set(untold) - set(with_lens), poses)
     return ScannerChoice(_with_terms(network, chosen, sigma_mm), tuple(remarks))
 
 
@@ -115,10 +117,10 @@ class _Equations:
         left, _ = self._reduced(taken)
         return [term for term, told in zip(self.terms, left, strict=True) if term not in taken and not told]
 
-    def next(self, taken: Sequence[str]) -> tuple[str, float] | None:
-        """The term that explains most beside those that are taken, and the probability of so much by chance."""
+    def next(self, taken: Sequence[str], among: Collection[str]) -> tuple[str, float] | None:
+        """Of some terms that which explains most beside those taken, and the probability of so much by chance."""
         told, explained = self._reduced(taken)
-        open_ = np.array([each not in taken for each in self.terms]) & told
+        open_ = np.array([each in among and each not in taken for each in self.terms]) & told
         if not open_.any():
             return None
         best = int(np.argmax(np.where(open_, explained, -np.inf)))
@@ -142,12 +144,21 @@ class _Equations:
         return float(self.right[at] @ np.linalg.solve(self.normal[np.ix_(at, at)], self.right[at]))
 
 
-def _equations(trial: Adjustment, scanner: Scanner) -> _Equations:
-    """Of one scanner's terms, those of others being free beside them."""
+def _free_distortion(trial: Adjustment) -> list[str]:
+    """The distortion parameters of all cameras that are not fixed."""
+    names = [f"IO.{camera.name}.{name}" for camera in trial.network.cameras for name in camera.distortion.parameters]
+    return [name for name in names if name in trial.names and trial.sigma(name) > 0.0]
+
+
+def _equations(trial: Adjustment, scanner: Scanner, held: Sequence[str] = ()) -> _Equations:
+    """Of one scanner's terms, those of others being free beside them; held: other unknowns, taken as known."""
     terms = tuple(scanner.terms)
     names = [f"SC.{scanner.name}.{term}" for term in terms]
     values = np.array([trial.value(name) for name in names])
-    normal = np.linalg.inv(trial.cofactor_of(names))
+    cofactor, count = trial.cofactor_of([*names, *held]), len(names)
+    by_held = cofactor[:count, count:]
+    taken = by_held @ np.linalg.solve(cofactor[count:, count:], by_held.T) if held else 0.0
+    normal = np.linalg.inv(cofactor[:count, :count] - taken)
     right = normal @ values
     observations, rows = trial.network.observations, trial.network.rows_by_scanner[scanner.name]
     weights = np.linalg.inv(observations.covariance_mm2[rows])
@@ -161,11 +172,12 @@ def _equations(trial: Adjustment, scanner: Scanner) -> _Equations:
     )
 
 
-def _needed(equations: _Equations) -> tuple[str, ...]:
+def _needed(equations: _Equations, smooth: Collection[str]) -> tuple[str, ...]:
     taken: list[str] = []
     level = LEVEL / len(equations.terms)
-    while (best := equations.next(taken)) is not None and best[1] < level:
-        taken.append(best[0])
+    for among in (smooth, set(equations.terms) - set(smooth)):
+        while (best := equations.next(taken, among)) is not None and best[1] < level:
+            taken.append(best[0])
     return tuple(term for term in equations.terms if term in taken)
 
 

@@ -133,7 +133,7 @@ def _warnings(last: Run, cofactor: Cofactor) -> list[str]:
     ]
     if last.converged:
         warnings += filter(None, [undetermined(problem, last.end.state, cofactor.variances)])
-        warnings += hardly_told(problem, last.end.state, last.numbering.free, last.factor, cofactor.variances)
+        warnings += hardly_told(problem, last.end.state, last.numbering.free, last.factor, cofactor)
     return warnings + _unseen(problem) + _films_by_targets(problem)
 
 

@@ -93,7 +93,7 @@ def _smallest(triangle: Triangle, below: float) -> tuple[Array, Array]:
     """The singular values (d,) of a triangle below a part of the largest, and their right vectors (s, d)."""
     if len(triangle) <= DENSE:
         _, singular, right = np.linalg.svd(triangle.toarray())
-        hardly = singular <= below * singular[0]
+        hardly = singular <= max(below * singular[0], ROUNDING)  # of all columns of length one the largest is 1 or more
         return singular[hardly], right[hardly].T
     largest = triangle.largest_singular
     count = FIRST_COUNT

@@ -1,6 +1,7 @@
 """Bends of a scanner that the observations do not tell from what the films and the fiducial marks do, in words."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,9 +9,11 @@ from numpy.typing import NDArray
 from adjust.functional_model.scanner import degree_of
 from adjust.least_squares.factor import Factor
 from adjust.problem import Problem, State
+from adjust.result import Cofactor
 from adjust.undetermined.directions import Lead
 
 SCANNER_RANK = -2
+INTERIOR = ("c", "x0", "y0")
 ALIKE_DEG = 20.0  # two frames whose turns in the scanner differ by less lie alike in it
 HARDLY = 20.0  # times as uncertain as with all else known: from there on the observations hardly tell a term
 
@@ -20,33 +23,114 @@ Pose = tuple[int, bool]  # how a frame is turned in its scan, degrees, and wheth
 
 
 GIVEN = "x' and y' of the fiducial marks (F5, F6), or to the term itself"
+GIVEN_LENS = "the distortion, from an earlier calibration say, or to the term itself"
 
 
-def hardly_told(problem: Problem, state: State, free: Indices, factor: Factor, variances: Array) -> Iterator[str]:
-    """Sentences on the terms that a regular network hardly tells from what films and fiducial marks do.
+@dataclass(frozen=True)
+class ScannerLead(Lead):
+    """Of a term of a scanner's bend. poses: in which the scanner's frames lie."""
+
+    poses: Sequence[Pose] = ()
+
+    def sentence(self, moved: Iterable[str]) -> tuple[str, str]:
+        """Cause and remedy by what moves along: the lens, the fiducial marks, or nothing that could."""
+        moved = list(moved)
+        by_lens = any(name.startswith("IO.") and name.rsplit(".", 1)[1] not in INTERIOR for name in moved)
+        seen = by_lens or any(name.startswith("FID.") for name in moved)
+        why = _Why(self.motion.split()[2], self.poses, "lens" if by_lens else "marks" if seen else "")
+        return replace(self, because=why.cause, given=why.given, otherwise=why.otherwise)._told(moved)
+
+    def _told(self, moved: Iterable[str]) -> tuple[str, str]:
+        return super().sentence(moved)
+
+
+@dataclass(frozen=True)
+class _Why:
+    """Why a term is not told. taken_by: what does the same, "lens" or "marks"; empty where the term is not seen."""
+
+    term: str
+    poses: Sequence[Pose]
+    taken_by: str
+
+    @property
+    def cause(self) -> str:
+        if not self.taken_by:
+            return "the marks in its scans are too few, or lie too much alike, to show it"
+        if self.taken_by == "lens":
+            as_they_lie = "in frames that all lie alike" if self._even_alike else "however the frames lie"
+            return f"the distortion of a lens does the same {as_they_lie}"
+        if len(self.poses) == 1:
+            return "all frames lie alike in the scanner: its bend and the fiducial marks' places are one and the same"
+        if _are_half_turns(self.poses) and degree_of(self.term) % 2:
+            return (
+                "frames turned by 180 degrees tell terms of even degree from the fiducial marks, and none of odd degree"
+            )
+        listed = ", ".join(f"{turn}{' mirrored' if mirrored else ''}" for turn, mirrored in self.poses)
+        return f"it, or its sum with others, looks the same in all poses in which the frames lie ({listed} degrees)"
+
+    @property
+    def given(self) -> str:
+        return GIVEN_LENS if self.taken_by == "lens" else GIVEN
+
+    @property
+    def otherwise(self) -> str:
+        if self._even_alike:
+            return "scan some of the frames turned by 180 degrees"
+        if self.taken_by == "marks" and _are_half_turns(self.poses):
+            return "scan some of the frames turned by 90 degrees"
+        return "leave it out"
+
+    @property
+    def _even_alike(self) -> bool:
+        return bool(self.taken_by) and len(self.poses) == 1 and degree_of(self.term) % 2 == 0
+
+
+def hardly_told(problem: Problem, state: State, free: Indices, factor: Factor, cofactor: Cofactor) -> Iterator[str]:
+    """Sentences on the terms that a regular network hardly tells from what films, marks and lenses do.
 
     Frames never lie quite alike, and given fiducial marks have some standard deviation: a bend is then determined, but
-    by next to nothing. variances (n,) of all unknowns, factor: of these.
+    by next to nothing. factor, cofactor: of the free unknowns, and of all.
     """
+    unknowns = problem.unknowns
     places = {int(position): i for i, position in enumerate(free)}
-    for name, positions in problem.unknowns.scanner.items():
-        terms = [
-            problem.unknowns.names[position].rsplit(".", 1)[1]
-            for position in map(int, positions)
-            if position in places and np.sqrt(variances[position]) * factor.scale[places[position]] > HARDLY
-        ]
-        yield from untold_sentences(name, terms, _poses(problem, state, name))
+    for name, positions in unknowns.scanner.items():
+        open_ = [int(position) for position in positions if int(position) in places]
+        ratios = np.sqrt(cofactor.variances[open_]) * factor.scale[[places[position] for position in open_]]
+        hardly = [position for position, ratio in zip(open_, ratios, strict=True) if ratio > HARDLY]
+        if not hardly:
+            continue
+        lens = [int(i) for camera in unknowns.camera.values() for i in camera[3:] if int(i) in places]
+        held = held_variances(cofactor.of(np.array([*hardly, *lens])), len(hardly))
+        scale = factor.scale[[places[position] for position in hardly]]
+        names = [unknowns.names[position].rsplit(".", 1)[1] for position in hardly]
+        by_lens = [term for term, ratio in zip(names, np.sqrt(held) * scale, strict=True) if ratio <= HARDLY]
+        yield from untold_sentences(name, names, by_lens, _poses(problem, state, name))
 
 
-def untold_sentences(scanner: str, terms: Sequence[str], poses: Sequence[Pose]) -> Iterator[str]:
-    """Sentences on some terms of a scanner's bend that are not, or hardly, told from the fiducial marks' places."""
-    told: dict[tuple[str, str], list[str]] = {}
+def held_variances(cofactor: Array, count: int) -> Array:
+    """The variances of the first quantities of a cofactor matrix (n, n), with all others known."""
+    own, by_others, others = cofactor[:count, :count], cofactor[:count, count:], cofactor[count:, count:]
+    scale = np.sqrt(np.diag(others))
+    reduced = by_others / scale
+    taken = (reduced @ np.linalg.pinv(others / np.outer(scale, scale), hermitian=True) * reduced).sum(axis=1)
+    return np.asarray(np.maximum(np.diag(own) - taken, 0.0))
+
+
+def untold_sentences(
+    scanner: str, terms: Sequence[str], by_lens: Collection[str], poses: Sequence[Pose]
+) -> Iterator[str]:
+    """Sentences on some terms of a scanner's bend that are not, or hardly, told from other unknowns.
+
+    by_lens: those that would be told if the lenses' distortion were known.
+    """
+    told: dict[tuple[str, str, str], list[str]] = {}
     for term in terms:
-        told.setdefault((_because(term, poses), _otherwise(term, poses)), []).append(term)
-    for (because, otherwise), alike in told.items():
+        why = _Why(term, poses, "lens" if term in by_lens else "marks")
+        told.setdefault((why.cause, why.given, why.otherwise), []).append(term)
+    for (cause, given, otherwise), alike in told.items():
         yield (
-            f"The bend of scanner {scanner} is hardly told from the fiducial marks and the other unknowns in its "
-            f"term{'s' * (len(alike) > 1)} {', '.join(alike)}: {because}. Give a standard deviation to {GIVEN}, "
+            f"The bend of scanner {scanner} is hardly told from the other unknowns in its "
+            f"term{'s' * (len(alike) > 1)} {', '.join(alike)}: {cause}. Give a standard deviation to {given}, "
             f"or {otherwise}."
         )
 
@@ -66,23 +150,7 @@ def _lead(problem: Problem, scanner: str, position: int, poses: Sequence[Pose]) 
     functional = np.zeros(len(problem.unknowns))
     functional[position] = 1.0
     motion = f"The term {term} of the bend of scanner {scanner} can change"
-    return Lead(SCANNER_RANK, functional, motion, GIVEN, _because(term, poses), None, _otherwise(term, poses))
-
-
-def _because(term: str, poses: Sequence[Pose]) -> str:
-    if len(poses) == 1:
-        return "all frames lie alike in the scanner: its bend and the fiducial marks' own places are one and the same"
-    if _are_half_turns(poses) and degree_of(term) % 2:
-        return "frames turned by 180 degrees tell terms of even degree from the fiducial marks, and this is an odd one"
-    listed = ", ".join(f"{turn}{' mirrored' if mirrored else ''}" for turn, mirrored in poses)
-    return f"it, or its sum with others, looks the same in all poses in which the frames lie ({listed} degrees)"
-
-
-def _otherwise(term: str, poses: Sequence[Pose]) -> str:
-    if _are_half_turns(poses):
-        even = degree_of(term) % 2 == 0 and len(poses) == 1
-        return f"scan some of the frames turned by {'180' if even else '90'} degrees"
-    return "leave it out"
+    return ScannerLead(SCANNER_RANK, functional, motion, GIVEN, poses=poses)
 
 
 def _are_half_turns(poses: Sequence[Pose]) -> bool:

@@ -1,5 +1,7 @@
 """The scanner apart from the film: derivatives, the truth given back, what tells it from fiducials, what not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bent_scans import HALF_MM, MIDDLE_MM, RESEAU_MM, bent, displacement, films, in_a_bent_scanner
@@ -176,9 +178,10 @@ def test_claimed_sigmas_are_realised() -> None:
     """Frames in four poses, marks nobody knows: the bend's errors over its standard deviations."""
     names = ("a20", "a11", "b02", "a30", "b21")
     truth = {name: BEND_MM[name] for name in names}
-    errors, sigmas = [], []
+    errors, sigmas, start = [], [], approximate(films([0.0, 90.0, 180.0, 270.0], {}, {}))
     for seed in range(14):
-        result = solved(films([0.0, 90.0, 180.0, 270.0], truth, free(*names), np.random.default_rng(seed)))
+        network = films([0.0, 90.0, 180.0, 270.0], truth, free(*names), np.random.default_rng(seed))
+        result = adjust(network, start)
         errors.append([result.value(f"SC.S.{name}") - truth[name] for name in names])
         sigmas.append([result.sigma(f"SC.S.{name}") for name in names])
     ratio = np.sqrt((np.array(errors) ** 2).mean() / (np.array(sigmas) ** 2).mean())
@@ -191,6 +194,9 @@ def test_the_bend_is_tested_for_significance() -> None:
     tests = {test.name: test for test in scanner_tests(result, network.scanners[0])}
     assert tests["a20"].p < 1e-6
     assert tests["b02"].p > 0.01
+    without = solved(replace(network, scanners=(Scanner("S"),)))
+    f = (without.vpv - result.vpv) / 2 / result.sigma0**2
+    assert tests["all"].statistic == pytest.approx(f, rel=1e-3)
     assert tests["all"].p < 1e-6
 
 
@@ -199,6 +205,9 @@ def test_approximations_know_a_bend_that_is_given() -> None:
     truth = {"a20": 1.0, "b11": -0.8}
     network = films([0.0, 90.0], truth, {name: Prior(value) for name, value in truth.items()})
     np.testing.assert_allclose(bent(truth, network.straight_xy_mm), network.observations.xy_mm, atol=1e-9)
+    straight = approximate(films([0.0, 90.0], {}, {}))
+    for name, film in approximate(network).transformation.items():
+        np.testing.assert_allclose(film, straight.transformation[name], atol=1e-9)
     result = solved(network)
     assert result.converged
     assert np.abs(result.residuals.v_mm).max() < 1e-9
@@ -212,3 +221,28 @@ def test_what_is_wrong_with_a_scanner_is_said() -> None:
     network = films([0.0], {}, free("a20"))
     with pytest.raises(AdjustmentError, match="scanner S, which is not given"):
         solved(Network(network.cameras, network.images, (), network.observations))
+
+
+def test_a_bend_that_a_lens_makes_too_is_laid_to_the_lens() -> None:
+    """Radial distortion of the third degree and the bend (r² x, r² y) look alike however the frames lie."""
+    points = field_points(np.random.default_rng(5), 40)
+    attitudes = tuple((0.0, 0.0, np.radians(90.0 * i)) for i in range(4))
+    truth = Truth(attitudes=attitudes, distortion={"k3": 0.0}, middle_mm=MIDDLE_MM, x0=0.0, y0=0.0)
+    network, start = simulated(np.random.default_rng(4), truth, points=points, free={"k3": np.inf})
+    radial = ("a30", "a12", "b21", "b03")
+    result = adjust(in_a_bent_scanner(network, {}, free(*radial)), start)
+    (warning,) = [text for text in result.warnings if "bend of scanner S" in text]
+    assert ": the distortion of a lens does the same however the frames lie" in warning
+    assert "a30" in warning
+    known = adjust(
+        in_a_bent_scanner(simulated(np.random.default_rng(4), truth, points=points)[0], {}, free(*radial)), start
+    )
+    assert not any("bend of scanner S" in text for text in known.warnings)
+
+
+def test_a_bend_that_no_mark_shows_is_laid_to_the_marks() -> None:
+    """Four marks on the corners of a square: all six terms of degree 2 but two sums are constant or linear there."""
+    corners = {str(i): (106.0 * x, 106.0 * y) for i, (x, y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1)))}
+    result = solved(films([0.0, 180.0], {}, free("a20"), sigma_given_mm=0.0, marks_mm=corners, scatter=0.0))
+    (direction,) = result.singular
+    assert "too few, or lie too much alike" in direction.cause

@@ -1,5 +1,8 @@
 """The bend that observations ask for: the terms that are there, no others, and what is said where none can be told."""
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 import pytest
 from bent_scans import RESEAU_MM, films, in_a_bent_scanner
@@ -8,7 +11,7 @@ from simulated import Truth, field_points, simulated
 from adjust.adjustment import adjust
 from adjust.choices.scanner_choice import choose_bends, with_bends
 from adjust.initial_values.approximations import approximate
-from adjust.network import Network
+from adjust.network import Approximations, Network
 from adjust.result import Adjustment
 
 QUARTERS = [0.0, 90.0, 180.0, 270.0]
@@ -18,8 +21,18 @@ def adjusted(network: Network) -> Adjustment:
     return adjust(network, approximate(network))
 
 
-def chosen(network: Network) -> set[str]:
-    return set(choose_bends(network, adjusted).network.scanners[0].terms)
+def laid_in_quarters(network: Network) -> Adjustment:
+    """From marks without errors: to find those of films among marks a millimetre off takes longest."""
+    return adjust(network, _start())
+
+
+@cache
+def _start() -> Approximations:
+    return approximate(films(QUARTERS, {}, {}))
+
+
+def chosen(network: Network, by: Callable[[Network], Adjustment] = adjusted) -> set[str]:
+    return set(choose_bends(network, by).network.scanners[0].terms)
 
 
 def test_the_terms_that_are_there_are_chosen() -> None:
@@ -42,7 +55,8 @@ def test_a_carriage_that_wavers_is_found_by_a_reseau() -> None:
 
 def test_where_nothing_bends_nothing_is_chosen() -> None:
     """At one percent for all candidates together: none in 10 networks."""
-    found = [chosen(films(QUARTERS, {}, {}, np.random.default_rng(seed))) for seed in range(10)]
+    networks = [films(QUARTERS, {}, {}, np.random.default_rng(seed)) for seed in range(10)]
+    found = [chosen(network, laid_in_quarters) for network in networks]
     assert not any(found)
 
 

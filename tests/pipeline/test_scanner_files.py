@@ -149,16 +149,16 @@ def test_a_rendered_project_of_a_bent_scanner_looks_for_it(tmp_path: Path) -> No
 
 
 def test_a_design_says_what_cannot_be_told_of_the_scanner(tmp_path: Path) -> None:
-    """The template's frames lie in two poses, one of them mirrored; laid alike they tell less."""
+    """The template's second frame turned by 180 degrees against the first, and laid like it, which tells less."""
     text = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
     text = text.replace('scanner = "none"  ', 'scanner = ["a20"]  ').replace(
         "alternatives = true", "alternatives = false"
     )
-    alike = text.replace('pose = "90m"', 'pose = "0"')
+    turned, alike = (text.replace('pose = "90m"', f'pose = "{pose}"') for pose in ("180", "0"))
     sigmas = {}
-    for name, content in (("two", text), ("alike", alike)):
+    for name, content in (("two", turned), ("alike", alike)):
         (tmp_path / f"{name}.toml").write_text(content, encoding="utf-8")
         run(["design", str(tmp_path / f"{name}.toml"), str(tmp_path / name)])
         found = json.loads((tmp_path / name / "design.json").read_text(encoding="utf-8"))
         sigmas[name] = found["scanners"]["scanner"]["a20"]["sigma"]
-    assert 0.0 < sigmas["two"] < sigmas["alike"]
+    assert 0.0 < sigmas["two"] < 0.99 * sigmas["alike"]
