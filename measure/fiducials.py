@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from measure.fiducial_options import FiducialOptions
 from measure.film import AFFINITY_SIGMA
 from measure.frames.chance import doubt, expected_as_good, expected_where_seen
-from measure.frames.fiducial_rows import absent_frame, present_frame
+from measure.frames.fiducial_rows import absent_frame, lost_frame, present_frame
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.frame_border import at_border
@@ -55,7 +55,7 @@ def measure_fiducials(
     options = options or FiducialOptions()
     layout = at_border(layout)
     if scan.is_lost:
-        return absent_frame(scan, layout, scan.damage.rstrip("."), options.rotation_deg)
+        return lost_frame(scan, layout)
     search = FrameSearch(scan, layout, options)
     hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
     found, frame = _at_first_look(search, hypotheses, pitch_um is not None)
@@ -66,7 +66,6 @@ def measure_fiducials(
         closer = [replace(each, tolerance=min(each.tolerance, limit)) for each in hypotheses[0]]
         found, frame = _at_a_closer_look(search, closer)
     if frame is None:
-        reason = f"{reason}; {scan.damage.rstrip('.')}" if scan.damage else reason
         absent = absent_frame(scan, layout, reason, options.rotation_deg)
         return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
     found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.results import MarkMeasurement
+from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.status import Status
 
@@ -15,6 +15,15 @@ _REACH_PX = 20.0  # about a mark whose size is not told: that of a disk or cross
 def without_lost(scan: Scan, marks: Sequence[MarkMeasurement]) -> tuple[MarkMeasurement, ...]:
     """The marks; those at places where the file does not give the pixels are `predicted` there, with that reason."""
     return tuple(_told(scan, mark) for mark in marks)
+
+
+def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
+    """The frame without observations where the scan's file is damaged, which is the first of its problems."""
+    if not scan.damage:
+        return frame
+    marks = without_lost(scan, frame.marks)
+    problem = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file anew, or rescan."
+    return replace(frame, marks=marks, problems=(problem, *(each for each in frame.problems if each != problem)))
 
 
 def _told(scan: Scan, mark: MarkMeasurement) -> MarkMeasurement:

@@ -20,11 +20,22 @@ _FAINT = "the frame was found at a closer look only, its marks being faint besid
 _ASSUMED = "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere"
 
 
+def lost_frame(scan: Scan, layout: FiducialLayout) -> FrameMeasurement:
+    """Of a scan whose file gives none of its pixels."""
+    marks = tuple(
+        MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {scan.damage}")
+        for mark in layout.marks
+    )
+    return FrameMeasurement(scan.name, marks)
+
+
 def absent_frame(scan: Scan, layout: FiducialLayout, reason: str, rotation_deg: float) -> FrameMeasurement:
     """Of a scan in which no frame was found; reason: why, a part of a sentence; rotation_deg: by how much turned it was
     sought."""
+    also = "; parts of the scan's file are damaged" if scan.damage else ""
     marks = tuple(
-        MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}") for mark in layout.marks
+        MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}{also}")
+        for mark in layout.marks
     )
     problem = (
         f"no fiducial was measured: {reason}; look whether the camera is that of the scan, the pitch right, and the "

@@ -181,7 +181,7 @@ class Scan:
 
     @property
     def damage(self) -> str:
-        """What of the file was found to be damaged so far, and what to do, a sentence; empty where nothing was."""
+        """What of the file was found to be damaged so far, a part of a sentence; empty where nothing was."""
         lost = self._segments.lost
         if not lost:
             return ""
@@ -192,7 +192,7 @@ class Scan:
             if self.is_lost
             else f"parts cannot be trusted ({places}{more})"
         )
-        return f"the scan's file is damaged: {what}. No mark is measured there: copy the file anew, or rescan."
+        return f"the scan's file is damaged: {what}"
 
     def reduced(self, factor: int, weights: Sequence[float] | None = None) -> Array:
         """The whole scan, area-averaged by an integer factor: pixel (i, j) is the mean over factor x factor pixels,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from measure.checks.judgement import judged
-from measure.checks.lost_pixels import without_lost
+from measure.checks.lost_pixels import with_damage
 from measure.checks.pitch_check import pitch_problem
 from measure.codes_and_boards.coma import one_definition
 from measure.errors import MeasurementError
@@ -158,24 +158,12 @@ def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
     frame = _fiducials(project, name, scan, camera)
     pitch, problems, notes = _pitch(project, scan, camera, frame)
     frame = replace(frame, problems=(*frame.problems, *problems))
-    notes = (*(f"{_sentence(note)}." for note in scan.notes), *notes, *_missed_reading(project, frame))
+    notes = (*(f"{note[0].upper()}{note[1:]}." for note in scan.notes), *notes, *_missed_reading(project, frame))
     measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(camera, measured):
         measured = replace(measured, frame=replace(frame, problems=(*frame.problems, misplaced)))
-    return _without_lost(scan, measure_targets(project, scan, measured))
-
-
-def _without_lost(scan: Scan, measured: MeasuredScan) -> MeasuredScan:
-    """The scan without marks where its file is damaged, which is the first of its problems."""
-    if not scan.damage:
-        return measured
-    frame = measured.frame
-    marks = without_lost(scan, frame.marks)
-    return replace(measured, frame=replace(frame, marks=marks, problems=(_sentence(scan.damage), *frame.problems)))
-
-
-def _sentence(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}" if text else ""
+    measured = measure_targets(project, scan, measured)
+    return replace(measured, frame=with_damage(scan, measured.frame))
 
 
 def _fiducials(project: Project, name: str, scan: Scan, camera: CameraFile) -> FrameMeasurement:
@@ -203,7 +191,7 @@ def _missed_reading(project: Project, frame: FrameMeasurement) -> tuple[str, ...
     """A note where something would have been read, but nothing is there that reads."""
     undecided = project.writing == "pose" and frame.pose is not None and not frame.pose.decided
     asked = project.writing == "all" or undecided
-    return (f"{_sentence(MISSING)}.",) if asked and networks() is None else ()
+    return (f"{MISSING[0].upper()}{MISSING[1:]}.",) if asked and networks() is None else ()
 
 
 def _as_learned(learned: LearnedFrom, scan: Scan) -> Pose:

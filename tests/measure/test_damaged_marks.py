@@ -15,6 +15,7 @@ import tifffile
 from damaged_files import DAMAGES, measured, outcome, stored
 from numpy.typing import NDArray
 
+from measure.checks.lost_pixels import with_damage
 from measure.errors import MeasurementError
 from measure.scans.scan import open_scan
 from measure.status import Status
@@ -83,6 +84,8 @@ def test_thirty_bytes_lost_from_a_jpeg_stream(tmp_path: Path) -> None:
     del data[len(data) // 2 : len(data) // 2 + 30]
     (tmp_path / "s.jpg").write_bytes(bytes(data))
     frame = measured(tmp_path / "s.jpg")
+    with open_scan(tmp_path / "s.jpg") as scan:
+        frame = with_damage(scan, frame)
     assert {mark.status for mark in frame.marks} == {Status.ABSENT}
     assert all("its stream ends before the picture does" in mark.reason for mark in frame.marks)
     assert "file is damaged" in frame.problems[0]
