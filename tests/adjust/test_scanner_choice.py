@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bent_scans import RESEAU_MM, films, in_a_bent_scanner
-from simulated import Truth, field_points, simulated
+from bent_scans import MIDDLE_MM, RESEAU_MM, films, in_a_bent_scanner
+from simulated import STATIONS, Truth, field_points, simulated
 
 from adjust.adjustment import adjust
 from adjust.choices.scanner_choice import choose_bends, with_bends
@@ -76,6 +76,16 @@ def test_targets_tell_the_bend_of_frames_that_lie_alike() -> None:
     network, _ = simulated(np.random.default_rng(4), truth, points=points)
     bent = in_a_bent_scanner(network, {"a20": 0.05}, {})
     assert len(chosen(bent)) > 0
+
+
+def test_two_photographs_are_enough_for_terms_that_they_tell() -> None:
+    """Their trial has far more terms than they tell, which are held by no more than its prior."""
+    truth = Truth(stations=STATIONS[:2], attitudes=((0.0, 0.0, 0.0), (-0.05, 0.36, 1.6)), middle_mm=MIDDLE_MM)
+    points = field_points(np.random.default_rng(5), 30)
+    network, _ = simulated(np.random.default_rng(4), truth, points=points, free={"k3": np.inf, "k5": np.inf})
+    choice = choose_bends(in_a_bent_scanner(network, {"a20": 0.04, "b11": -0.03}, {}), adjusted)
+    assert {"a20", "b11"} <= set(choice.network.scanners[0].terms)
+    assert not any("not looked for" in text for text in choice.remarks)
 
 
 def test_a_bend_of_given_terms_over_the_extent_of_the_scans() -> None:
