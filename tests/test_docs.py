@@ -1,6 +1,5 @@
 """The pages of docs/ that speak of the code: what they name exists, and what they quote is what the program says."""
 
-import ast
 import importlib
 import importlib.util
 import re
@@ -10,7 +9,6 @@ from types import ModuleType
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
-PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images")
 
 
 def test_every_name_in_the_theory_exists() -> None:
@@ -81,17 +79,7 @@ def script(name: str) -> ModuleType:
 
 def test_every_module_stands_on_the_map_of_the_code_with_its_own_words() -> None:
     page = (DOCS / "code.md").read_text(encoding="utf-8")
-    told = dict(re.findall(r"^- `([\w.]+)`: (.+)$", page, flags=re.MULTILINE))
-    files = [path for folder in (*PACKAGES, "benchmarks") for path in (DOCS.parent / folder).rglob("*.py")]
-    modules = {
-        ".".join(path.relative_to(DOCS.parent).with_suffix("").parts): path
-        for path in files
-        if path.name != "__init__.py"
-    }
-    assert sorted(told) == sorted(modules)
-    for name, path in modules.items():
-        own = " ".join((ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split())
-        assert own.startswith(told[name]), name
+    assert page == script("make_code_map").mapped(page), "run python docs/make_code_map.py"
 
 
 def test_what_the_map_of_the_code_says_to_enter_by_exists() -> None:
