@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from adjust.assessment import RunAssessment
 from adjust.errors import AdjustmentError, NoImageError
 from adjust.initial_values.approximations import approximate
 from adjust.initial_values.far_points import far_points
@@ -14,7 +15,6 @@ from adjust.least_squares.kept_memory import keep_freed_memory
 from adjust.network import STRAIGHT, Approximations, Network
 from adjust.options import Datum, Method, Options
 from adjust.problem import Problem, number
-from adjust.quality.assessment import RunAssessment
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
 from adjust.result import Adjustment, Cofactor
 from adjust.runs import Run, again, run

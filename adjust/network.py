@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
+from adjust.functional_model.line_of_sight import STRAIGHT as STRAIGHT
+from adjust.functional_model.line_of_sight import LineOfSight as LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND, Bend, is_term
 from adjust.functional_model.transformation import film_kind
@@ -228,26 +230,6 @@ class Observations:
             self.xy_mm[rows],
             self.covariance_mm2[rows],
         )
-
-
-@dataclass(frozen=True)
-class LineOfSight:
-    """What bends the lines of sight of aerial frames; a straight line by default.
-
-    curvature: X, Y are map coordinates, true to scale at the height Z = 0, and Z heights above the curved earth.
-    refraction: in the standard atmosphere; Z are heights above sea. unit_m: metres of the object unit.
-    """
-
-    curvature: bool = False
-    refraction: bool = False
-    unit_m: float = 1.0
-
-    @property
-    def is_straight(self) -> bool:
-        return not (self.curvature or self.refraction)
-
-
-STRAIGHT = LineOfSight()
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from adjust.quality.probabilities import Probabilities
+from adjust.probabilities import Probabilities
 from adjust.quality.reweighting import WeightFunction
-from adjust.quality.tested import PRIOR_GROUPS
+from adjust.tested import PRIOR_GROUPS
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]

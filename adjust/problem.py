@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.film_kinds import FilmKind
-from adjust.functional_model.further_observations import FurtherObservation, further_observations
 from adjust.functional_model.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.functional_model.scanner import Bend
 from adjust.functional_model.transformation import film_kind
+from adjust.further_observations import FurtherObservation, further_observations
 from adjust.network import Approximations, Network, Transformation
 from adjust.unknowns import Unknowns, list_unknowns
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.network import Network
-from adjust.quality.probabilities import Probabilities
-from adjust.quality.tested import Tested
+from adjust.probabilities import Probabilities
+from adjust.tested import Tested
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

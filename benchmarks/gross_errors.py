@@ -18,7 +18,7 @@ from scipy import special
 
 from adjust.adjustment import Options, adjust
 from adjust.network import Network
-from adjust.quality.probabilities import Probabilities
+from adjust.probabilities import Probabilities
 from adjust.result import Adjustment, Suspect
 
 SIGMAS = 10.0

@@ -31,8 +31,8 @@ from adjust.adjustment import adjust
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.approximations import approximate
 from adjust.least_squares.iteration import linearise
+from adjust.least_squares.numbering import Numbering
 from adjust.network import Exterior
-from adjust.numbering import Numbering
 from adjust.problem import ABSENT, number
 
 Array = NDArray[np.float64]

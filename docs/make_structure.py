@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.functions import compute, derivatives
+from adjust.functions import compute, derivatives
 from adjust.network import (
     Approximations,
     Camera,

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from adjust.adjustment import Options, with_datum
 from adjust.errors import AdjustmentError
-from adjust.functional_model.projection import ImageModel, approximate_image
+from adjust.functional_model.projection import ImageModel
+from adjust.images import approximate_image
 from adjust.initial_values.intersection import intersect
 from adjust.network import Approximations, Network
 from adjust.problem import number

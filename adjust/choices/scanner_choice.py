@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
-from adjust.functional_model.projection import adjusted_image
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
+from adjust.images import adjusted_image
 from adjust.network import Network, Prior, Scanner
 from adjust.quality.significance import LEVEL
 from adjust.result import Adjustment

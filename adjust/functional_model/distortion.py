@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.correction import Correction, Imaged
+from adjust.functional_model.correction import Correction, DistortionModel, Imaged
 from adjust.functional_model.families import family
-from adjust.network import Distortion
 from adjust.small_matrices import columns, zeros
 
 Array = NDArray[np.float64]
@@ -61,7 +60,7 @@ class ImageEquations:
 
 
 def image_equations(
-    distortion: Distortion, interior: Array, parameters: Array, xy_mm: Array, ray: Array
+    distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array, ray: Array
 ) -> ImageEquations:
     """The pair of equations of n points of one camera.
 
@@ -72,7 +71,7 @@ def image_equations(
 
 
 def equations_of(
-    distortion: Distortion, interior: Array, parameters: Array, xy_mm: Array, imaged: Imaged
+    distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array, imaged: Imaged
 ) -> ImageEquations:
     """The same of points whose rays' images are known."""
     c, principal_point = interior[0], interior[1:]

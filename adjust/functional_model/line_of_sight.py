@@ -11,12 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.atmosphere import bending
-from adjust.network import LineOfSight
 
 Array = NDArray[np.float64]
 
 EARTH_RADIUS_M = 6.371e6  # mean; the local one differs by half a percent, and the curvature with it
 SMALL_RAD = 1e-2  # angle at the earth's centre below which a series is exact
+
+
+@dataclass(frozen=True)
+class LineOfSight:
+    """What bends the lines of sight of aerial frames; a straight line by default.
+
+    curvature: X, Y are map coordinates, true to scale at the height Z = 0, and Z heights above the curved earth.
+    refraction: in the standard atmosphere; Z are heights above sea. unit_m: metres of the object unit.
+    """
+
+    curvature: bool = False
+    refraction: bool = False
+    unit_m: float = 1.0
+
+    @property
+    def is_straight(self) -> bool:
+        return not (self.curvature or self.refraction)
+
+
+STRAIGHT = LineOfSight()
 
 
 @dataclass(frozen=True)

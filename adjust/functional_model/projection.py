@@ -5,15 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.correction import Imaged, no_correction
+from adjust.functional_model.correction import DistortionModel, Imaged, no_correction
 from adjust.functional_model.distortion import image_equations
-from adjust.functional_model.families import family, parameter_names
-from adjust.functional_model.line_of_sight import sight_vectors
-from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.families import family
+from adjust.functional_model.line_of_sight import STRAIGHT, LineOfSight, sight_vectors
 from adjust.functional_model.scanner import NO_BEND, Bend
-from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.network import EXTERIOR_NAMES, STRAIGHT, Approximations, Distortion, Image, LineOfSight, Network
-from adjust.result import Adjustment
+from adjust.functional_model.transformation import Film
 from adjust.small_matrices import applied, determinant, product, solved
 
 Array = NDArray[np.float64]
@@ -31,7 +28,7 @@ class ImageModel:
     rotation (3, 3) object to camera; station (3,) in object units; bend_parameters (k,) of the scanner's bend.
     """
 
-    distortion: Distortion
+    distortion: DistortionModel
     interior: Array
     parameters: Array
     rotation: Array
@@ -73,61 +70,6 @@ class ImageModel:
         return ideal_from_observed(self.distortion, self.interior, self.parameters, xy_mm)
 
 
-def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
-    """An image with the values of an adjustment."""
-    network = adjustment.network
-    image = network.image_by_name[name]
-    camera = network.camera_by_name[image.camera]
-
-    def values(owner: str, names: tuple[str, ...]) -> Array:
-        return np.array([adjustment.value(f"{owner}.{each}") for each in names])
-
-    exterior = values(f"EO.{name}", EXTERIOR_NAMES)
-    parameters = values(f"T.{name}", film_parameter_names(image.transformation))
-    bend = bend_of(network, image)
-    return ImageModel(
-        distortion=camera.distortion,
-        interior=values(f"IO.{camera.name}", ("c", "x0", "y0")),
-        parameters=values(f"IO.{camera.name}", parameter_names(camera.distortion.family)),
-        rotation=rotation_from_angles(exterior[3:]),
-        station=exterior[:3],
-        film=_film(network, image, parameters, name in adjustment.mirrored),
-        line_of_sight=network.line_of_sight,
-        bend=bend,
-        bend_parameters=values(f"SC.{image.scanner}", bend.terms),
-    )
-
-
-def bend_of(network: Network, image: Image) -> Bend:
-    """That of the image's scanner."""
-    return network.scanner_by_name[image.scanner].bend if image.scanner else NO_BEND
-
-
-def approximate_image(network: Network, approximations: Approximations, name: str) -> ImageModel:
-    """An image with its approximations and the given distortion."""
-    image = network.image_by_name[name]
-    camera = network.camera_by_name[image.camera]
-    given = camera.distortion.parameters
-    names = parameter_names(camera.distortion.family)
-    exterior = approximations.exterior[name]
-    film_parameters = approximations.transformation.get(name, np.empty(0))
-    return ImageModel(
-        distortion=camera.distortion,
-        interior=approximations.interior[camera.name],
-        parameters=np.array([given[each].value if each in given else 0.0 for each in names]),
-        rotation=rotation_from_angles(exterior[3:]),
-        station=exterior[:3],
-        film=_film(network, image, film_parameters, name in approximations.mirrored),
-        line_of_sight=network.line_of_sight,
-        bend=bend_of(network, image),
-        bend_parameters=network.scanner_by_name[image.scanner].given if image.scanner else np.empty(0),
-    )
-
-
-def _film(network: Network, image: Image, parameters: Array, mirrored: bool) -> Film:
-    return Film(image.transformation, parameters, network.extent_by_image[image.name].center_mm, mirrored)
-
-
 def rays(rotation: Array, vector: Array) -> tuple[Array, Array]:
     """The rays (n, 2), -U/W and -V/W, along vectors (n, 3) from station to point, and these in the camera's axes.
 
@@ -139,7 +81,7 @@ def rays(rotation: Array, vector: Array) -> tuple[Array, Array]:
     return -in_camera[..., :2] / np.where(depth == 0.0, 1.0, depth), in_camera
 
 
-def camera_from_ray(distortion: Distortion, interior: Array, parameters: Array, ray: Array) -> tuple[Array, Mask]:
+def camera_from_ray(distortion: DistortionModel, interior: Array, parameters: Array, ray: Array) -> tuple[Array, Mask]:
     """The observed camera coordinates (n, 2) in mm of rays (n, 2), and which of them (n,) were found.
 
     The correction is defined at the observed point, so that it is inverted by Newton's method. Where the distortion
@@ -148,13 +90,15 @@ def camera_from_ray(distortion: Distortion, interior: Array, parameters: Array, 
     return camera_from_image(distortion, interior, parameters, imaged_ray(distortion, parameters, ray))
 
 
-def imaged_ray(distortion: Distortion, parameters: Array, ray: Array) -> Imaged:
+def imaged_ray(distortion: DistortionModel, parameters: Array, ray: Array) -> Imaged:
     """The images of rays (n, 2) at c = 1."""
     with np.errstate(over="ignore", invalid="ignore"):
         return family(distortion.family).image(ray, parameters)
 
 
-def camera_from_image(distortion: Distortion, interior: Array, parameters: Array, imaged: Imaged) -> tuple[Array, Mask]:
+def camera_from_image(
+    distortion: DistortionModel, interior: Array, parameters: Array, imaged: Imaged
+) -> tuple[Array, Mask]:
     """As `camera_from_ray`, of rays whose images are known."""
     c, principal_point = interior[0], interior[1:]
     correct = family(distortion.family).correct
@@ -175,7 +119,9 @@ def camera_from_image(distortion: Distortion, interior: Array, parameters: Array
     return xy_mm, found
 
 
-def ideal_from_observed(distortion: Distortion, interior: Array, parameters: Array, xy_mm: Array) -> tuple[Array, Mask]:
+def ideal_from_observed(
+    distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array
+) -> tuple[Array, Mask]:
     """Camera coordinates (n, 2) in mm free of distortion, of observed ones (n, 2); which were found."""
     ray = (xy_mm - interior[1:]) / interior[0]
     found = np.zeros(len(ray), dtype=bool)
@@ -190,7 +136,7 @@ def ideal_from_observed(distortion: Distortion, interior: Array, parameters: Arr
     return interior[1:] + interior[0] * ray, found
 
 
-def folded_over(distortion: Distortion, interior: Array, parameters: Array, xy_mm: Array) -> Mask:
+def folded_over(distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array) -> Mask:
     """Which observed camera points (n, 2) in mm lie beyond where the distortion turns the image back on itself."""
     ideal_mm, found = ideal_from_observed(distortion, interior, parameters, xy_mm)
     with np.errstate(over="ignore", invalid="ignore"):

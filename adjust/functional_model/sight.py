@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.correction import DistortionModel
 from adjust.functional_model.projection import ideal_from_observed
-from adjust.network import Distortion
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,12 @@ class Sight:
 
 
 def freed_sight(
-    points: tuple[str, ...], camera_mm: Array, sigma_mm: float, interior: Array, distortion: Distortion, known: Array
+    points: tuple[str, ...],
+    camera_mm: Array,
+    sigma_mm: float,
+    interior: Array,
+    distortion: DistortionModel,
+    known: Array,
 ) -> Sight:
     """The sight of points observed at camera_mm (n, 2), freed of the distortion as far as its parameters `known` have
     it; a coordinate that it cannot have produced stays as it is. interior: c, x0', y0' (3,)."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.functions import Derivatives
-from adjust.functional_model.further_observations import FurtherObservation
+from adjust.functions import Derivatives
+from adjust.further_observations import FurtherObservation
 from adjust.least_squares.elimination import Sums
 from adjust.least_squares.factor import Blocks
-from adjust.numbering import Numbering, Touched
+from adjust.least_squares.numbering import Numbering, Touched
 from adjust.problem import ABSENT, Problem, State
 from adjust.small_matrices import applied, inverse, lower_root, product
 

@@ -13,16 +13,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.further_observations import FurtherObservation
+from adjust.further_observations import FurtherObservation
 from adjust.least_squares.factor import Blocks, Factor
 from adjust.least_squares.iteration import Linearised
+from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_differences
-from adjust.numbering import Numbering
+from adjust.probabilities import Probabilities
 from adjust.problem import ABSENT, Problem
-from adjust.quality.probabilities import Probabilities
-from adjust.quality.tested import Tested, TestedUnits
 from adjust.result import OuterEffect, Reliability
 from adjust.small_matrices import applied, eigen, inverse, laid_out, product
+from adjust.tested import Tested, TestedUnits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -5,14 +5,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.further_observations import square_sum
+from adjust.further_observations import square_sum
 from adjust.least_squares.factor import Blocks, Factor
 from adjust.least_squares.rows import prior_differences
 from adjust.problem import ABSENT, Problem, State
 from adjust.quality.reliability import UNCHECKED, Misfits, redundancies, statistics
 from adjust.quality.reweighting import Weighting
-from adjust.quality.tested import TestedUnits
 from adjust.result import FurtherResidual, Group, Residuals
+from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem import Problem
-from adjust.quality.tested import TestedUnits
 from adjust.small_matrices import laid_out
+from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

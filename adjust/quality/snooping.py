@@ -16,13 +16,13 @@ from scipy import special
 
 from adjust.least_squares.factor import Factor
 from adjust.least_squares.iteration import Linearised
-from adjust.numbering import Numbering
-from adjust.quality.probabilities import Probabilities
+from adjust.least_squares.numbering import Numbering
+from adjust.probabilities import Probabilities
 from adjust.quality.reliability import UNCHECKED, Misfits, statistics, unit_rows
 from adjust.quality.reweighting import Weighting, robust_scale
-from adjust.quality.tested import TestedUnits
 from adjust.result import Reliability, Suspect
 from adjust.small_matrices import applied, eigen
+from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

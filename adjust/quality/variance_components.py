@@ -10,11 +10,11 @@ from scipy.sparse import csr_array
 from adjust.least_squares.factor import Factor
 from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.normal_equations import spread_squares
-from adjust.numbering import Numbering
+from adjust.least_squares.numbering import Numbering
 from adjust.quality.reliability import Misfits, unit_rows
 from adjust.quality.residuals import group_sums
 from adjust.quality.reweighting import Weighting
-from adjust.quality.tested import TestedUnits
+from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 

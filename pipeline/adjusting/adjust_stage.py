@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.adjustment import Options, adjust
-from adjust.functional_model.projection import adjusted_image
+from adjust.images import adjusted_image
 from adjust.initial_values.approximations import approximate
 from adjust.network import Network
 from adjust.result import Adjustment

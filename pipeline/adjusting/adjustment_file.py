@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import family, parameter_names
-from adjust.functional_model.projection import adjusted_image
 from adjust.functional_model.transformation import film_parameter_names
+from adjust.images import adjusted_image
 from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior, Scanner
 from adjust.quality.correlation import correlations
 from adjust.quality.significance import SignificanceTest, group_tests, parameter_tests, scanner_tests

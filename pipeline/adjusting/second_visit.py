@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from adjust.functional_model.projection import adjusted_image
+from adjust.images import adjusted_image
 from adjust.result import Adjustment
 from measure.checks.lost_pixels import without_lost
 from measure.errors import MeasurementError

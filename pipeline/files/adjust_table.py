@@ -10,7 +10,7 @@ from adjust.functional_model.transformation import film_kind
 from adjust.network import Transformation
 from adjust.options import MEASURED_KINDS
 from adjust.quality.reweighting import WeightFunction
-from adjust.quality.tested import PRIOR_GROUPS
+from adjust.tested import PRIOR_GROUPS
 from pipeline.files.tables import Table
 
 Datum = Literal["control", "minimal", "free"]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.projection import adjusted_image
+from adjust.images import adjusted_image
 from adjust.network import (
     EXTERIOR_NAMES,
     Approximations,

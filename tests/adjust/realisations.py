@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from reference_cases import CAMERA, Case, approximations_of, network_of, own_name
 
-from adjust.functional_model.functions import computed_observations
+from adjust.functions import computed_observations
 from adjust.network import Approximations, Camera, Fiducial, Network, ObjectPoint, Prior
 from adjust.problem import number
 

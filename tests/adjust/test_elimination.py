@@ -15,9 +15,9 @@ from adjust.least_squares import elimination, multifrontal, triangle
 from adjust.least_squares.elimination import eliminate
 from adjust.least_squares.factor import Blocks, Factor
 from adjust.least_squares.iteration import Linearised, factorise, linearise
+from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
 from adjust.network import Approximations, Network, Observations
-from adjust.numbering import Numbering
 from adjust.problem import number
 
 Array = NDArray[np.float64]

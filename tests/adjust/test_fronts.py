@@ -17,9 +17,9 @@ from adjust.least_squares.elimination import eliminate
 from adjust.least_squares.factor import Blocks, Factor
 from adjust.least_squares.fronts import Fronts, fronts_of
 from adjust.least_squares.iteration import factorise, linearise
+from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, prior_root_weights
 from adjust.network import Approximations, Fiducial, Network, ObjectPoint, Observations, Prior
-from adjust.numbering import Numbering
 from adjust.problem import number
 from adjust.undetermined import diagnosis
 

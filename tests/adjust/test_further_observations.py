@@ -12,6 +12,7 @@ from adjust.adjustment import Options, adjust
 from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
+from adjust.least_squares.numbering import Numbering
 from adjust.network import (
     Distance,
     Exterior,
@@ -19,7 +20,6 @@ from adjust.network import (
     ObjectPoint,
     Prior,
 )
-from adjust.numbering import Numbering
 from adjust.problem import number
 from adjust.result import Adjustment
 

@@ -12,7 +12,7 @@ from simulated import Truth, camera_point, field_points, simulated, start_of
 from adjust.adjustment import Options, adjust
 from adjust.choices.planning import plan
 from adjust.functional_model.line_of_sight import EARTH_RADIUS_M, sight_vectors
-from adjust.functional_model.projection import approximate_image
+from adjust.images import approximate_image
 from adjust.network import LineOfSight, Network
 
 Array = NDArray[np.float64]

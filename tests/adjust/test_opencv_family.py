@@ -12,15 +12,10 @@ from simulated import Truth, camera_point, field_points, simulated
 from adjust.adjustment import adjust
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.projection import (
-    ImageModel,
-    adjusted_image,
-    approximate_image,
-    camera_from_ray,
-    ideal_from_observed,
-)
+from adjust.functional_model.projection import ImageModel, camera_from_ray, ideal_from_observed
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.functional_model.transformation import Film
+from adjust.images import adjusted_image, approximate_image
 from adjust.initial_values.approximations import approximate
 from adjust.network import Approximations, Camera, Distortion, Image, Network, ObjectPoint, Observations, Prior
 

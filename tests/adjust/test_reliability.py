@@ -11,7 +11,7 @@ from simulated import Truth, field_points, simulated
 
 from adjust.adjustment import Options, adjust
 from adjust.network import Approximations, Calibration, Camera, Exterior, Network, ObservationKind, Prior
-from adjust.quality.probabilities import Probabilities
+from adjust.probabilities import Probabilities
 from adjust.result import Adjustment, Reliability
 
 Array = NDArray[np.float64]

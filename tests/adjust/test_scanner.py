@@ -10,8 +10,8 @@ from simulated import Truth, field_points, simulated
 
 from adjust.adjustment import Options, adjust
 from adjust.errors import AdjustmentError
-from adjust.functional_model.projection import adjusted_image
 from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
+from adjust.images import adjusted_image
 from adjust.initial_values.approximations import approximate
 from adjust.network import Network, Prior, Scanner, Transformation
 from adjust.quality.significance import scanner_tests

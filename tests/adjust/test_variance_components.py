@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from simulated import field_points, simulated
 
 from adjust.adjustment import Options, adjust
-from adjust.functional_model.functions import compute, derivatives
 from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functions import compute, derivatives
 from adjust.least_squares.iteration import linearise
+from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
 from adjust.network import Approximations, Network
-from adjust.numbering import Numbering
 from adjust.problem import State, number
 from adjust.result import Adjustment
 

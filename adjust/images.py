@@ -1,0 +1,69 @@
+"""The images of a network as they were adjusted, or as they are known before: models that project points."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.functional_model.scanner import NO_BEND, Bend
+from adjust.functional_model.transformation import Film, film_parameter_names
+from adjust.network import EXTERIOR_NAMES, Approximations, Image, Network
+from adjust.result import Adjustment
+
+Array = NDArray[np.float64]
+
+
+def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
+    """An image with the values of an adjustment."""
+    network = adjustment.network
+    image = network.image_by_name[name]
+    camera = network.camera_by_name[image.camera]
+
+    def values(owner: str, names: tuple[str, ...]) -> Array:
+        return np.array([adjustment.value(f"{owner}.{each}") for each in names])
+
+    exterior = values(f"EO.{name}", EXTERIOR_NAMES)
+    parameters = values(f"T.{name}", film_parameter_names(image.transformation))
+    bend = bend_of(network, image)
+    return ImageModel(
+        distortion=camera.distortion,
+        interior=values(f"IO.{camera.name}", ("c", "x0", "y0")),
+        parameters=values(f"IO.{camera.name}", parameter_names(camera.distortion.family)),
+        rotation=rotation_from_angles(exterior[3:]),
+        station=exterior[:3],
+        film=_film(network, image, parameters, name in adjustment.mirrored),
+        line_of_sight=network.line_of_sight,
+        bend=bend,
+        bend_parameters=values(f"SC.{image.scanner}", bend.terms),
+    )
+
+
+def bend_of(network: Network, image: Image) -> Bend:
+    """That of the image's scanner."""
+    return network.scanner_by_name[image.scanner].bend if image.scanner else NO_BEND
+
+
+def approximate_image(network: Network, approximations: Approximations, name: str) -> ImageModel:
+    """An image with its approximations and the given distortion."""
+    image = network.image_by_name[name]
+    camera = network.camera_by_name[image.camera]
+    given = camera.distortion.parameters
+    names = parameter_names(camera.distortion.family)
+    exterior = approximations.exterior[name]
+    film_parameters = approximations.transformation.get(name, np.empty(0))
+    return ImageModel(
+        distortion=camera.distortion,
+        interior=approximations.interior[camera.name],
+        parameters=np.array([given[each].value if each in given else 0.0 for each in names]),
+        rotation=rotation_from_angles(exterior[3:]),
+        station=exterior[:3],
+        film=_film(network, image, film_parameters, name in approximations.mirrored),
+        line_of_sight=network.line_of_sight,
+        bend=bend_of(network, image),
+        bend_parameters=network.scanner_by_name[image.scanner].given if image.scanner else np.empty(0),
+    )
+
+
+def _film(network: Network, image: Image, parameters: Array, mirrored: bool) -> Film:
+    return Film(image.transformation, parameters, network.extent_by_image[image.name].center_mm, mirrored)
