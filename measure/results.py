@@ -67,15 +67,17 @@ class Pose:
     counter-clockwise, and so seen in the scan.
     decided: whether something in the picture (or the user) decides it; otherwise it is assumed.
     evidence: what speaks for it, and by how much, one sentence each.
-    likelihoods: the logarithms of all poses', by name, as far as they were compared. writing: the pose in which most of
-    the writing lies, as far as any was read; "" where that is not clear.
+    written: log-likelihoods of the poses, by name, by what is written alone; empty where nothing was read. writing: the
+    pose in which most of that lies in the scan; "" where that is not clear. roll: what is to be asked once for all
+    frames of the camera; "" where there is no such question.
     """
 
     name: str
     decided: bool
     evidence: tuple[str, ...] = ()
-    likelihoods: Mapping[str, float] = field(default_factory=dict)
+    written: Mapping[str, float] = field(default_factory=dict)
     writing: str = ""
+    roll: str = ""
 
 
 @dataclass(frozen=True, repr=False)

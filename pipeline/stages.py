@@ -13,8 +13,10 @@ from pipeline.adjusting.second_visit import measure_again
 from pipeline.errors import InputError, WriteError
 from pipeline.files.adjustment_reader import covariance_path
 from pipeline.files.atomic import write_atomically
+from pipeline.files.images_file import fill_images
 from pipeline.files.project_file import Project
 from pipeline.measuring.comparator_file import ComparatorPoint, read_comparator, write_comparator
+from pipeline.measuring.frames_file import for_images, write_frames
 from pipeline.measuring.measure_stage import measure_scans
 from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
 from pipeline.opencv_check.check import check_against_opencv
@@ -51,15 +53,17 @@ def run_all(project: Project, reporter: Reporter) -> Summary:
             new.publish()  # hours of measuring are not lost for a wrong point number
             raise
         new.publish()
+        _fill_images(project, scans)
         return summary
 
 
 def run_measure(project: Project, reporter: Reporter) -> Summary:
     """Scans to comparator.csv."""
     with unpublished(project) as new:
-        _measured_marks(project, measured_from(project), new, reporter)
+        scans = _measured_marks(project, measured_from(project), new, reporter)
         data = measured(project, new.at)
         new.publish()
+    _fill_images(project, scans)
     return summarise(data, {"comparator coordinates": project.comparator, "measurement": project.measurement_path})
 
 
@@ -141,6 +145,15 @@ def _write_marks(project: Project, scans: Sequence[MeasuredScan], made_from: Mad
     write_measurement(measurement, scans, project.output, made_from)
     pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
     write_comparator(new.place(project.comparator), [scan.frame for scan in scans], pitch_um, of_file(measurement))
+    written = write_frames(new.place(project.frames_path), scans)
+    if not written:
+        new.remove(project.frames_path)
+
+
+def _fill_images(project: Project, scans: Sequence[MeasuredScan]) -> None:
+    """What was read on the film, where the user's own list has empty columns for it."""
+    if project.images_path is not None:
+        fill_images(project.images_path, for_images(scans))
 
 
 def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished) -> None:

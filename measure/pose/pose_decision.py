@@ -29,8 +29,8 @@ from measure.writing.line import Line
 
 Array = NDArray[np.float64]
 
-_DECIDED = 7.0  # log-odds: a thousand to one
-_TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence
+DECIDED = 7.0  # log-odds: a thousand to one
+TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence
 _NAMED = 4.0  # times the gate: how far from where a pose's placement puts a mark it still has its name
 _UNMIRRORED = 2.3  # log-odds before anything is seen: ten to one; of 16 scans of archives none was mirrored
 _QUOTED = 3  # lines of writing that are told
@@ -165,21 +165,21 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
     if not verdicts:
         return Pose("0", False, ("no pose names the marks that were found.",))
     seen = max(verdict.seen for verdict in verdicts)
-    alike = [verdict for verdict in verdicts if seen - verdict.seen < _DECIDED]
+    alike = [verdict for verdict in verdicts if seen - verdict.seen < DECIDED]
     best = max(alike, key=lambda verdict: verdict.total)
     others = sorted((v for v in verdicts if v not in alike), key=lambda verdict: -verdict.total)
     against = _against(best, others[0], layout, lines) if others else ()
-    of_all = {verdict.pose: verdict.seen for verdict in verdicts}
+    written = {verdict.pose: verdict.writing for verdict in verdicts} if lines else {}
     main = main_pose(lines)
     if len(alike) == 1:
         reasons = against or (f"no other pose explains the {found} marks found.",)
-        return Pose(best.pose, True, reasons, of_all, main)
+        return Pose(best.pose, True, reasons, written, main)
     names = ", ".join(verdict.pose for verdict in alike)
     lead = best.total - alike[0].total
-    near = [verdict for verdict in alike if best.total - verdict.total < _TOLD]
+    near = [verdict for verdict in alike if best.total - verdict.total < TOLD]
     upright = next((verdict.pose for verdict in near if main and pose_in_camera(main, verdict.pose) == "0"), "")
     like_writing = ", in which most of what is written is upright" if upright else ""
-    if lead > _TOLD:
+    if lead > TOLD:
         assumed = upright or best.pose
         equal = [verdict.pose for verdict in near if verdict.pose != assumed]
         as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
@@ -193,28 +193,28 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
             f"nothing in the {found} marks found tells the poses {names} apart: their pictures and given coordinates "
             f"are alike; {assumed} is assumed{like_writing}."
         )
-    return Pose(assumed, False, (told, *against), of_all, main)
+    return Pose(assumed, False, (told, *against), written, main)
 
 
 def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:
     """What speaks for the best pose against the likeliest of those that it rules out, a sentence each."""
     sentences = []
     by_site = best.pictures - rival.pictures
-    if by_site.sum() > _TOLD:
-        telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > _TOLD]
+    if by_site.sum() > TOLD:
+        telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > TOLD]
         kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in telling})
         sentences.append(
             f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks speak against the next best pose "
             f"{rival.pose} with log-odds {by_site.sum():.1f}."
         )
     asymmetry = float(np.sqrt(max(rival.chi_square - best.chi_square, 0.0)))
-    if abs(best.coordinates - rival.coordinates) > _TOLD:
+    if abs(best.coordinates - rival.coordinates) > TOLD:
         word = "against" if best.coordinates > rival.coordinates else "for"
         sentences.append(
             f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, speaks {word} pose {rival.pose} "
             f"with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
         )
-    if abs(best.writing - rival.writing) > _TOLD:
+    if abs(best.writing - rival.writing) > TOLD:
         sentences.append(_of_writing(best, rival, layout, lines))
     return tuple(sentences)
 

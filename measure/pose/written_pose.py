@@ -17,9 +17,10 @@ from measure.writing.line import Line
 
 Array = NDArray[np.float64]
 
-_A_CHARACTER = 0.6  # log-odds of a way to lie, a character that is legible in it beyond those of another way
-_ELSEWHERE = 4.6  # the most that a line says by where it stands if nothing in it shows a title or a plate: of a hundred
-_FEIGNED = 1 / 3000  # probability that a frame's writing reads as none of it should
+_A_CHARACTER = 1.4  # log-odds of a way to lie, a character that is legible in it beyond those of another way
+_A_PLACE = 0.7  # log-odds a legible character that a title or a plate stands where the camera has it
+_ANYBODYS = 4.6  # the most of that for a line in which nothing shows a title or a plate: a hundred to one
+_FEIGNED = 1 / 3000  # that what is written misleads: of so many readings none that was better by 3 characters was wrong
 _PLAINLY = 1.5  # times as many characters as in any other way
 _DIRECTIONS: Mapping[Side, tuple[int, int]] = {"left": (-1, 0), "right": (1, 0), "top": (0, 1), "bottom": (0, -1)}
 
@@ -27,6 +28,11 @@ _DIRECTIONS: Mapping[Side, tuple[int, int]] = {"left": (-1, 0), "right": (1, 0),
 def writing_likelihoods(lines: Sequence[Line], places: Sequence[WrittenPlace], poses: Sequence[str]) -> Array:
     """(n,) log-likelihoods of the poses: 0 for the best, and no less than the probability that writing misleads."""
     scores = np.array([sum((line_score(line, places, pose) for line in lines), 0.0) for pose in poses])
+    return bounded(scores)
+
+
+def bounded(scores: Array) -> Array:
+    """(n,) log-likelihoods of which none is less than the probability that writing misleads."""
     return np.asarray(np.log((1 - _FEIGNED) * np.exp(scores - scores.max(initial=-np.inf)) + _FEIGNED))
 
 
@@ -34,12 +40,13 @@ def line_score(line: Line, places: Sequence[WrittenPlace], pose: str) -> float:
     """The log-likelihood of one line in a pose, up to a constant of the line."""
     own = {pose_in_camera(way, pose): reading.legible for way, reading in line.ways.items()}
     upright = {way: legible for way, legible in own.items() if not way.endswith("m")}
-    anyhow, longest = _A_CHARACTER * max(upright.values()), _A_CHARACTER * max(own.values())
+    anyhow = _A_CHARACTER * max(upright.values())
     plate = is_plate(line)
     expected = [] if is_of_film(line) else [place for place in places if place.plate == plate]
     if not expected:
         return anyhow
-    elsewhere = anyhow - (longest if plate or is_title(line) else min(longest, _ELSEWHERE))
+    misplaced = _A_PLACE * max(own.values())
+    elsewhere = anyhow - (misplaced if plate or is_title(line) else min(misplaced, _ANYBODYS))
     side = side_in_camera(line.side, pose)
     there = [max(upright.values()) if place.pose is None else upright.get(place.pose, 0.0)
              for place in expected if place.side == side]  # fmt: skip

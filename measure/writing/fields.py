@@ -92,7 +92,7 @@ _PATTERNS: tuple[tuple[str, str, Reader], ...] = (
     ("camera_type", rf"({'|'.join(_TYPES)})", _type),
     ("camera_number", rf"{_BEFORE_NUMBER}(\d{{3,6}}) ?(?={_DISTANCE}(?!\d)|\D|$)", _as_it_stands),
     ("principal_distance_mm", rf"(?:^|[^\d.,]|{_BEFORE_NUMBER}\d{{3,6}}){_DISTANCE}(?![\d.,/-])", _as_it_stands),
-    ("run", r"\bRUN ?(?:NO\.? ?)?([0-9A-Z]{1,5})\b", _as_it_stands),
+    ("run", r"\bRUN ?(?:NO\.? ?)?([0-9A-Z]{1,5})(?![\w.,:/'-])", _as_it_stands),
     ("frames", r"(?<![\w.-])(\d{2,5}) ?- ?(\d{2,5})(?![\w.-])", _frames),
     ("date", r"(?<!\d)(\d{1,2}) ?[./-] ?(\d{1,2}) ?[./-] ?(\d{4}|\d{2})(?!\d)", _date),
     ("date", rf"(\d{{1,2}})?[ .]*({'|'.join(_MONTHS)})[A-Z]*[ .]*(\d{{4}}|\d\d)(?!\d)", _named_date),

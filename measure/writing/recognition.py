@@ -13,6 +13,7 @@ Picture = NDArray[np.uint8]
 WAYS = ("0", "180", "0m", "180m")  # in which a line may lie that runs from left to right
 HEIGHT_PX = 48  # of a line, as the network reads it
 _SURE = 0.5  # a character of this confidence counts nothing, one of 1 as a whole
+_BLANK, _BLANK_COLUMNS = 1.5, 1.5  # times the usual step from letter to letter, and columns more than it
 _PLAIN = str.maketrans("′’‘´`″“”：，。．（）－—–／", "'''''\"\"\":,..()---/")  # signs for which the network knows many
 
 
@@ -33,8 +34,19 @@ def _decoded(probabilities: NDArray[np.float32], characters: Sequence[str]) -> R
     is none (connectionist temporal classification). What no Latin keyboard writes is not taken for writing."""
     best = probabilities.argmax(axis=1)
     starts = np.flatnonzero((best > 0) & np.concatenate([[True], best[1:] != best[:-1]]))
-    read = [(characters[best[column]].translate(_PLAIN), float(probabilities[column].max())) for column in starts]
-    read = [(character, confidence) for character, confidence in read if character.isascii()]
-    legible = sum(max(confidence - _SURE, 0.0) / (1.0 - _SURE) for character, confidence in read if character != " ")
-    mean = sum(confidence for _, confidence in read) / max(len(read), 1)
-    return Reading("".join(character for character, _ in read).strip(), mean, legible)
+    read = [characters[best[column]].translate(_PLAIN) for column in starts]
+    kept = [index for index, character in enumerate(read) if character.isascii()]
+    starts, text = starts[kept], "".join(read[index] for index in kept)
+    letters = np.array([letter != " " for letter in text], dtype=bool)
+    confidences = probabilities.max(axis=1)[starts][letters].astype(float)
+    legible = float(((confidences - _SURE) / (1.0 - _SURE)).clip(0.0).sum())
+    return Reading(_spaced(text, starts), float(confidences.mean()) if len(confidences) else 0.0, legible)
+
+
+def _spaced(text: str, columns: NDArray[np.int_]) -> str:
+    """The text with blanks where letters stand plainly farther apart: the network sees few blanks itself."""
+    steps = np.diff(columns, prepend=columns[:1])
+    usual = float(np.median(steps[1:])) if len(steps) > 1 else 0.0
+    wide = steps >= max(_BLANK * usual, usual + _BLANK_COLUMNS)
+    spaced = "".join(f" {letter}" if gap else letter for letter, gap in zip(text, wide, strict=True))
+    return " ".join(spaced.split())

@@ -1,5 +1,7 @@
 """images.csv: exterior orientations, approximate or observed, the camera and the scanner of each image."""
 
+import csv
+import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,10 +11,13 @@ import numpy as np
 
 from adjust.network import Exterior
 from pipeline.errors import InputError
+from pipeline.files.atomic import write_atomically
 from pipeline.files.csv_table import Row, read_csv
+from pipeline.files.text_file import read_bytes
 
 ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = tuple(f"s{element}" for element in ELEMENTS)
+WRITTEN = ("run", "frame", "date", "time", "height", "scale", "camera_number")  # what may be read on the film
 
 
 @dataclass(frozen=True)
@@ -32,13 +37,40 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
     """
     exterior: dict[str, Exterior | None] = {}
     camera, scanner = {}, {}
-    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner")):
+    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner", *WRITTEN)):
         name = image_name(row.name("image"))
         if name in exterior:
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
         exterior[name] = _exterior(row, antenna)
         camera[name], scanner[name] = row.text("camera"), row.text("scanner")
     return GivenImages(exterior, camera, scanner)
+
+
+def fill_images(path: Path, values: Mapping[str, Mapping[str, str]]) -> None:
+    """Write values by image and column into the cells of images.csv that are empty, and leave all else as it stands.
+    Raises InputError where the file cannot be read or written."""
+    text = read_bytes(path).decode("utf-8")
+    lines = text.splitlines(keepends=True)
+    header: list[str] = []
+    for index, line in enumerate(lines):
+        if not line.strip() or line.lstrip("\ufeff ").startswith("#"):
+            continue
+        body = line.rstrip("\r\n")
+        cells = next(csv.reader([body.lstrip("\ufeff")]))
+        if not header:
+            header = [cell.strip() for cell in cells]
+            continue
+        own = values.get(image_name(cells[header.index("image")]), {})
+        filled = [
+            own.get(column, "") if not cell.strip() else cell for column, cell in zip(header, cells, strict=False)
+        ]
+        if filled != cells[: len(header)]:
+            written = io.StringIO()
+            csv.writer(written, lineterminator=line[len(body) :]).writerow([*filled, *cells[len(header) :]])
+            lines[index] = written.getvalue()
+    changed = "".join(lines)
+    if changed != text:
+        write_atomically(path, changed)
 
 
 def image_name(text: str) -> str:

@@ -56,6 +56,7 @@ class Project:
     adjust: AdjustSettings
     max_pixels: int | None = None
     writing: Reads = "pose"
+    images_path: Path | None = None
 
     def open_scan(self, name: str) -> Scan:
         """The scan of an image. Raises MeasurementError where it cannot be read."""
@@ -83,13 +84,17 @@ class Project:
         return self.output / "measurement.json"
 
     @property
+    def frames_path(self) -> Path:
+        return self.output / "frames.csv"
+
+    @property
     def report_path(self) -> Path:
         return self.output / "report.html"
 
     @property
     def results(self) -> tuple[Path, ...]:
         """What the program may write: an earlier result at most may stand there."""
-        measured = (self.comparator, self.measurement_path) if self.scans else ()
+        measured = (self.comparator, self.measurement_path, self.frames_path) if self.scans else ()
         adjusted = (self.adjustment_path, covariance_path(self.adjustment_path), self.check_path, self.choice_path)
         return (*measured, *adjusted, self.report_path)
 
@@ -173,6 +178,7 @@ def read_project(path: Path) -> Project:
         given_points=read_points(named["points"]) if "points" in named else None,
         given_images=images,
         given_distances=read_distances(named["distances"]) if "distances" in named else (),
+        images_path=named.get("images"),
     )
     if not project.scans and not project.comparator.exists():
         raise InputError(

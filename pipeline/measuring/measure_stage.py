@@ -26,8 +26,10 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.learned_table import LearnedFrom
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_model import misplaced_principal_point
+from pipeline.measuring.frames_file import with_same_frames
 from pipeline.measuring.learn_stage import learn_marks, pose_of
 from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.measuring.roll import poses_of_roll
 from pipeline.measuring.sheet_check import with_checked_sheet
 from pipeline.measuring.target_stage import check_targets, measure_targets
 from pipeline.measuring.tie_stage import check_tie_names, with_ties
@@ -51,7 +53,7 @@ def measure_scans(project: Project, reporter: Reporter, learned_folder: Path) ->
     _check_readable(project)
     with worker_pool(len(project.scans)) as workers:
         learned = learn_marks(project, reporter, workers, learned_folder)
-        scans = _measured_scans(learned, reporter, workers)
+        scans = with_same_frames(_as_rolls(learned, _measured_scans(learned, reporter, workers), workers))
         scans = _of_each_camera(project, scans, _at_one_definition)
         checked = with_checked_sheet(project, _of_each_camera(learned, scans, partial(_judged, learned)))
         if project.ties is None:
@@ -69,6 +71,28 @@ def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> 
             if done == 1 < len(futures):
                 reporter.say(expected_time(seconds, len(futures)))
     return [future.result()[0] for future in futures]
+
+
+def _as_rolls(project: Project, measured: Sequence[MeasuredScan], workers: Executor) -> list[MeasuredScan]:
+    """The scans with the poses that all frames of a camera tell together; measured again where marks change names."""
+    poses: dict[str, Pose] = {}
+    for camera in project.cameras.values():
+        own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
+        free = [scan for scan in own if pose_of(project, camera, scan.frame.image) == "auto"]
+        poses |= poses_of_roll(free, camera.writing)
+    renamed = {
+        scan.frame.image: replace(project, pose=poses[scan.frame.image].name, writing="none")
+        for scan in measured
+        if scan.frame.image in poses and scan.frame.pose and scan.frame.pose.name != poses[scan.frame.image].name
+    }
+    again = {image: workers.submit(measure_scan, posed, image) for image, posed in renamed.items()}
+    scans = []
+    for scan in measured:
+        image = scan.frame.image
+        new = again[image].result() if image in again else scan
+        frame = replace(new.frame, pose=poses.get(image, scan.frame.pose), writing=scan.frame.writing)
+        scans.append(replace(new, frame=frame))
+    return scans
 
 
 def _timed(project: Project, name: str) -> tuple[MeasuredScan, float]:

@@ -13,6 +13,7 @@ import numpy as np
 from measure.covariance import Cause, Covariance
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
+from measure.writing.line import Line, Reading
 from pipeline.errors import InputError
 from pipeline.files.atomic import write_atomically
 from pipeline.files.text_file import read_json
@@ -66,6 +67,7 @@ def _image(measured: MeasuredScan, folder: Path) -> dict[str, Any]:
         "height_px": measured.height_px,
         "pitch_um": list(measured.pitch_um),
         "pose": None if frame.pose is None else _pose(frame.pose),
+        "writing": None if frame.writing is None else [_line(line) for line in frame.writing],
         "pixel_from_camera": None if matrix is None else matrix.tolist(),
         "problems": list(frame.problems),
         "notes": list(measured.notes),
@@ -78,8 +80,13 @@ def _relative(scan: Path, folder: Path) -> str:
     return Path(os.path.relpath(scan.resolve(), folder.resolve())).as_posix()
 
 
+def _line(line: Line) -> dict[str, Any]:
+    ways = {pose: vars(reading) for pose, reading in line.ways.items()}
+    return {"text": line.text, "pose": line.pose, "side": line.side, "outline_px": line.outline_px, "ways": ways}
+
+
 def _pose(pose: Pose) -> dict[str, Any]:
-    return {"name": pose.name, "decided": pose.decided, "evidence": list(pose.evidence)}
+    return {"name": pose.name, "decided": pose.decided, "evidence": list(pose.evidence), "roll": pose.roll}
 
 
 def _mark(mark: MarkMeasurement) -> dict[str, Any]:
@@ -106,13 +113,23 @@ def _measured(name: str, image: Mapping[str, Any], folder: Path) -> MeasuredScan
     frame = FrameMeasurement(
         image=name,
         marks=tuple(_read_mark(mark) for mark in image["marks"]),
-        pose=None if pose is None else Pose(pose["name"], pose["decided"], tuple(pose["evidence"])),
+        pose=None if pose is None else _read_pose(pose),
         pixel_from_camera=None if matrix is None else np.array(matrix, dtype=np.float64),
         problems=tuple(image["problems"]),
+        writing=None if image.get("writing") is None else tuple(_read_line(line) for line in image["writing"]),
     )
     pitch = image["pitch_um"]
     size = (image["width_px"], image["height_px"])
     return MeasuredScan(folder / image["scan"], *size, (pitch[0], pitch[1]), frame, tuple(image.get("notes", ())))
+
+
+def _read_pose(pose: Mapping[str, Any]) -> Pose:
+    return Pose(pose["name"], pose["decided"], tuple(pose["evidence"]), roll=pose.get("roll", ""))
+
+
+def _read_line(line: Mapping[str, Any]) -> Line:
+    ways = {pose: Reading(**reading) for pose, reading in line["ways"].items()}
+    return Line(ways, line["pose"], tuple((col, row) for col, row in line["outline_px"]), line["side"])
 
 
 def _read_mark(mark: Mapping[str, Any]) -> MarkMeasurement:

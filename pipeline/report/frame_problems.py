@@ -4,13 +4,18 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
-from pipeline.report.data import Problem
+from pipeline.report.data import Json, Problem
 from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
 from pipeline.wording import LISTED, counted, listed
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
+
+_ONE_ANSWER = (
+    "One answer holds for all of them: say in the camera file beside which side of the frame it writes, and how, as "
+    'writing = ["left: reads upward"].'
+)
 
 Sentence = TypeVar("Sentence", Problem, str)
 
@@ -30,14 +35,20 @@ def said_by(shots: list[Frame], said: Callable[[Frame], Iterable[Sentence]]) -> 
     return images
 
 
+def _assumed(pose: Json) -> Problem:
+    if pose.get("roll"):
+        return Problem(f"pose assumed: {pose['roll']}.", _ONE_ANSWER)
+    return Problem(
+        f"pose assumed ({pose['name']}). {' '.join(pose.get('evidence', ()))}",
+        'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
+    )
+
+
 def _problems_of(frame: Frame) -> Iterator[Problem]:
     pose, said = frame.scan.get("pose"), set[str]()
     if pose and not pose["decided"]:
         said.update(pose.get("evidence", ()))
-        yield Problem(
-            f"pose assumed ({pose['name']}). {' '.join(pose.get('evidence', ()))}",
-            'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
-        )
+        yield _assumed(pose)
     yield from (Problem(problem) for problem in frame.scan.get("problems", ()) if problem not in said)
     lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
     found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)

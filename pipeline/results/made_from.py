@@ -17,7 +17,17 @@ MARKS, POINTS, IMAGES, DISTANCES = "marks", "points", "images", "distances"
 PLACES = "points, orientations or lenses"
 
 # Of a project; all else of it is a setting, and so is what may be added.
-_FILES = {"path", "cameras", "scans", "comparator", "output", "given_points", "given_images", "given_distances"}
+_FILES = {
+    "path",
+    "cameras",
+    "scans",
+    "comparator",
+    "output",
+    "given_points",
+    "given_images",
+    "given_distances",
+    "images_path",
+}
 _NO_MATTER = {"max_pixels"}
 # Of a camera: what tells where its targets are, but not what its marks are.
 _LENS = {

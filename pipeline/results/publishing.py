@@ -20,6 +20,7 @@ _JSON = rb'\s*\{\s*("reseau"|"verdict": "[a-z ]+",\s*"reason"|"chosen": (null|\{
 _HEADS = {
     ".json": _JSON,
     ".npz": rb"PK\x03\x04.{26}(fingerprint|names)\.npy",
+    ".csv": rb"# written about the frames, reseau",
     ".html": rb"<!DOCTYPE html>.*<title>.*: calibration report</title>",
     ".toml": rb"# Marks learned by reseau",
     ".tif": rb"(II|MM).*reseau",

@@ -1,0 +1,252 @@
+"""The pose by what is written, in rendered frames, against their truth.
+
+python benchmarks/writing.py [FRAMES] [WITHOUT] [ROWS.jsonl]
+
+Frames of four marks alike, in all poses, of every background, negatives too, blurred, grainy, compressed. Titles of 6
+to 40 characters stand beside one side, among them words that are the same upside down or in a mirror; on some a plate
+beside the opposite side, and a number by hand anywhere. Three of four cameras say where they write. The frames WITHOUT
+writing are of cameras that say so too. ROWS keeps what is done: a run that is stopped goes on.
+"""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+from search_frames import SIDES
+from writing_lines import ALIKE, line_text
+
+from measure.fiducial_options import FiducialOptions
+from measure.fiducials import measure_fiducials
+from measure.marks.poses import POSES
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Side, WrittenPlace, ring_cross
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from measure.writing.fields import is_plate
+from measure.writing.line import Line, Reading
+from pipeline.rendered.scene_file import scene_mark
+from synthetic_images.background import scene_background
+from synthetic_images.frame import make_frame
+from synthetic_images.render import grey_strips
+from synthetic_images.scene import (
+    Background,
+    DiskField,
+    Film,
+    FilmTransformation,
+    Scanner,
+    Scene,
+    SceneCamera,
+    SceneFiducial,
+    SceneImage,
+    Tones,
+    Writing,
+)
+from synthetic_images.writing import FONTS, HANDWRITING
+
+Generator = np.random.Generator
+Row = dict[str, Any]
+
+SEED = 62
+FRAME_MM, PITCH_UM, MARGIN_MM, AT_MM = 24.0, 40.0, 4.2, 10.6
+READABLE = 12  # characters
+BINS = (0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.5)
+OPPOSITE: Mapping[Side, Side] = {"left": "right", "right": "left", "top": "bottom", "bottom": "top"}
+TURNED: Mapping[str, str] = {"0": "180", "180": "0", "90": "270", "270": "90"}
+
+
+def main() -> None:
+    """Print the tables."""
+    written, without = (int(text) for text in (*sys.argv[1:3], "500", "200")[:2])
+    path = Path(sys.argv[3]) if len(sys.argv) > 3 else None
+    kept = [json.loads(line) for line in path.read_text().splitlines()] if path and path.exists() else []
+    rows = {row["index"]: row for row in kept}
+    total = written + without
+    for index in range(total):
+        if index not in rows:
+            bare = (index + 1) * without // total > index * without // total  # spread over the run
+            rows[index] = row_of(index, not bare)
+            if path:
+                with path.open("a") as file:
+                    file.write(json.dumps(rows[index]) + "\n")
+    report(list(rows.values()))
+
+
+def report(rows: list[Row]) -> None:
+    """What became of the poses, and log-odds against how often they are right."""
+    classes = {
+        f"places known, {READABLE} and more characters": [r for r in rows if r["places"] and r["letters"] >= READABLE],
+        f"places known, fewer than {READABLE}": [r for r in rows if r["places"] and 0 < r["letters"] < READABLE],
+        "places not known": [r for r in rows if not r["places"] and r["letters"]],
+        "nothing written": [r for r in rows if not r["letters"]],
+    }
+    for name, own in classes.items():
+        counts = Counter(outcome(row) for row in own)
+        print(f"{name}: {len(own)} frames: {', '.join(f'{count} {told}' for told, count in sorted(counts.items()))}")
+    for row in rows:
+        if "WRONG" in outcome(row):
+            print(row)
+    read = [row for row in rows if row["letters"] and row["likelihoods"]]
+    print("\nlog-odds of mirrored or not, and of the turn among the four (places known): told, frames, right")
+    table("mirror", [mirror_lead(row) for row in read])
+    table("turn", [turn_lead(row) for row in read if row["places"]])
+
+
+def outcome(row: Row) -> str:
+    """Of one frame."""
+    if row["found"] is None:
+        return "not found"
+    right = row["found"] == row["true"]
+    if row["decided"]:
+        return "decided right" if right else "decided WRONG"
+    mirrored = row["found"].endswith("m") == row["true"].endswith("m")
+    sure = abs(mirror_lead(row)[0]) >= 7.0 if row["likelihoods"] else False
+    return f"assumed, mirror {'told' if sure else 'assumed'} {'right' if mirrored else 'WRONG' if sure else 'wrong'}"
+
+
+def mirror_lead(row: Row) -> tuple[float, bool]:
+    """The log-odds that the better one of mirrored or not has, and whether it is the true one."""
+    plain, mirrored = (
+        max(value for pose, value in row["likelihoods"].items() if pose.endswith("m") == face) for face in (False, True)
+    )
+    return abs(plain - mirrored), (mirrored > plain) == row["true"].endswith("m")
+
+
+def turn_lead(row: Row) -> tuple[float, bool]:
+    """The log-odds of the best of the four turns with the true mirror against the next, and whether it is true."""
+    own = {p: v for p, v in row["likelihoods"].items() if p.endswith("m") == row["true"].endswith("m")}
+    best, second, *_ = sorted(own, key=lambda pose: -own[pose])
+    return own[best] - own[second], best == row["true"]
+
+
+def table(name: str, leads: Iterable[tuple[float, bool]]) -> None:
+    told = list(leads)
+    for low, high in pairwise(BINS):
+        inside = [right for lead, right in told if low <= lead < high]
+        if inside:
+            print(f"  {name} {low:.1f} to {high:.1f}: {len(inside):4d} frames, {sum(inside):4d} right")
+
+
+def row_of(index: int, written: bool) -> Row:
+    """One frame, rendered and measured."""
+    rng = np.random.default_rng([SEED, index])
+    side = SIDES[rng.integers(4)]
+    way = str(rng.choice(("0", "180") if side in ("top", "bottom") else ("90", "270")))
+    plate_way = TURNED[way] if rng.random() < 0.7 else way
+    lines = titles(rng, side, way)
+    lines += plate(rng, OPPOSITE[side], plate_way) if rng.random() < 0.4 else []
+    lines += by_hand(rng) if rng.random() < 0.4 else []
+    known = (WrittenPlace(side, way), WrittenPlace(OPPOSITE[side], plate_way, plate=True))
+    places = known if rng.random() < 0.75 else ()
+    mark = MarkShape(ring_cross(0.5, 0.1, 0.8, 0.1))
+    corners = [(AT_MM, -AT_MM), (-AT_MM, -AT_MM), (-AT_MM, AT_MM), (AT_MM, AT_MM)]
+    marks = tuple(LayoutMark(str(number), xy, (0.005, 0.005), mark) for number, xy in enumerate(corners, 1))
+    made = scene(rng, marks, tuple(lines) if written else ())
+    grey = np.concatenate(list(grey_strips(make_frame(made, 0), 0, scene_background(made))))
+    scan = Scan(Path(f"{index}.tif"), WholePicture(stored(rng, grey)[..., None]), NO_TAGS)
+    layout = FiducialLayout(marks, (FRAME_MM, FRAME_MM), places)
+    found = measure_fiducials(scan, layout, (PITCH_UM, PITCH_UM), FiducialOptions(writing="pose"))
+    return {
+        "index": index,
+        "true": made.images[0].pose,
+        "places": [(place.side, place.pose, place.plate) for place in places],
+        "letters": sum(len(line.text.replace(" ", "")) for line in lines) if written else 0,
+        "texts": [line.text for line in lines],
+        "found": None if found.pose is None else found.pose.name,
+        "decided": found.pose is not None and found.pose.decided,
+        "likelihoods": {} if found.pose is None else dict(found.pose.written),
+        "read": [
+            {"text": each.text, "side": each.side, "ways": {way: read.legible for way, read in each.ways.items()}}
+            for each in found.writing or ()
+        ],
+        "evidence": [] if found.pose is None else list(found.pose.evidence),
+    }
+
+
+def titles(rng: Generator, side: Side, way: str) -> list[Writing]:
+    """6 to 40 characters in one to four lines."""
+    asked, lines, letters = int(rng.integers(6, 41)), list[Writing](), 0
+    while letters < asked and len(lines) < 4:
+        text = str(rng.choice(ALIKE)) if rng.random() < 0.2 else line_text(rng)
+        if len(text) > asked - letters + 3 or is_plate(Line({"0": Reading(text, 1.0, 1.0)}, "0", ((0, 0),) * 4, side)):
+            continue
+        lines.append(line(rng, text, side, way, len(lines)))
+        letters += len(text.replace(" ", ""))
+    return lines
+
+
+def plate(rng: Generator, side: Side, way: str) -> list[Writing]:
+    number = f"Nr {int(rng.integers(100, 20000))} {float(rng.uniform(151, 155)):.2f}"
+    texts = ["WILD 15/4 UAG", number] if rng.random() < 0.5 else [number]
+    return [line(rng, text, side, way, index) for index, text in enumerate(texts)]
+
+
+def by_hand(rng: Generator) -> list[Writing]:
+    side = SIDES[rng.integers(4)]
+    way = str(rng.choice(("0", "180") if side in ("top", "bottom") else ("90", "270")))
+    return [line(rng, str(int(rng.integers(1, 9999))), side, way, 4, HANDWRITING)]
+
+
+def line(rng: Generator, text: str, side: Side, way: str, slot: int, font: str | None = None) -> Writing:
+    """At one of five places beside a side: two rows of two, and one at the end."""
+    height = float(rng.uniform(0.45, 0.75))
+    height = min(height, 9.5 / (0.8 * len(text)))
+    along = (-5.2, 5.2, -5.2, 5.2, 11.3)[slot]
+    away = FRAME_MM / 2 + (1.0, 1.0, 2.6, 2.6, 1.8)[slot]
+    xy = {"left": (-away, along), "right": (away, along), "top": (along, away), "bottom": (along, -away)}[side]
+    return Writing(text, xy, height, float(way), False, font or str(rng.choice(FONTS)))
+
+
+def scene(rng: Generator, marks: tuple[LayoutMark, ...], lines: tuple[Writing, ...]) -> Scene:
+    scale = 1.0 + rng.normal(0.0, 0.001, 2)
+    image = SceneImage(
+        name="frame",
+        exterior=(0.0, 0.0, 100.0, 0.0, 0.0, 0.0),
+        pose=str(rng.choice(POSES)),
+        turn_rad=float(np.radians(rng.normal(0.0, 0.8))),
+        film=FilmTransformation((float(scale[0]), float(scale[1])), float(rng.normal(0.0, 3e-4))),
+        neighbour=SIDES[rng.integers(4)] if not lines and rng.random() < 0.5 else None,
+        writing=lines,
+    )
+    scanner = Scanner(
+        (PITCH_UM, PITCH_UM),
+        margin_mm=MARGIN_MM,
+        blur_px=float(rng.uniform(0.5, 1.2)),
+        noise=0.01,
+        negative=bool(rng.random() < 0.3),
+    )
+    return Scene(
+        name="written",
+        seed=int(rng.integers(2**31)),
+        camera=SceneCamera(
+            "written",
+            (FRAME_MM, FRAME_MM),
+            25.0,
+            fiducials=tuple(SceneFiducial(mark.id, mark.xy_mm, scene_mark(mark.mark)) for mark in marks),
+        ),
+        field=DiskField((), 1.0),
+        images=(image,),
+        scanner=scanner,
+        film=Film(deformation_um=3.0, grain=float(rng.uniform(0.0, 0.03)), grain_px=1.0, dust=30, scratches=3, hairs=3),
+        tones=Tones(background=float(rng.uniform(0.25, 0.5)), contrast=float(rng.uniform(0.04, 0.12))),
+        background=get_args(Background)[rng.integers(3)],
+        pad_mm=1.4,
+    )
+
+
+def stored(rng: Generator, grey: np.ndarray[Any, np.dtype[np.uint16]]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """In 8 bits, half of them through JPEG."""
+    picture = (grey >> 8).astype(np.uint8)
+    if rng.random() < 0.5:
+        _, packed = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(40, 95))])
+        picture = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
+    return picture
+
+
+if __name__ == "__main__":
+    main()

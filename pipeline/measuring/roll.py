@@ -1,0 +1,95 @@
+"""The frames of a camera brought to one direction by what is written on them, so that their marks have the same names.
+
+A camera's titles lie the same way in all its frames. So frames that lie otherwise in their scans are known to, and what
+is written on each adds to what tells how the camera has it. What is not told even so is one question for all.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from measure.marks.poses import POSES, pose_in_camera
+from measure.marks.shapes import WrittenPlace
+from measure.pose.pose_decision import DECIDED, TOLD
+from measure.pose.written_pose import bounded, line_score
+from measure.results import FrameMeasurement, Pose
+from measure.status import Status
+from measure.writing.line import Line
+from pipeline.measuring.measurement_file import MeasuredScan
+
+_ONE_QUESTION = (
+    "the frames are named so that what is written lies alike in all of the camera whose writing was read; nothing says "
+    "how the camera has it"
+)
+_TURNS = ("0", "90", "180", "270")  # in which writing may lie in the camera's frame
+
+
+def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Mapping[str, Pose]:
+    """By image those poses of one camera's frames that change when all are looked at together. scans: of one camera,
+    whose poses nobody has set; places: where the camera writes."""
+    frames = [scan.frame for scan in scans]
+    poses = {frame.image: frame.pose for frame in frames if frame.pose is not None and frame.pose.writing}
+    if len(poses) < 2:
+        return {}
+    told = _told([frame for frame in frames if frame.image in poses], places)
+    alike = [turn for turn in _TURNS if told[turn] > -DECIDED]
+    usual = Counter(_turn(pose) for pose in poses.values())
+    chosen = max(alike, key=lambda turn: (told[turn] > -TOLD, usual[turn]))
+    undecided = [frame for frame in frames if frame.image in poses and not poses[frame.image].decided]
+    return {frame.image: _together(frame, chosen, len(alike) == 1, len(poses)) for frame in undecided}
+
+
+def _told(frames: Sequence[FrameMeasurement], places: Sequence[WrittenPlace]) -> Mapping[str, float]:
+    """Log-likelihoods of the turns of the writing in the camera's frame, 0 for the best. What stands on several frames,
+    numbers apart, is one title, or one stamp, and counts once."""
+    texts: dict[str, tuple[Pose, Line]] = {}
+    for frame in frames:
+        assert frame.pose is not None
+        for line in frame.writing or ():
+            texts.setdefault(re.sub(r"[\W\d]", "", line.text) or re.sub(r"\d", "0", line.text), (frame.pose, line))
+    decided = {_turn(frame.pose) for frame in frames if frame.pose and frame.pose.decided}
+    scores = [sum(line_score(line, places, _in_scan(pose, turn)) for pose, line in texts.values()) for turn in _TURNS]
+    likelihoods = bounded(np.array(scores)) - [DECIDED if decided - {turn} else 0.0 for turn in _TURNS]
+    return dict(zip(_TURNS, (likelihoods - likelihoods.max()).tolist(), strict=True))
+
+
+def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Pose:
+    """The pose of a frame whose writing lies in the camera's frame as in that of so many frames together. told: whether
+    these say so, or only agree."""
+    assert frame.pose is not None
+    pose = replace(frame.pose, name=_in_scan(frame.pose, turn))
+    if not _face_is_told(pose) or _is_doubted(frame):
+        like = f"named {pose.name} as the other frames of the camera, so that its writing lies as theirs."
+        return replace(pose, evidence=(*pose.evidence, like)) if pose.name != frame.pose.name else pose
+    if not told:
+        return replace(pose, evidence=(f"{_ONE_QUESTION}.", *pose.evidence[1:]), roll=_ONE_QUESTION)
+    together = f"what is written lies alike in {frames} frames of the camera, and together they tell how it has it."
+    return replace(pose, decided=True, evidence=(together, *pose.evidence[1:]))
+
+
+def _face_is_told(pose: Pose) -> bool:
+    """Whether the frame by itself says if its scan is mirrored."""
+    faces = [
+        max((value for name, value in pose.written.items() if name.endswith("m") == mirrored), default=0.0)
+        for mirrored in (False, True)
+    ]
+    return abs(faces[0] - faces[1]) >= DECIDED
+
+
+def _is_doubted(frame: FrameMeasurement) -> bool:
+    """Whether it may not be the frame at all."""
+    evidence = frame.pose.evidence if frame.pose else ()
+    return not any(mark.status == Status.MEASURED for mark in frame.marks) or any(p in evidence for p in frame.problems)
+
+
+def _turn(pose: Pose) -> str:
+    """How the writing lies in the camera's frame, if the frame lies in that pose."""
+    return pose_in_camera(pose.writing, pose.name)
+
+
+def _in_scan(pose: Pose, turn: str) -> str:
+    """The pose of a frame whose writing lies so in the camera's frame."""
+    return next(name for name in POSES if pose_in_camera(pose.writing, name) == turn)

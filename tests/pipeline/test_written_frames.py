@@ -1,0 +1,244 @@
+"""What is written on the frames, through the files: frames.csv, images.csv, the camera's file, a roll's poses."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from measure.covariance import Cause, Covariance
+from measure.marks.poses import POSES, pose_in_camera
+from measure.marks.shapes import Side, WrittenPlace
+from measure.pose.written_pose import side_in_camera, writing_likelihoods
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.status import Status
+from measure.writing import networks as networks_module
+from measure.writing.line import Line, Reading
+from pipeline.cli import run
+from pipeline.errors import InputError
+from pipeline.files.camera_file import parse_camera, read_camera
+from pipeline.files.camera_text import camera_text
+from pipeline.files.images_file import fill_images, read_images
+from pipeline.files.tables import Table
+from pipeline.measuring.frames_file import for_images, with_same_frames, write_frames
+from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
+from pipeline.measuring.roll import poses_of_roll
+from pipeline.rendered.scene_file import render_project
+
+WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
+TITLES = ("RUN 7", "8601-8639", "16.5.68", "14,000'", "8617", "AUSTRALIAN")
+
+
+def line(text: str, pose: str = "0", side: Side = "top") -> Line:
+    turn = int(pose.removesuffix("m")) % 180
+    ways = [way for way in POSES if int(way.removesuffix("m")) % 180 == turn]
+    outline = ((10.0, 20.0), (50.0, 20.0), (50.0, 30.0), (10.0, 30.0))
+    return Line({way: Reading(text, 0.9, len(text) * (way == pose)) for way in ways}, pose, outline, side)
+
+
+def scan(image: str, lines: Sequence[Line] | None, pose: Pose | None = None) -> MeasuredScan:
+    mark = MarkMeasurement("1", "fiducial", np.zeros(2), Covariance({Cause.NOISE: np.eye(2)}), Status.MEASURED)
+    frame = FrameMeasurement(image, (mark,), pose, writing=None if lines is None else tuple(lines))
+    return MeasuredScan(Path(f"{image}.tif"), 100, 100, (20.0, 20.0), frame)
+
+
+def test_frames_csv_has_every_line_with_what_it_says(tmp_path: Path) -> None:
+    path = tmp_path / "out" / "frames.csv"
+    assert write_frames(path, [scan("a", [line("RUN 7"), line("1/3/85"), line("Survey, Office")]), scan("b", None)])
+    rows = [row for row in path.read_text(encoding="utf-8").splitlines() if not row.startswith("#")]
+    assert rows == [
+        "image,field,text,value,confidence,place,col_px,row_px",
+        "a,run,RUN 7,7,0.90,top,30,25",
+        "a,date,1/3/85,,0.90,top,30,25",
+        'a,text,"Survey, Office",,0.90,top,30,25',
+    ]
+    assert not write_frames(path, [scan("a", []), scan("b", None)])
+
+
+def test_empty_columns_of_images_csv_are_filled_and_nothing_else_is_touched(tmp_path: Path) -> None:
+    path = tmp_path / "images.csv"
+    before = "# by hand\r\nimage,camera,run,frame,date,height\r\na.tif,c.toml,,,1970-01-01,\r\nb,,5,,,\r\n"
+    path.write_bytes(before.encode())
+    told = for_images([scan("a", [line(text) for text in TITLES]), scan("b", [line("1/3/85"), line("RUN 8")])])
+    assert told == {"a": {"run": "7", "frame": "8617", "date": "1968-05-16", "height": "14000 ft"}, "b": {"run": "8"}}
+    fill_images(path, told)
+    assert path.read_bytes().decode() == before.replace("c.toml,,,1970-01-01,", "c.toml,7,8617,1970-01-01,14000 ft")
+    assert dict(read_images(path).camera) == {"a": "c.toml", "b": ""}
+
+
+def test_two_scans_that_say_the_same_frame_are_told() -> None:
+    lines = [line(text) for text in TITLES]
+    first, second, other = with_same_frames([scan("a", lines), scan("b", lines), scan("c", lines[:-2])])
+    assert "frame 8617, run 7, frames 8601-8639, date 1968-05-16" in first.frame.problems[0]
+    assert "that of b" in first.frame.problems[0]
+    assert "that of a" in second.frame.problems[0]
+    assert other.frame.problems == ()
+
+
+def test_what_was_read_is_kept_in_the_measurement(tmp_path: Path) -> None:
+    path = tmp_path / "measurement.json"
+    before = scan("a", [line("RUN 7", "90m", "left")], Pose("90", False, ("because",), roll="one question"))
+    write_measurement(path, [before, scan("b", None)])
+    kept, unread = read_measurement(path)
+    assert kept.frame.writing == before.frame.writing
+    assert kept.frame.pose == before.frame.pose
+    assert unread.frame.writing is None
+
+
+CAMERA = {"frame_mm": [230.0, 230.0], "fiducial": [{"id": "1", "xy_mm": [1.0, 2.0]}]}
+
+
+def test_a_camera_file_says_where_it_writes(tmp_path: Path) -> None:
+    asked = ["left: reads upward", "right: plate reads downward", "top"]
+    camera = parse_camera(Table({**CAMERA, "writing": asked}, tmp_path / "camera.toml", ""))
+    assert camera.layout if camera.writing == (*WILD, WrittenPlace("top")) else None
+    camera.path.write_text(camera_text(camera, lambda name, _: name), encoding="utf-8")
+    assert read_camera(camera.path).writing == camera.writing
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("writing", ["left: upward"], "'left: upward'. A place is a side of the frame"),
+        ("writing", ["middle"], "A place is a side of the frame"),
+        ("data_strip", "left", r'writing = \["left: reads upward"\]'),
+    ],
+)
+def test_a_place_that_is_none_is_refused(key: str, value: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse_camera(Table({**CAMERA, key: value}, Path("camera.toml"), ""))
+
+
+Written = tuple[str, str, Side]
+TITLE: Written = ("DEVELOPMENT RECORD", "90", "left")
+OTHER: Written = ("AUSTRALIAN CAPITAL", "90", "left")
+
+
+def posed(
+    image: str, pose: str, camera: Written, name: str = "", places: Sequence[WrittenPlace] = WILD
+) -> MeasuredScan:
+    """A frame that lies in a pose, its line given as the camera's frame has it, and what that says of the pose."""
+    text, own, camera_side = camera
+    sides: Sequence[Side] = ("left", "right", "top", "bottom")
+    side = next(each for each in sides if side_in_camera(each, pose) == camera_side)
+    lines = [line(text, next(each for each in POSES if pose_in_camera(each, pose) == own), side)]
+    written = dict(zip(POSES, writing_likelihoods(lines, places, POSES).tolist(), strict=True))
+    return scan(image, lines, Pose(name or pose, False, ("not told.",), written, lines[0].pose))
+
+
+def test_frames_of_a_roll_are_named_alike_and_leave_one_question() -> None:
+    """Nothing says where the camera writes; by itself one frame would be named otherwise."""
+    scans = [posed(name, pose, TITLE, places=()) for name, pose in (("a", "0"), ("b", "90"), ("c", "180m"))]
+    scans.append(posed("d", "0", TITLE, name="180", places=()))
+    poses = poses_of_roll(scans, ())
+    assert {image: pose.name for image, pose in poses.items()} == {"a": "0", "b": "90", "c": "180m", "d": "0"}
+    assert len({pose.roll for pose in poses.values()} - {""}) == 1
+    assert all(pose.roll and not pose.decided for pose in poses.values())
+
+
+def test_what_single_frames_do_not_tell_they_tell_together() -> None:
+    """A line that may be anybody's tells by its place 4.6 at most; two of them tell enough."""
+    scans = [posed("a", "0", TITLE), posed("b", "270m", OTHER)]
+    assert poses_of_roll(scans[:1], WILD) == {}
+    together = poses_of_roll(scans, WILD)
+    assert {image: (pose.name, pose.decided) for image, pose in together.items()} == {
+        "a": ("0", True),
+        "b": ("270m", True),
+    }
+    doubted = replace(scans[1], frame=replace(scans[1].frame, problems=("not told.",)))
+    assert not poses_of_roll([scans[0], doubted], WILD)["b"].decided
+
+
+def test_one_stamp_on_many_frames_tells_no_more_than_one() -> None:
+    stamp: Written = ("LIBRARY OF FILMS", "270", "right")
+    scans = [posed(name, "0", (f"LIBRARY COPY {name}", *stamp[1:])) for name in "1234"]
+    poses = poses_of_roll(scans, WILD)
+    assert not any(pose.decided for pose in poses.values())
+
+
+def test_a_frame_that_is_decided_tells_the_others_how_they_lie() -> None:
+    known = posed("a", "90", TITLE, places=())
+    known = replace(known, frame=replace(known.frame, pose=replace(known.frame.pose, decided=True)))  # type: ignore[type-var]
+    poses = poses_of_roll([known, posed("b", "180", TITLE, name="90", places=())], ())
+    assert {image: (pose.name, pose.decided) for image, pose in poses.items()} == {"b": ("180", True)}
+
+
+SCENE = """
+seed = 3
+[camera]
+name = "written"
+frame_mm = [23.0, 23.0]
+principal_distance_mm = 25.0
+writing = ["left: reads upward"]
+[camera.mark.m]
+kind = "ring-cross"
+ring_mm = 0.5
+ring_line_mm = 0.1
+arm_mm = 0.8
+line_mm = 0.1
+[[camera.fiducial]]
+id = "1"
+xy_mm = [-10.0, -10.0]
+sigma_mm = 0.005
+mark = "m"
+[[camera.fiducial]]
+id = "2"
+xy_mm = [10.0, 10.0]
+sigma_mm = 0.005
+mark = "m"
+[[camera.fiducial]]
+id = "3"
+xy_mm = [-10.0, 10.0]
+sigma_mm = 0.005
+mark = "m"
+[[camera.fiducial]]
+id = "4"
+xy_mm = [10.0, -10.0]
+sigma_mm = 0.005
+mark = "m"
+[field]
+kind = "natural"
+[picture]
+pad_mm = 1.4
+[scan]
+pitch_um = 40.0
+margin_mm = 4.0
+[[writing]]
+text = "RUN 7 16.5.68"
+xy_mm = [-13.5, -2.0]
+height_mm = 0.8
+turn_deg = 90.0
+[[image]]
+name = "a"
+position = [0.0, 0.0, 100.0]
+angles_deg = [0.0, 0.0, 0.0]
+pose = "90m"
+"""
+
+
+@pytest.mark.usefixtures("in_one_process")
+def test_a_rendered_frame_is_read_and_its_pose_decided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "scene.toml").write_text(SCENE, encoding="utf-8")
+    render_project(tmp_path / "scene.toml", tmp_path / "p")
+    project = tmp_path / "p" / "project.toml"
+    project.write_text(
+        'camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = 40.0\n[object]\nimages = "images.csv"\n',
+        encoding="utf-8",
+    )
+    (tmp_path / "p" / "images.csv").write_text("image,run,date\na,,\n", encoding="utf-8")
+    run(["measure", str(project)])
+    frame = json.loads((tmp_path / "p" / "out" / "measurement.json").read_text(encoding="utf-8"))["images"]["a"]
+    assert frame["pose"]["name"] == "90m"
+    assert frame["pose"]["decided"]
+    assert "a,run," in (tmp_path / "p" / "out" / "frames.csv").read_text(encoding="utf-8")
+    assert (tmp_path / "p" / "images.csv").read_text(encoding="utf-8") == "image,run,date\na,7,1968-05-16\n"
+    monkeypatch.setattr("pipeline.measuring.measure_stage.networks", lambda: None)
+    monkeypatch.setattr("measure.fiducials.networks", lambda: None)
+    run(["measure", str(project)])
+    frame = json.loads((tmp_path / "p" / "out" / "measurement.json").read_text(encoding="utf-8"))["images"]["a"]
+    assert not frame["pose"]["decided"]
+    assert any("pip install --no-deps rapidocr-onnxruntime" in note for note in frame["notes"])
+    assert networks_module.PACKAGE == "rapidocr_onnxruntime"
+    assert not (tmp_path / "p" / "out" / "frames.csv").exists()
