@@ -55,10 +55,10 @@ def carriage_terms(films: Iterable[str]) -> tuple[str, ...]:
 
 def _left_by(films: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
     kinds = set(films) - {"none"}
-    return tuple(name for name in names if all(_is_left(kind, name) for kind in kinds))
+    return tuple(name for name in names if all(is_left(kind, name) for kind in kinds))
 
 
-def _is_left(kind: str, name: str) -> bool:
+def is_left(kind: str, name: str) -> bool:
     """Whether a film transformation leaves a term as it is, and does not take it or a part of it."""
     linear = kind not in ("congruent", "similarity") and not kind.startswith("conformal")
     match name:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.scanner import degree_of
+from adjust.functional_model.scanner import degree_of, is_left
 from adjust.least_squares.factor import Factor
 from adjust.problem import Problem, State
 from adjust.result import Cofactor
@@ -28,13 +28,18 @@ GIVEN_LENS = "the distortion, from an earlier calibration say, or to the term it
 
 @dataclass(frozen=True)
 class ScannerLead(Lead):
-    """Of a term of a scanner's bend. poses: in which the scanner's frames lie."""
+    """Of a term of a scanner's bend. poses: in which the scanner's frames lie; taken_by_film: the transformation that
+    does the same, empty where none does."""
 
     poses: Sequence[Pose] = ()
+    taken_by_film: str = ""
 
     def sentence(self, moved: Iterable[str]) -> tuple[str, str]:
         """Cause and remedy by what moves along: the lens, the fiducial marks, or nothing that could."""
         moved = list(moved)
+        if self.taken_by_film:
+            because = f"the {self.taken_by_film} transformation of its films does the same"
+            return replace(self, because=because, given="the term itself", otherwise="leave it out")._told(moved)
         by_lens = any(name.startswith("IO.") and name.rsplit(".", 1)[1] not in INTERIOR for name in moved)
         seen = by_lens or any(name.startswith("FID.") for name in moved)
         why = _Why(self.motion.split()[2], self.poses, "lens" if by_lens else "marks" if seen else "")
@@ -150,7 +155,9 @@ def _lead(problem: Problem, scanner: str, position: int, poses: Sequence[Pose]) 
     functional = np.zeros(len(problem.unknowns))
     functional[position] = 1.0
     motion = f"The term {term} of the bend of scanner {scanner} can change"
-    return ScannerLead(SCANNER_RANK, functional, motion, GIVEN, poses=poses)
+    kinds = (image.transformation for image in problem.network.images if image.scanner == scanner)
+    film = next((kind for kind in kinds if not is_left(kind, term)), "")
+    return ScannerLead(SCANNER_RANK, functional, motion, GIVEN, poses=poses, taken_by_film=film)
 
 
 def _are_half_turns(poses: Sequence[Pose]) -> bool:

@@ -118,6 +118,9 @@ def _better(setup: Setup) -> Iterator[Change]:
     if any(0.0 < point.sigma_planimetry < math.inf for point in setup.points):
         points = (replace(point, sigma_planimetry=point.sigma_planimetry / 2) for point in setup.points)
         yield "given X and Y twice as good", replace(setup, points=tuple(points))
+    if setup.bends and len(setup.images) > 1:
+        images = (replace(image, turn_rad=image.turn_rad + (i % 2) * math.pi) for i, image in enumerate(setup.images))
+        yield "every second scan turned by 180 degrees", replace(setup, images=tuple(images))
     settings = setup.settings
     if setup.transformation != "none":
         finer = replace(settings, sigma_fiducial_um=settings.sigma_fiducial_um / 2)

@@ -66,8 +66,8 @@ class Expected:
     def camera_sigmas(self) -> Mapping[str, float]:
         """The standard deviations of what is to be found of the camera, by name; nothing that is fixed.
 
-        c, x0, y0 and fiducials (rms of all coordinates) in um, distortion parameters in their own units, `ray`: where a
-        ray is imaged at the largest radius, um.
+        c, x0, y0, fiducials (rms of all coordinates) and scanner (rms of the terms of its bend) in um, distortion
+        parameters in their own units, `ray`: where a ray is imaged at the largest radius, um.
         """
         names = list(self._unknowns)
         told = dict(zip(names, self.plan.sigmas(self._full_names, np.eye(len(names))), strict=True))
@@ -75,7 +75,14 @@ class Expected:
         sigmas |= {name: float(told[name]) for name in self.family_parameters}
         marks = [float(told[name]) for name in names[len(INTERIOR) + len(self._parameters) :]]
         sigmas |= {"fiducials": UM_PER_MM * rms(marks), "ray": self.curve[-1].ray_um}
+        sigmas |= {"scanner": UM_PER_MM * rms(list(self.scanner_sigmas.values()))}
         return {name: sigma for name, sigma in sigmas.items() if sigma > 0.0}
+
+    @cached_property
+    def scanner_sigmas(self) -> Mapping[str, float]:
+        """Of the terms of the scanner's bend, mm, by their names in the adjustment; empty where none is to be found."""
+        names = [f"SC.{scanner.name}.{term}" for scanner in self.network.scanners for term in scanner.terms]
+        return {name: self.plan.sigma(name) for name in names}
 
     @cached_property
     def curve(self) -> tuple[AtRadius, ...]:

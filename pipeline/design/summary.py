@@ -24,8 +24,8 @@ KINDS = {
     "exterior": "given exterior",
 }
 UNIT_WORDS = {"um": " µm", "object unit": ""}
-LABELS = {"c": "c", "x0": "x0'", "y0": "y0'", "fiducials": "fiducials", "ray": "ray"}
-UNITS = {"c": "µm", "x0": "µm", "y0": "µm", "fiducials": "µm", "ray": "µm"}
+LABELS = {"c": "c", "x0": "x0'", "y0": "y0'", "fiducials": "fiducials", "ray": "ray", "scanner": "scanner"}
+UNITS = {"c": "µm", "x0": "µm", "y0": "µm", "fiducials": "µm", "ray": "µm", "scanner": "µm"}
 
 
 def print_design(
@@ -113,9 +113,8 @@ def _fiducial_table(expected: Expected, alone: Mapping[str, float]) -> Table:
 
 def _scanner_table(expected: Expected) -> Table:
     table = Table("term", "sigma, µm", title="Bend of the scanner", title_justify="left")
-    for scanner in expected.network.scanners:
-        for term in scanner.terms:
-            table.add_row(term, _sigma(UM_PER_MM * expected.plan.sigma(f"SC.{scanner.name}.{term}")))
+    for name, sigma in expected.scanner_sigmas.items():
+        table.add_row(name.rsplit(".", 1)[1], _sigma(UM_PER_MM * sigma))
     return table
 
 

@@ -246,3 +246,10 @@ def test_a_bend_that_no_mark_shows_is_laid_to_the_marks() -> None:
     result = solved(films([0.0, 180.0], {}, free("a20"), sigma_given_mm=0.0, marks_mm=corners, scatter=0.0))
     (direction,) = result.singular
     assert "too few, or lie too much alike" in direction.cause
+
+
+def test_a_bend_that_the_films_make_too_is_laid_to_the_films() -> None:
+    network = films([0.0, 90.0], {}, free("a11"), kind="polynomial(2)", sigma_given_mm=0.0, scatter=0.0)
+    (direction,) = solved(network).singular
+    assert "the polynomial(2) transformation of its films does the same" in direction.cause
+    assert direction.remedy.endswith("or leave it out.")
