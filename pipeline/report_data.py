@@ -12,7 +12,7 @@ from pipeline.files.text_file import read_json
 from pipeline.measuring.comparator_file import measurement_of, read_comparator
 from pipeline.report.data import Problem, ReportData
 from pipeline.results.fingerprints import of_file
-from pipeline.results.made_from import CAMERAS, PLACES, SCAN, SETTINGS, adjusted_from, differing, measured_from
+from pipeline.results.made_from import CAMERA, PLACES, SCAN, SETTINGS, adjusted_from, differing, measured_from
 from pipeline.results.publishing import outside_note
 from pipeline.wording import listed
 
@@ -91,11 +91,12 @@ def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem
     for what, names in kinds.items():
         if names:
             yield Problem(f"{what}: {listed(names)}.", "Run `reseau measure`; what is shown is of the earlier scans.")
-    kinds_of_files = [name for name in (CAMERAS, SETTINGS) if name in others]
-    if kinds_of_files:
+    changed = ["project" if name == SETTINGS else name for name in others if name in made and name in now]
+    changed = [name for name in changed if name == "project" or name.startswith(CAMERA)]
+    if changed:
         yield Problem(
-            f"The marks were measured with other {' and '.join(kinds_of_files)} than there are now.",
-            "Run `reseau measure`; what is shown is of the earlier ones.",
+            f"The marks were measured with other settings than there are now of {listed(changed)}.",
+            "Run `reseau measure`; what is shown was measured with the earlier ones.",
         )
 
 

@@ -12,7 +12,7 @@ from pipeline.results.fingerprints import fingerprint, of_scan
 MadeFrom = dict[str, str]
 
 # The names of the parts are words of messages: "is of other ... than there are now".
-CAMERAS, SETTINGS, SCAN = "cameras", "settings", "scan "
+CAMERAS, SETTINGS, SCAN, CAMERA = "cameras", "settings", "scan ", "camera "
 MARKS, POINTS, IMAGES, DISTANCES = "marks", "points", "images", "distances"
 PLACES = "points, orientations or lenses"
 
@@ -32,30 +32,30 @@ _NO_MATTER = {"max_pixels"}
 # Of a camera: what tells where its targets are, but not what its marks are.
 _LENS = {
     "principal_distance_mm", "principal_point_mm", "principal_distance_sigma_mm", "principal_point_sigma_mm",
-    "distortion", "calibration", "source", "path",
+    "distortion", "calibration",
 }  # fmt: skip
+_ORIGIN = {"path", "source"}
 
 
 def measured_from(project: Project) -> MadeFrom:
     """Of a measurement: every scan, what is sought in it, and what tells where to look. The last changes no mark that
     was measured, but which are found, and what they are named."""
-    sought = [{name: value for name, value in _of(camera).items() if name not in _LENS} for camera in _used(project)]
     coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
     places = [
         coordinates,
         project.given_points and project.given_points.normals,
         project.given_images and project.given_images.exterior,
-        [
-            {name: value for name, value in _of(camera).items() if name in _LENS - {"source"}}
-            for camera in _used(project)
-        ],
+        {camera.name: {name: _of(camera)[name] for name in _LENS} for camera in project.cameras.values()},
         project.film_sigma_mm,
     ]
     return {
-        CAMERAS: fingerprint([sought, {image: project.camera_of(image).name for image in project.scans}]),
         SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
         PLACES: fingerprint(places),
-        **{f"{SCAN}{image}": of_scan(path) for image, path in project.scans.items()},
+        **{f"{CAMERA}{camera.name}": fingerprint(_sought(camera)) for camera in project.cameras.values()},
+        **{
+            f"{SCAN}{image}": fingerprint([of_scan(path), project.camera_of(image).name])
+            for image, path in project.scans.items()
+        },
     }
 
 
@@ -89,8 +89,8 @@ def _settings(project: Project) -> dict[str, Any]:
     return {name: value for name, value in _of(project).items() if name not in _FILES | _NO_MATTER}
 
 
-def _used(project: Project) -> list[CameraFile]:
-    return list(project.cameras.values())
+def _sought(camera: CameraFile) -> dict[str, Any]:
+    return {name: value for name, value in _of(camera).items() if name not in _LENS | _ORIGIN}
 
 
 def _of(value: Any) -> dict[str, Any]:

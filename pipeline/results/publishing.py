@@ -169,6 +169,8 @@ def _clear(project: Project) -> None:
 
 
 def _is_alive(pid: int) -> bool:
+    if os.name != "posix":  # elsewhere signal 0 does not ask, it ends
+        return True
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

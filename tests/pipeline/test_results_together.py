@@ -9,18 +9,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from test_command_line import replaced, results, rewritten_scans
 
 from adjust.errors import AdjustmentError
+from adjust.network import Prior
 from measure.errors import MeasurementError
+from measure.status import Status
 from pipeline import stages
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.measuring.comparator_file import read_comparator, write_comparator
 from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
 from pipeline.report_data import adjusted
-from pipeline.results.fingerprints import of_file
+from pipeline.results.fingerprints import fingerprint, of_file, of_scan
 from pipeline.results.made_from import measured_from
 from pipeline.summary import summarise
 
@@ -94,6 +97,7 @@ def test_a_scan_that_is_not_measured_yet_is_named(project: Path, capsys: SAID) -
         assert code == 1
         assert told["adjustment"] is not None  # it is of these marks
         assert "Not measured yet: frame4." in said(told)
+        assert "other settings" not in said(told)
 
 
 def another_scan(folder: Path) -> None:
@@ -169,7 +173,7 @@ def moved_point(folder: Path) -> None:
     [
         (another_scan, "Changed since it was measured: frame2.", {"adjustment", "check"}),
         (scan_gone, "Measured, but no scan of the project any more: frame2.", {"adjustment", "check"}),
-        (another_mark, "The marks were measured with other cameras than there are now.", set()),
+        (another_mark, "The marks were measured with other settings than there are now of camera ", set()),
         (moved_mark, "adjustment.json is of other marks than there are now", set()),
         (moved_point, "adjustment.json is of other points than there are now", set()),
         (robust, "adjustment.json is of other settings than there are now", set()),
@@ -367,3 +371,33 @@ def test_what_an_ended_process_left_is_cleared(project: Path) -> None:
     assert not left.exists()
     assert not list(project.glob(".comparator*"))
     assert mine.exists()
+
+
+def test_values_that_differ_have_fingerprints_that_differ() -> None:
+    values: list[object] = [
+        1, 1.0, "1", None, True, [1, [2]], [[1], 2], [[1, 2]], [], {}, "", {"a": 1}, {"a": 2}, {"b": 1}, ["a", 1],
+        np.array([1.0, 2.0]), np.array([1.0, 2.5]), np.array([[1.0, 2.0]]), np.array([1, 2]), np.array(["a", "b"]),
+        Prior(1.0, 0.0), Prior(1.0, 0.5), Path("a.csv"), Path("b.csv"), Status.WEAK, Status.MEASURED,
+    ]  # fmt: skip
+    assert len({fingerprint(value) for value in values}) == len(values)
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    assert fingerprint(Path("here/a.csv")) == fingerprint(Path("there/a.csv"))
+    with pytest.raises(TypeError):
+        fingerprint(object())
+
+
+def test_a_scan_counts_as_another_wherever_a_piece_of_it_changes(tmp_path: Path) -> None:
+    """The pieces lie from the first byte to the last, and small files are read whole."""
+    for size in (0, 1, 1000, 200_000, 5_000_000):
+        file = tmp_path / "scan.tif"
+        data = bytearray(np.random.default_rng(size).bytes(size))
+        file.write_bytes(data)
+        seen = {of_scan(file)}
+        places = range(0, size, max(size // 7, 1)) if size <= 200_000 else (0, 30_000, 2_130_000, size - 1)
+        for at in list(places)[:8]:
+            changed = data.copy()
+            changed[at] ^= 1
+            file.write_bytes(changed)
+            seen.add(of_scan(file))
+        assert len(seen) == 1 + len(list(places)[:8]), size
+    assert of_scan(tmp_path / "none.tif") == ""
