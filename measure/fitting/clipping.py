@@ -29,6 +29,7 @@ _FEWEST = 20  # pixels: fewer bend no fit
 _CHANCE = 1e-6  # of a natural end: there are many windows
 _GROSS = 3.5  # standard deviations: beyond it a residual is damage
 _SCALE_ROUNDS = 8  # each leaves at most two fifths of what was wrong
+_CLEAR = 3.0  # standard deviations of the noise
 _TELLS = 0.5  # derivative of the residual, from which on it is a residual like the others
 
 
@@ -83,6 +84,15 @@ def noise_scale(residuals: Array, sides: Sides, start_dn: float, least_dn: float
         variance = (squares + sigma**2 * np.sum(hazard**2)) / max(len(ordinary) + information, 1.0)
         sigma = max(float(np.sqrt(variance)), least_dn)
     return sigma
+
+
+def clear_of_ends(drawn: Array, grey: Array, sides: Sides, sigma_dn: float) -> Mask:
+    """(height, width): where what is drawn lies so far from limits of what was clipped that noise goes either way."""
+    clear = np.ones(drawn.shape, dtype=bool)
+    for side in (1, -1):
+        if np.any(sides == side):
+            clear &= side * (grey[sides == side].mean() - drawn) > _CLEAR * sigma_dn
+    return clear
 
 
 def tells(slopes: Array) -> Mask:

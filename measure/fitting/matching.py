@@ -18,7 +18,7 @@ from measure.covariance import Cause, Covariance
 from measure.fitting.border_search import is_overwhelming, likely_border
 from measure.fitting.bordered_model import BorderedModel
 from measure.fitting.changed_tone import covariance_of_changed_tone
-from measure.fitting.clipping import Sides
+from measure.fitting.clipping import Sides, clear_of_ends
 from measure.fitting.generators import is_round
 from measure.fitting.landscape import covariance_of_landscape
 from measure.fitting.linear_fit import LinearFit
@@ -380,7 +380,9 @@ def _tone(fit: PictureFit, linear: LinearFit) -> ToldTone | None:
     model, coding = fit.model, fit.coding
     if coding.tone.is_known or isinstance(model.mark, MarkTemplate) or model.background_px is not None:
         return None
-    return told_tone(linear, model.grey - model.residuals, coding.tone, coding.full_scale_dn)
+    drawn = model.grey - (model.uncensored if model.is_clipped else model.residuals)
+    clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
+    return told_tone(linear, drawn, model.grey, clear, coding.tone, coding.full_scale_dn)
 
 
 def _blur_sigma(model: PictureModel, covariance: Array) -> float:

@@ -8,28 +8,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.linear_fit import LinearFit
+from measure.fitting.picture_model import GREY
 from measure.noise.pixel_sums import combined, products
 from measure.scans.told_tone import ToldTone
 from measure.scans.tone import SaidOfTone, Tone
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
+_LEAST_SHOWN = 1e-6  # of uneven light that the picture hardly tells from the unknowns
 _LEAST_VARIANCE = 1e-9  # of a combination of departures that the picture hardly shows, over that of the others
 
 
-def told_tone(fit: LinearFit, drawn: Array, tone: Tone, full_scale_dn: float) -> ToldTone:
-    """Beside the unknowns of a linearised fit. drawn (height, width): its picture, in light.
+def told_tone(fit: LinearFit, drawn: Array, grey: Array, clear: Mask, tone: Tone, full_scale_dn: float) -> ToldTone:
+    """Beside the unknowns of a linearised fit. drawn, grey (height, width): the light that it draws, and that it was
+    fitted to; clear, alike: where that is not near an end of the scanner's range, which changes what noise does.
 
     With the departures d the residuals are r + H d - D x. The score H'r of what D leaves of H grows with d by N and has
     the covariance S that the noise gives it: N' S^-1 N is the information, also where the noise is not white. H is
-    taken at the drawn light: at the observed one, it would go along with the noise.
+    taken at the drawn light: at the observed one, it would go along with the noise. Light that is not even on the mark
+    or about it says nothing of the curve, but might seem to: D has bends of both, too.
+
+    What another curve moves the mark by follows from the observed light, with all that the drawing leaves unexplained.
     """
     changes = tone.changes(drawn, full_scale_dn) * fit.used
-    left = (changes - combined(products(changes, fit.design), fit.by_grey)) * fit.used
+    left = _beside(fit, changes * clear)
     normal = products(left, changes)
     score = -products(left, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
     covariance = fit.covariance(left)
     covariance += _LEAST_VARIANCE * max(float(np.trace(covariance)), 1e-30) * np.eye(len(covariance))
     said = SaidOfTone.by_score(normal, score + normal @ tone.mean, covariance)
     codes = tone.code(np.quantile(drawn[fit.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
-    return ToldTone(said, products(fit.by_grey[:2], changes), float(codes[0]), float(codes[1]))
+    on_place = products(fit.by_grey[:2], tone.changes(grey, full_scale_dn) * fit.used)
+    return ToldTone(said, on_place, float(codes[0]), float(codes[1]))
+
+
+def _beside(fit: LinearFit, changes: Array) -> Array:
+    """(k, height, width) what is left of changes beside the unknowns, and beside light that is uneven."""
+    uneven = _uneven(fit.design[-GREY]) * fit.used
+    known = uneven - combined(products(uneven, fit.design), fit.by_grey)
+    left = changes - combined(products(changes, fit.design), fit.by_grey)
+    shares = np.linalg.pinv(products(known, uneven), rcond=_LEAST_SHOWN, hermitian=False) @ products(uneven, left)
+    return np.asarray((left - combined(shares.T, known)) * fit.used)
+
+
+def _uneven(shown: Array) -> Array:
+    """(8, height, width) slopes and bends of the light of a mark's picture, and bends of that about it."""
+    height, width = shown.shape
+    col = np.broadcast_to(np.linspace(-1.0, 1.0, width), shown.shape)
+    row = np.broadcast_to(np.linspace(-1.0, 1.0, height)[:, None], shown.shape)
+    bends = [col * col, col * row, row * row]
+    return np.stack([*(shown * each for each in (col, row, *bends)), *bends])

@@ -26,31 +26,49 @@ from measure.marks.shapes import Disk, Mark, MarkShape, Ring
 from measure.match_options import MatchOptions
 from measure.noise.noise import may_be_noise
 from measure.scans.told_tone import FrameTone, ToldTone
+from measure.scans.tone import Tone
 
 Array = NDArray[np.float64]
 
 _STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
-_TONE_ROUNDS, _MOVED = 5, 0.1  # of matching by a better curve; of its standard deviation that a mark may still move
+# Whether marks that contradict one another are doubted, in each round of matching by a better curve: far off all do.
+_TONE_ROUNDS = (False, False, False, True, True)
+_OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # powers; of a contradiction that needs none of them
+_MOVED = 0.1  # of its standard deviation that a mark may still move
 _SETTLED_PX = 1.5  # about a mark that was matched already
 
 
 def settle(sighter: FrameSighter) -> None:
     """Match marks that do not tell their own rotation and scale once more, with those of the frame; and those that the
     frame's stretch and shear move, which no match tells; and as long as they say of the tone curve what moves them,
-    those by that curve."""
+    those by that curve. Far from the right curve noise is not even, and may hide it: where what the marks say does not
+    agree, other curves are begun with, too."""
     if sighter.belongs.sum() < 2:
         return
+    _settle_from(sighter, sighter.scan.tone)
+    for power in _OTHER_STARTS if sighter.tone.contradiction > _AGREED else ():
+        before = sighter.tone, sighter.scan, list(sighter.sightings)
+        _settle_from(sighter, sighter.prior_tone.like_power(power))
+        if sighter.tone.contradiction >= before[0].contradiction:
+            sighter.tone, sighter.scan, sighter.sightings = before
+            sighter.judge()
+
+
+def _settle_from(sighter: FrameSighter, tone: Tone) -> None:
+    """From where the marks were seen, beginning with a tone curve."""
     unsettled = {index for index, fit in _clear(sighter).items() if _leans_or_is_strained(sighter, index, fit)}
-    for _ in range(_TONE_ROUNDS):
-        unsettled |= _moved_by_tone(sighter)
+    if tone is not sighter.scan.tone:
+        sighter.scan, unsettled = sighter.scan.seen_through(tone), set(_told_of_tone(sighter))
+    for doubting in _TONE_ROUNDS:
+        unsettled |= _moved_by_tone(sighter, doubting)
         if not unsettled:
-            break
+            continue
         frame_sigma = _frame_sigma(sighter)
         for index in sorted(unsettled):
             _match_again(sighter, index, sighter.options.match, frame_sigma)
         sighter.judge()
         unsettled = set()
-    sighter.tone = FrameTone.of(sighter.prior_tone, _told_of_tone(sighter))
+    sighter.tone = FrameTone.of(sighter.prior_tone, _told_of_tone(sighter), sighter.scan.tone)
 
 
 def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: Match) -> bool:
@@ -58,11 +76,11 @@ def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: Match) -> bool
     return leans_on_frame(mark) or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
 
 
-def _moved_by_tone(sighter: FrameSighter) -> set[int]:
+def _moved_by_tone(sighter: FrameSighter, doubting: bool) -> set[int]:
     """The marks that say something of the tone curve, if what all of them say moves any; the scan is then seen through
     that."""
     told, before = _told_of_tone(sighter), sighter.scan.tone
-    found = FrameTone.of(sighter.prior_tone, told)
+    found = FrameTone.of(sighter.prior_tone, told, before, doubting)
     clear = _clear(sighter)
     if not any(found.moves_px(one, before) > _MOVED * clear[index].sigma_px for index, one in told.items()):
         return set()

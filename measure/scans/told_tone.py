@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.scans.tone import SaidOfTone, Tone, said_by_all
+from measure.scans.tone import SaidOfTone, Tone
 
 Array = NDArray[np.float64]
 
@@ -27,20 +27,32 @@ class ToldTone:
 @dataclass(frozen=True, eq=False)
 class FrameTone:
     """tone: what is believed of the curve after all marks. said: what these say of it alone, None where nothing; least,
-    greatest: the codes between which they do, shares of full scale."""
+    greatest: the codes between which they do, shares of full scale; contradiction: of the curve that they were matched
+    by, as `Tone` has it, and how far that is from what they say of it."""
 
     tone: Tone
     said: SaidOfTone | None = None
     least: float = 0.0
     greatest: float = 1.0
+    contradiction: float = 0.0
 
     @classmethod
-    def of(cls, prior: Tone, told: Mapping[int, ToldTone]) -> "FrameTone":
-        said = said_by_all([one.said for one in told.values()])
-        if said is None:
+    def of(cls, prior: Tone, told: Mapping[int, ToldTone], matched_by: Tone, doubting: bool = True) -> "FrameTone":
+        """By what each mark says; doubting: as `Tone.told` takes it."""
+        if not told:
             return cls(prior)
+        each = [one.said for one in told.values()]
+        tone, said = prior.told(each, doubting)
         least, greatest = min(one.least for one in told.values()), max(one.greatest for one in told.values())
-        return cls(prior.told(said), said, least, greatest)
+        apart = tone.mean - matched_by.mean
+        return cls(tone, said, least, greatest, matched_by.contradiction(each) + float(apart @ apart))
+
+    @property
+    def note(self) -> str:
+        """A sentence: which curve, and whence."""
+        value, sigma = self.tone.power_between(self.least, self.greatest)
+        exact = f"{value:.2f}" if self.tone.is_known else f"{value:.2f} (σ {sigma:.2f})"
+        return f"Light was taken to grow as the grey value to the power of {exact}: {self.tone.source}."
 
     def moves_px(self, told: ToldTone, before: Tone) -> float:
         """How far a mark lies elsewhere by this curve than by the one before."""

@@ -26,7 +26,8 @@ _WAVE_SIGMAS = (0.3, 0.5, 0.2, 0.15)
 _SIGMAS = np.array([_POWER_SIGMA, *_WAVE_SIGMAS])
 # What is believed of a curve that the file says: programs round it, and a scanner's light and dark are not exactly its.
 _DECLARED_SIGMA = 0.1  # of the standard deviations above
-_LEAST_INFORMATION = 1e-6  # of departures of one standard deviation: less is none
+_CHANCE_SIGMAS = 2.0  # by which chance alone makes pictures contradict one another
+_WORTH_ROUNDS = 4  # of judging by the curve found how well the pictures agree on it
 _CONTRADICTED = np.log(1000.0)  # log-odds, at which a picture is believed against what its file says
 
 
@@ -66,6 +67,16 @@ class SaidOfTone:
         weighted = np.linalg.solve(covariance, np.column_stack([normal, score])).T
         information = weighted[:-1] @ normal
         return cls((information + information.T) / 2, weighted[-1] @ normal, float(weighted[-1] @ score), len(score))
+
+    @classmethod
+    def together(cls, each: Sequence["SaidOfTone"], worth: float = 1.0) -> "SaidOfTone":
+        """What several pictures say, each worth a share of what it claims."""
+        return cls(
+            np.sum([worth * one.information for one in each], axis=0),
+            np.sum([worth * one.right for one in each], axis=0),
+            worth * sum(one.square for one in each),
+            sum(one.count for one in each),
+        )
 
     def misfit(self, departures: Array) -> float:
         """Chi-square of departures, on `count` degrees of freedom."""
@@ -110,24 +121,51 @@ class Tone:
         mean[0] = (_POWER - self._base_power) / _POWER_SIGMA
         return replace(self, mean=mean, covariance=np.eye(len(_SIGMAS)))
 
+    def like_power(self, value: float) -> "Tone":
+        """The same with the departure that makes it most like a power."""
+        mean = self.mean.copy()
+        mean[0] += (value - self.power_between(0.1, 0.9)[0]) / _POWER_SIGMA
+        return self.at(mean)
+
     def at(self, mean: Array) -> "Tone":
         """The same with other departures."""
         return replace(self, mean=mean)
 
-    def told(self, said: SaidOfTone) -> "Tone":
-        """What is believed when pictures have said something, too. What the file says they may contradict."""
-        if self.is_known:
-            return self
-        believed, odds = self._with(said)
+    def told(self, each: Sequence[SaidOfTone], doubting: bool = True) -> tuple["Tone", SaidOfTone | None]:
+        """What is believed when pictures have said something, too, and what that is together. What the file says they
+        may contradict. doubting: whether they count by how well they agree; far from the curve they need not."""
+        if self.is_known or not each:
+            return self, None
+        believed, said, odds = self._told(each, doubting)
         if not self.is_declared:
-            return believed
-        free, free_odds = self.forgetting()._with(said)
+            return believed, said
+        free, free_said, free_odds = self.forgetting()._told(each, doubting)
         if free_odds - odds < _CONTRADICTED:
-            return believed
-        return replace(free, source=f"{self.source}, but the pictures contradict it", is_declared=False)
+            return believed, said
+        contradicted = replace(free, source=f"{self.source}, but the pictures contradict it", is_declared=False)
+        return contradicted, free_said
+
+    def _told(self, each: Sequence[SaidOfTone], doubting: bool) -> tuple["Tone", SaidOfTone, float]:
+        """The posterior, what was said, and the logarithm of how likely the prior makes that.
+
+        Pictures that contradict one another or the prior beyond chance have edges that are not as they are drawn: of
+        sharpened pictures, of film developed unevenly. Their own scatter tells how little they are worth, and what
+        makes them differ may be common to all, so that their number does not help."""
+        worth = 1.0
+        for _ in range(_WORTH_ROUNDS if doubting else 1):
+            said = SaidOfTone.together(each, worth)
+            tone, odds = self._with(said)
+            worth = 1 / (1 + tone.contradiction(each) * len(each))
+        return tone, said, odds
+
+    def contradiction(self, each: Sequence[SaidOfTone]) -> float:
+        """By how much more than by chance pictures contradict this curve: chi-square over its degrees of freedom, less
+        what chance makes of that."""
+        count = sum(one.count for one in each)
+        misfit = sum(one.misfit(self.mean) for one in each) / count
+        return max(misfit - 1 - _CHANCE_SIGMAS * float(np.sqrt(2 / count)), 0.0)
 
     def _with(self, said: SaidOfTone) -> tuple["Tone", float]:
-        """The posterior, and the logarithm of how likely the prior makes what is said."""
         prior = np.linalg.inv(self.covariance)
         covariance = np.linalg.inv(prior + said.information)
         right = prior @ self.mean + said.right
@@ -192,21 +230,6 @@ class Tone:
     def __repr__(self) -> str:
         value, sigma = self.power_between(0.1, 0.9)
         return f"Tone(like a power of {value:.2f} +- {sigma:.2f}: {self.source})"
-
-
-def said_by_all(each: Sequence[SaidOfTone]) -> SaidOfTone | None:
-    """What several marks or scans say together; None where there are none. What contradicts one another beyond chance,
-    by drawings that are not exact, say, is told by its own scatter how little it is worth."""
-    if not each:
-        return None
-    information = np.sum([one.information for one in each], axis=0)
-    right = np.sum([one.right for one in each], axis=0)
-    count, k = sum(one.count for one in each), len(right)
-    square = sum(one.square for one in each)
-    together = SaidOfTone(information, right, square, count)
-    likeliest = np.asarray(np.linalg.solve(information + _LEAST_INFORMATION * np.eye(k), right), float)
-    worse = max(together.misfit(likeliest) / max(count - k, 1), 1.0)
-    return SaidOfTone(information / worse, right / worse, square / worse, count)
 
 
 def _waves(code: Array) -> Array:

@@ -28,6 +28,7 @@ from pipeline.files.tie_table import TieSettings, read_ties
 FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
 _COARSEST_PITCH_UM = 1e4  # above it nm were meant: film of a few pixels shows no mark
 DEFAULT_SCANNER = "1"  # the name of that of all images that name none
+TONES = ("linear", "srgb")  # beside auto and a power
 UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 
 
@@ -36,6 +37,7 @@ class Project:
     """A project file as read; paths are resolved against the file's folder.
 
     cameras: by file name; the first one serves where images.csv names none. scans: by image name, in their order.
+    tone: the curve of the scans: auto, one of TONES, or the power of the grey value that light grows as.
     unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
     writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
     """
@@ -47,6 +49,7 @@ class Project:
     pitch_um: tuple[float, float] | None
     output: Path
     pose: str
+    tone: float | str
     targets: TargetSettings | None
     ties: TieSettings | None
     given_points: GivenPoints | None
@@ -158,6 +161,7 @@ def read_project(path: Path) -> Project:
         pitch_um=_pitch(table),
         output=table.path_of("output", "out"),
         pose=measure.text("pose", "auto", ("auto", *POSES)),
+        tone=measure.number_or_text("tone", "auto", ("auto", *TONES), above=0.0),
         targets=read_targets(table.table("targets")) if "targets" in table else None,
         ties=read_ties(table.table("ties")) if "ties" in table else None,
         given_points=None,

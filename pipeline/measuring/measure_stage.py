@@ -20,6 +20,7 @@ from measure.fiducials import measure_fiducials
 from measure.marks.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
+from measure.scans.tone import Tone
 from measure.writing.networks import MISSING, networks
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
@@ -33,6 +34,7 @@ from pipeline.measuring.roll import poses_of_roll
 from pipeline.measuring.sheet_check import with_checked_sheet
 from pipeline.measuring.target_stage import check_targets, measure_targets
 from pipeline.measuring.tie_stage import check_tie_names, with_ties
+from pipeline.measuring.tone_stage import ScannerTones, scanner_tones
 from pipeline.progress import Reporter
 from pipeline.workers import processes, worker_pool
 
@@ -53,7 +55,9 @@ def measure_scans(project: Project, reporter: Reporter, learned_folder: Path) ->
     _check_readable(project)
     with worker_pool(len(project.scans)) as workers:
         learned = learn_marks(project, reporter, workers, learned_folder)
-        scans = with_same_frames(_as_rolls(learned, _measured_scans(learned, reporter, workers), workers))
+        tones = scanner_tones(learned, reporter, workers)
+        measured = _measured_scans(learned, tones, reporter, workers)
+        scans = with_same_frames(_as_rolls(learned, tones, measured, workers))
         scans = _of_each_camera(project, scans, _at_one_definition)
         checked = with_checked_sheet(project, _of_each_camera(learned, scans, partial(_judged, learned)))
         if project.ties is None:
@@ -62,9 +66,9 @@ def measure_scans(project: Project, reporter: Reporter, learned_folder: Path) ->
             return with_ties(project, project.ties, checked, count, workers)
 
 
-def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> list[MeasuredScan]:
+def _measured_scans(project: Project, tones: ScannerTones, reporter: Reporter, workers: Executor) -> list[MeasuredScan]:
     with reporter.stage("measured") as count:
-        futures = {workers.submit(_timed, project, name): name for name in project.scans}
+        futures = {workers.submit(_timed, project, name, tones): name for name in project.scans}
         for done, future in enumerate(as_completed(futures), 1):
             _, seconds = future.result()
             count(futures[future], done, len(futures))
@@ -73,7 +77,9 @@ def _measured_scans(project: Project, reporter: Reporter, workers: Executor) -> 
     return [future.result()[0] for future in futures]
 
 
-def _as_rolls(project: Project, measured: Sequence[MeasuredScan], workers: Executor) -> list[MeasuredScan]:
+def _as_rolls(
+    project: Project, tones: ScannerTones, measured: Sequence[MeasuredScan], workers: Executor
+) -> list[MeasuredScan]:
     """The scans with the poses that all frames of a camera tell together; measured again where marks change names."""
     poses: dict[str, Pose] = {}
     for camera in project.cameras.values():
@@ -85,7 +91,7 @@ def _as_rolls(project: Project, measured: Sequence[MeasuredScan], workers: Execu
         for scan in measured
         if scan.frame.image in poses and scan.frame.pose and scan.frame.pose.name != poses[scan.frame.image].name
     }
-    again = {image: workers.submit(measure_scan, posed, image) for image, posed in renamed.items()}
+    again = {image: workers.submit(measure_scan, posed, image, tones) for image, posed in renamed.items()}
     scans = []
     for scan in measured:
         image = scan.frame.image
@@ -95,10 +101,10 @@ def _as_rolls(project: Project, measured: Sequence[MeasuredScan], workers: Execu
     return scans
 
 
-def _timed(project: Project, name: str) -> tuple[MeasuredScan, float]:
+def _timed(project: Project, name: str, tones: ScannerTones) -> tuple[MeasuredScan, float]:
     """A scan measured, and the seconds that it took."""
     start = time.monotonic()
-    return measure_scan(project, name), time.monotonic() - start
+    return measure_scan(project, name, tones), time.monotonic() - start
 
 
 def expected_time(first_s: float, scans: int) -> str:
@@ -171,18 +177,22 @@ def _check_readable(project: Project) -> None:
         raise MeasurementError("\n".join(messages))
 
 
-def measure_scan(project: Project, name: str) -> MeasuredScan:
-    """Measure one scan of the project: its fiducials, then its targets."""
+def measure_scan(project: Project, name: str, tones: ScannerTones | None = None) -> MeasuredScan:
+    """Measure one scan of the project: its fiducials, then its targets. tones: what other scans said of their
+    scanners' curves."""
     with project.open_scan(name) as scan:
-        return _measured(project, name, scan)
+        return _measured(project, name, scan, (tones or ScannerTones()).tone_of(project, name))
 
 
-def _measured(project: Project, name: str, scan: Scan) -> MeasuredScan:
+def _measured(project: Project, name: str, scan: Scan, tone: Tone) -> MeasuredScan:
+    """tone: the curve that fiducials are seen through; targets have edges all round, and are measured as they are."""
     camera = project.camera_of(name)
-    frame = _fiducials(project, name, scan, camera)
+    frame = _fiducials(project, name, scan.seen_through(tone), camera)
     pitch, problems, notes = _pitch(project, scan, camera, frame)
     frame = replace(frame, problems=(*frame.problems, *problems))
-    notes = (*(f"{note[0].upper()}{note[1:]}." for note in scan.notes), *notes, *_missed_reading(project, frame))
+    curve = (frame.tone.note,) if frame.tone else ()
+    file_notes = (f"{note[0].upper()}{note[1:]}." for note in scan.notes)
+    notes = (*file_notes, *notes, *curve, *_missed_reading(project, frame))
     measured = MeasuredScan(scan.path, scan.width_px, scan.height_px, pitch, frame, notes)
     if misplaced := misplaced_principal_point(camera, measured):
         measured = replace(measured, frame=replace(frame, problems=(*frame.problems, misplaced)))

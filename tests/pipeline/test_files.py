@@ -329,3 +329,20 @@ def test_trying_whether_a_folder_takes_results_touches_no_file_of_it(tmp_path: P
 def test_an_image_is_called_as_its_file_without_what_no_table_keeps() -> None:
     assert image_name("scans/roll 7/ frame 1 .TIF") == "frame 1"
     assert image_name("frame.2") == "frame.2"
+
+
+@pytest.mark.parametrize(
+    ("said", "tone"), [("", "auto"), ('tone = "linear"', "linear"), ("tone = 2.2", 2.2), ('tone = "srgb"', "srgb")]
+)
+def test_the_tone_curve_of_a_project(tmp_path: Path, said: str, tone: float | str) -> None:
+    written(tmp_path, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
+    written(tmp_path, "comparator.csv", "image,point,kind,x_mm,y_mm\n")
+    assert read_project(written(tmp_path, "project.toml", f'camera = "camera.toml"\n[measure]\n{said}\n')).tone == tone
+
+
+@pytest.mark.parametrize(("said", "words"), [('"gamma"', ["tone", "linear"]), ("-1.0", ["tone", "greater than 0"])])
+def test_a_tone_curve_that_is_none(tmp_path: Path, said: str, words: list[str]) -> None:
+    path = written(tmp_path, "project.toml", f'camera = "camera.toml"\n[measure]\ntone = {said}\n')
+    message = refused(read_project, path)
+    for word in words:
+        assert word in message
