@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from adjust.errors import NoImageError
 from adjust.functional_model.families import family
 from adjust.functions import blind_mark
-from adjust.least_squares.factor import Factor
 from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
 from adjust.least_squares.numbering import Numbering
+from adjust.linear_algebra.factor import Factor
 from adjust.options import Options
 from adjust.problem import Problem, State
 from adjust.quality.reliability import Misfits, misfits, statistics

@@ -53,6 +53,12 @@ def test_the_rooms_of_a_package_use_one_another_in_no_circle(package: str, user:
     TopologicalSorter(uses).prepare()
 
 
+def test_the_formulas_of_adjust_know_no_network() -> None:
+    linear_algebra, functional_model = (ROOT / "adjust" / name for name in ("linear_algebra", "functional_model"))
+    assert rooms_used(linear_algebra, "adjust") == {"linear_algebra"}
+    assert rooms_used(functional_model, "adjust") == {"linear_algebra", "functional_model"}
+
+
 def rooms_used(room: Path, package: str) -> set[str]:
     """The rooms of a package from which the files of one import."""
     files = room.glob("*.py") if room.is_dir() else [room]

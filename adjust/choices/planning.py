@@ -11,9 +11,9 @@ from adjust.adjustment import Options, adjust_problem, with_datum
 from adjust.errors import AdjustmentError
 from adjust.functions import blind_mark, computed_observations
 from adjust.further_observations import at_computed
-from adjust.least_squares.factor import Factor
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
+from adjust.linear_algebra.factor import Factor
 from adjust.network import Approximations, Network
 from adjust.problem import Problem, number
 from adjust.quality.cofactor import free_cofactor

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.correction import Correction, DistortionModel, Imaged
 from adjust.functional_model.families import family
-from adjust.small_matrices import columns, zeros
+from adjust.linear_algebra.small_matrices import columns, zeros
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.small_matrices import applied, determinant, solved
+from adjust.linear_algebra.small_matrices import applied, determinant, solved
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

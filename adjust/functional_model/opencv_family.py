@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.correction import Imaged, undistorted
-from adjust.small_matrices import applied, matrices, product, vectors
+from adjust.linear_algebra.small_matrices import applied, matrices, product, vectors
 
 Array = NDArray[np.float64]
 

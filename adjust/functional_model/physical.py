@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.correction import Correction, Settings
-from adjust.small_matrices import matrices, vectors
+from adjust.linear_algebra.small_matrices import matrices, vectors
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.line_of_sight import STRAIGHT, LineOfSight, sight_vectors
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film
-from adjust.small_matrices import applied, determinant, product, solved
+from adjust.linear_algebra.small_matrices import applied, determinant, product, solved
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

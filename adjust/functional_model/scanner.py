@@ -29,7 +29,7 @@ from adjust.functional_model.polynomial_sets import (
     summed,
 )
 from adjust.functional_model.transformation import order_of
-from adjust.small_matrices import determinant, solved
+from adjust.linear_algebra.small_matrices import determinant, solved
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

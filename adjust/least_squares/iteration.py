@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from adjust.functions import compute, computed_observations, derivatives
 from adjust.further_observations import square_sum
-from adjust.least_squares.elimination import eliminate
-from adjust.least_squares.factor import Factor
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, of_cameras, prior_differences, prior_root_weights, whitened_rows
+from adjust.linear_algebra.elimination import eliminate
+from adjust.linear_algebra.factor import Factor
 from adjust.problem import Problem, State
 from adjust.result import Iteration, Termination
 

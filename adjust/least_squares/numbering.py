@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from adjust.least_squares.fronts import Fronts, band_order, fronts_of
-from adjust.least_squares.normal_equations import Groups
+from adjust.linear_algebra.fronts import Fronts, band_order, fronts_of
+from adjust.linear_algebra.normal_equations import Groups
 from adjust.problem import ABSENT, Problem, side_by_side
 
 Indices = NDArray[np.intp]

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from adjust.functions import Derivatives
 from adjust.further_observations import FurtherObservation
-from adjust.least_squares.elimination import Sums
-from adjust.least_squares.factor import Blocks
 from adjust.least_squares.numbering import Numbering, Touched
+from adjust.linear_algebra.elimination import Sums
+from adjust.linear_algebra.factor import Blocks
+from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
 from adjust.problem import ABSENT, Problem, State
-from adjust.small_matrices import applied, inverse, lower_root, product
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

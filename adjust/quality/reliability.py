@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.further_observations import FurtherObservation
-from adjust.least_squares.factor import Blocks, Factor
 from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_differences
+from adjust.linear_algebra.factor import Blocks, Factor
+from adjust.linear_algebra.small_matrices import applied, eigen, inverse, laid_out, product
 from adjust.probabilities import Probabilities
 from adjust.problem import ABSENT, Problem
 from adjust.result import OuterEffect, Reliability
-from adjust.small_matrices import applied, eigen, inverse, laid_out, product
 from adjust.tested import Tested, TestedUnits
 
 Array = NDArray[np.float64]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.further_observations import square_sum
-from adjust.least_squares.factor import Blocks, Factor
 from adjust.least_squares.rows import prior_differences
+from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem import ABSENT, Problem, State
 from adjust.quality.reliability import UNCHECKED, Misfits, redundancies, statistics
 from adjust.quality.reweighting import Weighting

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.linear_algebra.small_matrices import laid_out
 from adjust.problem import Problem
-from adjust.small_matrices import laid_out
 from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]

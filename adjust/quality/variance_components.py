@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from adjust.least_squares.factor import Factor
 from adjust.least_squares.iteration import Linearised
-from adjust.least_squares.normal_equations import spread_squares
 from adjust.least_squares.numbering import Numbering
+from adjust.linear_algebra.factor import Factor
+from adjust.linear_algebra.normal_equations import spread_squares
 from adjust.quality.reliability import Misfits, unit_rows
 from adjust.quality.residuals import group_sums
 from adjust.quality.reweighting import Weighting

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.least_squares.factor import Factor
+from adjust.linear_algebra.factor import Factor
 from adjust.problem import Problem, State
 from adjust.result import NullDirection
 from adjust.undetermined.datum import free_coordinates, object_datum

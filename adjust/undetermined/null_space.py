@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.least_squares.factor import Factor
-from adjust.least_squares.multifrontal import with_rows
-from adjust.least_squares.triangle import Triangle
+from adjust.linear_algebra.factor import Factor
+from adjust.linear_algebra.multifrontal import with_rows
+from adjust.linear_algebra.triangle import Triangle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

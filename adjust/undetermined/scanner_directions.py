@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.scanner import degree_of, is_left
-from adjust.least_squares.factor import Factor
+from adjust.linear_algebra.factor import Factor
 from adjust.problem import Problem, State
 from adjust.result import Cofactor
 from adjust.undetermined.directions import Lead

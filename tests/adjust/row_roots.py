@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.least_squares.factor import Blocks, Factor
+from adjust.linear_algebra.factor import Blocks, Factor
 
 
 def row_roots(factor: Factor, blocks: Iterable[Blocks]) -> Iterator[NDArray[np.float64]]:

@@ -11,12 +11,12 @@ from scipy.sparse import eye_array
 from simulated import Truth, field_points, simulated
 
 from adjust.adjustment import adjust
-from adjust.least_squares import elimination, multifrontal, triangle
-from adjust.least_squares.elimination import eliminate
-from adjust.least_squares.factor import Blocks, Factor
 from adjust.least_squares.iteration import Linearised, factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
+from adjust.linear_algebra import elimination, multifrontal, triangle
+from adjust.linear_algebra.elimination import eliminate
+from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.network import Approximations, Network, Observations
 from adjust.problem import number
 

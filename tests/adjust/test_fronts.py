@@ -12,13 +12,13 @@ from scipy.sparse.linalg import splu
 from simulated import Truth, simulated
 
 from adjust.adjustment import adjust
-from adjust.least_squares import elimination, fronts, triangle
-from adjust.least_squares.elimination import eliminate
-from adjust.least_squares.factor import Blocks, Factor
-from adjust.least_squares.fronts import Fronts, fronts_of
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, prior_root_weights
+from adjust.linear_algebra import elimination, fronts, triangle
+from adjust.linear_algebra.elimination import eliminate
+from adjust.linear_algebra.factor import Blocks, Factor
+from adjust.linear_algebra.fronts import Fronts, fronts_of
 from adjust.network import Approximations, Fiducial, Network, ObjectPoint, Observations, Prior
 from adjust.problem import number
 from adjust.undetermined import diagnosis

@@ -7,9 +7,9 @@ from setups import UNKNOWN, Array, Setup, vertical
 from simulated import field_points
 
 from adjust.adjustment import Options, adjust
-from adjust.least_squares.factor import BlockFactors, Factor
-from adjust.least_squares.fronts import Fronts
-from adjust.least_squares.triangle import Triangle
+from adjust.linear_algebra.factor import BlockFactors, Factor
+from adjust.linear_algebra.fronts import Fronts
+from adjust.linear_algebra.triangle import Triangle
 from adjust.undetermined import null_space
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from adjust.least_squares.factor import BlockFactors, Blocks, Factor
-from adjust.least_squares.fronts import Fronts
-from adjust.least_squares.triangle import Triangle
+from adjust.linear_algebra.factor import BlockFactors, Blocks, Factor
+from adjust.linear_algebra.fronts import Fronts
+from adjust.linear_algebra.triangle import Triangle
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

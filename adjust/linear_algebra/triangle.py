@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import rq, solve_triangular
 from scipy.linalg.lapack import dtrcon
 
-from adjust.least_squares.fronts import Front, Fronts
+from adjust.linear_algebra.fronts import Front, Fronts
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
-from adjust.least_squares.block_squares import Normal, by_squares, is_tall, normal_of
-from adjust.least_squares.factor import BlockFactors, Blocks, Factor, of_columns
-from adjust.least_squares.fronts import Fronts
-from adjust.least_squares.multifrontal import of_normal_equations, reflected, reflections_cost, triangle_of
-from adjust.least_squares.normal_equations import Groups, border_square, spread_squares
+from adjust.linear_algebra.block_squares import Normal, by_squares, is_tall, normal_of
+from adjust.linear_algebra.factor import BlockFactors, Blocks, Factor, of_columns
+from adjust.linear_algebra.fronts import Fronts
+from adjust.linear_algebra.multifrontal import of_normal_equations, reflected, reflections_cost, triangle_of
+from adjust.linear_algebra.normal_equations import Groups, border_square, spread_squares
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
