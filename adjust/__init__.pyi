@@ -14,5 +14,6 @@ from .network import Network as Network
 from .network import ObjectPoint as ObjectPoint
 from .network import Observations as Observations
 from .network import Prior as Prior
+from .network import Scanner as Scanner
 from .options import Options as Options
 from .result import Adjustment as Adjustment

@@ -21,6 +21,7 @@ from pipeline.rendered.scene_file import read_scene
 from pipeline.rendered.scene_project import write_project as write_rendered
 from pipeline.report.scanner_views import bend_field
 from synthetic_images.film import frame_geometry, scanner_bend
+from synthetic_images.frame import frame_truth
 
 TRUTH = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
 QUARTERS = [0.0, 90.0, 180.0, 270.0] * 2
@@ -174,3 +175,33 @@ def test_a_design_tries_scans_turned_by_180_degrees(tmp_path: Path) -> None:
     rms_um = 1e3 * np.sqrt(np.mean([term["sigma"] ** 2 for term in found["scanners"]["scanner"].values()]))
     assert turned["sigmas"]["scanner"] < 0.99 * rms_um
     assert turned["gain_percent"]["scanner"] == pytest.approx(100.0 * (1.0 - turned["sigmas"]["scanner"] / rms_um))
+
+
+def test_two_photographs_of_a_rendered_scene_give_its_scanner_back(tmp_path: Path) -> None:
+    """Marks where the renderer puts them, to 1.5 um: most of the terms that are tried are not told by two frames."""
+    text = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
+    text = text.replace("# bend_um = {a20 = 20.0, b11 = -15.0}", "bend_um = {a20 = 20.0, b11 = -15.0}")
+    (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
+    scene_file = read_scene(tmp_path / "scene.toml")
+    write_rendered(scene_file, tmp_path)
+    project_text = (tmp_path / "project.toml").read_text(encoding="utf-8")
+    kept = [
+        line for line in project_text.splitlines() if not line.startswith(("scans", "[targets]", "kind", "diameter"))
+    ]
+    (tmp_path / "project.toml").write_text("\n".join(kept) + "\n", encoding="utf-8")
+    rng, rows = np.random.default_rng(1), ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
+    for i, image in enumerate(scene_file.scene.images):
+        truth = frame_truth(scene_file.scene, i)
+        for kind, marks in (("fiducial", truth.fiducials), ("target", truth.targets)):
+            for id, position in marks.items():
+                x, y = position.center_px * [0.045, -0.045] + rng.normal(0.0, 0.0015, 2)
+                if not position.hidden:
+                    rows.append(f"{image.name},{id},{kind},{x:.6f},{y:.6f},0.0015,0.0015")
+    (tmp_path / "comparator.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    assert run(["adjust", str(tmp_path / "project.toml")]) == DONE
+    (found,) = stored(tmp_path)["scanners"].values()
+    assert set(found["terms"]) == {"a20", "b11"}
+    bed_mm = max(scene_file.scene.camera.frame_mm) / 2 + scene_file.scene.scanner.margin_mm
+    (half_x, half_y), terms = found["half_mm"], found["terms"]
+    for name, true in (("a20", 0.020 * (half_x / bed_mm) ** 2), ("b11", -0.015 * half_x * half_y / bed_mm**2)):
+        assert abs(terms[name]["value"] - true) < 4.0 * terms[name]["sigma"]
