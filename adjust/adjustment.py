@@ -13,6 +13,7 @@ from adjust.initial_values.approximations import approximate
 from adjust.initial_values.far_points import far_points
 from adjust.least_squares.kept_memory import keep_freed_memory
 from adjust.network import STRAIGHT, Approximations, Network
+from adjust.network_slips import network_slip, stations_elsewhere
 from adjust.options import Datum, Method, Options
 from adjust.problem import Problem, number
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
@@ -27,23 +28,65 @@ __all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "with_datum
 
 Indices = NDArray[np.intp]
 
+TRIAL_STEPS = 6  # of an adjustment that only has to show whether the observations agree: v'Pv falls with every one
 
-def adjust(network: Network, approximations: Approximations, options: Options | None = None) -> Adjustment:
+
+def adjust(
+    network: Network, approximations: Approximations | None = None, options: Options | None = None
+) -> Adjustment:
     """Adjust a network by least squares, all unknowns together.
 
     The combined model A v + B dx = w is relinearised at the adjusted observations and unknowns until both stand still
     (Torlegård, equations F1 to F9). The cofactor matrix is that of all unknowns, nothing held fixed but what a standard
     deviation of 0 fixes. A singular network is a result with its null directions, not an error: its values are the
-    approximations, its cofactor matrix is zero and means nothing. Where the iteration does not come to rest it is begun
-    anew from approximations found from the network itself, and a warning says so. Given points that are far off are
-    named where the observations do not agree for them; robust estimation and data snooping begin without them.
+    approximations, its cofactor matrix is zero and means nothing. Where no approximations are given, or the iteration
+    does not come to rest from them, it begins with those found from the network itself. Given points that are far off
+    are named where the observations do not agree for them; robust estimation and data snooping begin without them.
 
     Raises AdjustmentError where the network is empty or contradictory, where the approximations put a point where it
-    has no image, or where the chosen datum does not hold the object space.
+    has no image, where the chosen datum does not hold the object space, or where a slip that concerns the whole network
+    explains what else contradicts itself everywhere (see `network_slip`).
     """
     keep_freed_memory()
     validate(network)
     options = options or Options()
+    weighs_anew = options.plain != options
+    if weighs_anew:  # what is wrong with all would be weighed away here and there
+        _check_whole(network, _plainly(network, options), options)
+    try:
+        start = approximations or approximate(with_held(network, options.datum_coordinates))
+        result = _adjusted(network, start, options)
+    except AdjustmentError:
+        if not weighs_anew:
+            _check_whole(network, None, options)
+        raise
+    if result.termination == "singular":
+        return result
+    if not weighs_anew:
+        _check_whole(network, result, options)
+    told = stations_elsewhere(network, result)
+    return replace(result, remarks=(*result.remarks, told)) if told else result
+
+
+def _check_whole(network: Network, given: Adjustment | None, options: Options) -> None:
+    """Raise AdjustmentError where a slip of the whole network explains what the network as it is given does not."""
+    slip = network_slip(network, given, lambda other: _plainly(other, options), options.probabilities.family)
+    if slip:
+        raise AdjustmentError(slip)
+
+
+def _plainly(network: Network, options: Options) -> Adjustment | None:
+    """A network adjusted from its own approximations with the weights as they are given; None where it cannot begin."""
+    plain = replace(options.plain, iteration_limit=min(options.iteration_limit, TRIAL_STEPS))
+    try:
+        own = approximate(with_held(network, options.datum_coordinates))
+        return adjust_problem(_numbered(network, own, plain), plain)
+    except AdjustmentError:
+        return None
+
+
+def _adjusted(network: Network, approximations: Approximations, options: Options) -> Adjustment:
+    """The adjustment, and what is to be said of single given points."""
     begun = _without_slips(network, approximations, options) if options.robust or options.snooping else None
     if begun is not None and begun.converged:
         return begun if _agrees(begun, options) else _with_slips(begun, network, approximations, options)
@@ -100,7 +143,7 @@ def _slips(network: Network, approximations: Approximations, options: Options) -
     if not far:
         return []
     without, start = freed(network, approximations, far)
-    plain = replace(options, robust=False, snooping=False, variance_components=False)
+    plain = options.plain
     try:
         return slips(network, far, adjust_problem(_numbered(without, start, plain), plain), options)
     except AdjustmentError:  # without these points it cannot even begin

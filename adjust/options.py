@@ -1,6 +1,6 @@
 """How to adjust."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 from adjust.probabilities import Probabilities
@@ -63,6 +63,11 @@ class Options:
                 f"there is no group {', '.join(strangers)}: variance components are those of "
                 f"{', '.join((*MEASURED_KINDS, *PRIOR_GROUPS))}"
             )
+
+    @property
+    def plain(self) -> "Options":
+        """The same with all weights as they are given."""
+        return replace(self, robust=False, snooping=False, variance_components=False)
 
     @property
     def groups(self) -> tuple[str, ...]:

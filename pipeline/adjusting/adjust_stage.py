@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from adjust.adjustment import Options, adjust
 from adjust.images import adjusted_image
-from adjust.initial_values.approximations import approximate
 from adjust.network import Network
 from adjust.result import Adjustment
-from adjust.undetermined.datum_choice import with_held
 from pipeline.adjusting.network import build_network, unmeasured_points
 from pipeline.adjusting.scanners import with_scanners
 from pipeline.files.project_file import Project
@@ -34,8 +32,8 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     """
     network, left_out = build_network(project, marks)
     options = adjustment_options(project)
-    network, untold = with_scanners(project, network, partial(_adjusted, options=options))
-    adjustment = _adjusted(network, options)
+    network, untold = with_scanners(project, network, partial(adjust, options=options))
+    adjustment = adjust(network, options=options)
     uncorrected = np.zeros_like(network.observations.xy_mm)
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _without_eccentricity(project, network, adjustment, options)
@@ -61,10 +59,6 @@ def adjustment_options(project: Project) -> Options:
     )
 
 
-def _adjusted(network: Network, options: Options) -> Adjustment:
-    return adjust(network, approximate(with_held(network, options.datum_coordinates)), options)
-
-
 def _without_eccentricity(
     project: Project, network: Network, adjustment: Adjustment, options: Options
 ) -> tuple[Adjustment, Array]:
@@ -77,7 +71,7 @@ def _without_eccentricity(
         if _in_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
             break
         applied = wanted
-        adjustment = _adjusted(_shifted(network, -applied), options)
+        adjustment = adjust(_shifted(network, -applied), options=options)
     return adjustment, uncorrected
 
 

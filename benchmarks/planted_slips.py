@@ -1,0 +1,31 @@
+"""Slips of whole networks (mirrored points, another unit, y down, another c, exchanged frames): what is said of them.
+
+PYTHONPATH=tests/adjust python benchmarks/planted_slips.py [NETWORKS]
+
+Networks of four images and 14 to 30 control points of 5 cm, anew for every seed; one row a kind of slip. named: the
+slip is named, and nothing else blamed. unnamed: nothing is blamed. misleading: something else is blamed.
+"""
+
+import sys
+import time
+from collections import Counter
+
+from planted import KINDS, network, outcome, said
+
+
+def main() -> None:
+    """Print the table."""
+    networks = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    print(f"{'slip':58} {'named':>6} {'unnamed':>8} {'misleading':>11} {'CPU s each':>11}")
+    for name, kind in KINDS.items():
+        begun, count = time.process_time(), Counter[str]()
+        for seed in range(networks):
+            count[outcome(kind, said(kind.spoil(network(seed, kind.oriented))))] += 1
+        spent = (time.process_time() - begun) / networks
+        print(
+            f"{name:58} {count['named']:6d} {count['unnamed']:8d} {count['misleading']:11d} {spent:11.1f}", flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()

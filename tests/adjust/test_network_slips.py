@@ -1,0 +1,62 @@
+"""Slips of whole networks are named, and nothing else is blamed; what is no such slip is not taken for one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import KINDS, exchanged, network, outcome, said, with_points
+
+from adjust.adjustment import Options, adjust
+from adjust.errors import AdjustmentError
+from adjust.network_slips import AXES
+
+FAST = (
+    "sign of X, approximate orientations",
+    "sign of Z, observed orientations",
+    "y of the camera down",
+    "c 10 mm too long",
+    "mm for m, approximate orientations",
+    "names of two frames exchanged, approximate orientations",
+    "nothing, approximate orientations",
+)
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in KINDS]
+)
+def test_what_is_wrong_with_all_is_named(name: str) -> None:
+    kind = KINDS[name]
+    sentences = said(kind.spoil(network(0, kind.oriented)))
+    assert outcome(kind, sentences) == "named", sentences
+
+
+def test_targets_of_exchanged_frames_are_named() -> None:
+    few = network(1)
+    with pytest.raises(AdjustmentError, match=r"targets of the frames f1 and f3 are exchanged\. Without this all"):
+        adjust(exchanged(few))
+
+
+@pytest.mark.parametrize("options", [Options(robust=True), Options(snooping=True)])
+def test_robust_methods_do_not_hide_a_slip_of_the_whole(options: Options) -> None:
+    with pytest.raises(AdjustmentError, match="The points are mirrored"):
+        adjust(with_points(network(2), lambda xyz: xyz * [1.0, 1.0, -1.0]), options=options)
+
+
+def test_flat_fields_are_mirrored_by_their_stations_alone() -> None:
+    """Their residuals are those of the true field: cameras behind it see it so."""
+    given = network(3, np.full(6, np.inf), relief=0.0)
+    told = [each for each in adjust(with_points(given, lambda xyz: xyz[[1, 0, 2]])).warnings if "nowhere near" in each]
+    assert ["X and Y of all points are exchanged" in each for each in told] == [True]
+    assert not [each for each in adjust(given).warnings if "nowhere near" in each]
+
+
+def test_every_mirror_is_its_own_inverse_and_turns_the_hand() -> None:
+    for words, moved in AXES.items():
+        np.testing.assert_array_equal(moved @ moved, np.eye(3), err_msg=words)
+        assert np.linalg.det(moved) == pytest.approx(-1.0)
+
+
+def test_sigmas_that_are_somewhat_too_small_are_no_slip() -> None:
+    given = network(4)
+    close = given.observations.covariance_mm2 / 1.7**2
+    assert adjust(replace(given, observations=replace(given.observations, covariance_mm2=close))).converged
