@@ -72,12 +72,14 @@ def measure_fiducials(
     lines = _read(scan, layout, frame) if options.writing == "all" else None
     pose, against = Pose(options.pose, True, _SET), ""
     if options.pose == "auto":
+        frame = _in_every_pose(search, found, frame)
         pose, placement = _named(search, found, frame, lines or ())
         if options.writing == "pose" and not pose.decided and frame.accepted:
             lines = _read(scan, layout, frame)
             pose, placement = _named(search, found, frame, lines or ())
         if pose.name != frame.placement.pose:
             frame = measure_frame(scan, layout, placement, options)
+        frame = _as_if_set(search, hypotheses, frame)
     else:
         against = _against_the_set_pose(search, found, frame, lines or ())
     chance = doubt(search, frame)
@@ -86,6 +88,31 @@ def measure_fiducials(
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
     return replace(present_frame(scan, layout, frame, pose, pitch_um, problems, chance), writing=lines)
+
+
+def _in_every_pose(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> Frame:
+    """The frame, or that in another pose at its place in which more of its marks are seen: marks that lean to one side
+    look like their mirror images, moved and turned a little."""
+    if frame.is_whole:
+        return frame
+    others = [pose for pose in search.unlike_poses(frame.placement) if pose != frame.placement.pose]
+    placements = [_posed(found, frame.placement, pose) for pose in others]
+    frames = [measure_frame(search.scan, search.layout, placement, search.options) for placement in placements]
+    return max([frame, *frames], key=_worth)
+
+
+def _as_if_set(search: FrameSearch, hypotheses: Sequence[Sequence[PitchHypothesis]], frame: Frame) -> Frame:
+    """The frame, or the one that is found if its pose is set, if more of its marks are seen then: what a search for all
+    poses finds in one of them is not all that a search for that one does."""
+    if frame.is_whole:
+        return frame
+    of_pose = FrameSearch(search.scan, search.layout, replace(search.options, pose=frame.placement.pose))
+    _, again = _anywhere(of_pose, [one for group in hypotheses for one in group if one.mm == frame.placement.pitch_mm])
+    return frame if again is None else max(frame, again, key=_worth)
+
+
+def _worth(frame: Frame) -> tuple[bool, int, int]:
+    return frame.accepted and frame.placement.surroundings != CLOSE, frame.measured, int(frame.belongs.sum())
 
 
 def _read(scan: Scan, layout: FiducialLayout, frame: Frame | None) -> tuple[Line, ...] | None:

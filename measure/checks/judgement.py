@@ -172,7 +172,7 @@ def _film_of(shared: Explanation, place: int, layout: FiducialLayout, believed_m
     if frame is None or frame.film_mm is None:
         return (shared.film.sigma_mm if shared.film.is_more else believed_mm), []
     alone = len(shared.frames) == 1
-    off = frame.misfit.distances_mm(shared.expected_mm(place)[0])
+    off = frame.under(shared.film).distances_mm(shared.expected_mm(place)[0])
     names = [layout.marks[index].id for index in frame.misfit.index]
     told = _told(dict(zip(names, off.tolist(), strict=True)))
     than = "the given coordinates" if alone else "what the camera's frames have in common"

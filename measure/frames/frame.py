@@ -95,6 +95,11 @@ class Frame:
         return self.accepted and self.measured >= self._least
 
     @property
+    def is_whole(self) -> bool:
+        """Whether every mark that lies in the scan was plainly seen where the others put it."""
+        return self.accepted and int(self.belongs.sum()) == self.inside and self.all_clear
+
+    @property
     def is_complete(self) -> bool:
         """Whether it needs no other search: every mark plainly seen where the others put it."""
         return bool(self.accepted and len(self.belongs) >= _CHECKED and self.belongs.all() and self.all_clear)

@@ -45,13 +45,13 @@ class _Answers:
 class _Searched:
     """One hypothesis searched, in one pose after another. whole: the search in the whole scan, if this one is only
     about where the frame's edges put the marks. looks: by pose, the kind of response of every mark; found: by pose,
-    the placements; differ: poses whose marks do not lie within the tolerance of another pose's."""
+    the placements; unlike: poses whose marks do not lie within the tolerance of another pose's before."""
 
     search: PlacementSearch
     whole: "_Searched | None" = None
     looks: dict[str, tuple[int, ...]] = field(default_factory=dict)
     found: dict[str, list[Placement]] = field(default_factory=dict)
-    differ: int = 0
+    unlike: list[str] = field(default_factory=list)
 
     def try_pose(self, pose: str, own: tuple[int, ...]) -> None:
         """Search in a pose, own being the kinds of its marks' looks; if it is another one's twin, it has its places."""
@@ -62,7 +62,7 @@ class _Searched:
         )
         found = [place.posed(pose) for place in self.found[twin]] if twin else search.of_pose(pose, own)
         self.looks[pose], self.found[pose] = own, found
-        self.differ += not like
+        self.unlike += [] if like else [pose]
 
     def _same_picture(self, known: str, pose: str, own: tuple[int, ...], within_mm: float) -> bool:
         return same_picture(self.search.marks, (known, self.looks[known]), (pose, own), within_mm)
@@ -177,6 +177,11 @@ class FrameSearch:
         seen = {index: places[index] for index in np.flatnonzero(inside).tolist()}
         return self._expected(placement, seen, len(seen), search.tolerance_px)
 
+    def unlike_poses(self, placement: Placement) -> tuple[str, ...]:
+        """The poses that show the marks' pictures elsewhere than all before them, under this placement's hypothesis."""
+        searched = self._searched.get(placement.pitch_mm)
+        return tuple(searched.unlike) if searched else self.poses
+
     def was_everywhere(self, placement: Placement) -> bool:
         """Whether the frame was searched in the whole scan, not only in the middle of it."""
         searched = self._searched.get(placement.pitch_mm)
@@ -225,7 +230,7 @@ class FrameSearch:
         places = min(self.scan.width_px * self.scan.height_px, middles_px) / search.responses.reduction**2
         of_other = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
         polarities = 2 if len(self._signs) > 1 else 1
-        return places / same_px * of_other / same_px * searched.differ * polarities
+        return places / same_px * of_other / same_px * len(searched.unlike) * polarities
 
     @property
     def _signs(self) -> set[int]:
