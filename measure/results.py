@@ -1,7 +1,7 @@
 """What a measurement hands on: marks with covariance, status and reason, and the frame they were found in."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from html import escape
 from typing import Literal
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
+from measure.marks.poses import pose_in_camera
 from measure.scans.told_tone import FrameTone
 from measure.status import Status
 from measure.writing.line import Line
@@ -59,6 +60,9 @@ class MarkMeasurement:
         return self.point, str(self.status), place, told, self.reason
 
 
+POSE_DECIDED = 7.0  # log-odds: a thousand to one
+
+
 @dataclass(frozen=True)
 class Pose:
     """How the scan was laid on the scanner: its counter-clockwise turn in degrees, "m" behind it if mirrored.
@@ -78,6 +82,22 @@ class Pose:
     written: Mapping[str, float] = field(default_factory=dict)
     writing: str = ""
     roll: str = ""
+
+    @property
+    def rivals(self) -> tuple[str, ...]:
+        """How the frame may lie beside how it is taken to: the poses, in its own axes, that nothing tells from this."""
+        if self.decided or self.name not in self.likelihoods:
+            return ()
+        least = self.likelihoods[self.name] - POSE_DECIDED
+        return tuple(
+            pose_in_camera(name, self.name)
+            for name, likelihood in self.likelihoods.items()
+            if name != self.name and likelihood > least
+        )
+
+    def is_decided_but_for(self, alike: Collection[str]) -> bool:
+        """Whether it is decided, or no other than poses under which the marks are alike may be right."""
+        return self.decided or bool(self.rivals and set(self.rivals) <= set(alike))
 
 
 @dataclass(frozen=True, repr=False)

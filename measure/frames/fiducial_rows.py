@@ -57,8 +57,7 @@ def present_frame(
     elsewhere, sentences, beside those that its marks show; chance: why it may be none at all: then none of its marks is
     certain, nor if it was found at a closer look."""
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
-    if not pose.decided:
-        marks = tuple(_of_assumed_name(row, mark) for row, mark in zip(marks, layout.marks, strict=True))
+    marks = tuple(_of_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
     weak = chance or (_FAINT if frame.placement.surroundings == CLOSE else "")
     if weak:
         marks = tuple(
@@ -112,11 +111,12 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
 
 
-def _of_assumed_name(row: MarkMeasurement, mark: LayoutMark) -> MarkMeasurement:
+def _of_assumed_name(row: MarkMeasurement, mark: LayoutMark, pose: Pose) -> MarkMeasurement:
     """A drawn mark is the same place under every name. A learned one's origin is where somebody clicked: at another
-    mark that looks like it, it lies elsewhere."""
-    learned = isinstance(mark.mark, MarkTemplate) and mark.mark.learned_mm > 0
-    return replace(row, status=Status.WEAK, reason=_ASSUMED) if learned and row.status is Status.MEASURED else row
+    mark that looks like it, it lies elsewhere, but where the marks' symmetry leaves it the same."""
+    if not isinstance(mark.mark, MarkTemplate) or mark.mark.learned_mm == 0 or pose.is_decided_but_for(mark.mark.alike):
+        return row
+    return replace(row, status=Status.WEAK, reason=_ASSUMED) if row.status is Status.MEASURED else row
 
 
 def _by_edges(edges: SecondPlace | None) -> dict[str, float]:

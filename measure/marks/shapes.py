@@ -101,7 +101,8 @@ class MarkTemplate:
     deviation of noise in the chip's own slopes, per pixel, as a fit sees them. steady: which of its pixels look alike
     in all of them, None where all do. steadiness: (rows, columns), 1 where a picture differs from the chip by noise,
     and less where it differs by more: the ratio of the standard deviations; None where that is not known.
-    learned_mm: the side of the square that was learned, 0 of a chip that somebody cut out.
+    learned_mm: the side of the square that was learned, 0 of a chip that somebody cut out. alike: the poses that take
+    the camera's learned marks, with their origins, to one another.
     """
 
     image: Array
@@ -116,6 +117,7 @@ class MarkTemplate:
     steady: NDArray[np.bool_] | None = None
     steadiness: NDArray[np.float64] | None = None
     learned_mm: float = 0.0
+    alike: tuple[str, ...] = ()
 
 
 Mark = MarkShape | MarkTemplate

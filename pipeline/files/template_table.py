@@ -51,6 +51,8 @@ def template_lines(template: MarkTemplate, name: str, save: SavePicture) -> list
 
 def _learned_lines(template: MarkTemplate, range_dn: float, name: str, save: SavePicture) -> list[str]:
     lines = [f"[mark.{name}.learned]", f"size_mm = {template.learned_mm!r}"]
+    if template.alike:
+        lines.append(f"alike = [{', '.join(map(quoted, template.alike))}]")
     lines += [f"range_dn = {range_dn!r}", f"noise_dn = {template.noise_dn!r}"]
     lines.append(f"slope_noise_dn = {template.slope_noise_dn!r}")
     for key, values in (("steadiness", template.steadiness), ("steady", template.steady)):
@@ -94,6 +96,7 @@ def _learned(template: MarkTemplate, table: Table) -> MarkTemplate:
         steadiness=steadiness,
         steady=None if steady is None else steady > 0.5,
         learned_mm=table.number("size_mm", above=0.0),
+        alike=table.texts("alike") if "alike" in table else (),
     )
     table.done()
     return learned

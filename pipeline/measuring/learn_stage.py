@@ -3,7 +3,7 @@
 One scan's pictures, its first ones, find the marks in every other, and the mean over all of them is the template.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from importlib.metadata import version
@@ -14,8 +14,10 @@ import numpy as np
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
+from measure.marks.shapes import MarkTemplate
 from measure.results import FrameMeasurement
 from measure.special_marks.learned import Chip, cut, template_of
+from measure.special_marks.symmetry import with_common_origins
 from pipeline.files.atomic import write_atomically
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
 from pipeline.files.camera_text import camera_text
@@ -75,7 +77,10 @@ def _learned(project: Project, camera: CameraFile, place: Path, reporter: Report
         tell(f"{camera.name}: their first pictures", 0, 3)
         start = first_pictures(project, camera, names, workers)
         tell(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
-        chips = _chips(project, camera.learned, names, start, workers)
+        chips, rivals = _chips(project, camera.learned, names, start, workers)
+        if rivals:
+            start = _with_common_origins(start, rivals)
+            chips, _ = _chips(project, camera.learned, names, start, workers)
         tell(f"{camera.name}: averaged", 2, 3)
         mean = _averaged(start, camera.learned, chips, workers)
     return _stored(mean, place, _learned_folder(project))
@@ -83,36 +88,46 @@ def _learned(project: Project, camera: CameraFile, place: Path, reporter: Report
 
 def _chips(
     project: Project, learned: Sequence[GivenFiducial], names: Sequence[str], start: CameraFile, workers: Executor
-) -> Mapping[str, list[Chip]]:
-    """The pictures of every learned mark, by fiducial."""
-    chips: dict[str, list[Chip]] = {}
-    for of_scan in workers.map(_chips_of, *zip(*[(project, start, learned, name) for name in names], strict=True)):
+) -> tuple[Mapping[str, list[Chip]], set[str]]:
+    """The pictures of every learned mark, by fiducial, and the poses that some frame's marks do not tell apart."""
+    chips, rivals = dict[str, list[Chip]](), set[str]()
+    jobs = [(project, start, learned, name) for name in names]
+    for of_scan, of_frame in workers.map(_chips_of, *zip(*jobs, strict=True)):
+        rivals |= set(of_frame)
         for id, chip in of_scan.items():
             chips.setdefault(id, []).append(chip)
-    return chips
+    return chips, rivals
 
 
-def _chips_of(project: Project, camera: CameraFile, learned: Sequence[GivenFiducial], name: str) -> Mapping[str, Chip]:
-    """The pictures of learned marks in one scan, as far as they are found."""
+def _chips_of(
+    project: Project, camera: CameraFile, learned: Sequence[GivenFiducial], name: str
+) -> tuple[Mapping[str, Chip], tuple[str, ...]]:
+    """The pictures of learned marks in one scan, as far as they are found, and the poses that they leave possible."""
     with project.open_scan(name) as scan:
         pitch = project.pitch_um or scan.pitch_um
         options = FiducialOptions(pose_of(project, camera, scan.name), film_sigma_mm=project.film_sigma_mm)
         frame = measure_fiducials(scan, camera.layout(), pitch, options)
         matrix = frame.pixel_from_camera
         found = {mark.point: mark.center_px for mark in frame.marks if mark.status.is_observation}
+        rivals = frame.pose.rivals if frame.pose else ()
         if matrix is None or not _is_named(frame, camera):
-            return {}
-        return {
+            return {}, rivals
+        chips = {
             one.id: cut(scan, np.column_stack([matrix[:, :2], center]), one.learned_mm, frame.weights)
             for one in learned
             if (center := found.get(one.id)) is not None
         }
+        return chips, rivals
 
 
 def _is_named(frame: FrameMeasurement, start: CameraFile) -> bool:
-    """Whether the marks found are those of their names for sure, or at least if the scan lies as the one clicked in."""
+    """Whether the marks found are those of their names for sure, or but for names that their symmetry leaves equal, or
+    at least if the scan lies as the one clicked in."""
     pose, learned = frame.pose, start.learned_from
-    return pose is not None and learned is not None and (pose.decided or pose.name == learned.pose)
+    if pose is None or learned is None:
+        return False
+    alike = next((one.mark.alike for one in start.fiducials if isinstance(one.mark, MarkTemplate)), ())
+    return pose.is_decided_but_for(alike) or pose.name == learned.pose
 
 
 def pose_of(project: Project, camera: CameraFile, scan: str) -> str:
@@ -130,7 +145,25 @@ def _averaged(
     found = [one for one in learned if one.id in chips]
     templates = workers.map(template_of, [chips[one.id] for one in found], [one.learned_mm for one in found])
     mean = {one.id: template for one, template in zip(found, templates, strict=True)}
-    return replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
+    camera = replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
+    alike = {pose for one in start.fiducials if isinstance(one.mark, MarkTemplate) for pose in one.mark.alike}
+    return _with_common_origins(camera, alike)
+
+
+def _with_common_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
+    """The camera with the origins of its learned marks where those poses, which frames do not tell apart, take them to
+    one another, as far as the marks look alike in them."""
+    learned = [one for one in camera.fiducials if isinstance(one.mark, MarkTemplate) and one.mark.learned_mm]
+    if not learned:
+        return camera
+    places = np.array([one.seen_mm or one.xy_mm for one in learned])
+    marks = [one.mark for one in learned if isinstance(one.mark, MarkTemplate)]
+    templates, moves = with_common_origins(marks, places, poses)
+    seen = {
+        one.id: replace(one, mark=template, seen_mm=(float(x), float(y)))
+        for one, template, (x, y) in zip(learned, templates, places + moves, strict=True)
+    }
+    return replace(camera, fiducials=tuple(seen.get(one.id, one) for one in camera.fiducials))
 
 
 def _stored(camera: CameraFile, place: Path, folder: Path) -> CameraFile:

@@ -10,13 +10,14 @@ from drawn_frames import CORNERS, PITCH_UM, frame_picture, layout_of, measured, 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import _as_if_set, _in_every_pose
 from measure.frames.frame_measurement import measure_frame
-from measure.marks.shapes import MarkShape, polygon, turned
+from measure.marks.shapes import MarkShape, polygon, turned_part
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import pitch_hypotheses
 
 HALF_WEDGE = MarkShape(polygon(((0.0, 0.0), (1.4, 0.0), (1.4, 0.8))))
-LEANING = layout_of([turned(HALF_WEDGE, float(np.degrees(np.arctan2(y, x)))) for x, y in CORNERS])
+ANGLES = [float(np.degrees(np.arctan2(y, x))) for x, y in CORNERS]
+LEANING = layout_of([MarkShape(tuple(turned_part(part, angle) for part in HALF_WEDGE.parts)) for angle in ANGLES])
 PITCH = (PITCH_UM, PITCH_UM)
 
 

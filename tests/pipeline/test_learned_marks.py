@@ -15,6 +15,7 @@ from rich.console import Console
 
 from measure.marks.shapes import MarkTemplate
 from measure.results import FrameMeasurement
+from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import Project, read_project
@@ -186,7 +187,7 @@ def test_cameras_whose_files_are_named_alike_are_stored_apart(
 ) -> None:
     """The second in another folder, beside a third that has the name which the second would get. What is stored of each
     is its first pictures: it has no second scan to seek them in."""
-    monkeypatch.setattr(learn_stage, "_chips", lambda *_: {})
+    monkeypatch.setattr(learn_stage, "_chips", lambda *_: ({}, set()))
     files = {"f0": "a/camera.toml", "f1": "b/camera.toml", "f2": "b/camera-2.toml"}
     project_of(tmp_path, LEARNED, f'"{rendered}/scans/*.tif"')
     given = (tmp_path / "camera.toml").read_text()
@@ -249,3 +250,47 @@ def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
     outside = replace(camera, clicks=replace(camera.clicks, scan="f1", px={**camera.clicks.px, "2": (9999.0, 3.0)}))
     with pytest.raises(InputError, match=r"click of fiducial '2', \[9999.0, 3.0\], lies outside"):
         learned(replace(project, cameras={"camera.toml": outside}))
+
+
+def test_symmetric_marks_in_frames_that_lie_in_different_ways_are_measured(tmp_path: Path) -> None:
+    """Crosses clicked beside their middles in one frame: no pose is decided, and all frames repeat them."""
+    poses = ("0", "90", "180m", "270")
+    images = tuple(
+        scene.SceneImage(f"f{k}", (40.0 * k, 10.0 * k, 100.0, 0.0, 0.0, 0.5 * k), pose=pose, turn_rad=0.004 * k)
+        for k, pose in enumerate(poses)
+    )
+    crossed = (areas.bar((-0.9, 0.0), (0.9, 0.0), 0.15), areas.bar((0.0, -0.9), (0.0, 0.9), 0.15))
+    camera = scene.SceneCamera(
+        "small",
+        (16.0, 16.0),
+        30.0,
+        fiducials=tuple(scene.SceneFiducial(id, place, scene.DrawnMark(crossed)) for id, place in CORNERS.items()),
+    )
+    scanner = scene.Scanner((50.0, 50.0), margin_mm=1.0, noise=0.004)
+    field = scene.DiskField((), 1.0)
+    render_scene(scene.Scene("turned", 5, camera, field, images, scanner, background="terrain", pad_mm=1.6), tmp_path)
+    true = truth(tmp_path)
+    rng = np.random.default_rng(6)
+    px = true["f1"] + rng.uniform(-2.5, 2.5, (4, 2))
+    lines = "".join(f"{id} = [{col:.0f}, {row:.0f}]\n" for id, (col, row) in zip(CORNERS, px.tolist(), strict=True))
+    project = project_of(tmp_path, f'{LEARNED}[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}', pose="auto")
+    frames = measured(project, *(f"f{k}" for k in range(4)))
+    outward, across = [], []
+    for frame in frames:
+        assert frame.pose is not None
+        assert not frame.pose.decided or frame.image == "f1"
+        places = true[frame.image]
+        for mark in frame.marks:
+            assert mark.status is Status.MEASURED, mark.reason
+            off = np.asarray(mark.center_px) - places
+            nearest = int(np.hypot(*off.T).argmin())
+            radial = (places[nearest] - places.mean(axis=0)) / np.hypot(*(places[nearest] - places.mean(axis=0)))
+            outward.append(float(off[nearest] @ radial))
+            across.append(float(off[nearest] @ (-radial[1], radial[0])))
+    # Every pose takes origins that lie outward of their marks to one another: nothing tells them from the middles.
+    np.testing.assert_allclose(outward, np.mean(outward), atol=0.02)
+    np.testing.assert_allclose(across, 0.0, atol=0.02)
+    template = learned(project).default_camera.fiducials[0].mark
+    assert isinstance(template, MarkTemplate)
+    assert len(template.shares) == 4
+    assert_measured_alike(project, frames[0])
