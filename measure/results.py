@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
-from measure.marks.poses import pose_in_camera
 from measure.scans.told_tone import FrameTone
 from measure.status import Status
 from measure.writing.line import Line
@@ -60,9 +59,6 @@ class MarkMeasurement:
         return self.point, str(self.status), place, told, self.reason
 
 
-POSE_DECIDED = 7.0  # log-odds: a thousand to one
-
-
 @dataclass(frozen=True)
 class Pose:
     """How the scan was laid on the scanner: its counter-clockwise turn in degrees, "m" behind it if mirrored.
@@ -73,7 +69,8 @@ class Pose:
     evidence: what speaks for it, and by how much, one sentence each.
     written: log-likelihoods of the poses, by name, by what is written alone; empty where nothing was read. writing: the
     pose in which most of that lies in the scan; "" where that is not clear. roll: what is to be asked once for all
-    frames of the camera; "" where there is no such question.
+    frames of the camera; "" where there is no such question. rivals: the poses, in the frame's own axes, in which it
+    may lie as well, where what is seen does not tell them apart.
     """
 
     name: str
@@ -82,18 +79,7 @@ class Pose:
     written: Mapping[str, float] = field(default_factory=dict)
     writing: str = ""
     roll: str = ""
-
-    @property
-    def rivals(self) -> tuple[str, ...]:
-        """How the frame may lie beside how it is taken to: the poses, in its own axes, that nothing tells from this."""
-        if self.decided or self.name not in self.likelihoods:
-            return ()
-        least = self.likelihoods[self.name] - POSE_DECIDED
-        return tuple(
-            pose_in_camera(name, self.name)
-            for name, likelihood in self.likelihoods.items()
-            if name != self.name and likelihood > least
-        )
+    rivals: tuple[str, ...] = ()
 
     def is_decided_but_for(self, alike: Collection[str]) -> bool:
         """Whether it is decided, or no other than poses under which the marks are alike may be right."""

@@ -22,13 +22,14 @@ from measure.marks.poses import pose_in_camera, up_from_camera
 from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, MarkTemplate
 from measure.pose.pose_pictures import Drawings, Shown, Site
 from measure.pose.written_pose import line_score, main_pose, writing_likelihoods
-from measure.results import POSE_DECIDED, Pose
+from measure.results import Pose
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.writing.line import Line
 
 Array = NDArray[np.float64]
 
+DECIDED = 7.0  # log-odds: a thousand to one
 TOLD = 1.0  # log-odds: less than e to one is no evidence worth a sentence
 _NAMED = 4.0  # times the gate: how far from where a pose's placement puts a mark it still has its name
 _UNMIRRORED = 2.3  # log-odds before anything is seen: ten to one; of 16 scans of archives none was mirrored
@@ -164,7 +165,7 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
     if not verdicts:
         return Pose("0", False, ("no pose names the marks that were found.",))
     seen = max(verdict.seen for verdict in verdicts)
-    alike = [verdict for verdict in verdicts if seen - verdict.seen < POSE_DECIDED]
+    alike = [verdict for verdict in verdicts if seen - verdict.seen < DECIDED]
     best = max(alike, key=lambda verdict: verdict.total)
     others = sorted((v for v in verdicts if v not in alike), key=lambda verdict: -verdict.total)
     against = _against(best, others[0], layout, lines) if others else ()
@@ -192,7 +193,8 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
             f"nothing in the {found} marks found tells the poses {names} apart: their pictures and given coordinates "
             f"are alike; {assumed} is assumed{like_writing}."
         )
-    return Pose(assumed, False, (told, *against), written, main)
+    rivals = tuple(pose_in_camera(verdict.pose, assumed) for verdict in alike if verdict.pose != assumed)
+    return Pose(assumed, False, (told, *against), written, main, rivals=rivals)
 
 
 def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:

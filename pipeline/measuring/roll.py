@@ -13,9 +13,9 @@ import numpy as np
 
 from measure.marks.poses import POSES, pose_in_camera
 from measure.marks.shapes import WrittenPlace
-from measure.pose.pose_decision import TOLD
+from measure.pose.pose_decision import DECIDED, TOLD
 from measure.pose.written_pose import bounded, line_score
-from measure.results import POSE_DECIDED, FrameMeasurement, Pose
+from measure.results import FrameMeasurement, Pose
 from measure.status import Status
 from measure.writing.line import Line
 from pipeline.measuring.measurement_file import MeasuredScan
@@ -35,7 +35,7 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
     if len(poses) < 2:
         return {}
     told = _told([frame for frame in frames if frame.image in poses], places)
-    alike = [turn for turn in _TURNS if told[turn] > -POSE_DECIDED]
+    alike = [turn for turn in _TURNS if told[turn] > -DECIDED]
     usual = Counter(_turn(pose) for pose in poses.values())
     chosen = max(alike, key=lambda turn: (told[turn] > -TOLD, usual[turn]))
     undecided = [frame for frame in frames if frame.image in poses and not poses[frame.image].decided]
@@ -52,7 +52,7 @@ def _told(frames: Sequence[FrameMeasurement], places: Sequence[WrittenPlace]) ->
             texts.setdefault(re.sub(r"[\W\d]", "", line.text) or re.sub(r"\d", "0", line.text), (frame.pose, line))
     decided = {_turn(frame.pose) for frame in frames if frame.pose and frame.pose.decided}
     scores = [sum(line_score(line, places, _in_scan(pose, turn)) for pose, line in texts.values()) for turn in _TURNS]
-    likelihoods = bounded(np.array(scores)) - [POSE_DECIDED if decided - {turn} else 0.0 for turn in _TURNS]
+    likelihoods = bounded(np.array(scores)) - [DECIDED if decided - {turn} else 0.0 for turn in _TURNS]
     return dict(zip(_TURNS, (likelihoods - likelihoods.max()).tolist(), strict=True))
 
 
@@ -76,7 +76,7 @@ def _face_is_told(pose: Pose) -> bool:
         max((value for name, value in pose.written.items() if name.endswith("m") == mirrored), default=0.0)
         for mirrored in (False, True)
     ]
-    return abs(faces[0] - faces[1]) >= POSE_DECIDED
+    return abs(faces[0] - faces[1]) >= DECIDED
 
 
 def _is_doubted(frame: FrameMeasurement) -> bool:
