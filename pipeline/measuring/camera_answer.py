@@ -1,7 +1,7 @@
 """What trying the library's cameras on a scan says: which of them stand out, in words, in figures and as JSON."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,12 +56,15 @@ class Trial:
 @dataclass(frozen=True)
 class Identification:
     """The trials, best first, and what follows from them. unreported: by name, what cameras without any calibration
-    report rest on. pitch_um: of the scan in x and y, as given or as its file has it."""
+    report rest on. pitch_um: of the scan in x and y, as given or as its file has it. plate: what the camera's own plate
+    says, by field; contradicted: by name, how it says that it is of no such camera."""
 
     scan: Path
     trials: tuple[Trial, ...]
     unreported: Mapping[str, str] = field(default_factory=dict)
     pitch_um: tuple[float, float] | None = None
+    plate: Mapping[str, str] = field(default_factory=dict)
+    contradicted: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @property
     def best(self) -> tuple[Trial, ...]:
@@ -86,7 +89,20 @@ class Identification:
             told += " Their marks are alike; the data strip or the focal length must decide."
         named = [name for trial in self.best for name in trial.cameras if name in self.unreported]
         told += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
-        return told + self._against_pitch(first)
+        return told + self._of_plate() + self._against_pitch(first)
+
+    def _of_plate(self) -> str:
+        """What the plate says of the cameras that stand out."""
+        if not self.plate:
+            return ""
+        words = {"camera_type": "{}", "camera_number": "Nr {}", "principal_distance_mm": "principal distance {} mm"}
+        read = ", ".join(word.format(self.plate[name]) for name, word in words.items() if name in self.plate)
+        standing = [name for trial in self.best for name in trial.cameras]
+        left = [name for name in standing if name not in self.contradicted]
+        if not left:
+            return f" Its plate says {read}, which none of them is."
+        agree = f"; of these that is {' or '.join(left)}" if len(left) < len(standing) else ""
+        return f" Its plate says {read}{agree}."
 
     def _against_pitch(self, trial: Trial) -> str:
         """A sentence where the pitch cannot be right if the scan is of that camera."""
@@ -103,7 +119,8 @@ class Identification:
     def as_json(self) -> Json:
         trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
         best = [name for trial in self.best for name in trial.cameras]
-        return {"scan": str(self.scan), "best": best, "sentence": self.sentence(), "trials": trials}
+        told = {"scan": str(self.scan), "best": best, "sentence": self.sentence(), "trials": trials}
+        return {**told, "plate": dict(self.plate), "contradicted": sorted(self.contradicted)}
 
 
 def print_identification(identification: Identification, console: Console) -> None:

@@ -17,8 +17,11 @@ from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.scans.scan import Scan, open_scan
 from measure.scans.thumbnail import thumbnail
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.writing.networks import networks
+from measure.writing.reading import read_writing
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_answer import Identification, Trial
+from pipeline.measuring.camera_plate import contradictions, plate_of
 from pipeline.progress import Count, Reporter
 
 Array = NDArray[np.float64]
@@ -58,7 +61,19 @@ def identify(
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
     ranked = tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected)))
-    return Identification(path, ranked, unreported, given)
+    plate = _plate(path, max_pixels) if any(trial.stands_out for trial in trials) else {}
+    told = {name: contradictions(camera, plate) for name, camera in cameras.items()}
+    contradicted = {name: against for name, against in told.items() if against}
+    return Identification(path, ranked, unreported, given, plate, contradicted)
+
+
+def _plate(path: Path, max_pixels: int | None) -> dict[str, str]:
+    """What the camera's own plate says in the scan, as far as anything is there that reads."""
+    reader = networks()
+    if reader is None:
+        return {}
+    with open_scan(path, max_pixels) as scan:
+        return plate_of(read_writing(scan, reader))
 
 
 class _Try:

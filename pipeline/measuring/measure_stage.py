@@ -27,6 +27,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.learned_table import LearnedFrom
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_model import misplaced_principal_point
+from pipeline.measuring.camera_plate import with_plates
 from pipeline.measuring.frames_file import with_same_frames
 from pipeline.measuring.learn_stage import learn_marks, pose_of
 from pipeline.measuring.measurement_file import MeasuredScan
@@ -58,6 +59,7 @@ def measure_scans(project: Project, reporter: Reporter, learned_folder: Path) ->
         tones = scanner_tones(learned, reporter, workers)
         measured = _measured_scans(learned, tones, reporter, workers)
         scans = with_same_frames(_as_rolls(learned, tones, measured, workers))
+        scans = _with_plates(project, scans)
         scans = _of_each_camera(project, scans, _at_one_definition)
         checked = with_checked_sheet(project, _of_each_camera(learned, scans, partial(_judged, learned)))
         if project.ties is None:
@@ -99,6 +101,15 @@ def _as_rolls(
         frame = replace(new.frame, pose=poses.get(image, scan.frame.pose), writing=scan.frame.writing)
         scans.append(replace(new, frame=frame))
     return scans
+
+
+def _with_plates(project: Project, measured: Sequence[MeasuredScan]) -> list[MeasuredScan]:
+    """The scans with what their cameras' plates say, in their order."""
+    told: dict[str, MeasuredScan] = {}
+    for camera in project.cameras.values():
+        own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
+        told |= {scan.frame.image: scan for scan in with_plates(camera, own)}
+    return [told[scan.frame.image] for scan in measured]
 
 
 def _timed(project: Project, name: str, tones: ScannerTones) -> tuple[MeasuredScan, float]:

@@ -14,6 +14,7 @@ from pipeline.report.data import Json, ReportData, Thumbnail
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.verdict import suspect_rows
+from pipeline.report.writing import written
 
 OPEN_FRAMES = 12  # with more frames, only those with a lost mark are unfolded
 PLOT_PX = 330.0
@@ -48,6 +49,7 @@ class FrameView:
     cards: tuple[Card, ...]
     hidden: int
     plot: Markup | None
+    writing: Markup | None
     orientation: tuple[tuple[str, str, str], ...]
     transformation: tuple[tuple[str, str, str], ...]
     is_open: bool
@@ -75,6 +77,7 @@ def frame_views(data: ReportData, shots: list[Frame]) -> list[FrameView]:
                 cards=cards,
                 hidden=len(frame.marks) - len(cards),
                 plot=plots.get(frame.image),
+                writing=written(frame.scan),
                 orientation=_quantities(stored.get("exterior", {})),
                 transformation=_quantities(stored.get("transformation", {})),
                 is_open=len(shots) <= OPEN_FRAMES or _lost_fiducial(frame),

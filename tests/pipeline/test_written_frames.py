@@ -22,10 +22,13 @@ from pipeline.files.camera_file import parse_camera, read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import fill_images, read_images
 from pipeline.files.tables import Table
+from pipeline.measuring.camera_answer import Identification, Trial
+from pipeline.measuring.camera_plate import contradictions, plate_of, with_plates
 from pipeline.measuring.frames_file import for_images, with_same_frames, write_frames
 from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
 from pipeline.measuring.roll import poses_of_roll
 from pipeline.rendered.scene_file import render_project
+from pipeline.report.writing import written
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
 TITLES = ("RUN 7", "8601-8639", "16.5.68", "14,000'", "8617", "AUSTRALIAN")
@@ -163,6 +166,63 @@ def test_a_frame_that_is_decided_tells_the_others_how_they_lie() -> None:
     known = replace(known, frame=replace(known.frame, pose=replace(known.frame.pose, decided=True)))  # type: ignore[type-var]
     poses = poses_of_roll([known, posed("b", "180", TITLE, name="90", places=())], ())
     assert {image: (pose.name, pose.decided) for image, pose in poses.items()} == {"b": ("180", True)}
+
+
+RC10 = parse_camera(
+    Table({**CAMERA, "name": "Wild RC10, 153 mm", "principal_distance_mm": 153.0}, Path("camera.toml"), "")
+)
+
+
+def test_a_plate_is_held_against_the_cameras_file() -> None:
+    own = with_plates(RC10, [scan("a", [line("WILD 15/4 UAG"), line("Nr 13043 152.75")]), scan("b", None)])
+    assert own[0].frame.problems == ()
+    assert "(Nr 13043) says a principal distance of 152.75 mm, its file 153 mm" in own[0].notes[0]
+    assert own[1].notes == ()
+    assert contradictions(RC10, plate_of([line("RMK A 30/23"), line("Nr 1234 305.12")])) == [
+        "it is of a camera by Zeiss",
+        "it gives a principal distance of 305.12 mm",
+    ]
+    other = with_plates(RC10, [scan("a", [line("Nr 1234 305.12")])])[0]
+    assert "not of Wild RC10, 153 mm: it gives a principal distance of 305.12 mm" in other.frame.problems[0]
+    assert other.notes == ()
+
+
+def test_plates_of_two_cameras_under_one_file_are_told() -> None:
+    first, second, mute = with_plates(
+        RC10, [scan("a", [line("Nr 13043")]), scan("b", [line("Nr 13022")]), scan("c", [])]
+    )
+    assert "Nr 13022, 13043" in first.frame.problems[0]
+    assert first.frame.problems == second.frame.problems
+    assert mute.frame.problems == ()
+
+
+def test_the_library_names_a_camera_by_its_plate_or_says_that_it_is_none() -> None:
+    trial = Trial(("rc10-153", "rc10-305"), 4, 4, 0.9, 9.0, 0.9, None, None, None, "", 1.0, 1e-9)
+    plate = {"camera_number": "13043", "principal_distance_mm": "152.75"}
+    told = Identification(Path("a.tif"), (trial,), plate=plate, contradicted={"rc10-305": ["it gives 152.75 mm"]})
+    assert told.sentence().endswith("Its plate says Nr 13043, principal distance 152.75 mm; of these that is rc10-153.")
+    none = replace(told, contradicted={name: ["another"] for name in trial.cameras})
+    assert none.sentence().endswith("which none of them is.")
+
+
+def test_the_report_draws_lines_in_place_and_those_that_told_stand_out() -> None:
+    told = {"text": "RUN 7", "pose": "90m", "outline_px": [[10, 10], [20, 10], [20, 90], [10, 90]]}
+    drawn = written(
+        {
+            "width_px": 100,
+            "height_px": 200,
+            "writing": [told, {**told, "text": "8617"}],
+            "pose": {"evidence": ['of 2 lines of writing "RUN 7" speak most']},
+        }
+    )
+    assert drawn is not None
+    assert 'transform="matrix(' in drawn
+    # 3.2 page pixels a pixel. Right in its own frame is up in the scan after mirror and turn: down the page.
+    matrix = [float(value) for value in drawn.split("matrix(")[1].split(")")[0].split()]
+    assert matrix == pytest.approx([0.0, 1.0, 1.0, 0.0, 48.0, 160.0])
+    assert 'class="told"' in drawn.split(">RUN 7<")[0].rsplit("<text", 1)[1]
+    assert 'class="read"' in drawn.split(">8617<")[0].rsplit("<text", 1)[1]
+    assert written({"width_px": 100, "height_px": 200, "writing": None}) is None
 
 
 SCENE = """
