@@ -18,7 +18,7 @@ from measure.writing.line import Line
 Array = NDArray[np.float64]
 
 _A_CHARACTER = 1.4  # log-odds of a way to lie, a character that is legible in it beyond those of another way
-_A_PLACE = 0.7  # log-odds a legible character that a title or a plate stands where the camera has it
+_A_PLACE = 0.8  # log-odds a legible character that a title or a plate stands where the camera has it
 _ANYBODYS = 4.6  # the most of that for a line in which nothing shows a title or a plate: a hundred to one
 _FEIGNED = 1 / 3000  # that what is written misleads: of so many readings none that was better by 3 characters was wrong
 _PLAINLY = 1.5  # times as many characters as in any other way
