@@ -1,10 +1,12 @@
 """What a chip is worth that was sampled as coarsely as the pictures it is compared with."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from true_marks import KIND, some_mark
 
 from measure.fitting.matching import MatchOptions, match
+from measure.fitting.sandwich_covariance import sandwich_covariance
 from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkTemplate
 
@@ -17,6 +19,18 @@ def coarse(fine: NDArray[np.float64], col: int, row: int) -> NDArray[np.float64]
     rows = len(fine) // FOLD - 1
     part = fine[row : row + rows * FOLD, col : col + rows * FOLD]
     return np.asarray(part.reshape(rows, FOLD, rows, FOLD).mean(axis=(1, 3)))
+
+
+def test_where_residuals_are_alike_everywhere_it_is_the_ordinary_covariance() -> None:
+    """Of a slope and an offset under white noise: neither larger nor smaller."""
+    rng, sigma, ratios = np.random.default_rng(2), 3.0, []
+    rows, cols = np.mgrid[0:24, 0:24] - 11.5
+    design = np.stack([np.ones_like(cols), cols / 8.0, np.sin(rows)])
+    inverse = np.linalg.inv(np.einsum("ihw,jhw->ij", design, design))
+    for _ in range(60):
+        claimed = sandwich_covariance(inverse, design, rng.normal(0, sigma, cols.shape), np.ones(cols.shape, bool))
+        ratios.append(np.diag(claimed) / (sigma**2 * np.diag(inverse)))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_chip_sampled_too_coarsely_is_found_in_pictures_shifted_by_known_parts_of_a_pixel() -> None:
