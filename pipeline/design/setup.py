@@ -14,6 +14,7 @@ from adjust.network import Approximations, Network, Prior, Transformation
 from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
+from pipeline.files.project_file import DEFAULT_SCANNER
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.rendered.scene_project import SceneFile, film_transformation
 from synthetic_images.film import turn
@@ -22,8 +23,6 @@ from synthetic_images.scene import SceneCamera, SceneImage
 from synthetic_images.targets import field_targets
 
 Array = NDArray[np.float64]
-
-SCANNER = "scanner"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,7 @@ def planned_network(setup: Setup) -> tuple[Network, Approximations]:
     planned = Network(
         cameras=(camera,),
         images=tuple(
-            network.Image(image.name, camera.name, setup.transformation, scanner=SCANNER if setup.bends else "")
+            network.Image(image.name, camera.name, setup.transformation, scanner=DEFAULT_SCANNER if setup.bends else "")
             for image in setup.images
         ),
         points=tuple(_object_point(point) for point in points),
@@ -141,7 +140,7 @@ def _scanners(setup: Setup) -> tuple[network.Scanner, ...]:
     settings, half_mm = setup.settings, max(setup.lens.frame_mm) / 2.0
     names = smooth_terms([setup.transformation]) if settings.scanner == "bend" else settings.scanner
     prior = Prior(0.0, settings.scanner_sigma_um / 1000.0)
-    return (network.Scanner(SCANNER, dict.fromkeys(names, prior), half_mm=(half_mm, half_mm)),)
+    return (network.Scanner(DEFAULT_SCANNER, dict.fromkeys(names, prior), half_mm=(half_mm, half_mm)),)
 
 
 def _sigmas(point: PlannedPoint) -> tuple[float, float]:

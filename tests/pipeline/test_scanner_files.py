@@ -161,7 +161,7 @@ def test_a_design_says_what_cannot_be_told_of_the_scanner(tmp_path: Path) -> Non
         (tmp_path / f"{name}.toml").write_text(content, encoding="utf-8")
         run(["design", str(tmp_path / f"{name}.toml"), str(tmp_path / name)])
         found = json.loads((tmp_path / name / "design.json").read_text(encoding="utf-8"))
-        sigmas[name] = found["scanners"]["scanner"]["a20"]["sigma"]
+        sigmas[name] = found["scanners"]["1"]["a20"]["sigma"]
     assert 0.0 < sigmas["two"] < 0.99 * sigmas["alike"]
 
 
@@ -172,7 +172,7 @@ def test_a_design_tries_scans_turned_by_180_degrees(tmp_path: Path) -> None:
     run(["design", str(tmp_path / "scene.toml"), str(tmp_path / "out")])
     found = json.loads((tmp_path / "out" / "design.json").read_text(encoding="utf-8"))
     (turned,) = [one for one in found["what_would_help"] if one["change"] == "every second scan turned by 180 degrees"]
-    rms_um = 1e3 * np.sqrt(np.mean([term["sigma"] ** 2 for term in found["scanners"]["scanner"].values()]))
+    rms_um = 1e3 * np.sqrt(np.mean([term["sigma"] ** 2 for term in found["scanners"]["1"].values()]))
     assert turned["sigmas"]["scanner"] < 0.99 * rms_um
     assert turned["gain_percent"]["scanner"] == pytest.approx(100.0 * (1.0 - turned["sigmas"]["scanner"] / rms_um))
 
