@@ -34,7 +34,10 @@ _STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
 # Whether marks that contradict one another are doubted, in each round of matching by a better curve: far off all do.
 _TONE_ROUNDS = (False, False, False, True, True)
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # powers; of a contradiction that needs none of them
-_MOVED = 0.1  # of its standard deviation that a mark may still move
+_CONTRADICTED = (
+    1.0  # likewise, with which marks are not measured: chi-square over its degrees of freedom, beyond chance
+)
+_MOVED = 0.3  # of its standard deviation that a mark may still move
 _SETTLED_PX = 1.5  # about a mark that was matched already
 
 
@@ -46,7 +49,7 @@ def settle(sighter: FrameSighter) -> None:
     if sighter.belongs.sum() < 2:
         return
     _settle_from(sighter, sighter.scan.tone)
-    for power in _OTHER_STARTS if sighter.tone.contradiction > _AGREED else ():
+    for power in _OTHER_STARTS if sighter.tone.contradiction > _AGREED and _leans_on_tone(sighter) else ():
         before = sighter.tone, sighter.scan, list(sighter.sightings)
         _settle_from(sighter, sighter.prior_tone.like_power(power))
         if sighter.tone.contradiction >= before[0].contradiction:
@@ -88,15 +91,25 @@ def _moved_by_tone(sighter: FrameSighter, doubting: bool) -> set[int]:
     return set(told)
 
 
+def _leans_on_tone(sighter: FrameSighter) -> bool:
+    """Whether what is not known of any curve moves a mark by more than its standard deviation."""
+    fits = _clear(sighter)
+    return any(one.leans_px > fits[index].sigma_px for index, one in _told_of_tone(sighter).items())
+
+
 def _told_of_tone(sighter: FrameSighter) -> dict[int, ToldTone]:
     return {index: fit.tone for index, fit in _clear(sighter).items() if fit.tone is not None}
 
 
 def count_tone(sighter: FrameSighter) -> None:
-    """What is not known of the tone curve, in the covariance of every mark that it moves."""
+    """What is not known of the tone curve, in the covariance of every mark that it moves. Where the marks agree on no
+    curve, something else is in their edges, and those that lean on the curve are doubted."""
     for index, fit in _clear(sighter).items():
-        if fit.tone is not None:
-            sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(fit.tone))
+        if fit.tone is None:
+            continue
+        sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(fit.tone))
+        if sighter.tone.contradiction > _CONTRADICTED and fit.tone.leans_px > fit.sigma_px:
+            sighter.doubt(index, "the marks' edges agree on no tone curve: they are not as drawn, or lit unevenly")
 
 
 def share_blur(sighter: FrameSighter) -> None:

@@ -23,6 +23,11 @@ class ToldTone:
     least: float
     greatest: float
 
+    @property
+    def leans_px(self) -> float:
+        """How far what is not known of any curve moves the mark."""
+        return float(np.hypot(*self.on_place[:, 0]))
+
 
 @dataclass(frozen=True, eq=False)
 class FrameTone:
