@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
-from pipeline.report.data import Json, Problem
+from pipeline.report.data import Problem
 from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
@@ -26,6 +26,12 @@ def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
         yield Problem(f"{listed(images)}: {problem.what}", problem.next_step)
 
 
+def assumed_poses(shots: list[Frame]) -> Iterator[Problem]:
+    """The poses that nothing decides, said once where several frames say the same."""
+    for problem, images in said_by(shots, _assumed).items():
+        yield Problem(f"{listed(images)}: {problem.what}", problem.next_step)
+
+
 def said_by(shots: list[Frame], said: Callable[[Frame], Iterable[Sentence]]) -> dict[Sentence, list[str]]:
     """The frames' names by what they say."""
     images: dict[Sentence, list[str]] = {}
@@ -35,20 +41,22 @@ def said_by(shots: list[Frame], said: Callable[[Frame], Iterable[Sentence]]) -> 
     return images
 
 
-def _assumed(pose: Json) -> Problem:
+def _assumed(frame: Frame) -> Iterator[Problem]:
+    pose = frame.scan.get("pose")
+    if not pose or pose["decided"]:
+        return
     if pose.get("roll"):
-        return Problem(f"pose assumed: {pose['roll']}.", _ONE_ANSWER)
-    return Problem(
-        f"pose assumed ({pose['name']}). {' '.join(pose.get('evidence', ()))}",
-        'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
-    )
+        yield Problem(f"pose assumed: {pose['roll']}.", _ONE_ANSWER)
+    else:
+        yield Problem(
+            f"pose assumed ({pose['name']}). {' '.join(pose.get('evidence', ()))}",
+            'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
+        )
 
 
 def _problems_of(frame: Frame) -> Iterator[Problem]:
-    pose, said = frame.scan.get("pose"), set[str]()
-    if pose and not pose["decided"]:
-        said.update(pose.get("evidence", ()))
-        yield _assumed(pose)
+    pose = frame.scan.get("pose")
+    said = set(pose.get("evidence", ())) if pose and not pose["decided"] else set()
     yield from (Problem(problem) for problem in frame.scan.get("problems", ()) if problem not in said)
     lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
     found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)

@@ -1,6 +1,6 @@
 """The verdict on a calibration, and what needs a look."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,12 +9,13 @@ from scipy.special import chdtri, ndtri
 
 from measure.status import Status
 from pipeline.report.data import Json, Problem, ReportData
-from pipeline.report.frame_problems import frame_problems, pixel_locking, said_by
+from pipeline.report.frame_problems import assumed_poses, frame_problems, pixel_locking, said_by
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.wording import counted, listed
 
 Level = Literal["good", "look", "failed"]
+Look = Callable[[ReportData, list[Frame]], Iterable[Problem]]
 
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
 
@@ -59,17 +60,9 @@ class Verdict:
 def judge(data: ReportData) -> Verdict:
     """Judge what is there: the measurement, the adjustment, the check against OpenCV."""
     shots = frames(data)
-    fatal = tuple(_no_solution(data.adjustment)) if data.adjustment else ()
-    problems = (
-        *fatal,
-        *data.problems,
-        *frame_problems(shots),
-        *pixel_locking(shots),
-        *(Problem(warning) for warning in (data.adjustment["warnings"] if data.adjustment else ())),
-        *(_adjustment_problems(data.adjustment) if data.adjustment and not fatal else ()),
-        *(_check_problems(data.check) if data.check else ()),
-    )
-    level: Level = "failed" if fatal or not _observed(data, shots) else "look" if problems else "good"
+    problems = tuple(problem for look in NEEDS_A_LOOK.values() for problem in look(data, shots))
+    is_fatal = data.adjustment is not None and any(_no_solution(data.adjustment))
+    level: Level = "failed" if is_fatal or not _observed(data, shots) else "look" if problems else "good"
     return Verdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
 
 
@@ -107,16 +100,12 @@ def _no_solution(adjustment: Json) -> Iterator[Problem]:
         )
 
 
-def _adjustment_problems(adjustment: Json) -> Iterator[Problem]:
-    if adjustment["redundancy"] > 0:
-        yield from _global_test(adjustment)
-    else:
+def _unchecked(adjustment: Json) -> Iterator[Problem]:
+    if adjustment["redundancy"] <= 0:
         yield Problem(
             "Nothing checks the result: there are as many unknowns as observations.",
             "Add points or frames; until then no standard deviation here has been confirmed by the data.",
         )
-    yield from _further_problems(adjustment)
-    yield from _suspects(adjustment["suspects"])
 
 
 def _suspects(rows: list[Json]) -> Iterator[Problem]:
@@ -159,23 +148,32 @@ def _beyond_chance(adjustment: Json, rows: list[Json]) -> list[Json]:
     return [row for row in rows if abs(row["w"] or 0.0) > limit]
 
 
-def _global_test(adjustment: Json) -> Iterator[Problem]:
-    sigma0 = adjustment["sigma0"]
-    low, high = sigma0_bounds(adjustment["redundancy"])
-    groups = {name: group for name, group in adjustment["groups"].items() if (group["redundancy"] or 0.0) >= 1.0}
-    by_group = ", ".join(f"{name} {fixed(group['sigma0'])}" for name, group in groups.items())
-    if sigma0 > high:
+def _too_large(adjustment: Json) -> Iterator[Problem]:
+    _, high = sigma0_bounds(adjustment["redundancy"])
+    if adjustment["sigma0"] > high:
         yield Problem(
-            f"{_sigma0_and('above', high, sigma0)}: the residuals are larger than the sigmas given ({by_group}).",
+            f"{_sigma0_and('above', high, adjustment['sigma0'])}: the residuals are larger than the sigmas given "
+            f"({_by_group(adjustment)}).",
             "Reject gross errors first; then the film or lens has deformation that the model lacks: state it by "
             "film_sigma_um or add distortion parameters. All sigmas of the result are already multiplied by σ₀.",
         )
-    elif sigma0 < low:
-        yield Problem(
-            f"{_sigma0_and('below', low, sigma0)}: the marks fit better than the sigmas given ({by_group}).",
-            "Lower the sigmas of the group that is below 1 (sigma_target_um, sigma_fiducial_um, film_sigma_um, or "
-            "comparator.csv; datum: sigma_mm of the fiducials). All sigmas of the result are already multiplied by σ₀.",
+
+
+def _too_small(adjustment: Json) -> Iterator[str]:
+    """Better than promised is no harm: a note."""
+    low, _ = sigma0_bounds(adjustment["redundancy"])
+    if adjustment["sigma0"] < low:
+        yield (
+            f"{_sigma0_and('below', low, adjustment['sigma0'])}: the marks fit better than the sigmas given "
+            f"({_by_group(adjustment)}). Lower the sigmas of the group that is below 1 (sigma_target_um, "
+            "sigma_fiducial_um, film_sigma_um, or comparator.csv; datum: sigma_mm of the fiducials); all sigmas of the "
+            "result are already multiplied by σ₀."
         )
+
+
+def _by_group(adjustment: Json) -> str:
+    groups = {name: group for name, group in adjustment["groups"].items() if (group["redundancy"] or 0.0) >= 1.0}
+    return ", ".join(f"{name} {fixed(group['sigma0'])}" for name, group in groups.items())
 
 
 def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
@@ -192,6 +190,46 @@ def _check_problems(check: Json) -> Iterator[Problem]:
         )
 
 
+def _is_solved(data: ReportData) -> bool:
+    return data.adjustment is not None and not any(_no_solution(data.adjustment))
+
+
+def _is_film_alone(data: ReportData) -> bool:
+    """Whether fiducial marks are all there was to adjust."""
+    return data.adjustment is not None and not any(map(camera_is_calibrated, data.adjustment["cameras"].values()))
+
+
+def _of_solution(look: Callable[[Json], Iterator[Problem]], checked: bool = False) -> Look:
+    """What an adjustment needs a look at where it has a solution, and redundancy if that is asked for."""
+
+    def of(data: ReportData, _: list[Frame]) -> Iterator[Problem]:
+        if data.adjustment is not None and _is_solved(data) and (not checked or data.adjustment["redundancy"] > 0):
+            yield from look(data.adjustment)
+
+    return of
+
+
+def _of_frames(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
+    if not _is_film_alone(data):
+        yield from assumed_poses(shots)
+    yield from frame_problems(shots)
+
+
+# All that makes exit code 1, with the names that docs/reading-the-report.md tells them by.
+NEEDS_A_LOOK: dict[str, Look] = {
+    "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
+    "made from": lambda data, _: data.problems,
+    "frames": _of_frames,
+    "pixel locking": lambda _, shots: pixel_locking(shots),
+    "warnings": lambda data, _: map(Problem, data.adjustment["warnings"] if data.adjustment else ()),
+    "σ₀": _of_solution(_too_large, checked=True),
+    "redundancy": _of_solution(_unchecked),
+    "distances, calibrations, antennas": _of_solution(_further_problems),
+    "gross errors": _of_solution(lambda adjustment: _suspects(adjustment["suspects"])),
+    "OpenCV": lambda data, _: _check_problems(data.check) if data.check else (),
+}
+
+
 def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     """What is worth knowing and needs no action."""
     yield from data.notes
@@ -204,10 +242,18 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
     elif not data.check:
         yield "There is no check against OpenCV yet: run `reseau check`."
-    elif data.check["verdict"] == "not possible":
+    elif data.check["verdict"] == "not possible" and not _is_film_alone(data):
         yield f"OpenCV cannot check this calibration. {data.check['reason']}"
     if data.adjustment:
         yield from _weight_notes(data.adjustment)
+        if _is_solved(data) and data.adjustment["redundancy"] > 0:
+            yield from _too_small(data.adjustment)
+    if _is_film_alone(data):
+        for problem in assumed_poses(shots):
+            yield f"{problem.what} {problem.next_step}"
+        yield (
+            "Fiducial marks are the same in every frame: if two scans bear each other's names, nothing here shows it."
+        )
     for note, images in said_by(shots, lambda frame: frame.scan.get("notes", ())).items():
         yield f"{listed(images)}: {note}"
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):

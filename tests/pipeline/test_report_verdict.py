@@ -1,6 +1,7 @@
 """The verdict: the tests behind it against published tables, and a problem for everything that needs a look."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import made_up_calibration
@@ -12,7 +13,7 @@ from pipeline.report import Problem, ReportData, judge
 from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import frames
 from pipeline.report.parameters import spoken_name
-from pipeline.report.verdict import critical_w, sigma0_bounds
+from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
 
 Json = dict[str, Any]
 
@@ -61,8 +62,10 @@ def test_sigma0_above_and_below_its_bounds(adjusted: ReportData) -> None:
     assert "σ₀ = 1.60 is above 1.11" in told(changed(adjusted, sigma0=1.6))
     assert "film_sigma_um" in told(changed(adjusted, sigma0=1.6))
     assert "(target 1.02, fiducial 0.97)" in told(changed(adjusted, sigma0=1.6)), "no group without a check"
-    assert "σ₀ = 0.50 is below 0.89" in told(changed(adjusted, sigma0=0.5))
-    assert "σ₀ = 0.886 is below 0.887" in told(changed(adjusted, sigma0=0.8864)), "0.89 is not below 0.89"
+    for sigma0, words in ((0.5, "σ₀ = 0.50 is below 0.89"), (0.8864, "σ₀ = 0.886 is below 0.887")):
+        verdict = judge(changed(adjusted, sigma0=sigma0))
+        assert verdict.exit_code == 0, "better than promised is no harm"
+        assert words in " ".join(verdict.notes)
 
 
 def suspect(**values: object) -> Json:
@@ -108,6 +111,32 @@ def test_an_assumed_pose_needs_a_look_once_for_all_frames(measured: ReportData) 
     assert len(judge(data).problems) == 1
     assert "f1, f2, f3, f4, f5: pose assumed (0). The marks are symmetric to 3 µm." in told(data)
     assert 'pose = "90"' in told(data)
+
+
+def test_a_pose_assumed_is_a_note_where_fiducials_are_all_there_is(adjusted: ReportData) -> None:
+    assert adjusted.adjustment is not None
+    assert adjusted.measurement is not None
+    pose = {"name": "0", "decided": False, "evidence": ["The marks are symmetric to 3 µm."]}
+    images = {name: {**scan, "pose": pose} for name, scan in adjusted.measurement["images"].items()}
+    bare = {
+        name: {**camera, "principal_distance_mm": {"value": 153.0, "sigma": None}}
+        for name, camera in adjusted.adjustment["cameras"].items()
+    }
+    check = {"verdict": "not possible", "reason": "No camera is calibrated."}
+    data = replace(changed(adjusted, cameras=bare), measurement={"images": images}, check=check)
+    verdict = judge(data)
+    assert verdict.exit_code == 0
+    told = " ".join(verdict.notes)
+    assert "pose assumed (0). The marks are symmetric to 3 µm." in told
+    assert "if two scans bear each other's names, nothing here shows it" in told
+    assert "OpenCV cannot check" not in told
+    assert judge(replace(adjusted, measurement={"images": images})).exit_code == 1
+
+
+def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reading-the-report.md").read_text(encoding="utf-8")
+    table = page.split("| test | passed when | false alarms |\n|---|---|---|\n")[1].split("\n\n")[0]
+    assert [line.split(" | ")[0].removeprefix("| ") for line in table.splitlines()] == list(NEEDS_A_LOOK)
 
 
 def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured: ReportData) -> None:
