@@ -23,6 +23,7 @@ _CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak
 _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
 _CHECKED = 4  # marks that agree: an affine transformation through them has a check
 WRONG_PX, WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
+_PLAIN_SIGMA_PX = 0.25  # in plain noise a standard deviation says all; on a landscape it knows of in part only
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _LEAST_SCATTER_MM = 2 * SCATTER_MM  # of few marks, which may agree by chance better than film keeps them
 _SAME_MARK_PX = 5.0  # two fits of one mark lie nearer to one another, two marks do not: each is some 14 px large
@@ -117,6 +118,12 @@ class Frame:
         nearest = [min(float(np.hypot(*(place - known))) for known in own) for place in others]
         return max(nearest) < _SAME_MARK_PX
 
+    @property
+    def _unlike_drawing(self) -> float:
+        """What of their pictures the marks lack alike: not they are damaged, but drawn otherwise than they are."""
+        fractions = [fit.damaged_fraction for fit in self.fits if fit is not None]
+        return float(np.median(fractions)) if len(fractions) >= _CHECKED else 0.0
+
     def misfit(self) -> str:
         """A sentence for a frame that is not accepted."""
         return (
@@ -135,9 +142,10 @@ class Frame:
             reasons.append(f"it correlates with its drawing by only {fit.likeness:.2f}")
         if fit.snr < _CLEAR_SNR:
             reasons.append(f"its contrast is only {fit.snr:.1f} times the noise")
-        if fit.damaged_fraction > CLEAR_DAMAGE:
+        if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, CLEAR_DAMAGE):
             reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
-        if chdtrc(2, (WRONG_PX / sigma_px) ** 2) > WRONG_CHANCE:
+        is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX
+        if chdtrc(2, (WRONG_PX / sigma_px) ** 2) > WRONG_CHANCE and not is_plain:
             reasons.append(f"its standard deviation is {sigma_px:.2f} px")
         return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")

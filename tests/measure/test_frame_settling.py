@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from true_marks import KIND, TrueMark, some_mark
 
+from measure.covariance import Covariance
 from measure.fiducial_options import FiducialOptions
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
@@ -55,3 +56,31 @@ def test_faint_marks_are_matched_with_the_others_blur() -> None:
         to_bound.append(float(np.sqrt(np.trace(fit.covariance_px2) / np.trace(mark.bound(4 * NOISE / CONTRAST)))))
     assert np.sqrt(np.mean(squares)) < 1.7
     assert np.mean(to_bound) < 1.15  # of what is only seen it is 1.3
+
+
+def test_a_faint_mark_in_plain_noise_is_measured_with_the_standard_deviation_that_it_has() -> None:
+    """In white noise a claim of 0.2 px is one; on a landscape it knows of the noise in part."""
+    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    sighting = frame.sightings[0]
+    assert sighting.fit is not None
+    known = Covariance.of_noise(0.2**2 * np.eye(2))
+    for is_white, status in ((True, Status.MEASURED), (False, Status.WEAK)):
+        fit = replace(sighting.fit, place_covariance=known, covariance_is_white=is_white)
+        one = replace(frame, sightings=(replace(sighting, fit=fit), *frame.sightings[1:]))
+        assert one.verdict(0)[0] is status
+
+
+def test_what_all_marks_lack_alike_is_the_drawings_and_no_damage() -> None:
+    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+
+    def status(own: float, others: float) -> Status:
+        sightings = [
+            replace(each, fit=replace(each.fit, damaged_fraction=own if index == 0 else others))
+            for index, each in enumerate(frame.sightings)
+            if each.fit is not None
+        ]
+        return replace(frame, sightings=tuple(sightings)).verdict(0)[0]
+
+    assert status(0.3, 0.0) is Status.WEAK
+    assert status(0.3, 0.2) is Status.MEASURED
+    assert status(0.6, 0.5) is Status.WEAK
