@@ -24,6 +24,7 @@ _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit 
 _CHECKED = 4  # marks that agree: an affine transformation through them has a check
 WRONG_PX, WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
 _PLAIN_SIGMA_PX = 0.25  # in plain noise a standard deviation says all; on a landscape it knows of in part only
+_MOST_UNLIKE = 0.03  # of a mark that its drawing may lack: with more gone, what is left may still be another's
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _LEAST_SCATTER_MM = 2 * SCATTER_MM  # of few marks, which may agree by chance better than film keeps them
 _SAME_MARK_PX = 5.0  # two fits of one mark lie nearer to one another, two marks do not: each is some 14 px large
@@ -142,7 +143,7 @@ class Frame:
             reasons.append(f"it correlates with its drawing by only {fit.likeness:.2f}")
         if fit.snr < _CLEAR_SNR:
             reasons.append(f"its contrast is only {fit.snr:.1f} times the noise")
-        if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, CLEAR_DAMAGE):
+        if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, _MOST_UNLIKE):
             reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
         sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX

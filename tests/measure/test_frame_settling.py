@@ -81,6 +81,6 @@ def test_what_all_marks_lack_alike_is_the_drawings_and_no_damage() -> None:
         ]
         return replace(frame, sightings=tuple(sightings)).verdict(0)[0]
 
-    assert status(0.3, 0.0) is Status.WEAK
-    assert status(0.3, 0.2) is Status.MEASURED
-    assert status(0.6, 0.5) is Status.WEAK
+    assert status(0.27, 0.0) is Status.WEAK
+    assert status(0.27, 0.2) is Status.MEASURED
+    assert status(0.4, 0.4) is Status.WEAK
