@@ -49,11 +49,13 @@ def started(folder: Path, command: str) -> subprocess.Popen[bytes]:
 
 
 def seconds_of(source: Path, folder: Path, command: str) -> tuple[float, State]:
-    """How long the command takes when nobody ends it, and its results."""
+    """How long the command takes when nobody ends it, and its results. folder: for now; the report has its name."""
     shutil.copytree(source, folder)
     start = time.monotonic()
     started(folder, command).wait(LONGEST_S)
-    return time.monotonic() - start, state(folder)
+    seconds, results = time.monotonic() - start, state(folder)
+    shutil.rmtree(folder)
+    return seconds, results
 
 
 def trial(source: Path, folder: Path, command: str, sign: signal.Signals, whom: Whom, after_s: float) -> Ended:

@@ -19,7 +19,7 @@ def counted(old: Path, folder: Path, command: str, trials: int, whoms: tuple[Who
     """How so many trials ended. old: a project whose results are of other input than it has now."""
     rng = random.Random(seed)
     earlier = state(old)
-    seconds, complete = seconds_of(old, folder / "complete", command)
+    seconds, complete = seconds_of(old, folder / "trial", command)
     assert complete.keys() >= earlier.keys() - {"out/check.json", "out/report.html"}
     assert all(complete[name] != earlier[name] for name in ("out/adjustment.json", "out/adjustment.npz"))
     found: Counter[str] = Counter()
