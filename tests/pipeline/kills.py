@@ -39,7 +39,9 @@ def state(folder: Path) -> State:
 
 
 def started(folder: Path, command: str) -> subprocess.Popen[bytes]:
-    program = "from pipeline.main import main; main()"
+    # What is started in the background of a shell inherits that it hears no interrupt.
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = f"{heard}; from pipeline.main import main; main()"
     return subprocess.Popen(
         [sys.executable, "-c", program, command, str(folder / "project.toml")],
         start_new_session=True,
