@@ -225,7 +225,7 @@ def test_different_standard_deviations_are_told() -> None:
 
 def test_a_prior_that_contradicts_the_observations_differs() -> None:
     network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
-    camera = replace(network.cameras[0], principal_distance_mm=Prior(C_MM + 0.5, 0.002))
+    camera = replace(network.cameras[0], principal_distance_mm=Prior(C_MM + 0.2, 0.002))
     check = checked(replace(network, cameras=(camera,)))
     assert check.verdict == "differs"
     assert "Priors or weights move c" in check.reason
