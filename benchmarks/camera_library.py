@@ -13,19 +13,49 @@ import csv
 import json
 import math
 import sys
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mark_drawings import (
+    ALIKE_CORNERS,
+    ALIKE_SIDES,
+    CHECK,
+    CORNERS,
+    CURVED_FLAT,
+    EACH_SIDE,
+    EIGHT,
+    GALLERY,
+    KC6A,
+    KC6A_SIDES,
+    LEARNED,
+    NOTCHES,
+    OTHER_WINGS,
+    PARK,
+    RMK,
+    RMK_EIGHT,
+    SIDES,
+    SMALL_FLAT,
+    T5,
+    T11_NOTCH,
+    T12_CROSS,
+    T12_NOTCH,
+    TALL_FLAT,
+    WILD_ALL_PLAIN,
+    WILD_PLAIN,
+    WILD_RING,
+    WILD_RING_SIDES,
+    WINGS,
+)
 
 from measure.noise.noise import SIGMA_OF_DEVIATION
 
 # Numbered as in the reports of the US Geological Survey, x' to the right and y' up. Their form, as in OSL/1785, has the
 # data strip to the left; what forms of other makers and of before 1960 have is not known.
 PLACES = {"ll": "1", "ur": "2", "ul": "3", "lr": "4", "ml": "5", "mr": "6", "mt": "7", "mb": "8"}
-CORNERS, SIDES = ("ll", "ur", "ul", "lr"), ("ml", "mr", "mt", "mb")
 DIRECTIONS = {"ll": (-1, -1), "ur": (1, 1), "ul": (-1, 1), "lr": (1, -1)} | {
     "ml": (-1, 0),
     "mr": (1, 0),
@@ -65,8 +95,8 @@ class Kind:
     cones_mm: nominal focal lengths. gate_mm: farther from the median is another kind of mark, or a typing error.
     separated: take the marks' places from their separations. sigma_mm: of coordinates with too few reports for a
     spread. writing: the line that says where the camera writes, as
-    far as anybody knows. drawn: places whose marks are drawn,
-    by the drawing `mark`, which `shape` tells about.
+    far as anybody knows. drawn: by place, which of the drawings `marks` its mark has; `shape` tells about them. A kind
+    may stand for some cameras of a model only, those with such marks.
     """
 
     file: str
@@ -79,8 +109,8 @@ class Kind:
     sigma_mm: float
     shape: str
     separated: bool = False
-    drawn: tuple[str, ...] = ()
-    mark: str = ""
+    drawn: Mapping[str, str] = field(default_factory=dict)
+    marks: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = field(default=())
     writing: str = ""
 
@@ -105,14 +135,10 @@ class TypicalMark:
             f"xy_mm = [{x:.3f}, {y:.3f}]",
             f"sigma_mm = [{sx:.3f}, {sy:.3f}]               # of {self.reports} report{'s' * (self.reports > 1)}{few}",
         ]
-        if not kind.mark:
+        if not kind.marks:
             return [*lines, 'mark = "learned"']
-        return [
-            *lines,
-            'mark = "drawn"'
-            if self.place in kind.drawn
-            else 'mark = "none"                           # its shape is not known',
-        ]
+        name = kind.drawn.get(self.place, "none")
+        return [*lines, f'mark = "{name}"' + ("" if name != "none" else " " * 27 + "# its shape is not known")]
 
 
 BY_FORM = 'writing = ["left"]                       # as the form of the reports has it (OSL/1785)'
@@ -122,66 +148,65 @@ OF_WILD = (
 )
 OF_ZEISS = 'writing = ["left: reads upward"]         # side: the reports\' form (OSL/1785); direction: a frame of 1979'
 LEARNED_NOTE = (
-    " They are learned from the scans, from what recurs in all of them or from clicks in one; or\n"
-    "# draw them. A learned mark lies off the reported one by as much as its template does, and its sigma grows by\n"
-    "# that."
+    "# They are learned from the scans, from what recurs in all of them or from clicks in one; or draw them. A learned",
+    "# mark lies off the reported one by as much as its template does, and its sigma grows by that.",
 )
-LEARNED = """kind = "learned"
-size_mm = 5.0
-"""
-RING_CROSS = """kind = "ring-cross"
-ring_mm = 0.80
-ring_line_mm = 0.17
-arm_mm = 1.75
-line_mm = 0.10
-gap_mm = 0.08
-angle_deg = 45
-polarity = "light"
-"""
-PLAIN_CROSS = """kind = "cross"
-arm_mm = 1.75
-line_mm = 0.12
-gap_mm = 0.25
-angle_deg = 45
-polarity = "light"
-"""
-RMK_NOTCH = """kind = "polygon"                        # the frame's dark block, drawn as on the right side, x outwards
-vertices_mm = [[0.0, 0.0], [1.2, 1.8], [-0.2, 3.4], [-0.2, 5.0], [4.0, 5.0],
-               [4.0, -5.0], [-0.2, -5.0], [-0.2, -3.4], [1.2, -1.8]]
-polarity = "dark"
-rotate = "radial"
-"""
 OLD_WILD = "the corners: from two Wild frames of 1968 and 1972 that do not name their model"
 NEW_WILD = "the corners: from three Wild frames of 1985 to 1997 that do not name their model"
 UNKNOWN = "not known"
+K17 = ("K-17", "K-17 (modified)", "K-17B", "K-17B (modified)", "K-17C (modified)")
 KINDS = (
     Kind("wild-rc5", "Wild RC5", ("RC5", "RC5A", "RC5/8"), (153,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False,
-         CORNERS, PLAIN_CROSS, writing=OF_WILD),
+         ALIKE_CORNERS, WILD_PLAIN, writing=OF_WILD),
     Kind("wild-rc8", "Wild RC8", ("RC8",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, OLD_WILD, False,
-         CORNERS, PLAIN_CROSS, writing=OF_WILD),
-    Kind("wild-rc9", "Wild RC9", ("RC9",), (88,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False, CORNERS, PLAIN_CROSS,
+         ALIKE_CORNERS, WILD_PLAIN, writing=OF_WILD),
+    Kind("wild-rc9", "Wild RC9", ("RC9",), (88,), 228.0, CORNERS, 0.3, 0.01, OLD_WILD, False, ALIKE_CORNERS, WILD_PLAIN,
          writing=BY_FORM),
     Kind("wild-rc10", "Wild RC10", ("RC10", "RC10A", "RC10A*"), (88, 153, 214, 305), 228.0, CORNERS + SIDES, 0.3,
-         0.01, NEW_WILD, False, CORNERS, RING_CROSS,
+         0.01, NEW_WILD, False, ALIKE_CORNERS, WILD_RING,
          ("Eleven reports, rejected here, have the side marks at 112.5 mm.",), writing=OF_WILD),
     Kind("wild-rc30", "Wild RC30", ("RC30",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, NEW_WILD, False,
-         CORNERS, RING_CROSS),
+         ALIKE_CORNERS, WILD_RING),
     Kind("zeiss-rmk-a", "Zeiss RMK A",
          ("RMK A 8.5/23", "RMK A 15/23", "RMK 15/23", "RMK AR 15/23", "RMK A 21/23", "RMK A 30/23", "RMK 30/23",
           "RMK AR 30/23"), (86, 153, 209, 305), 234.0, CORNERS + SIDES, 0.5, 0.02,
-         "the sides: from a frame of 1978 with four notches 226 mm apart", False, SIDES, RMK_NOTCH,
+         "the sides: from a frame of 1978 with four notches 226 mm apart", False, ALIKE_SIDES, RMK,
          ("Many cameras have no corner marks; seven reports, rejected here, have them at 105.0 mm.",
           "The frame of 1978 ends 117 mm from the middle, 4 mm beyond its notches."), writing=OF_ZEISS),
     Kind("zeiss-rmk-top", "Zeiss RMK TOP", ("RMK TOP",), (153, 305), 230.0, CORNERS + SIDES, 0.3, 0.02, UNKNOWN),
     Kind("jena-lmk", "Jena LMK", ("LMK",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01, UNKNOWN, writing=BY_FORM),
-    Kind("fairchild-k17", "Fairchild K-17", ("K-17", "K-17 (modified)", "K-17B", "K-17B (modified)",
-         "K-17C (modified)"), (153, 210, 305), 228.6, SIDES, 2.0, 0.2, UNKNOWN, True),
+    Kind("fairchild-k17", "Fairchild K-17", K17, (153, 210, 305), 228.6, SIDES, 2.0, 0.2, UNKNOWN, True),
     Kind("fairchild-t11", "Fairchild T-11", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, UNKNOWN),
     Kind("fairchild-t12", "Fairchild T-12", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1, UNKNOWN, notes=(
         "Corner marks, where there are any, lie anywhere from 105.6 to 116.3 mm: none are given.",
         "Seven reports, rejected here, have the side marks at 110 mm.")),
     Kind("fairchild-kc1", "Fairchild KC-1", ("KC-1", "KC-1A", "KC-1B"), (153,), 228.6, SIDES, 1.0, 0.1, UNKNOWN),
-    Kind("fairchild-kc6a", "Fairchild KC-6A", ("KC-6A",), (152,), 228.6, SIDES, 1.0, 0.1, UNKNOWN),
+    Kind("fairchild-kc6a", "Fairchild KC-6A", ("KC-6A",), (152,), 228.6, SIDES, 1.0, 0.1, GALLERY, False, KC6A_SIDES,
+         KC6A),
+    Kind("wild-rc8-eight", "Wild RC8 with plain side crosses", ("RC8",), (153,), 228.0, CORNERS + SIDES, 0.3, 0.01,
+         f"{OLD_WILD}; the sides: {GALLERY}", False, EIGHT, WILD_ALL_PLAIN, writing=OF_WILD),
+    Kind("wild-rc10-eight", "Wild RC10 with plain corners and ringed sides", ("RC10", "RC10A", "RC10A*"),
+         (88, 153, 214, 305), 228.0, CORNERS + SIDES, 0.3, 0.01, f"{OLD_WILD}; the sides: {GALLERY}", False, EIGHT,
+         WILD_RING_SIDES, writing=OF_WILD),
+    Kind("zeiss-rmk-a-eight", "Zeiss RMK A with corner crosses", ("RMK A 15/23", "RMK 15/23", "RMK AR 15/23"), (153,),
+         234.0, CORNERS + SIDES, 0.5, 0.02, f"the sides: from a frame of 1978; the corners: {GALLERY}", False, EIGHT,
+         RMK_EIGHT, writing=OF_ZEISS),
+    Kind("park", "Park with ringed crosses", ("Park",), (153,), 228.6, CORNERS + SIDES, 0.5, 0.03, GALLERY, False,
+         EIGHT, PARK),
+    Kind("fairchild-t5", "Fairchild T-5", ("T-5",), (153,), 229.8, SIDES, 2.0, 0.2, GALLERY, True, EACH_SIDE, T5),
+    Kind("fairchild-t11-notch", "Fairchild T-11 with notches", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1, GALLERY,
+         False, NOTCHES, T11_NOTCH),
+    Kind("fairchild-t11-check", "Fairchild T-11 with checked squares", ("T-11",), (153,), 228.6, SIDES, 2.0, 0.1,
+         GALLERY, False, ALIKE_SIDES, CHECK),
+    Kind("fairchild-t12-notch", "Fairchild T-12 with notches", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1,
+         GALLERY, False, NOTCHES, T12_NOTCH),
+    Kind("fairchild-t12-cross", "Fairchild T-12 with crosses", ("T-12", "T-12A"), (152,), 228.6, SIDES, 1.5, 0.1,
+         GALLERY, False, ALIKE_SIDES, T12_CROSS),
+    *(Kind(f"fairchild-k17-{name}", f"Fairchild K-17, {words} wings", K17, (153, 210, 305), 228.6, SIDES, 2.0, 0.2,
+           GALLERY, True, sides, marks)
+      for name, words, sides, marks in (("small-flat", "small flat", OTHER_WINGS, SMALL_FLAT),
+                                        ("tall-flat", "tall flat", WINGS, TALL_FLAT),
+                                        ("curved-flat", "curved and flat", WINGS, CURVED_FLAT))),
 )  # fmt: skip
 
 
@@ -211,7 +236,7 @@ def _typed(folder: Path) -> Iterable[Report]:
             separations = {name: _number(row[name]) for name in SEPARATIONS}
             yield Report(
                 "USGS",
-                _model(row["camera_model"]),
+                _model(row["camera_model"] or row["camera_make"]),
                 row["camera_serial"],
                 _number(row["focal"]),
                 {place: pair for place, pair in pairs.items() if not math.isnan(sum(pair))},
@@ -273,7 +298,8 @@ def _camera(
         + (" Seen with the data strip to the left." if kind.writing else ""),
         *(f"# {note}" for note in kind.notes),
         *_separation_lines(kind, own),
-        f"# Shape of the marks: {kind.shape}." + ("" if kind.mark else LEARNED_NOTE),
+        *textwrap.wrap(f"# Shape of the marks: {kind.shape}.", 118, subsequent_indent="# "),
+        *(() if kind.marks else LEARNED_NOTE),
         "",
         f'name = "{kind.title}, {cone_mm} mm"',
         f"frame_mm = [{kind.frame_mm}, {kind.frame_mm}]",
@@ -296,7 +322,8 @@ def _camera(
     ]
     for mark in marks:
         lines += ["", *mark.lines(kind)]
-    lines += ["", "[mark.drawn]", kind.mark.rstrip()] if kind.mark else ["", "[mark.learned]", LEARNED.rstrip()]
+    for name, drawing in (kind.marks or {"learned": LEARNED}).items():
+        lines += ["", f"[mark.{name}]", drawing.rstrip()]
     return "\n".join(lines) + "\n"
 
 

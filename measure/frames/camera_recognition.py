@@ -17,8 +17,8 @@ from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis
 
-_COMPARED = 8  # best placements: the one that chance makes least is among them
-_QUICK = Effort(held_bytes=120 << 20, half_px=16)
+_COMPARED = 5  # best placements: the one that chance makes least is among them
+_QUICK = Effort(held_bytes=84 << 20, half_px=16)
 _SURE = 0.01  # constellations expected by chance: other pitches need not be tried
 _PLACES = 2  # that are looked at
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.marks.rendering import extent_px, known_picture
-from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
+from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
 from measure.scans.scan import SINGLE_CHANNELS, Scan
 from measure.search.correlation import WIDE, Map, Surroundings
 from measure.search.held import Held
@@ -85,8 +85,8 @@ class Responses:
 
 @dataclass(frozen=True)
 class Effort:
-    """How much a search takes. held_bytes: of correlations, at a time. half_px: how far about a mark's point its
-    picture reaches at most, in the reduced scan: of a cross with one arm far longer the middle tells enough."""
+    """How much a search takes. held_bytes: of correlations, at a time. half_px: how far about its point a cross is
+    drawn at most, in the reduced scan: where one arm is far longer the middle tells enough."""
 
     held_bytes: int
     half_px: int
@@ -113,7 +113,7 @@ def respond(
 ) -> tuple[Responses, tuple[int, ...]]:
     """The responses to the looks that differ, lighter (+1) and darker (-1) than their surroundings as signs says, and
     for every look which of the kinds is its own. held: what there is of these maps, and of others of the scan. most_px:
-    of the reduced scan, how far about its point a mark's picture reaches."""
+    of the reduced scan, how far about its point a cross is drawn at most."""
     reduction = _reduction(scan, looks)
     kinds, index = _distinct(_templates(looks, reduction, most_px))
     details = [_reduced_detail_px(looks[index.index(kind)], reduction) for kind in range(len(kinds))]
@@ -208,7 +208,9 @@ def _is_quarter(turn: Array) -> bool:
 def _template(look: Look, reduction: int, most_px: int) -> Array:
     linear = _centred(look.linear) / reduction
     least, greatest = extent_px(look.mark, linear)
-    half = min(int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + _RIM_PX, most_px)
+    half = int(np.ceil(np.abs(np.concatenate([least, greatest])).max())) + _RIM_PX
+    if isinstance(look.mark, MarkShape) and any(isinstance(part, Bar) for part in look.mark.parts):
+        half = min(half, most_px)
     linear[:, 2] = half
     return known_picture(look.mark, linear, 2 * half + 1, 2 * half + 1, _BLUR_PX)
 

@@ -47,9 +47,9 @@ def library_json() -> list[Json]:
 
 def print_library(console: Console) -> None:
     """The library for a person: a line a camera, a source line a kind of camera, and how to use one."""
-    table = Table(box=None, pad_edge=False)
+    table, widest = Table(box=None, pad_edge=False), max(map(len, library_names()))
     for heading in ("camera", "frame, mm", "c, mm", "marks", "shape", "reports"):
-        table.add_column(heading, no_wrap=True)
+        table.add_column(heading, no_wrap=True, min_width=widest if heading == "camera" else None)
     sources: dict[str, str] = {}
     for entry in library_json():
         c = entry["principal_distance_mm"]

@@ -1,8 +1,7 @@
 """Which camera a scan is of: every camera whose marks are drawn is tried on it, at reduced size."""
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,28 +10,22 @@ from numpy.typing import NDArray
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
 from measure.fiducial_options import FiducialOptions
-from measure.frames.camera_recognition import answer, likeness, seen
+from measure.frames.camera_recognition import likeness
 from measure.frames.frame import Frame
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.scans.scan import Scan, open_scan
-from measure.scans.thumbnail import thumbnail
-from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.scans.scan import open_scan
 from measure.writing.networks import networks
 from measure.writing.reading import read_writing
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, plate_of
+from pipeline.measuring.layout_search import LayoutSearch, Tried, same_marks
 from pipeline.progress import Count, Reporter
 
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
 
-_LARGEST_PX = 1600  # of what is looked at: a tenth of a millimetre of aerial film, as wide as the finest lines of marks
-_COARSEST_PX = 1024  # the same while the pitch is sought: lines are half a pixel wide then, and marks a dozen long
-_FEW = 3  # layouts that answer best while the pitch is sought, and are tried at the pitch that each comes to
-_PITCH_TOLERANCE = 0.02  # of that pitch
-_ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
-_STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is so deformed
+_FEW = 3  # of the answers while the pitch is sought: those that are tried at the pitch that each comes to
 _CERTAIN = 0.01  # constellations expected by chance: no mark need be matched in wrong places to know better
 _BY_CHANCE = 1.0  # constellation expected: chance may have made it
 _ODDS = 1000.0  # times what chance makes of another camera's marks: that one is seen, and not this
@@ -51,13 +44,13 @@ def identify(
     Raises MeasurementError for a scan that cannot be read.
     """
     with open_scan(path, max_pixels) as whole, reporter.stage("trying") as count:
-        given = whole.pitch_um if pitch_um is None else (pitch_um, pitch_um)
+        search, given = LayoutSearch(whole), whole.pitch_um if pitch_um is None else (pitch_um, pitch_um)
         layouts = {names: cameras[names[0]].layout() for names in _alike(cameras)}
         trials = list[Trial]()
         if given is not None:
-            trials = _as_given(whole, layouts, given, count)
+            trials = _as_given(search, layouts, given, count)
         if not any(trial.stands_out for trial in trials):
-            trials = _at_any_pitch(whole, layouts, count)
+            trials = _at_any_pitch(search, layouts, count)
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
     ranked = tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected)))
@@ -76,69 +69,31 @@ def _plate(path: Path, max_pixels: int | None) -> dict[str, str]:
         return plate_of(read_writing(scan, reader))
 
 
-class _Try:
-    """A layout that is tried on a scan, as it answers in a thumbnail of it under hypotheses about the pitch there;
-    tried: how many others were tried before."""
-
-    def __init__(
-        self,
-        whole: Scan,
-        small: Scan,
-        layout: FiducialLayout,
-        hypotheses: Sequence[Sequence[PitchHypothesis]],
-        tried: int = 0,
-    ) -> None:
-        start = time.perf_counter()
-        self.whole, self.small, self.layout, self.hypotheses, self.tried = whole, small, layout, hypotheses, tried
-        self.answer = answer(small, layout, hypotheses, tried)
-        self.seconds = time.perf_counter() - start
-
-    def seen(self) -> Frame | None:
-        """The frame as its marks look in the scan itself."""
-        return seen(self.whole, self.layout, self.answer, self.whole.width_px / self.small.width_px)
-
-    def stretched(self) -> "_Try":
-        """The same with marks in wrong places."""
-        x, y = _STRETCH
-        marks = tuple(replace(mark, xy_mm=(x * mark.xy_mm[0], y * mark.xy_mm[1])) for mark in self.layout.marks)
-        return _Try(self.whole, self.small, replace(self.layout, marks=marks), self.hypotheses, self.tried)
-
-    def refined(self, fine: Scan) -> "_Try":
-        """The same at the pitch that the best answer came to, in a larger thumbnail."""
-        if not self.answer.placements:
-            return self
-        linear = self.answer.placements[0].pixel_from_camera[:, :2]
-        pitch_mm = self.small.width_px / fine.width_px / float(np.sqrt(abs(np.linalg.det(linear))))
-        hypothesis = PitchHypothesis((pitch_mm, pitch_mm), _PITCH_TOLERANCE, (pitch_mm, pitch_mm))
-        return _Try(self.whole, fine, self.layout, [[hypothesis]], sum(map(len, self.hypotheses)))
-
-
 def _as_given(
-    whole: Scan, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float], count: Count
+    search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float], count: Count
 ) -> list[Trial]:
-    """The trials at the given pitch, or with pixels that are longer one way."""
-    small, options, tries = thumbnail(whole, _LARGEST_PX), FiducialOptions(pitch_is_right=True), dict[Names, _Try]()
-    times = whole.width_px / small.width_px
-    for done, (names, layout) in enumerate(layouts.items()):
+    """The trials at the given pitch, or, as long as no layout is found at that, with pixels that are longer one way."""
+    tries = dict[Names, Tried]()
+    for done, (names, layout) in enumerate(reversed(list(layouts.items()))):
         count(f"the marks of {', '.join(names)}", done, 2 * len(layouts))
-        hypotheses = pitch_hypotheses(small, layout, (times * pitch_um[0], times * pitch_um[1]), options)
-        tries[names] = _Try(whole, small, layout, hypotheses)
-    return _trials(tries, count)
+        is_right = any(each.answer.expected <= _CERTAIN for each in tries.values())
+        tries[names] = search.at_pitch(layout, pitch_um, is_right)
+    return _trials(search, tries, count)
 
 
-def _at_any_pitch(whole: Scan, layouts: Mapping[Names, FiducialLayout], count: Count) -> list[Trial]:
-    """The trials of a scan that the frame may fill: what its pixels then measure each layout says for itself, in a
-    picture of half the size, and those that answer best are tried at that pitch."""
-    fine = thumbnail(whole, _LARGEST_PX)
-    small, tries = thumbnail(fine, _COARSEST_PX), dict[Names, _Try]()
+def _at_any_pitch(search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], count: Count) -> list[Trial]:
+    """The trials of a scan that the frame may fill: what its pixels then measure each layout says for itself, and those
+    that answer best are tried at that pitch."""
+    tries = dict[Names, Tried]()
     for done, (names, layout) in enumerate(layouts.items()):
         count(f"at any pitch the marks of {', '.join(names)}", done, 2 * len(layouts))
-        tries[names] = _Try(whole, small, layout, pitch_hypotheses(small, layout, None, FiducialOptions()))
-    best = sorted(tries, key=lambda names: tries[names].answer.expected)[:_FEW]
-    return _trials(tries | {names: tries[names].refined(fine) for names in best}, count)
+        tries[names] = search.at_any_pitch(layout)
+    least = sorted({each.answer.expected for each in tries.values()})[:_FEW]
+    best = {names: search.refined(each) for names, each in tries.items() if each.answer.expected in least}
+    return _trials(search, tries | best, count)
 
 
-def _trials(tries: Mapping[Names, _Try], count: Count) -> list[Trial]:
+def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) -> list[Trial]:
     """Of every layout, those first that answer better than chance. Once one of these stands out, the marks of another
     are looked at only where it answers better than chance too, and may be more than a part of what was found."""
     trials: list[Trial] = []
@@ -150,7 +105,7 @@ def _trials(tries: Mapping[Names, _Try], count: Count) -> list[Trial]:
             trials.append(_not_looked_at(names, each))
         else:
             count(", ".join(names), done, 2 * len(ranked))
-            trials.append(_trial(names, each))
+            trials.append(_trial(search, names, each))
     return trials
 
 
@@ -161,20 +116,20 @@ def _expected_at_most(seen: Trial, marks: int) -> float:
     return min(_BY_CHANCE, _ODDS * seen.expected) if seen.found > marks else _BY_CHANCE
 
 
-def _not_looked_at(names: Names, each: _Try) -> Trial:
+def _not_looked_at(names: Names, each: Tried) -> Trial:
     expected = each.answer.expected
     if np.isfinite(expected):
         reason = f"not measured: chance makes {expected:.1g} constellations in such a scan that answer as well"
     else:
         reason = "not measured: nowhere in the scan do its marks answer together"
-    return Trial(names, 0, len(each.layout.marks), 0.0, 0.0, 0.0, None, None, None, reason, each.seconds, expected)
+    return Trial(names, 0, len(each.layout.marks), 0.0, 0.0, 0.0, None, None, None, reason, 0.0, expected)
 
 
 def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
     """The names of cameras with drawn marks, those together whose marks a scan cannot tell apart."""
     groups: list[list[str]] = []
     for name, camera in cameras.items():
-        own = next((group for group in groups if _same(cameras[group[0]].drawn, camera.drawn)), None)
+        own = next((group for group in groups if same_marks(cameras[group[0]].drawn, camera.drawn)), None)
         if own is not None:
             own.append(name)
         elif camera.drawn:
@@ -182,20 +137,9 @@ def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
     return [tuple(group) for group in groups]
 
 
-def _same(first: Sequence[LayoutMark], second: Sequence[LayoutMark]) -> bool:
-    return len(first) == len(second) and all(
-        _kind(a) == _kind(b) and np.hypot(a.xy_mm[0] - b.xy_mm[0], a.xy_mm[1] - b.xy_mm[1]) < _ALIKE_MM
-        for a, b in zip(first, second, strict=True)
-    )
-
-
-def _kind(mark: LayoutMark) -> str:
-    return repr(mark.mark)
-
-
-def _trial(names: Names, each: _Try) -> Trial:
+def _trial(search: LayoutSearch, names: Names, each: Tried) -> Trial:
     start, expected = time.perf_counter(), each.answer.expected
-    frame = each.seen()
+    frame = search.seen(each)
     fits = [fit for fit in frame.fits if fit] if frame else []
     residual = _residual(frame, each.layout) if frame else None
     return Trial(
@@ -205,22 +149,22 @@ def _trial(names: Names, each: _Try) -> Trial:
         likeness=float(np.mean([fit.likeness for fit in fits])) if fits else 0.0,
         snr=float(np.median([fit.snr for fit in fits])) if fits else 0.0,
         score=likeness(frame) if frame else 0.0,
-        chance=_score_by_chance(each) if frame and expected > _CERTAIN else None,
+        chance=_score_by_chance(search, each) if frame and expected > _CERTAIN else None,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
         reason="" if frame else "no three of its marks are seen where its constellation answers best",
-        seconds=each.seconds + time.perf_counter() - start,
+        seconds=time.perf_counter() - start,
         expected=expected,
         pixel_um=1000 / _px_per_mm(frame) if frame else None,
     )
 
 
-def _score_by_chance(each: _Try) -> float:
+def _score_by_chance(search: LayoutSearch, each: Tried) -> float:
     """Of the same marks in wrong places. What answers there so much less that the marks themselves are seen, none."""
-    wrong = each.stretched()
+    wrong = search.stretched(each)
     if wrong.answer.expected > _ODDS * each.answer.expected:
         return 0.0
-    frame = wrong.seen()
+    frame = search.seen(wrong)
     return likeness(frame) if frame else 0.0
 
 

@@ -32,6 +32,7 @@ LIBRARY = read_library()
 SCENE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")
 RENDERED = "wild-rc10-153"
 SEPARATION = re.compile(r"# Separation (.+): ([\d.]+) mm, spread ([\d.]+) \((\d+) reports\)")
+SPREADS = {"fairchild": 0.3, "park": 0.35}  # mm, of models whose cameras differ
 ENDS = {"left to right": ("5", "6"), "top to bottom": ("7", "8"), "1 to 2": ("1", "2"), "3 to 4": ("3", "4")}
 
 
@@ -81,7 +82,8 @@ def test_a_camera_is_typical_and_its_spread_is_one_of_cameras(name: str) -> None
     assert 0.0 < camera.principal_distance_sigma_mm < 0.011 * nominal
     sigmas = np.array([one.sigma_mm for one in camera.fiducials])
     assert (sigmas >= 0.005).all()
-    assert (sigmas < {"fairchild": 0.3, "register": 0.6}.get(name.split("-")[0], 0.05)).all()
+    reported = camera.source is not None and camera.source.reports
+    assert (sigmas < (SPREADS.get(name.split("-")[0], 0.05) if reported else 1.1)).all()
     assert len(camera.fiducials) in (4, 8, 9, 25)
     for words, mm, spread, _ in SEPARATION.findall(library_path(name).read_text(encoding="utf-8")):
         assert distance(camera, *ENDS[words]) == pytest.approx(float(mm), abs=max(0.02, 1.5 * float(spread)))
@@ -232,7 +234,7 @@ def test_a_part_of_a_lattice_is_no_other_camera(
     (scan,) = (frame.parent / "scans").glob("*.tif")
     two = {name: LIBRARY[name] for name in ("hasselblad-reseau-60", "register-glass-262")}
     monkeypatch.setattr(
-        "pipeline.measuring.camera_trials.answer", lambda _, layout, *__: Answer(10.0 ** -len(layout.marks), ())
+        "pipeline.measuring.layout_search.answer", lambda _, layout, *__: Answer(10.0 ** -len(layout.marks), ())
     )
     monkeypatch.setattr(
         camera_trials, "_trial", lambda *_: replace(trial(("lattice",), 0.5), found=found, expected=1e-25)
@@ -253,7 +255,7 @@ def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     def small_only(scan: Scan, layout: FiducialLayout, *given: Any) -> Answer:
         return answered(scan, layout, *given) if len(layout.marks) == 4 else Answer(math.inf, ())
 
-    monkeypatch.setattr("pipeline.measuring.camera_trials.answer", small_only)
+    monkeypatch.setattr("pipeline.measuring.layout_search.answer", small_only)
     assert run(["cameras", "--scan", str(scan), "--json"]) == 0
     trials = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["trials"]
     assert trials[0]["expected"] < 1e-4

@@ -1,0 +1,124 @@
+"""Layouts of marks looked for in thumbnails of one scan. What is looked for is the boldest marks of each: cameras in
+which these are alike, and lie alike, share one search."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from measure.fiducial_options import FiducialOptions
+from measure.frames.camera_recognition import Answer, answer, seen
+from measure.frames.frame import Frame
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon, thinnest_mm
+from measure.scans.scan import Scan
+from measure.scans.thumbnail import thumbnail
+from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+
+Hypotheses = Sequence[Sequence[PitchHypothesis]]
+
+_LARGEST_PX = (
+    1600  # of what is looked at: a seventh of a millimetre of aerial film, about as wide as marks' finest lines
+)
+_COARSE_PX = 1024  # the same while the pitch is sought: fine lines are half a pixel wide then
+_SOLID_PX = 800  # of solid marks, which are some millimetres large
+_COARSE_SOLID_PX = 512  # of these while the pitch is sought
+_PITCH_TOLERANCE = 0.02  # of the pitch that a layout came to
+_ALIKE_MM = 0.1  # two cameras whose marks lie so near to one another look alike in a scan
+_BOLD = 4  # marks that are looked for, at least
+_STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is so deformed
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A layout, its boldest marks, and how a picture of the scan answers to these under hypotheses about its pitch;
+    before: how many others had been tried."""
+
+    layout: FiducialLayout
+    bold: FiducialLayout
+    picture: Scan
+    hypotheses: Hypotheses
+    before: int
+    answer: Answer
+
+
+class LayoutSearch:
+    """The search in one scan."""
+
+    def __init__(self, whole: Scan) -> None:
+        self._whole = whole
+        self._fine = thumbnail(whole, _LARGEST_PX)
+        self._coarse, self._solid, self._coarse_solid = (
+            thumbnail(self._fine, side_px) for side_px in (_COARSE_PX, _SOLID_PX, _COARSE_SOLID_PX)
+        )
+        self._known: list[Tried] = []
+
+    def at_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float], is_right: bool) -> Tried:
+        """At the scan's pitch or, unless it is right, with pixels that are longer one way."""
+        bold = _boldest(layout)
+        picture = self._solid if all(_is_solid(mark) for mark in bold.marks) else self._fine
+        times = self._whole.width_px / picture.width_px
+        options = FiducialOptions(pitch_is_right=True)
+        hypotheses = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
+        return self._tried(layout, bold, picture, hypotheses[:1] if is_right else hypotheses)
+
+    def at_any_pitch(self, layout: FiducialLayout) -> Tried:
+        """Where the frame may fill the scan."""
+        bold = _boldest(layout)
+        picture = self._coarse_solid if all(_is_solid(mark) for mark in bold.marks) else self._coarse
+        return self._tried(layout, bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions()))
+
+    def refined(self, coarse: Tried) -> Tried:
+        """At the pitch that the best answer came to, in a larger picture."""
+        if not coarse.answer.placements:
+            return coarse
+        linear = coarse.answer.placements[0].pixel_from_camera[:, :2]
+        picture = self._solid if coarse.picture is self._coarse_solid else self._fine
+        pitch_mm = coarse.picture.width_px / picture.width_px / float(np.sqrt(abs(np.linalg.det(linear))))
+        hypothesis = PitchHypothesis((pitch_mm, pitch_mm), _PITCH_TOLERANCE, (pitch_mm, pitch_mm))
+        return self._tried(coarse.layout, coarse.bold, picture, [[hypothesis]], sum(map(len, coarse.hypotheses)))
+
+    def stretched(self, tried: Tried) -> Tried:
+        """The same with marks in wrong places."""
+        layout, bold = _stretched(tried.layout), _stretched(tried.bold)
+        return self._tried(layout, bold, tried.picture, tried.hypotheses, tried.before)
+
+    def seen(self, tried: Tried) -> Frame | None:
+        """The frame as all its marks look in the scan itself."""
+        return seen(self._whole, tried.layout, tried.answer, self._whole.width_px / tried.picture.width_px)
+
+    def _tried(
+        self, layout: FiducialLayout, bold: FiducialLayout, picture: Scan, hypotheses: Hypotheses, before: int = 0
+    ) -> Tried:
+        for known in self._known:
+            if known.picture is picture and known.hypotheses == hypotheses and same_marks(known.bold.marks, bold.marks):
+                return replace(known, layout=layout)
+        answered = answer(picture, bold, hypotheses, before)
+        self._known.append(Tried(layout, bold, picture, hypotheses, before, answered))
+        return self._known[-1]
+
+
+def same_marks(first: Sequence[LayoutMark], second: Sequence[LayoutMark]) -> bool:
+    """Whether a scan cannot tell the marks of two layouts apart."""
+    return len(first) == len(second) and all(
+        repr(a.mark) == repr(b.mark) and np.hypot(a.xy_mm[0] - b.xy_mm[0], a.xy_mm[1] - b.xy_mm[1]) < _ALIKE_MM
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+def _boldest(layout: FiducialLayout) -> FiducialLayout:
+    """The marks that are the plainest to see, where they are enough: solid ones, or else those of the widest lines."""
+    groups: dict[float, list[LayoutMark]] = {}
+    for mark in layout.marks:
+        groups.setdefault(np.inf if _is_solid(mark) else thinnest_mm(mark.mark), []).append(mark)
+    enough = [width for width, marks in groups.items() if len(marks) >= _BOLD]
+    return replace(layout, marks=tuple(groups[max(enough)])) if enough else layout
+
+
+def _is_solid(mark: LayoutMark) -> bool:
+    return isinstance(mark.mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.mark.parts)
+
+
+def _stretched(layout: FiducialLayout) -> FiducialLayout:
+    x, y = _STRETCH
+    marks = tuple(replace(mark, xy_mm=(x * mark.xy_mm[0], y * mark.xy_mm[1])) for mark in layout.marks)
+    return replace(layout, marks=marks)
