@@ -1,6 +1,5 @@
 """The library's drawings against pictures of real marks, and drawn cameras found among all others."""
 
-import warnings
 from importlib import resources
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from real_data import DATA, needs
 
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import Mark
@@ -22,7 +22,7 @@ Picture = NDArray[np.uint8]
 LIBRARY = read_library()
 SCENE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")
 QUICK = ("wild-18x18-115",)
-GALLERY = Path(__file__).parents[3] / "shared" / "data" / "mark_gallery"
+GALLERY = DATA / "mark_gallery"
 MM_A_PIXEL = 0.0320
 HALF_PX, SEARCH_PX, RIM_PX = 140, 9, 8
 DOTS = {"1": (304, 1606), "2": (1617, 301), "3": (304, 301), "4": (1617, 1606)} | {
@@ -50,14 +50,6 @@ SEEN = [
     ("wild_mid_crosshair", "wild-rc10-eight-153", "12345678", 0.65),
     ("zeiss_corner", "zeiss-rmk-a-eight-153", "1234", 0.6),
 ]
-
-
-@pytest.fixture(scope="module")
-def gallery() -> Path:
-    if not GALLERY.is_dir():
-        warnings.warn(f"REAL MARKS ARE NOT THERE: {GALLERY.resolve()} is missing", stacklevel=1)
-        pytest.skip(f"the pictures of real marks are missing: {GALLERY.resolve()}")
-    return GALLERY
 
 
 def place_of_dot(picture: Picture, near: tuple[int, int]) -> Array:
@@ -90,9 +82,10 @@ def likeness(picture: Picture, mark: Mark, dot: Array) -> float:
     return best
 
 
+@needs("mark_gallery")
 @pytest.mark.parametrize(("name", "camera", "marks", "least"), SEEN)
-def test_a_drawing_looks_like_the_real_mark(gallery: Path, name: str, camera: str, marks: str, least: float) -> None:
-    picture = np.asarray(cv2.imread(str(gallery / f"{name}.png")))
+def test_a_drawing_looks_like_the_real_mark(name: str, camera: str, marks: str, least: float) -> None:
+    picture = np.asarray(cv2.imread(str(GALLERY / f"{name}.png")))
     given = {mark.id: mark.mark for mark in LIBRARY[camera].layout().marks}
     like = {id: round(likeness(picture, given[id], place_of_dot(picture, DOTS[id])), 2) for id in marks}
     assert min(like.values()) > least, like
