@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 import cv2
@@ -23,9 +24,16 @@ def side_by_side(function: Callable[[Item], Made], items: Iterable[Item]) -> lis
     threads = cv2.getNumThreads()
     if threads <= 1:
         return [function(item) for item in items]
+    with one_opencv_thread(), ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, items))
+
+
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """OpenCV works in the calling thread alone, and afterwards with as many of its own as before."""
+    threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(function, items))
+        yield
     finally:
         cv2.setNumThreads(threads)

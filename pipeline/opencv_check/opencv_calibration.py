@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.scans.parallel import one_opencv_thread
 from pipeline.opencv_check.opencv_model import NAMES, Y_UP, Freedom, camera_matrix
 
 Array = NDArray[np.float64]
@@ -78,9 +79,10 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
     size = tuple(int(extent) + 2 for extent in np.ceil((corners[1] - corners[0]) / pixel_mm))
     tilted = "tau_x" in freedom.names or bool(start[-2:].any())
     lens = start[4:] if tilted else start[4:-2]
-    rms_px, adjusted_matrix, distortion, _, _, sigmas, _, _ = cv2.calibrateCameraExtended(
-        objects, pixels, (size[0], size[1]), matrix, lens.copy(), flags=_flags(freedom, tilted), criteria=CRITERIA
-    )
+    with one_opencv_thread():  # several add up the images in the order in which they end, which differs by the run
+        rms_px, adjusted_matrix, distortion, _, _, sigmas, _, _ = cv2.calibrateCameraExtended(
+            objects, pixels, (size[0], size[1]), matrix, lens.copy(), flags=_flags(freedom, tilted), criteria=CRITERIA
+        )
     rounding_px = np.concatenate([a - b for a, b in zip(exact, pixels, strict=True)])
     return OpenCvCalibration(
         parameters=_parameters(np.asarray(adjusted_matrix, dtype=np.float64), np.ravel(distortion), offset, pixel_mm),

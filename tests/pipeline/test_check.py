@@ -263,6 +263,34 @@ def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, wha
     assert ("factor of 1.4" if what == "sigmas" else "by 1.5") in check.reason
 
 
+def test_every_run_gets_the_same_digits_of_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV's threads add up the images in the order in which they end, and the last digits go by it."""
+    given, threads = [], []
+    plain = cv2.calibrateCameraExtended
+
+    def kept(*arguments: Any) -> OpenCvCalibration:
+        given.append(arguments)
+        return calibrate(*arguments)
+
+    def watched(*arguments: Any, **options: Any) -> Any:
+        threads.append(cv2.getNumThreads())
+        return plain(*arguments, **options)
+
+    monkeypatch.setattr("pipeline.opencv_check.check.calibrate", kept)
+    monkeypatch.setattr(cv2, "calibrateCameraExtended", watched)
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(4)
+    try:
+        checked(simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2")))
+        found = [calibrate(*given[0]) for _ in range(40)]
+        assert cv2.getNumThreads() == 4
+    finally:
+        cv2.setNumThreads(before)
+    assert set(threads) == {1}
+    digits = {(each.parameters.tobytes(), each.sigmas.tobytes(), each.rms_um) for each in found}
+    assert len(digits) == 1
+
+
 def test_what_robust_estimation_set_aside_is_left_out() -> None:
     network = simulated(CONVERGENT, distortion=free("torlegard", "k3", "k5", "k7", "p1", "p2"))
     xy_mm = network.observations.xy_mm.copy()
