@@ -72,12 +72,11 @@ def _plate(path: Path, max_pixels: int | None) -> dict[str, str]:
 def _as_given(
     search: LayoutSearch, layouts: Mapping[Names, FiducialLayout], pitch_um: tuple[float, float], count: Count
 ) -> list[Trial]:
-    """The trials at the given pitch, or, as long as no layout is found at that, with pixels that are longer one way."""
+    """The trials at the given pitch, or with pixels that are longer one way."""
     tries = dict[Names, Tried]()
-    for done, (names, layout) in enumerate(reversed(list(layouts.items()))):
+    for done, (names, layout) in enumerate(layouts.items()):
         count(f"the marks of {', '.join(names)}", done, 2 * len(layouts))
-        is_right = any(each.answer.expected <= _CERTAIN for each in tries.values())
-        tries[names] = search.at_pitch(layout, pitch_um, is_right)
+        tries[names] = search.at_pitch(layout, pitch_um)
     return _trials(search, tries, count)
 
 

@@ -52,14 +52,14 @@ class LayoutSearch:
         )
         self._known: list[Tried] = []
 
-    def at_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float], is_right: bool) -> Tried:
-        """At the scan's pitch or, unless it is right, with pixels that are longer one way."""
+    def at_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
+        """At the scan's pitch, or with pixels that are longer one way."""
         bold = _boldest(layout)
         picture = self._solid if all(_is_solid(mark) for mark in bold.marks) else self._fine
         times = self._whole.width_px / picture.width_px
         options = FiducialOptions(pitch_is_right=True)
         hypotheses = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
-        return self._tried(layout, bold, picture, hypotheses[:1] if is_right else hypotheses)
+        return self._tried(layout, bold, picture, hypotheses)
 
     def at_any_pitch(self, layout: FiducialLayout) -> Tried:
         """Where the frame may fill the scan."""
