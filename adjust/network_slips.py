@@ -59,6 +59,8 @@ def network_slip(network: Network, given: Adjustment | None, tried: Tried, famil
     sigma0 must be CLEARLY smaller, too. Hypotheses that leave the same residuals are tried once, without what is given
     of orientations, by which they are then told apart.
     """
+    if given is None:  # the approximations that were given may be all that is wrong
+        given = tried(network)
     if given is not None and _explains(given, family):
         return ""
     bare = replace(network, images=tuple(replace(image, exterior=None) for image in network.images))
@@ -252,7 +254,7 @@ def stations_elsewhere(network: Network, result: Adjustment) -> str:
     another unit, exchanged frames, or mirrored points of a flat field; empty where nothing does.
     """
     given = _given_stations(network)
-    if result.termination == "singular" or len(given) < 2:
+    if result.termination == "singular" or len(given) < 2 or not network.observed_points:
         return ""
     names, places = list(given), np.array(list(given.values()))
     stations, depths = _stations(result, given)

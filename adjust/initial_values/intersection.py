@@ -60,6 +60,7 @@ def _nearest(across: Array, centers: Array, point: Index, known: Array, usable: 
     either = given[:, :, None] | given[:, None, :]
     normal = np.where(either, np.eye(3), normal)
     points = np.full(known.shape, np.nan)
-    if usable.any():
-        points[usable] = np.linalg.solve(normal[usable], right[usable][..., None])[..., 0]
+    solvable = usable & (np.linalg.det(normal) != 0.0)  # of rays that all lost their weight nothing is left
+    if solvable.any():
+        points[solvable] = np.linalg.solve(normal[solvable], right[solvable][..., None])[..., 0]
     return points
