@@ -265,6 +265,7 @@ pad_mm = 1.4
 [scan]
 pitch_um = 40.0
 margin_mm = 4.0
+noise = 0.004
 [[writing]]
 text = "RUN 7 16.5.68"
 xy_mm = [-13.5, -2.0]
