@@ -107,6 +107,8 @@ def _measured(
         raise ValueError(f"{scan.name}: predicted twice: {', '.join(twice)}; each point is right once")
     refused = {prediction.point: _refusal(prediction, scan) for prediction in predictions}
     sought = [prediction for prediction in predictions if refused[prediction.point] is None]
+    # A disk near several places is fitted from the first: in what order they are given must not matter.
+    sought.sort(key=lambda prediction: prediction.point)
     found = {row.prediction.point: row for row in _identified(scan, sought, options, shape)}
     return tuple(_mark(refused[prediction.point] or found[prediction.point]) for prediction in predictions)
 

@@ -18,7 +18,7 @@ OPTIONAL = ("sX", "sY", "sZ", "nX", "nY", "nZ")
 
 @dataclass(frozen=True)
 class GivenPoints:
-    """Object points in the user's unit; normals (3,) of unit length for the disks that have one."""
+    """Object points in the user's unit, by their ids; normals (3,) of unit length for the disks that have one."""
 
     points: tuple[ObjectPoint, ...]
     normals: Mapping[str, NDArray[np.float64]]
@@ -42,7 +42,9 @@ def read_points(path: Path) -> GivenPoints:
             normals[id] = normal
     if not points:
         raise InputError(f"{path}: holds no point, only a header.")
-    return GivenPoints(tuple(points.values()), normals)
+    # Not as they stand in the file: sums, random draws and which target has a disk fitted first go by this order, and
+    # no digit of a result should.
+    return GivenPoints(tuple(points[id] for id in sorted(points)), normals)
 
 
 def _coordinate(row: Row, axis: str) -> Prior | None:

@@ -139,12 +139,14 @@ def test_small_disks_are_flagged_where_too_few_others_tell_what_they_look_like()
 
 
 def test_the_order_of_predictions_does_not_matter() -> None:
-    field = Field(7, np.array([5.0, 3.0]))
+    """Every disk lies near several places, so that another one is the first to have it fitted."""
+    field = Field(7, np.array([5.0, 3.0]), search_px=110.0)
     marks = field.measured()
     field.predictions.reverse()
     for name, mark in field.measured().items():
-        assert mark.status is marks[name].status
-        np.testing.assert_allclose(np.array(mark.center_px), np.array(marks[name].center_px), atol=0.01)
+        assert (mark.status, mark.reason, mark.quality) == (marks[name].status, marks[name].reason, marks[name].quality)
+        np.testing.assert_array_equal(np.array(mark.center_px), np.array(marks[name].center_px))
+        np.testing.assert_array_equal(mark.covariance_px2, marks[name].covariance_px2)
 
 
 def test_a_blank_scan_gives_rows_and_reasons() -> None:

@@ -1,6 +1,8 @@
 """The whole chain on rendered film, against its truth: three frames of the demonstration, and by hand all of it."""
 
 import json
+import random
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -8,6 +10,9 @@ import pytest
 from demonstration import FRAMES
 
 from pipeline.cli import DONE, run
+from pipeline.files.project_file import read_project
+from pipeline.measuring.comparator_file import write_comparator
+from pipeline.measuring.measure_stage import measure_scan
 from pipeline.rendered.against_truth import compare_with_truth
 
 in_its_group = pytest.mark.xdist_group("demonstration")  # one run of it serves all
@@ -44,6 +49,25 @@ def test_its_frames_are_measured_right_and_calibrated_within_their_sigmas(finish
 @in_its_group
 def test_its_frames_agree_with_opencv_and_are_reported(finished: tuple[Path, int]) -> None:
     assert_agrees_with_opencv_and_reports(finished[0], f"frame{FRAMES}")
+
+
+@in_its_group
+def test_the_order_of_points_csv_changes_no_digit(finished: tuple[Path, int], tmp_path: Path) -> None:
+    shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("out", "comparator.csv"))
+    head, *rows = (tmp_path / "points.csv").read_text(encoding="utf-8").splitlines()
+    random.Random(4).shuffle(rows)
+    (tmp_path / "points.csv").write_text("\n".join([head, *rows]), encoding="utf-8")
+    project = read_project(tmp_path / "project.toml")
+    scan = measure_scan(project, "frame1")
+    write_comparator(project.comparator, [scan.frame], {"frame1": scan.pitch_um})
+    before = (finished[0] / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    shuffled = project.comparator.read_text(encoding="utf-8").splitlines()
+    assert marks_of("frame1", shuffled) == marks_of("frame1", before)
+    assert len(marks_of("frame1", before)) > 40
+
+
+def marks_of(image: str, comparator: list[str]) -> list[str]:
+    return [line for line in comparator if line.startswith(f"{image},")]
 
 
 @pytest.mark.slow
