@@ -28,7 +28,7 @@ from measure.fitting.picture_model import GREY, PictureModel, State, background_
 from measure.fitting.scan_window import Coding, ScanWindow
 from measure.fitting.second_order import second_order
 from measure.fitting.second_place import SecondPlace, edge_place, sloping_place
-from measure.fitting.tone_estimate import told_tone
+from measure.fitting.tone_estimate import told_tone, untold_tone
 from measure.marks.rendering import extent_px, frame_beside, known
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Polygon
 from measure.match_options import MatchOptions
@@ -378,8 +378,10 @@ def _tone(fit: PictureFit, linear: LinearFit) -> ToldTone | None:
     """What the picture says of the tone curve, None where that is known, or the mark is a chip, cut from scans of the
     same curve."""
     model, coding = fit.model, fit.coding
-    if coding.tone.is_known or isinstance(model.mark, MarkTemplate) or model.background_px is not None:
+    if coding.tone.is_known or isinstance(model.mark, MarkTemplate):
         return None
+    if model.background_px is not None:
+        return untold_tone(linear, model.light, model.detail, coding.tone, coding.full_scale_dn)
     drawn = model.grey - (model.uncensored if model.is_clipped else model.residuals)
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
     return told_tone(linear, drawn, model.grey, clear, coding.tone, coding.full_scale_dn)

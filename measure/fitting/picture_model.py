@@ -59,6 +59,7 @@ class PictureModel:
     border_unknowns: how many a border in the ground has; border: where they stand in the design.
     bent: how far, in units of the blur, a series may bend the drawing before it is drawn anew.
     start: where the mark is expected, where the state begins too.
+    light (height, width): grey values with their surroundings, grey: what is fitted of them.
     ground (3, height, width): offset and slopes of the background.
     clipped (height, width): as `clipped_sides` gives it. noise_dn: standard deviation of the noise, which clipped grey
     values need; tells (height, width): False where a clipped one says nothing of it. slopes and information (height,
@@ -88,7 +89,7 @@ class PictureModel:
         is_chip = isinstance(mark, MarkTemplate)
         self.smoothed_px2 = _CHIP_SMOOTHED_PX**2 if is_chip else 0.0
         seen = np.asarray(cv2.GaussianBlur(grey, (0, 0), _CHIP_SMOOTHED_PX), dtype=float) if is_chip else grey
-        self.grey = self._detail(seen)
+        self.light, self.grey = seen, self.detail(seen)
         self.generators = generators(options.freedom, mark)
         self.linear = slice(2, 2 + len(self.generators))
         self.blur = 2 + len(self.generators) if options.estimate_blur else None
@@ -121,7 +122,7 @@ class PictureModel:
         place = self.state.pixel_from_mark
         shown = self._shown(width, height)
         greys = self.design[-GREY:]
-        greys[0], greys[1:] = self._detail(shown.value), self.ground
+        greys[0], greys[1:] = self.detail(shown.value), self.ground
         if not self.state.greys.any():
             self.state = State(place, self.state.variance_px2, factors(greys * used, self.grey))
         columns = self.design[: self.border.start]
@@ -134,13 +135,13 @@ class PictureModel:
         if self.blur is not None:
             columns[self.blur] = -0.5 * shown.laplacian
         if self.background_px is not None:
-            columns[:] = [self._detail(column) for column in columns]
+            columns[:] = [self.detail(column) for column in columns]
         contrast, beyond = self._by_border(shown)
         columns *= -contrast
         self.residuals = self.grey - combined(self.state.greys, greys) - beyond
         self._censor()
         if isinstance(self.mark, MarkTemplate):
-            self.half_tones = self.state.greys[0] * self._detail(4 * shown.value * (1 - shown.value))
+            self.half_tones = self.state.greys[0] * self.detail(4 * shown.value * (1 - shown.value))
             self.steadiness = chip_steadiness(self.mark, place, width, height)
             for each in (self.residuals, self.design, self.half_tones):
                 each *= self.steadiness
@@ -156,7 +157,7 @@ class PictureModel:
 
     def take_grey(self, grey: Array) -> None:
         """Other grey values (height, width) for the same light."""
-        change, self.grey = grey - self.grey, grey
+        change, self.grey, self.light = grey - self.grey, grey, grey
         self.residuals = self.residuals + change
         if self._linearised is not None:
             at, residuals = self._linearised
@@ -336,8 +337,8 @@ class PictureModel:
             return "the fit wants a mark of another size or direction than the one drawn"
         return ""
 
-    def _detail(self, image: NDArray[np.floating]) -> Array:
-        """Grey values, or their model, without what is coarser than the mark's lines."""
+    def detail(self, image: NDArray[np.floating]) -> Array:
+        """(height, width) grey values, or their model, without what is coarser than the mark's lines."""
         if self.background_px is None:
             return np.asarray(image, float)
         return np.asarray(image - cv2.GaussianBlur(image, (0, 0), self.background_px))

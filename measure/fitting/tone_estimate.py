@@ -4,6 +4,8 @@ In light the two sides of a blurred edge are alike; under a wrong curve one of t
 place, blur and contrast are fitted, and by how much tells the curve: one more linear estimate from the residuals.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,9 +40,22 @@ def told_tone(fit: LinearFit, drawn: Array, grey: Array, clear: Mask, tone: Tone
     covariance = fit.covariance(left)
     covariance += _LEAST_VARIANCE * max(float(np.trace(covariance)), 1e-30) * np.eye(len(covariance))
     said = SaidOfTone.by_score(normal, score + normal @ tone.mean, covariance)
-    codes = tone.code(np.quantile(drawn[fit.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
-    on_place = products(fit.by_grey[:2], tone.changes(grey, full_scale_dn) * fit.used)
-    return ToldTone(said, on_place, float(codes[0]), float(codes[1]))
+    return _told(fit, said, tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
+
+
+def untold_tone(
+    fit: LinearFit, light: Array, detail: Callable[[Array], Array], tone: Tone, full_scale_dn: float
+) -> ToldTone:
+    """Of a mark whose detail alone was fitted: the curve moves it all the same, but its picture says nothing of the
+    curve, for its surroundings are not drawn. light (height, width): with these; detail: takes them away."""
+    changes = np.stack([detail(each) for each in tone.changes(light, full_scale_dn)])
+    return _told(fit, SaidOfTone.nothing(), changes, tone, light, full_scale_dn)
+
+
+def _told(fit: LinearFit, said: SaidOfTone, changes: Array, tone: Tone, light: Array, full_scale_dn: float) -> ToldTone:
+    """changes (k, height, width): of what was fitted, by the departures; light (height, width): of the picture."""
+    codes = tone.code(np.quantile(light[fit.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
+    return ToldTone(said, products(fit.by_grey[:2], changes * fit.used), float(codes[0]), float(codes[1]))
 
 
 def _beside(fit: LinearFit, changes: Array) -> Array:

@@ -64,8 +64,9 @@ class FrameTone:
         return float(np.hypot(*(told.on_place @ (self.tone.mean - before.mean))))
 
     def covariance_px2(self, told: ToldTone) -> Array:
-        """(2, 2) of a mark's place, for what is not known of the curve."""
-        return np.asarray(told.on_place @ self.tone.covariance @ told.on_place.T)
+        """(2, 2) of a mark's place, for what is not known of the curve, whose variance of unit weight is by how much
+        the marks contradict one another on it: as much then moves them that is no curve."""
+        return np.asarray((1 + self.contradiction) * told.on_place @ self.tone.covariance @ told.on_place.T)
 
     def step_from(self, before: Tone) -> Tone:
         """The curve to match with next: no farther from the one before than what was linearised there holds."""

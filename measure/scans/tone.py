@@ -62,6 +62,11 @@ class SaidOfTone:
     count: int
 
     @classmethod
+    def nothing(cls) -> "SaidOfTone":
+        size = len(_SIGMAS)
+        return cls(np.zeros((size, size)), np.zeros(size), 0.0, 0)
+
+    @classmethod
     def by_score(cls, normal: Array, score: Array, covariance: Array) -> "SaidOfTone":
         """Of a score (k,) of that covariance (k, k) that grows with the departures by a normal matrix (k, k)."""
         weighted = np.linalg.solve(covariance, np.column_stack([normal, score])).T
@@ -162,6 +167,8 @@ class Tone:
         """By how much more than by chance pictures contradict this curve: chi-square over its degrees of freedom, less
         what chance makes of that."""
         count = sum(one.count for one in each)
+        if not count:
+            return 0.0
         misfit = sum(one.misfit(self.mean) for one in each) / count
         return max(misfit - 1 - _CHANCE_SIGMAS * float(np.sqrt(2 / count)), 0.0)
 
