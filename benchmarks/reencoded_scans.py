@@ -4,24 +4,27 @@
 
 FOLDER holds the frames of aerial film (film_scans/aerial of the test data). Each is decoded and coded anew, in 16 bits,
 by light = code ** 2.2 and by its inverse, so that what the scanner coded with one curve now has three. Every copy is
-measured by itself, with nothing said of its curve; --linear takes grey values as light, as a comparison. Told are the
-differences of places between the copies in their own standard deviations: those without what the copies share, film
-and grain, which moves no copy against another.
+measured by itself, with nothing said of its curve; --linear takes grey values as light, as a comparison. Told is how
+far each mark lies elsewhere in one copy than in another, in px and in the standard deviations of both claims together,
+with its statuses; then the largest of each frame, of marks that both copies call `measured` and of all.
 """
 
 import argparse
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.results import FrameMeasurement
+from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan, open_scan
 from measure.scans.tone import LINEAR, Tone
+from measure.status import Status
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path
 
@@ -35,6 +38,17 @@ CAMERAS = {
     "d2ee9cf2": "wild-rc8-153",
 }
 POWERS = {"as it is": 1.0, "2.2": 2.2, "1/2.2": 1 / 2.2}
+
+
+class Row(NamedTuple):
+    """A mark in two copies: how far apart, and that in the standard deviations of both claims together."""
+
+    frame: str
+    copies: str
+    point: str
+    statuses: tuple[Status, Status]
+    px: float
+    sigmas: float
 
 
 def copies(scan: Scan) -> dict[str, Scan]:
@@ -58,6 +72,7 @@ def main() -> None:
     parser.add_argument("--frame", default="")
     options = parser.parse_args()
     tone = LINEAR if options.linear else Tone.unknown()
+    rows: list[Row] = []
     for frame, camera in CAMERAS.items():
         if options.frame not in frame:
             continue
@@ -67,17 +82,42 @@ def main() -> None:
             curve = result.tone.tone if result.tone else "no frame"
             statuses = ", ".join(f"{mark.point} {mark.status}" for mark in result.marks if mark.center_px is not None)
             print(f"{frame} {name:>8}: {curve}; {statuses}", flush=True)
-        for one, other in combinations(results, 2):
-            for a, b in zip(results[one].marks, results[other].marks, strict=True):
-                if not (a.status.is_observation and b.status.is_observation):
-                    continue
-                off = np.asarray(a.center_px) - np.asarray(b.center_px)
-                known = [np.asarray(mark.covariance_px2) for mark in (a, b)]
-                sigmas = [float(np.sqrt(off @ np.linalg.solve(each, off))) for each in known]
-                print(
-                    f"  {one:>8} - {other:<5} mark {a.point}: {off[0]:+.3f} {off[1]:+.3f} px, "
-                    f"{sigmas[0]:.1f} and {sigmas[1]:.1f} of their sigmas {a.covariance} {b.covariance}"
-                )
+        rows += differences(frame, results)
+    print_table(rows)
+
+
+def differences(frame: str, results: Mapping[str, FrameMeasurement]) -> list[Row]:
+    """One for each mark that two copies have."""
+    return [
+        _row(frame, f"{one} - {other}", a, b)
+        for one, other in combinations(results, 2)
+        for a, b in zip(results[one].marks, results[other].marks, strict=True)
+        if a.status.is_observation and b.status.is_observation
+    ]
+
+
+def _row(frame: str, copies: str, a: MarkMeasurement, b: MarkMeasurement) -> Row:
+    assert a.center_px is not None
+    assert b.center_px is not None
+    assert a.covariance is not None
+    assert b.covariance is not None
+    off = np.asarray(a.center_px) - np.asarray(b.center_px)
+    sigmas = float(np.sqrt(off @ np.linalg.solve(a.covariance.px2 + b.covariance.px2, off)))
+    return Row(frame, copies, a.point, (a.status, b.status), float(np.hypot(*off)), sigmas)
+
+
+def print_table(rows: Sequence[Row]) -> None:
+    print(f"\n{'frame':10}{'copies':18}{'mark':6}{'statuses':22}{'px':>7}{'sigmas':>8}")
+    for row in rows:
+        statuses = ", ".join(row.statuses)
+        print(f"{row.frame:10}{row.copies:18}{row.point:6}{statuses:22}{row.px:7.3f}{row.sigmas:8.1f}")
+    print(f"\n{'largest differences':36}{'pairs':>6}{'px':>8}{'sigmas':>8}")
+    for frame in dict.fromkeys(row.frame for row in rows):
+        for least in (2, 0):
+            some = [row for row in rows if row.frame == frame and row.statuses.count(Status.MEASURED) >= least]
+            name = f"{frame}, {'measured in both' if least else 'all'}"
+            worst = (max((row.px for row in some), default=0.0), max((row.sigmas for row in some), default=0.0))
+            print(f"{name:36}{len(some):6}{worst[0]:8.3f}{worst[1]:8.1f}")
 
 
 if __name__ == "__main__":

@@ -108,6 +108,7 @@ def count_tone(sighter: FrameSighter) -> None:
         if fit.tone is None:
             continue
         sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(fit.tone))
+        sighter.widen(index, Cause.TONE, sighter.tone.covariance_of_own_px2(fit.tone, sighter.prior_tone))
         if sighter.tone.contradiction > _CONTRADICTED and fit.tone.leans_px > fit.sigma_px:
             sighter.doubt(index, "the marks' edges agree on no tone curve: they are not as drawn, or lit unevenly")
 

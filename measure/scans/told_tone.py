@@ -11,6 +11,7 @@ from measure.scans.tone import SaidOfTone, Tone
 Array = NDArray[np.float64]
 
 _LONGEST = 1.0  # departure that is changed at a time, in its standard deviations
+_CHANCE = 4.0  # square of the standard deviations by which a mark's own picture puts it elsewhere by chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +68,16 @@ class FrameTone:
         """(2, 2) of a mark's place, for what is not known of the curve, whose variance of unit weight is by how much
         the marks contradict one another on it: as much then moves them that is no curve."""
         return np.asarray((1 + self.contradiction) * told.on_place @ self.tone.covariance @ told.on_place.T)
+
+    def covariance_of_own_px2(self, told: ToldTone, prior: Tone) -> Array:
+        """(2, 2) of a mark's place, for how far the curve that its own picture wants would move it from here, beyond
+        what chance makes of that: a scan has one curve, so something else is in its edges."""
+        if not told.said.count:
+            return np.zeros((2, 2))
+        own, _ = prior.told([told.said], doubting=False)
+        off = told.on_place @ (own.mean - self.tone.mean)
+        by_chance = _CHANCE * float(np.trace(told.on_place @ own.covariance @ told.on_place.T))
+        return np.asarray(max(1 - by_chance / max(float(off @ off), 1e-12), 0.0) * np.outer(off, off))
 
     def step_from(self, before: Tone) -> Tone:
         """The curve to match with next: no farther from the one before than what was linearised there holds."""

@@ -10,7 +10,7 @@ from measure.fitting.scan_window import read_window
 from measure.frames.refinement import options_for
 from measure.marks.shapes import MarkShape, polygon
 from measure.match_options import MatchOptions
-from measure.scans.told_tone import FrameTone
+from measure.scans.told_tone import FrameTone, ToldTone
 from measure.scans.tone import LINEAR, SaidOfTone, Tone, power, sampled, srgb
 from synthetic_images.tone_curve import coded
 
@@ -132,3 +132,55 @@ def test_a_cross_does_not_move_by_the_curve() -> None:
     fit = fitted(mark, code_of(mark, 2.2, 50.0, rng), Tone.unknown())
     assert fit.tone is not None
     assert np.abs(fit.tone.on_place).max() < 0.02
+
+
+def test_marks_that_contradict_one_another_on_the_curve_are_known_no_better_than_that() -> None:
+    rng = np.random.default_rng(6)
+    marks = [some_mark(TIP, 1.0, rng) for _ in range(4)]
+    codes = [code_between_ends(mark, power, rng) for mark, power in zip(marks, (1.0, 2.2, 1.0, 2.2), strict=True)]
+    prior = Tone.unknown()
+    fits, found = settled(marks, codes, prior)
+    for mark, fit in zip(marks, fits, strict=True):
+        assert fit.tone is not None
+        error, tone = fit.center_px - mark.place[:, 2], found.covariance_of_own_px2(fit.tone, prior)
+        covariance = fit.covariance_px2 + found.covariance_px2(fit.tone) + tone
+        assert np.sqrt(error @ np.linalg.solve(covariance, error)) < 4  # by the curve's covariance alone up to 12
+
+
+def code_between_ends(mark: TrueMark, power: float, rng: np.random.Generator) -> np.ndarray:
+    """The same ends whatever the curve between them, so that no single curve explains two of them."""
+    share = np.clip(mark.picture + rng.standard_normal(mark.picture.shape) / 80, 0.0, 1.0)
+    return FULL * (0.1 + 0.6 * (0.05 + 0.9 * share) ** (1 / power))
+
+
+def test_what_the_marks_contradict_one_another_by_is_the_variance_of_unit_weight() -> None:
+    told = {n: told_of(way * np.eye(5)[0]) for n, way in enumerate((1.0, -1.0, 1.0, -1.0))}
+    agreed = {n: told_of(np.zeros(5)) for n in range(4)}
+    prior = Tone.unknown()
+    sigma, sigma_agreed = (
+        float(np.sqrt(FrameTone.of(prior, each, prior).covariance_px2(each[0])[0, 0])) for each in (told, agreed)
+    )
+    assert sigma_agreed < 0.06  # four marks, each 0.1 px
+    assert sigma > 1.0  # they are 1 px from what they agree on
+
+
+def told_of(departures: np.ndarray) -> ToldTone:
+    """A mark that says them with a standard deviation of 0.1, and moves by 1 px for each."""
+    information = 100 * np.eye(5)
+    said = SaidOfTone(information, information @ departures, float(departures @ information @ departures), 5)
+    return ToldTone(said, np.eye(2, 5), 0.1, 0.7)
+
+
+def test_a_mark_whose_detail_alone_was_fitted_moves_with_the_curve_and_says_nothing_of_it() -> None:
+    rng = np.random.default_rng(7)
+    mark, prior = some_mark(KIND["cross"], 1.0, rng), Tone.unknown()
+    row, col = np.mgrid[: mark.size, : mark.size]
+    landscape = 1 + 0.15 * (np.sin(col / 5) * np.sin(row / 5) - 1)
+    told = fitted(mark, landscape * code_of(mark, 2.2, 100.0, rng), prior).tone
+    assert told is not None
+    assert told.said.count == 0
+    found = FrameTone.of(prior, {0: told}, prior)
+    assert found.contradiction == 0.0
+    assert np.array_equal(found.tone.covariance, np.eye(5))
+    assert 0.005 < np.sqrt(np.trace(found.covariance_px2(told))) < 0.1
+    assert not found.covariance_of_own_px2(told, prior).any()
