@@ -101,7 +101,7 @@ LINES = (
         "pipeline/measuring/comparator_file.py",
         "np.array([pitch_um[0], -pitch_um[1]]) / 1000.0)\n\n\ndef pixel",
         "np.array([pitch_um[0], pitch_um[1]]) / 1000.0)\n\n\ndef pixel",
-        "pipeline/test_film_files.py",
+        "pipeline/test_demo.py",
     ),
     Broken(
         "pipeline/adjusting/network.py",
@@ -192,7 +192,7 @@ LINES = (
         "self.vpv / self.conditions",
         "adjust/test_adjust_reference.py",
     ),
-    Broken("adjust/choices/comparison.py", "chi / freedom) if", "chi) if", "adjust/test_comparison.py"),
+    Broken("adjust/choices/comparison.py", "chi / freedom)) if", "chi)) if", "adjust/test_comparison.py"),
     Broken(
         "adjust/undetermined/datum.py",
         "sum(axis=1).mean())) or 1.0",
