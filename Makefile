@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
+TESTED := $(VENV)/ready-to-test
 
 .PHONY: demo test lint types suite clean
 
@@ -15,23 +16,29 @@ test: lint
 
 # One BLAS thread a worker: two on two cores make the small factorisations ten times slower.
 suite: export OPENBLAS_NUM_THREADS = 1
-suite: $(READY)
+suite: $(TESTED)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
-lint: $(READY)
+lint: $(TESTED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(READY)
+types: $(TESTED)
 	$(BIN)/mypy
 
-# The second lock file's package carries the networks that read writing; what it asks for itself would replace OpenCV.
+# What running needs. The second lock file's package carries the networks that read writing; what it asks for itself would
+# replace OpenCV.
 $(READY): requirements.lock requirements-no-deps.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "reseau needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Say which one to use: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --requirement requirements.lock
 	$(BIN)/pip install --quiet --no-deps --requirement requirements-no-deps.lock
 	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+# What testing needs beside it: the checkers, the extras of every command, and what stands in for servers.
+$(TESTED): $(READY) requirements-test.lock
+	$(BIN)/pip install --quiet --requirement requirements-test.lock
 	touch $@
 
 clean:
