@@ -98,7 +98,7 @@ LINES = (
         "pipeline/test_perspective_disks.py",
     ),
     Broken(
-        "pipeline/measuring/comparator_file.py",
+        "pipeline/results/comparator_file.py",
         "np.array([pitch_um[0], -pitch_um[1]]) / 1000.0)\n\n\ndef pixel",
         "np.array([pitch_um[0], pitch_um[1]]) / 1000.0)\n\n\ndef pixel",
         "pipeline/test_demo.py",

@@ -18,9 +18,9 @@ import numpy as np
 import synthetic_images
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.files.project_file import read_project
-from pipeline.measuring.comparator_file import read_comparator
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import read_scene, render_project
+from pipeline.results.comparator_file import read_comparator
 from pipeline.stages import run_measure
 
 SCENES = Path(synthetic_images.__file__).parent / "scenes"

@@ -1,11 +1,11 @@
-from .adjusting.adjustment_file import write_adjustment as write_adjustment
 from .adjusting.network import build_network as build_network
 from .errors import InputError as InputError
-from .files.adjustment_reader import read_adjustment as read_adjustment
 from .files.camera_file import read_camera as read_camera
 from .files.images_file import read_images as read_images
 from .files.points_file import read_points as read_points
 from .files.project_file import read_project as read_project
-from .measuring.comparator_file import read_comparator as read_comparator
-from .measuring.comparator_file import write_comparator as write_comparator
-from .measuring.measurement_file import read_measurement as read_measurement
+from .results.adjustment_file import write_adjustment as write_adjustment
+from .results.adjustment_reader import read_adjustment as read_adjustment
+from .results.comparator_file import read_comparator as read_comparator
+from .results.comparator_file import write_comparator as write_comparator
+from .results.measurement_file import read_measurement as read_measurement

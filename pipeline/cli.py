@@ -16,7 +16,6 @@ import typer
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from pipeline import stages
-from pipeline.adjusting.adjustment_file import without_nan
 from pipeline.adjusting.choose_stage import choice_json, print_choice, run_choose
 from pipeline.adjusting.compare_stage import DRIFT, comparison_json, print_comparison, run_compare, verdict
 from pipeline.demo import run_demo
@@ -30,6 +29,7 @@ from pipeline.measuring.scan_kinds import identify_kinds, print_kinds, scan_file
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 from pipeline.resampling.resample_stage import resample, resampled_json
+from pipeline.results.adjustment_file import without_nan
 from pipeline.summary import Summary, print_summary
 from pipeline.terminal import PlainConsole, plain, spell_out_missing_letters
 

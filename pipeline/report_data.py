@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.files.adjustment_reader import read_adjustment, read_covariance
 from pipeline.files.project_file import Project
-from pipeline.files.text_file import read_json
-from pipeline.measuring.comparator_file import measurement_of, read_comparator
+from pipeline.publishing.made_from import CAMERA, PLACES, SCAN, SETTINGS, adjusted_from, differing, measured_from
+from pipeline.publishing.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
+from pipeline.results.adjustment_reader import read_adjustment, read_covariance
+from pipeline.results.comparator_file import measurement_of, read_comparator
 from pipeline.results.fingerprints import of_file
-from pipeline.results.made_from import CAMERA, PLACES, SCAN, SETTINGS, adjusted_from, differing, measured_from
-from pipeline.results.publishing import outside_note
-from pipeline.wording import listed
+from pipeline.text.text_file import read_json
+from pipeline.text.wording import listed
 
 Json = dict[str, Any]
 At = Callable[[Path], Path]

@@ -7,27 +7,28 @@ from importlib.metadata import version
 
 from adjust.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
-from pipeline.adjusting.adjustment_file import write_adjustment
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.adjusting.second_visit import measure_again
 from pipeline.errors import InputError, WriteError
-from pipeline.files.adjustment_reader import covariance_path
-from pipeline.files.atomic import write_atomically
-from pipeline.files.images_file import fill_images
+from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
-from pipeline.measuring.comparator_file import ComparatorPoint, read_comparator, write_comparator
-from pipeline.measuring.frames_file import for_images, write_frames
 from pipeline.measuring.measure_stage import measure_scans
-from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.progress import Reporter
+from pipeline.publishing.made_from import MadeFrom, adjusted_from, measured_from
+from pipeline.publishing.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
 from pipeline.report.page import write_report
 from pipeline.report_data import adjusted, measured
+from pipeline.results.adjustment_file import write_adjustment
+from pipeline.results.adjustment_reader import covariance_path
+from pipeline.results.comparator_file import ComparatorPoint, read_comparator, write_comparator
 from pipeline.results.fingerprints import of_file
-from pipeline.results.made_from import MadeFrom, adjusted_from, measured_from
-from pipeline.results.publishing import Unpublished, unpublished
+from pipeline.results.frames_file import for_images, write_frames
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measurement_file import read_measurement, write_measurement
 from pipeline.summary import Summary, summarise
+from pipeline.text.atomic import write_atomically
 from pipeline.thumbnails import Thumbnails
 
 
@@ -153,7 +154,7 @@ def _write_marks(project: Project, scans: Sequence[MeasuredScan], made_from: Mad
 def _fill_images(project: Project, scans: Sequence[MeasuredScan]) -> None:
     """What was read on the film, where the user's own list has empty columns for it."""
     if project.images_path is not None:
-        fill_images(project.images_path, for_images(scans))
+        fill_images(project.images_path, for_images(scans, WRITTEN))
 
 
 def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished) -> None:

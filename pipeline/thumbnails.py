@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from measure.errors import MeasurementError
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan, open_scan
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.report.data import Thumbnail
+from pipeline.results.measured_scan import MeasuredScan
 
 _FIDUCIAL_PX, _TARGET_PX = 81, 41  # the least width of a window
 _SHOWN_PX = 96  # a larger window is reduced to about this many pixels

@@ -42,6 +42,7 @@ def test_package_imports_only_what_the_architecture_allows(package: str) -> None
         ("measure", "pose", "frames"),
         ("adjust", "quality", "least_squares"),
         ("adjust", "result", "tested"),
+        ("pipeline", "files", "results"),
         ("pipeline", "adjusting", "measuring"),
     ],
 )
@@ -57,6 +58,12 @@ def test_the_formulas_of_adjust_know_no_network() -> None:
     linear_algebra, functional_model = (ROOT / "adjust" / name for name in ("linear_algebra", "functional_model"))
     assert rooms_used(linear_algebra, "adjust") == {"linear_algebra"}
     assert rooms_used(functional_model, "adjust") == {"linear_algebra", "functional_model"}
+
+
+def test_the_ground_and_the_formats_of_pipeline_know_no_project() -> None:
+    text, results = (ROOT / "pipeline" / name for name in ("text", "results"))
+    assert rooms_used(text, "pipeline") == {"text", "errors"}
+    assert rooms_used(results, "pipeline") == {"text", "errors", "results"}
 
 
 def rooms_used(room: Path, package: str) -> set[str]:

@@ -14,9 +14,9 @@ from adjust.result import Adjustment
 from pipeline.adjusting.network import build_network, unmeasured_points
 from pipeline.adjusting.scanners import with_scanners
 from pipeline.files.project_file import Project
-from pipeline.measuring.comparator_file import ComparatorPoint
 from pipeline.measuring.perspective_disks import across, disk_normals, eccentricity_mm, plane_normal
-from pipeline.wording import listed
+from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.text.wording import listed
 
 Array = NDArray[np.float64]
 

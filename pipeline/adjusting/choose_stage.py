@@ -15,13 +15,13 @@ from adjust.choices.candidates import Candidate
 from adjust.choices.model_choice import Choice, choose
 from adjust.choices.models import Model
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
-from pipeline.adjusting.adjustment_file import without_nan
-from pipeline.files.atomic import write_atomically
 from pipeline.files.project_file import Project
-from pipeline.measuring.comparator_file import read_comparator
 from pipeline.progress import Reporter
-from pipeline.results.made_from import adjusted_from
-from pipeline.results.publishing import unpublished
+from pipeline.publishing.made_from import adjusted_from
+from pipeline.publishing.publishing import unpublished
+from pipeline.results.adjustment_file import without_nan
+from pipeline.results.comparator_file import read_comparator
+from pipeline.text.atomic import write_atomically
 
 Json = dict[str, Any]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from adjust.choices.comparison import Comparison
-from pipeline.files.atomic import atomic_path
+from pipeline.text.atomic import atomic_path
 
 _RADII = 2.447747  # sigmas: the radius of an ellipse that holds 95 % of a plane's normal distribution
 _ARROW = 0.11  # of the frame's width: the longest arrow, or half the longest axis of an ellipse

@@ -13,13 +13,13 @@ from rich.text import Text
 
 from adjust.choices.comparison import CameraCalibration, Comparison, Test, Use, compare
 from adjust.functional_model.families import parameter_names
-from pipeline.adjusting.adjustment_file import without_nan
 from pipeline.adjusting.compare_picture import draw_comparison
 from pipeline.errors import InputError
-from pipeline.files.adjustment_reader import calibrated_lens, read_adjustment, read_covariance
-from pipeline.files.atomic import check_writable, write_atomically
-from pipeline.spelling import did_you_mean
-from pipeline.wording import listed
+from pipeline.results.adjustment_file import without_nan
+from pipeline.results.adjustment_reader import calibrated_lens, read_adjustment, read_covariance
+from pipeline.text.atomic import check_writable, write_atomically
+from pipeline.text.spelling import did_you_mean
+from pipeline.text.wording import listed
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

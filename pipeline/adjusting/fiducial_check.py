@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
-from pipeline.measuring.comparator_file import ComparatorPoint
+from pipeline.results.comparator_file import ComparatorPoint
 
 OTHER_UNIT = 5.0  # film and paper keep their size to some percent; the nearest other unit, cm, is ten times as large
 

@@ -23,9 +23,9 @@ from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import UNITS_MM, Project
-from pipeline.measuring.comparator_file import ComparatorPoint
-from pipeline.spelling import did_you_mean
-from pipeline.wording import listed
+from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.text.spelling import did_you_mean
+from pipeline.text.wording import listed
 
 Array = NDArray[np.float64]
 

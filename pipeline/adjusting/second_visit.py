@@ -14,11 +14,11 @@ from measure.scans.scan import open_scan
 from measure.status import Status
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field, measure_single_targets, target_field
 from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.target_stage import with_targets
 from pipeline.progress import Reporter
+from pipeline.results.measured_scan import MeasuredScan
 
 _SEARCH_PX = 2.0  # an adjusted orientation predicts to far less than that
 

@@ -10,12 +10,12 @@ import numpy as np
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.network import EXTERIOR_NAMES, Image
-from pipeline.adjusting.adjustment_file import ANGLES, DEG_PER_RAD, without_nan
 from pipeline.design.alternatives import Alternative
 from pipeline.design.expected import Expected, rms
 from pipeline.design.reliability import error_unit
 from pipeline.design.sweeps import Layouts, Swept
 from pipeline.design.variations import Variations
+from pipeline.results.adjustment_file import ANGLES, DEG_PER_RAD, without_nan
 
 Json = dict[str, Any]
 

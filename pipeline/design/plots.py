@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from pipeline.design.sweeps import Swept
-from pipeline.files.atomic import atomic_path
+from pipeline.text.atomic import atomic_path
 
 WIDE_RANGE = 2.0  # ratio of the largest to the smallest value from which on the axis is logarithmic
 STYLES = ("-", "--", ":", "-.")

@@ -15,8 +15,8 @@ from pipeline.design.plots import plot_sweep
 from pipeline.design.summary import print_design
 from pipeline.design.sweeps import Layouts, Swept, over_layouts, sweep
 from pipeline.design.variations import Variations
-from pipeline.files.atomic import check_writable, write_atomically
 from pipeline.progress import Reporter
+from pipeline.text.atomic import check_writable, write_atomically
 
 
 @dataclass(frozen=True, eq=False)

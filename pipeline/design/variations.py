@@ -10,10 +10,10 @@ import numpy as np
 
 from pipeline.design.setup import Setup, setup_of
 from pipeline.errors import InputError
-from pipeline.files.tables import Table, read_toml
 from pipeline.rendered.design_table import Sweep
 from pipeline.rendered.scene_file import parse_scene
-from pipeline.spelling import did_you_mean
+from pipeline.text.spelling import did_you_mean
+from pipeline.text.tables import Table, read_toml
 
 Values = dict[str, Any]
 

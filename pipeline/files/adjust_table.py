@@ -11,7 +11,7 @@ from adjust.network import Transformation
 from adjust.options import MEASURED_KINDS
 from adjust.quality.reweighting import WeightFunction
 from adjust.tested import PRIOR_GROUPS
-from pipeline.files.tables import Table
+from pipeline.text.tables import Table
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]

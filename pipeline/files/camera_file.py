@@ -15,8 +15,8 @@ from pipeline.files.camera_units import check_units
 from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.files.learned_table import Clicks, LearnedFrom, read_clicks, read_learned_from
 from pipeline.files.mark_table import read_mark
-from pipeline.files.tables import Table, read_toml
-from pipeline.spelling import did_you_mean
+from pipeline.text.spelling import did_you_mean
+from pipeline.text.tables import Table, read_toml
 
 NO_MARK = "none"  # a fiducial that is not to be looked for in scans
 CORNER_REACH = 1 / 6  # of half the frame: how far along its edges a corner is measured where nobody says

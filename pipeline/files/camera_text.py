@@ -9,7 +9,7 @@ from measure.marks import shapes
 from pipeline.files.camera_file import NO_MARK, CameraFile, GivenFiducial, written_place_text
 from pipeline.files.learned_table import LearnedFrom
 from pipeline.files.template_table import SavePicture, template_lines
-from pipeline.files.toml_text import numbers, quoted, sigma, sigmas
+from pipeline.text.toml_text import numbers, quoted, sigma, sigmas
 
 
 def camera_text(camera: CameraFile, save: SavePicture) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from measure.marks import shapes
 from measure.marks.rendering import extent_px
-from pipeline.files.tables import Table
+from pipeline.text.tables import Table
 
 FIELD_RATIO = 50.0  # of principal distance and half the diagonal, either way: 2.3 degrees of field to 178
 

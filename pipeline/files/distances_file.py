@@ -5,7 +5,7 @@ from pathlib import Path
 
 from adjust.network import Distance
 from pipeline.errors import InputError
-from pipeline.files.csv_table import Row, read_csv
+from pipeline.text.csv_table import Row, read_csv
 
 COLUMNS = ("from", "to", "distance", "sigma")
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.network import Calibration, Camera, Distortion, Fiducial, Prior
-from pipeline.files.adjustment_reader import Covariance, covariance_path, read_adjustment, read_covariance
-from pipeline.files.tables import Table
+from pipeline.results.adjustment_reader import Covariance, covariance_path, read_adjustment, read_covariance
+from pipeline.text.tables import Table
 
 Array = NDArray[np.float64]
 

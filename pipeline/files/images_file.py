@@ -11,9 +11,10 @@ import numpy as np
 
 from adjust.network import Exterior
 from pipeline.errors import InputError
-from pipeline.files.atomic import write_atomically
-from pipeline.files.csv_table import Row, read_csv
-from pipeline.files.text_file import read_bytes
+from pipeline.text.atomic import write_atomically
+from pipeline.text.csv_table import Row, read_csv
+from pipeline.text.image_names import image_name
+from pipeline.text.text_file import read_bytes
 
 ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = tuple(f"s{element}" for element in ELEMENTS)
@@ -71,14 +72,6 @@ def fill_images(path: Path, values: Mapping[str, Mapping[str, str]]) -> None:
     changed = "".join(lines)
     if changed != text:
         write_atomically(path, changed)
-
-
-def image_name(text: str) -> str:
-    """An image's name: its file's name without folder, without a picture's ending, and without blanks at its ends,
-    which no table keeps."""
-    path = Path(text)
-    endings = {".tif", ".tiff", ".jpg", ".jpeg", ".png"}
-    return (path.stem if path.suffix.lower() in endings else path.name).strip()
 
 
 def _exterior(row: Row, antenna: tuple[float, float, float]) -> Exterior | None:

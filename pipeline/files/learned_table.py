@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from measure.marks.poses import POSES
 from measure.marks.shapes import Point
-from pipeline.files.images_file import image_name
-from pipeline.files.tables import Table
+from pipeline.text.image_names import image_name
+from pipeline.text.tables import Table
 
 
 @dataclass(frozen=True)

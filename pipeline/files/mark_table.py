@@ -6,8 +6,8 @@ from typing import cast
 import numpy as np
 
 from measure.marks import shapes
-from pipeline.files.tables import Table
 from pipeline.files.template_table import read_template
+from pipeline.text.tables import Table
 
 KINDS = ("cross", "dot", "ring-cross", "ring-dot", "polygon", "parts", "template", "learned", "frame-corner")
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adjust.network import ObjectPoint, Prior
 from pipeline.errors import InputError
-from pipeline.files.csv_table import Row, read_csv
+from pipeline.text.csv_table import Row, read_csv
 
 REQUIRED = ("point", "X", "Y", "Z")
 OPTIONAL = ("sX", "sY", "sZ", "nX", "nY", "nZ")

@@ -15,15 +15,16 @@ from measure.marks.poses import POSES
 from measure.scans.scan import Scan, open_scan
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
-from pipeline.files.adjustment_reader import covariance_path
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.distances_file import GivenDistance, read_distances
-from pipeline.files.images_file import GivenImages, image_name, read_images
+from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import camera_path
 from pipeline.files.points_file import GivenPoints, read_points
-from pipeline.files.tables import Table, read_toml
 from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
+from pipeline.results.adjustment_reader import covariance_path
+from pipeline.text.image_names import image_name
+from pipeline.text.tables import Table, read_toml
 
 FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
 _COARSEST_PITCH_UM = 1e4  # above it nm were meant: film of a few pixels shows no mark

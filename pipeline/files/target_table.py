@@ -7,7 +7,7 @@ from typing import cast
 from measure.codes_and_boards.board_specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec
 from measure.codes_and_boards.ring_codes import RingCode
 from measure.marks.shapes import Polarity
-from pipeline.files.tables import Table
+from pipeline.text.tables import Table
 
 KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco")
 

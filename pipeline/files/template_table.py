@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from measure.errors import MeasurementError
 from measure.marks.shapes import MarkTemplate
 from measure.scans.scan import open_scan
-from pipeline.files.atomic import atomic_path
-from pipeline.files.tables import Table
-from pipeline.files.toml_text import numbers, quoted
+from pipeline.text.atomic import atomic_path
+from pipeline.text.tables import Table
+from pipeline.text.toml_text import numbers, quoted
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint16]

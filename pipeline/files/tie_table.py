@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from adjust.network import ObjectPoint, Prior
 from measure.natural_points.ties import TieOptions
-from pipeline.files.tables import Table
+from pipeline.text.tables import Table
 
 
 @dataclass(frozen=True)

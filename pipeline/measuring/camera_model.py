@@ -8,8 +8,8 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.transformation import Film
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.comparator_file import comparator_from_pixel, pixel_from_comparator
-from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 

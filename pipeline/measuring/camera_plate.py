@@ -6,7 +6,7 @@ from dataclasses import replace
 from measure.writing.fields import CAMERA, fields_of
 from measure.writing.line import Line
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.results.measured_scan import MeasuredScan
 
 _OTHER_CONE = 0.02  # of the principal distance: cameras of one cone differ by less
 _MAKERS = ("Wild", "Zeiss", "Jena", "Fairchild")

@@ -20,11 +20,11 @@ from pipeline.measuring.coded_points import (
     points_read,
     read_numbers,
 )
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field, target_field
 from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.unoriented import NamedField, name_field
-from pipeline.wording import listed
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.wording import listed
 
 
 def measure_coded_field(

@@ -16,8 +16,8 @@ from measure.single_targets.disk_search import disk_candidates
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.spelling import did_you_mean
-from pipeline.wording import listed
+from pipeline.text.spelling import did_you_mean
+from pipeline.text.wording import listed
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from pipeline.measuring.coded_points import (
     points_read,
     read_numbers,
 )
-from pipeline.wording import listed
+from pipeline.text.wording import listed
 
 _FOUND_WITHIN_PX = 2.0  # how far the fit may move from where the search has a dot
 

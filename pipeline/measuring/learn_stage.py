@@ -18,13 +18,13 @@ from measure.marks.shapes import MarkTemplate
 from measure.results import FrameMeasurement
 from measure.special_marks.learned import Chip, cut, template_of
 from measure.special_marks.symmetry import with_common_origins
-from pipeline.files.atomic import write_atomically
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.project_file import Project
 from pipeline.files.template_table import saved_in
 from pipeline.measuring.first_pictures import digest, first_pictures
 from pipeline.progress import Reporter
+from pipeline.text.atomic import write_atomically
 
 _BY = f"# Marks learned by reseau {version('reseau')}"
 

@@ -28,15 +28,15 @@ from pipeline.files.learned_table import LearnedFrom
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_model import misplaced_principal_point
 from pipeline.measuring.camera_plate import with_plates
-from pipeline.measuring.frames_file import with_same_frames
 from pipeline.measuring.learn_stage import learn_marks, pose_of
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.roll import poses_of_roll
 from pipeline.measuring.sheet_check import with_checked_sheet
 from pipeline.measuring.target_stage import check_targets, measure_targets
 from pipeline.measuring.tie_stage import check_tie_names, with_ties
 from pipeline.measuring.tone_stage import ScannerTones, scanner_tones
 from pipeline.progress import Reporter
+from pipeline.results.frames_file import with_same_frames
+from pipeline.results.measured_scan import MeasuredScan
 from pipeline.workers import processes, worker_pool
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.projection import ImageModel
-from pipeline.measuring.comparator_file import pixel_from_comparator
+from pipeline.results.comparator_file import pixel_from_comparator
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from measure.pose.written_pose import bounded, line_score
 from measure.results import FrameMeasurement, Pose
 from measure.status import Status
 from measure.writing.line import Line
-from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.results.measured_scan import MeasuredScan
 
 _ONE_QUESTION = (
     "the frames are named so that what is written lies alike in all of the camera whose writing was read; nothing says "

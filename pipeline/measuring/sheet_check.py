@@ -13,7 +13,7 @@ from measure.single_targets.common_points import ImagePoints, compared_together
 from measure.status import Status
 from pipeline.files.project_file import Project
 from pipeline.measuring.coded_points import CodedPoints
-from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 

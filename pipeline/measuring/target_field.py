@@ -15,8 +15,8 @@ from measure.single_targets.disk_search import disk_candidates
 from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.perspective_disks import disk_images, disk_normals, plane_normal
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from adjust.functional_model.rotation import rotation_from_vector
 from measure.results import MarkMeasurement
 from measure.single_targets.shared_offsets import TargetPlaces, compared
 from measure.status import Status
-from pipeline.measuring.comparator_file import pixel_from_comparator
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field
+from pipeline.results.comparator_file import pixel_from_comparator
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 

@@ -22,9 +22,7 @@ from pipeline.measuring.camera_model import camera_model
 from pipeline.measuring.coded_field import measure_coded_field
 from pipeline.measuring.coded_points import CodedPoints
 from pipeline.measuring.coded_sheet import measure_sheet
-from pipeline.measuring.comparator_file import comparator_from_pixel
 from pipeline.measuring.identification import PatternOptions, assign, log10_of_chance, recognise
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import (
     LEAST_DIAMETER_PX,
     Field,
@@ -34,6 +32,8 @@ from pipeline.measuring.target_field import (
 )
 from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.unoriented import NamedField, likely_diameters_px, name_field
+from pipeline.results.comparator_file import comparator_from_pixel
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from measure.natural_points.ties import measure_ties
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.tie_table import TieSettings
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.progress import Count
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from measure.single_targets.disk_patches import Candidate
 from measure.single_targets.targets import TargetPrediction
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_model import frame_mm
-from pipeline.measuring.comparator_file import comparator_from_pixel
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_field import Field
+from pipeline.results.comparator_file import comparator_from_pixel
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 

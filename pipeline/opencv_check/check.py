@@ -18,10 +18,10 @@ from adjust.errors import AdjustmentError
 from adjust.network import Camera
 from adjust.result import Adjustment
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
-from pipeline.opencv_check.check_result import CameraCheck, Check, Row, Verdict
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate
 from pipeline.opencv_check.opencv_conversion import Converted, converted
 from pipeline.opencv_check.opencv_model import NAMES, Freedom
+from pipeline.results.check_file import CameraCheck, Check, Row, Verdict
 
 LARGEST_DIFFERENCE = 1.0  # sigmas; about 0.1 is usual, for the two models are not quite the same
 LARGEST_SIGMA_RATIO = 1.2  # of the standard deviations; 1.006 to 1.03 is usual

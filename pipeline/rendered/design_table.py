@@ -6,7 +6,7 @@ from typing import cast, get_args
 
 from adjust.network import Transformation
 from pipeline.files.adjust_table import Datum, ScannerSetting, read_scanner, read_scanner_sigma, read_transformation
-from pipeline.files.tables import Table
+from pipeline.text.tables import Table
 
 Values = tuple[float, ...] | tuple[str, ...]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from measure.codes_and_boards.ring_codes import RingCode
 from pipeline.files.project_file import UNITS_MM
-from pipeline.files.tables import Table
+from pipeline.text.tables import Table
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarget, RingFigure
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ from measure.marks import shapes
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
 from pipeline.files.library import camera_path
-from pipeline.files.tables import Table, read_toml
 from pipeline.rendered.design_table import read_design
 from pipeline.rendered.field_table import read_field
 from pipeline.rendered.scene_project import Given, SceneFile, write_project
+from pipeline.text.tables import Table, read_toml
 from synthetic_images import areas, scene
 from synthetic_images.render import Progress, render_scene
 

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from adjust.network import Prior
 from measure.marks import shapes
-from pipeline.files.atomic import write_atomically
 from pipeline.files.camera_file import CameraFile, GivenFiducial
 from pipeline.files.camera_text import camera_text
-from pipeline.files.csv_table import csv_line
 from pipeline.files.project_file import UNITS_MM
 from pipeline.files.template_table import saved_in
 from pipeline.rendered.design_table import DesignSettings
+from pipeline.text.atomic import write_atomically
+from pipeline.text.csv_table import csv_line
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, FilmKind, RingFigure, Scene, SceneImage
 from synthetic_images.targets import Target, field_targets
 

@@ -6,7 +6,6 @@ import numpy as np
 from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
-from pipeline.files.adjustment_reader import Covariance
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image
@@ -14,6 +13,7 @@ from pipeline.report.lens_map import LensMap, lens_map
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import ParameterRow, group_sentences, high_correlations, parameter_rows
 from pipeline.report.verdict import camera_is_calibrated
+from pipeline.results.adjustment_reader import Covariance
 
 PLOT_PX = 560.0
 LONGEST_VECTOR_PX = 60.0

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.files.adjustment_reader import Covariance
-from pipeline.measuring.comparator_file import ComparatorPoint
+from pipeline.results.adjustment_reader import Covariance
+from pipeline.results.comparator_file import ComparatorPoint
 
 Json = dict[str, Any]
 

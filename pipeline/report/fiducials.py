@@ -8,9 +8,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from pipeline.files.adjustment_reader import Covariance
 from pipeline.report import svg
 from pipeline.report.data import Json
+from pipeline.results.adjustment_reader import Covariance
 
 Array = NDArray[np.float64]
 

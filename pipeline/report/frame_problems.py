@@ -8,7 +8,7 @@ from pipeline.report.data import Problem
 from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
-from pipeline.wording import LISTED, counted, listed
+from pipeline.text.wording import LISTED, counted, listed
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 

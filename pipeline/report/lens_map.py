@@ -6,11 +6,11 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from pipeline.files.adjustment_reader import Covariance
 from pipeline.report import svg
 from pipeline.report.lens import Lens, displacement
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.vectors import FOOT_PX, Plane, scale_bar
+from pipeline.results.adjustment_reader import Covariance
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from measure.covariance import Covariance
 from measure.status import Status
-from pipeline.measuring.comparator_file import ComparatorPoint
-from pipeline.measuring.measurement_file import read_covariance
 from pipeline.report.data import Json, ReportData
+from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.measurement_file import read_covariance
 
 Array = NDArray[np.float64]
 

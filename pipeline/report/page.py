@@ -10,7 +10,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from measure.status import MEANING
-from pipeline.files.atomic import write_atomically
 from pipeline.report.camera_views import camera_views
 from pipeline.report.charts import fraction_plot
 from pipeline.report.data import Json, ReportData
@@ -22,6 +21,7 @@ from pipeline.report.parameters import spoken_name
 from pipeline.report.scanner_views import scanner_views
 from pipeline.report.svg import round_step
 from pipeline.report.verdict import critical_w, judge, sigma0_bounds
+from pipeline.text.atomic import write_atomically
 
 LIST_LIMIT = 200  # rows of a long table
 

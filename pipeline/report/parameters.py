@@ -8,10 +8,10 @@ import numpy as np
 from adjust.functional_model.families import family as family_of
 from adjust.functional_model.families import parameter_names
 from adjust.quality.significance import LEVEL
-from pipeline.files.adjustment_reader import Covariance
 from pipeline.report.data import Json
 from pipeline.report.lens import largest_effects_um, lens
 from pipeline.report.numbers import fixed, significant, value_and_sigma
+from pipeline.results.adjustment_reader import Covariance
 
 MOSTLY_PRIOR = 0.9  # of the prior's sigma is left: the data have told little
 HIGH_CORRELATION = 0.9

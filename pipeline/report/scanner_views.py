@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from adjust.functional_model.scanner import Bend
-from pipeline.files.adjustment_reader import Covariance
 from pipeline.report import svg
 from pipeline.report.data import Json, ReportData
 from pipeline.report.fiducials import ellipse_axes, ellipses
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import ParameterRow, group_sentences, term_rows
 from pipeline.report.vectors import FOOT_PX, Plane, scale_bar
+from pipeline.results.adjustment_reader import Covariance
 
 Array = NDArray[np.float64]
 

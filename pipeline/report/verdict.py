@@ -12,7 +12,7 @@ from pipeline.report.data import Json, Problem, ReportData
 from pipeline.report.frame_problems import assumed_poses, frame_problems, pixel_locking, said_by
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
-from pipeline.wording import counted, listed
+from pipeline.text.wording import counted, listed
 
 Level = Literal["good", "look", "failed"]
 Look = Callable[[ReportData, list[Frame]], Iterable[Problem]]

@@ -11,9 +11,9 @@ from adjust.functional_model.projection import camera_from_ray, ideal_from_obser
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.network import Distortion
-from pipeline.files.adjustment_reader import calibrated_lens
-from pipeline.measuring.comparator_file import comparator_from_pixel, pixel_from_comparator
-from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.results.adjustment_reader import calibrated_lens
+from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

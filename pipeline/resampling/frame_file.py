@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tifffile import TiffFile, TiffFileError, TiffWriter
 
-from pipeline.files.atomic import atomic_path
 from pipeline.resampling.canvas import Canvas
 from pipeline.resampling.interpolation import Tile
+from pipeline.text.atomic import atomic_path
 
 Samples = NDArray[np.uint8 | np.uint16]
 

@@ -13,16 +13,17 @@ import numpy as np
 from measure.errors import MeasurementError
 from measure.scans.scan import open_scan
 from pipeline.errors import InputError
-from pipeline.files.adjustment_reader import read_adjustment
-from pipeline.files.atomic import check_writable
 from pipeline.files.project_file import Project
-from pipeline.measuring.measurement_file import MeasuredScan, read_measurement
 from pipeline.progress import Reporter
 from pipeline.resampling.canvas import canvas_of, scan_places
 from pipeline.resampling.frame_chain import FrameChain, adjusted_chain, measured_chain
 from pipeline.resampling.frame_file import TILE_PX, Description, read_description, write_frame
 from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile, interpolated
 from pipeline.resampling.source import source_of
+from pipeline.results.adjustment_reader import read_adjustment
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measurement_file import read_measurement
+from pipeline.text.atomic import check_writable
 from pipeline.workers import worker_pool
 
 BEST: Degree = 5

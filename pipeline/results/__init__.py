@@ -1,1 +1,1 @@
-"""What the program writes: from what each result was made, and how results take the places of earlier ones."""
+"""What the program writes, each format beside its reader."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.files.text_file import read_bytes
+from pipeline.text.text_file import read_bytes
 
 _PIECES, _PIECE = 8, 32768  # of a scan, spread evenly from its first byte to its last
 

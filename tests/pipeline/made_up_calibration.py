@@ -33,10 +33,10 @@ from adjust.result import (
     Suspect,
 )
 from measure.status import Status
-from pipeline.adjusting.adjustment_file import write_adjustment
-from pipeline.files.adjustment_reader import read_adjustment, read_covariance
-from pipeline.measuring.comparator_file import ComparatorPoint
 from pipeline.report import ReportData, Thumbnail
+from pipeline.results.adjustment_file import write_adjustment
+from pipeline.results.adjustment_reader import read_adjustment, read_covariance
+from pipeline.results.comparator_file import ComparatorPoint
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

@@ -13,10 +13,10 @@ from setups import Setup, vertical
 from adjust.adjustment import adjust
 from adjust.network import ObjectPoint, Prior
 from adjust.result import Adjustment, Residuals
-from pipeline.adjusting import covariance_arrays
-from pipeline.adjusting.adjustment_file import write_adjustment
 from pipeline.errors import InputError
-from pipeline.files.adjustment_reader import covariance_path, read_adjustment, read_covariance
+from pipeline.results import covariance_arrays
+from pipeline.results.adjustment_file import write_adjustment
+from pipeline.results.adjustment_reader import covariance_path, read_adjustment, read_covariance
 
 
 @pytest.fixture

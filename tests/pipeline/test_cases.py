@@ -9,10 +9,10 @@ import pytest
 from reference_cases import CASES, CAUSES, DROPPED
 
 from pipeline.adjusting.adjust_stage import adjust_marks
-from pipeline.adjusting.adjustment_file import adjustment_json
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
-from pipeline.measuring.comparator_file import read_comparator
+from pipeline.results.adjustment_file import adjustment_json
+from pipeline.results.comparator_file import read_comparator
 
 USUAL = ("F5-F9", "F7-F9")  # what is not left to the slow tests
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))

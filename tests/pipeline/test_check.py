@@ -25,8 +25,8 @@ from adjust.network import (
     Prior,
 )
 from pipeline.opencv_check.check import check_against_opencv
-from pipeline.opencv_check.check_result import CameraCheck, Check
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate
+from pipeline.results.check_file import CameraCheck, Check
 
 Array = NDArray[np.float64]
 

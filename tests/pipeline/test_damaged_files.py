@@ -18,7 +18,7 @@ import pytest
 from damaged_project import FILES, copied, damaged, made
 
 from pipeline.cli import run
-from pipeline.files.csv_table import csv_line, read_csv
+from pipeline.text.csv_table import csv_line, read_csv
 
 SAID = pytest.CaptureFixture[str]
 MESSAGE, RESULT = "message", "result"

@@ -11,9 +11,9 @@ from demonstration import FRAMES
 
 from pipeline.cli import DONE, run
 from pipeline.files.project_file import read_project
-from pipeline.measuring.comparator_file import write_comparator
 from pipeline.measuring.measure_stage import measure_scan
 from pipeline.rendered.against_truth import compare_with_truth
+from pipeline.results.comparator_file import write_comparator
 
 in_its_group = pytest.mark.xdist_group("demonstration")  # one run of it serves all
 

@@ -16,21 +16,23 @@ from measure.marks.shapes import MarkShape, MarkTemplate, Polygon
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
-from pipeline.files.atomic import atomic_path, check_writable, write_atomically
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
-from pipeline.files.images_file import image_name, read_images
+from pipeline.files.images_file import read_images
 from pipeline.files.points_file import read_points
 from pipeline.files.project_file import read_project
-from pipeline.files.tables import read_toml
 from pipeline.files.template_table import saved_in
-from pipeline.measuring.comparator_file import (
+from pipeline.results.comparator_file import (
     comparator_from_pixel,
     pixel_from_comparator,
     read_comparator,
     write_comparator,
 )
-from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measurement_file import read_measurement, write_measurement
+from pipeline.text.atomic import atomic_path, check_writable, write_atomically
+from pipeline.text.image_names import image_name
+from pipeline.text.tables import read_toml
 
 CAMERA = """
 name = "C"

@@ -13,8 +13,8 @@ from measure.status import Status
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
-from pipeline.measuring.comparator_file import read_comparator
 from pipeline.measuring.tie_stage import check_tie_names
+from pipeline.results.comparator_file import read_comparator
 from synthetic_images.film import FrameGeometry
 from synthetic_images.render import render_scene
 from synthetic_images.scene import DiskField, Distortion, Film, Scanner, Scene, SceneCamera, SceneImage

@@ -16,14 +16,14 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.network import EXTERIOR_NAMES
 from adjust.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
-from pipeline.adjusting.adjustment_file import write_adjustment
 from pipeline.errors import InputError
-from pipeline.files.adjustment_reader import read_adjustment
 from pipeline.files.project_file import read_project
-from pipeline.measuring.comparator_file import read_comparator
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.report import ReportData
 from pipeline.report.verdict import judge
+from pipeline.results.adjustment_file import write_adjustment
+from pipeline.results.adjustment_reader import read_adjustment
+from pipeline.results.comparator_file import read_comparator
 
 CASE = "iii_selfcal_all_unknown_datum_A"
 

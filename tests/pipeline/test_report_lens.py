@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.files.adjustment_reader import Covariance
 from pipeline.report.fiducials import Figure, figure, figure_plot
 from pipeline.report.lens import curves, curves_plot, displacement, largest_effects_um, lens
 from pipeline.report.lens_map import lens_map
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import high_correlations, parameter_rows
 from pipeline.report.vectors import Plane
+from pipeline.results.adjustment_reader import Covariance
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

@@ -10,8 +10,8 @@ import made_up_calibration
 import pytest
 
 from measure.status import MEANING, Status
-from pipeline.measuring.comparator_file import ComparatorPoint
 from pipeline.report import Problem, ReportData, render_report, write_report
+from pipeline.results.comparator_file import ComparatorPoint
 
 
 @pytest.fixture

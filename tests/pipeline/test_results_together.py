@@ -20,11 +20,12 @@ from measure.status import Status
 from pipeline import stages
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
-from pipeline.measuring.comparator_file import read_comparator, write_comparator
-from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
+from pipeline.publishing.made_from import measured_from
 from pipeline.report_data import adjusted
+from pipeline.results.comparator_file import read_comparator, write_comparator
 from pipeline.results.fingerprints import fingerprint, of_file, of_scan
-from pipeline.results.made_from import measured_from
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measurement_file import read_measurement, write_measurement
 from pipeline.summary import summarise
 
 SAID = pytest.CaptureFixture[str]
@@ -279,7 +280,7 @@ def test_a_place_that_cannot_be_taken_is_named_with_those_that_were(
             raise PermissionError(errno.EACCES, "held by another program")
         whole(source, target)
 
-    monkeypatch.setattr("pipeline.results.publishing.os.replace", held)
+    monkeypatch.setattr("pipeline.publishing.publishing.os.replace", held)
     assert run(["adjust", str(project / "project.toml")]) == 2
     message = capsys.readouterr().err
     assert "adjustment.npz: cannot be written (held by another program)" in message

@@ -16,10 +16,10 @@ from adjust.adjustment import adjust
 from adjust.initial_values.approximations import approximate
 from adjust.network import Network, Prior, Scanner
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.files.adjustment_reader import read_covariance
 from pipeline.rendered.scene_file import read_scene
 from pipeline.rendered.scene_project import write_project as write_rendered
 from pipeline.report.scanner_views import bend_field
+from pipeline.results.adjustment_reader import read_covariance
 from synthetic_images.film import frame_geometry, scanner_bend
 from synthetic_images.frame import frame_truth
 

@@ -18,9 +18,9 @@ from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import read_project
-from pipeline.measuring.comparator_file import read_comparator
 from pipeline.rendered.scene_file import read_scene, render_project
 from pipeline.rendered.scene_project import SceneFile, write_project
+from pipeline.results.comparator_file import read_comparator
 from synthetic_images.frame import frame_truth
 from synthetic_images.scene import BoardField, ChipMark, DrawnMark
 from synthetic_images.targets import field_targets

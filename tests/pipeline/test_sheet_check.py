@@ -13,8 +13,8 @@ from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.measure_stage import measure_scan
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.sheet_check import with_checked_sheet
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 COLUMNS, ROWS, WIDTH, HEIGHT, NOISE_PX = 9, 8, 2200, 1700, 0.05

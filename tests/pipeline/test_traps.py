@@ -18,7 +18,7 @@ from measure.marks.shapes import MarkShape, ring_cross
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from pipeline.measuring.comparator_file import read_comparator
+from pipeline.results.comparator_file import read_comparator
 
 RING_CROSS = MarkShape(ring_cross(0.8, 0.12, 0.6, 0.08))
 

@@ -13,12 +13,12 @@ from measure.results import MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
-from pipeline.files.tables import read_toml
 from pipeline.files.target_table import read_targets
 from pipeline.measuring.measure_stage import measure_scan
-from pipeline.measuring.measurement_file import MeasuredScan
 from pipeline.measuring.target_stage import check_targets
 from pipeline.rendered.scene_file import render_project
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.tables import read_toml
 
 Array = NDArray[np.float64]
 pytestmark = pytest.mark.xdist_group("unoriented")  # the fields are rendered once for all

@@ -9,7 +9,7 @@ from simulated_project import write_project
 
 from pipeline.adjusting.network import build_network
 from pipeline.files.project_file import read_project
-from pipeline.measuring.comparator_file import read_comparator
+from pipeline.results.comparator_file import read_comparator
 
 
 @pytest.mark.parametrize("film_um", [0.0, 7.0])

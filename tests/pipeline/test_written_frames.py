@@ -20,15 +20,16 @@ from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.camera_file import parse_camera, read_camera
 from pipeline.files.camera_text import camera_text
-from pipeline.files.images_file import fill_images, read_images
-from pipeline.files.tables import Table
+from pipeline.files.images_file import WRITTEN, fill_images, read_images
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, plate_of, with_plates
-from pipeline.measuring.frames_file import for_images, with_same_frames, write_frames
-from pipeline.measuring.measurement_file import MeasuredScan, read_measurement, write_measurement
 from pipeline.measuring.roll import poses_of_roll
 from pipeline.rendered.scene_file import render_project
 from pipeline.report.writing import written
+from pipeline.results.frames_file import for_images, with_same_frames, write_frames
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.measurement_file import read_measurement, write_measurement
+from pipeline.text.tables import Table
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
 TITLES = ("RUN 7", "8601-8639", "16.5.68", "14,000'", "8617", "AUSTRALIAN")
@@ -64,7 +65,7 @@ def test_empty_columns_of_images_csv_are_filled_and_nothing_else_is_touched(tmp_
     path = tmp_path / "images.csv"
     before = "# by hand\r\nimage,camera,run,frame,date,height\r\na.tif,c.toml,,,1970-01-01,\r\nb,,5,,,\r\n"
     path.write_bytes(before.encode())
-    told = for_images([scan("a", [line(text) for text in TITLES]), scan("b", [line("1/3/85"), line("RUN 8")])])
+    told = for_images([scan("a", [line(text) for text in TITLES]), scan("b", [line("1/3/85"), line("RUN 8")])], WRITTEN)
     assert told == {"a": {"run": "7", "frame": "8617", "date": "1968-05-16", "height": "14000 ft"}, "b": {"run": "8"}}
     fill_images(path, told)
     assert path.read_bytes().decode() == before.replace("c.toml,,,1970-01-01,", "c.toml,7,8617,1970-01-01,14000 ft")

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from small_scene import OBLIQUE, rendered, scene
 
 from pipeline.errors import InputError
-from pipeline.files.tables import Table
 from pipeline.rendered.scene_file import parse_scene
+from pipeline.text.tables import Table
 from synthetic_images.areas import coverage
 from synthetic_images.scene import SceneImage, Writing
 from synthetic_images.truth import truth_json

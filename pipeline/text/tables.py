@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.files.text_file import read_bytes, shown
-from pipeline.spelling import did_you_mean, nearest
-from pipeline.wording import LISTED
+from pipeline.text.spelling import did_you_mean, nearest
+from pipeline.text.text_file import read_bytes, shown
+from pipeline.text.wording import LISTED
 
 FREE = "free"
 MOST_MB = 4  # marks that were learned from 12,000 scans make a camera file of this size

@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.comparator_file import ComparatorPoint
+from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.fingerprints import fingerprint, of_scan
 
 MadeFrom = dict[str, str]

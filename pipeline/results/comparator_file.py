@@ -15,9 +15,9 @@ from adjust.network import ObservationKind
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
-from pipeline.files.atomic import write_atomically
-from pipeline.files.csv_table import Row, csv_line, read_csv
-from pipeline.files.images_file import image_name
+from pipeline.text.atomic import write_atomically
+from pipeline.text.csv_table import Row, csv_line, read_csv
+from pipeline.text.image_names import image_name
 
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",

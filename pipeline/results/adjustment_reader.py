@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import parameter_names
 from adjust.network import Distortion
 from pipeline.errors import InputError
-from pipeline.files.text_file import MOST_MB, read_bytes, read_json, shown
+from pipeline.text.text_file import MOST_MB, read_bytes, read_json, shown
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

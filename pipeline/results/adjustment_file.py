@@ -18,11 +18,11 @@ from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior, Sc
 from adjust.quality.correlation import correlations
 from adjust.quality.significance import SignificanceTest, group_tests, parameter_tests, scanner_tests
 from adjust.result import Adjustment, FurtherResidual
-from pipeline.adjusting.covariance_arrays import covariance_arrays, covariance_note
-from pipeline.adjusting.reliability_json import point_tests, reliability_json, suspect_json
-from pipeline.files.adjustment_reader import FURTHER_NUMBERS, covariance_path
-from pipeline.files.atomic import atomic_path
+from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
+from pipeline.results.covariance_arrays import covariance_arrays, covariance_note
 from pipeline.results.fingerprints import of_content
+from pipeline.results.reliability_json import point_tests, reliability_json, suspect_json
+from pipeline.text.atomic import atomic_path
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

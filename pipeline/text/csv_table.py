@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.files.text_file import read_bytes, shown
-from pipeline.spelling import did_you_mean
+from pipeline.text.spelling import did_you_mean
+from pipeline.text.text_file import read_bytes, shown
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 

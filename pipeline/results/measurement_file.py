@@ -3,7 +3,6 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,20 +14,9 @@ from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
 from measure.writing.line import Line, Reading
 from pipeline.errors import InputError
-from pipeline.files.atomic import write_atomically
-from pipeline.files.text_file import read_json
-
-
-@dataclass(frozen=True)
-class MeasuredScan:
-    """A scan and what was measured in it. notes: what is worth knowing of its file, and needs no action."""
-
-    scan: Path
-    width_px: int
-    height_px: int
-    pitch_um: tuple[float, float]
-    frame: FrameMeasurement
-    notes: tuple[str, ...] = ()
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.atomic import write_atomically
+from pipeline.text.text_file import read_json
 
 
 def write_measurement(

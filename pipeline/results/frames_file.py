@@ -7,10 +7,9 @@ from pathlib import Path
 
 from measure.results import FrameMeasurement
 from measure.writing.fields import Field, fields_of
-from pipeline.files.atomic import write_atomically
-from pipeline.files.csv_table import csv_line
-from pipeline.files.images_file import WRITTEN
-from pipeline.measuring.measurement_file import MeasuredScan
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.atomic import write_atomically
+from pipeline.text.csv_table import csv_line
 
 COLUMNS = ("image", "field", "text", "value", "confidence", "place", "col_px", "row_px")
 HEAD = """# written about the frames, reseau {version}: as far as it was read. place: the side of the scan; col_px,
@@ -38,9 +37,9 @@ def with_same_frames(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
     return [_told(scan, names[scan.frame.image], named) for scan in scans]
 
 
-def for_images(scans: Sequence[MeasuredScan]) -> Mapping[str, Mapping[str, str]]:
-    """By image the fields of images.csv, as far as one line says them, or several alike."""
-    return {scan.frame.image: _values(fields_of(scan.frame.writing or ()), WRITTEN) for scan in scans}
+def for_images(scans: Sequence[MeasuredScan], names: Sequence[str]) -> Mapping[str, Mapping[str, str]]:
+    """By image the fields of these names, as far as one line says them, or several alike."""
+    return {scan.frame.image: _values(fields_of(scan.frame.writing or ()), names) for scan in scans}
 
 
 def _rows(frame: FrameMeasurement) -> list[tuple[str, ...]]:
