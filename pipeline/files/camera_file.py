@@ -68,10 +68,11 @@ class Source:
 class CameraFile:
     """A camera file as read: mm, a standard deviation of 0 fixes, inf frees.
 
-    principal_distance_mm and principal_point_mm are None where the file leaves them to the points. writing:
-    where the camera writes on its film, as far as the file says. calibration: an earlier one,
-    which takes the place of the standard deviations of all that it gives. clicks: None where nobody has shown the
-    learned marks; learned_from: None before they are learned.
+    principal_distance_mm and principal_point_mm are None where the file leaves them to the points. number: of the
+    camera or its lens cone, as its plate in the picture has it; "" where the file is of a type. writing: where the
+    camera writes on its film, as far as the file says. calibration: an earlier one, which takes the place of the
+    standard deviations of all that it gives. clicks: None where nobody has shown the learned marks; learned_from: None
+    before they are learned.
     """
 
     path: Path
@@ -83,6 +84,7 @@ class CameraFile:
     principal_point_sigma_mm: tuple[float, float]
     distortion: network.Distortion
     fiducials: tuple[GivenFiducial, ...]
+    number: str = ""
     writing: tuple[shapes.WrittenPlace, ...] = ()
     calibration: EarlierCalibration | None = None
     source: Source | None = None
@@ -171,6 +173,7 @@ def parse_camera(table: Table) -> CameraFile:
         principal_point_sigma_mm=sigma.sigma_pair("principal_point_mm", (default_sigma, default_sigma)),
         distortion=_distortion(table.table("distortion"), frame),
         fiducials=fiducials,
+        number=_number(table),
         writing=_writing(table),
         source=_source(table.table("source")) if "source" in table else None,
         clicks=read_clicks(table.table("clicks"), learned) if "clicks" in table else None,
@@ -179,6 +182,13 @@ def parse_camera(table: Table) -> CameraFile:
     camera = replace(camera, calibration=read_calibration(sigma, camera.camera()))
     sigma.done()
     return camera
+
+
+def _number(table: Table) -> str:
+    number = table.text("number", "")
+    if number and not number.isdigit():
+        raise table.error("number", f'must be digits in quotes, as the plate has them: "13182", not {number!r}.')
+    return number
 
 
 def _writing(table: Table) -> tuple[shapes.WrittenPlace, ...]:

@@ -19,6 +19,8 @@ def camera_text(camera: CameraFile, save: SavePicture) -> str:
     lines = [f"name = {quoted(camera.name)}"]
     if camera.frame_mm is not None:
         lines.append(f"frame_mm = {numbers(camera.frame_mm)}")
+    if camera.number:
+        lines.append(f"number = {quoted(camera.number)}")
     if camera.writing:
         lines.append(f"writing = [{', '.join(quoted(written_place_text(place)) for place in camera.writing)}]")
     if camera.principal_distance_mm is not None:

@@ -108,7 +108,7 @@ def _with_plates(project: Project, measured: Sequence[MeasuredScan]) -> list[Mea
     told: dict[str, MeasuredScan] = {}
     for camera in project.cameras.values():
         own = [scan for scan in measured if project.camera_of(scan.frame.image) is camera]
-        told |= {scan.frame.image: scan for scan in with_plates(camera, own)}
+        told |= {scan.frame.image: scan for scan in with_plates(camera, own, project.cameras)}
     return [told[scan.frame.image] for scan in measured]
 
 

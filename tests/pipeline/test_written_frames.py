@@ -96,10 +96,11 @@ CAMERA = {"frame_mm": [230.0, 230.0], "fiducial": [{"id": "1", "xy_mm": [1.0, 2.
 
 def test_a_camera_file_says_where_it_writes(tmp_path: Path) -> None:
     asked = ["left: reads upward", "right: plate reads downward", "top"]
-    camera = parse_camera(Table({**CAMERA, "writing": asked}, tmp_path / "camera.toml", ""))
+    camera = parse_camera(Table({**CAMERA, "writing": asked, "number": "13182"}, tmp_path / "camera.toml", ""))
     assert camera.layout if camera.writing == (*WILD, WrittenPlace("top")) else None
     camera.path.write_text(camera_text(camera, lambda name, _: name), encoding="utf-8")
     assert read_camera(camera.path).writing == camera.writing
+    assert read_camera(camera.path).number == "13182"
 
 
 @pytest.mark.parametrize(
@@ -107,6 +108,7 @@ def test_a_camera_file_says_where_it_writes(tmp_path: Path) -> None:
     [
         ("writing", ["left: upward"], "'left: upward'. A place is a side of the frame"),
         ("writing", ["middle"], "A place is a side of the frame"),
+        ("number", "RC20 13182", 'must be digits in quotes, as the plate has them: "13182"'),
         ("data_strip", "left", r'writing = \["left: reads upward"\]'),
     ],
 )
@@ -175,7 +177,7 @@ RC10 = parse_camera(
 
 
 def test_a_plate_is_held_against_the_cameras_file() -> None:
-    own = with_plates(RC10, [scan("a", [line("WILD 15/4 UAG"), line("Nr 13043 152.75")]), scan("b", None)])
+    own = with_plates(RC10, [scan("a", [line("WILD 15/4 UAG"), line("Nr 13043 152.75")]), scan("b", None)], {})
     assert own[0].frame.problems == ()
     assert "(Nr 13043) says a principal distance of 152.75 mm, its file 153 mm" in own[0].notes[0]
     assert own[1].notes == ()
@@ -183,18 +185,29 @@ def test_a_plate_is_held_against_the_cameras_file() -> None:
         "it is of a camera by Zeiss",
         "it gives a principal distance of 305.12 mm",
     ]
-    other = with_plates(RC10, [scan("a", [line("Nr 1234 305.12")])])[0]
+    other = with_plates(RC10, [scan("a", [line("Nr 1234 305.12")])], {})[0]
     assert "not of Wild RC10, 153 mm: it gives a principal distance of 305.12 mm" in other.frame.problems[0]
     assert other.notes == ()
 
 
 def test_plates_of_two_cameras_under_one_file_are_told() -> None:
     first, second, mute = with_plates(
-        RC10, [scan("a", [line("Nr 13043")]), scan("b", [line("Nr 13022")]), scan("c", [])]
+        RC10, [scan("a", [line("Nr 13043")]), scan("b", [line("Nr 13022")]), scan("c", [])], {}
     )
     assert "Nr 13022, 13043" in first.frame.problems[0]
     assert first.frame.problems == second.frame.problems
     assert mute.frame.problems == ()
+
+
+def test_a_number_tells_two_cameras_of_a_type_apart() -> None:
+    first, second = replace(RC10, number="13043"), replace(RC10, number="13022")
+    cameras = {"first.toml": first, "second.toml": second}
+    plates = {"a": "Nr 13043", "b": "Nr 13022", "c": "Nr 999", "d": "RUN 7"}
+    scans = [scan(image, [line(plate)]) for image, plate in plates.items()]
+    own, other, unknown, mute = with_plates(first, scans, cameras)
+    assert own.frame.problems == mute.frame.problems == ()
+    assert "it gives the number 13022, the file 13043. Give this scan the camera second.toml" in other.frame.problems[0]
+    assert "it gives the number 999, the file 13043. Give this scan its own camera" in unknown.frame.problems[0]
 
 
 def test_the_library_names_a_camera_by_its_plate_or_says_that_it_is_none() -> None:
