@@ -8,7 +8,7 @@ import numpy as np
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family
 from adjust.functional_model.transformation import fewest_marks, marks_needed
-from adjust.network import Camera, Image, Network, Observations, Prior
+from adjust.problem.network import Camera, Image, Network, Observations, Prior
 
 TARGETS_NEEDED = 3
 DEFINITE = 1e-13  # least eigenvalue of an earlier calibration's correlation matrix

@@ -187,7 +187,7 @@ LINES = (
     ),
     Broken("adjust/least_squares/iteration.py", "(normalised**2).sum()", "0.0", "adjust/test_adjust_reference.py"),
     Broken(
-        "adjust/result.py",
+        "adjust/problem/result.py",
         "self.vpv / self.redundancy",
         "self.vpv / self.conditions",
         "adjust/test_adjust_reference.py",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.choices.comparison import CameraCalibration, compare
-from adjust.network import Distortion
+from adjust.problem.network import Distortion
 
 Array = NDArray[np.float64]
 

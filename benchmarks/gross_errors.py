@@ -16,10 +16,10 @@ from realisations import Exact, exact, realisation
 from reference_cases import load
 from scipy import special
 
-from adjust.adjustment import Options, adjust
-from adjust.network import Network
-from adjust.probabilities import Probabilities
-from adjust.result import Adjustment, Suspect
+from adjust.problem.network import Network
+from adjust.problem.probabilities import Probabilities
+from adjust.problem.result import Adjustment, Suspect
+from adjust.solution.adjustment import Options, adjust
 
 SIGMAS = 10.0
 KINDS = ("fiducial", "datum", "control", "target")

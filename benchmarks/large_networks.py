@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.network import (
+from adjust.problem.network import (
     Approximations,
     Camera,
     Distortion,

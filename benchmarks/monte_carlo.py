@@ -17,8 +17,8 @@ from realisations import Exact, exact, realisation
 from reference_cases import CAMERA, load
 from scipy import stats
 
-from adjust.adjustment import adjust
-from adjust.result import Adjustment
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 

@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.adjustment import Options, adjust
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
 from adjust.functional_model.transformation import Film
-from adjust.network import (
+from adjust.problem.network import (
     Approximations,
     Camera,
     Distortion,
@@ -32,7 +31,8 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.result import Adjustment
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 Row = tuple[str, str, ObservationKind, Array]  # image, point, kind, place in mm

@@ -27,13 +27,13 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from adjust.adjustment import adjust
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.approximations import approximate
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
-from adjust.network import Exterior
-from adjust.problem import ABSENT, number
+from adjust.problem.network import Exterior
+from adjust.problem.problem import ABSENT, number
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]

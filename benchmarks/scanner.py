@@ -18,11 +18,11 @@ from bent_scans import MIDDLE_MM, films, in_a_bent_scanner
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.choices.scanner_choice import choose_bends
 from adjust.initial_values.approximations import approximate
-from adjust.network import Approximations, Network, Prior
-from adjust.result import Adjustment
+from adjust.problem.network import Approximations, Network, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 Made = Callable[[np.random.Generator, Mapping[str, Prior]], tuple[Network, Approximations]]

@@ -17,10 +17,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
 from mishaps import MISHAPS, Mishap, sentences  # the tests' own networks
 from null_directions import AXES, CATALOGUE, Failure
 
-from adjust.adjustment import adjust
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.network import Network
-from adjust.result import NullDirection
+from adjust.problem.network import Network
+from adjust.problem.result import NullDirection
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functions import compute, derivatives
-from adjust.network import (
+from adjust.problem.functions import compute, derivatives
+from adjust.problem.network import (
     Approximations,
     Camera,
     Distortion,
@@ -23,7 +23,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.problem import ABSENT, Problem, number
+from adjust.problem.problem import ABSENT, Problem, number
 
 Array = NDArray[np.float64]
 

@@ -9,6 +9,20 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGES = {"measure", "adjust", "pipeline", "synthetic_images"}
 ALLOWED = {"measure": set[str](), "adjust": set[str](), "synthetic_images": set[str](), "pipeline": PACKAGES}
+ADJUST_FROM_THE_GROUND_UP = (
+    "errors",
+    "linear_algebra",
+    "functional_model",
+    "problem",
+    "least_squares",
+    "undetermined",
+    "validation",
+    "initial_values",
+    "quality",
+    "solution",
+    "target_names",
+    "choices",
+)  # folders, and the files at the root
 FORBIDDEN_LIBRARIES = {"adjust": {"cv2", "skimage", "tifffile", "imagecodecs"}}
 
 
@@ -41,7 +55,7 @@ def test_package_imports_only_what_the_architecture_allows(package: str) -> None
     [
         ("measure", "pose", "frames"),
         ("adjust", "quality", "least_squares"),
-        ("adjust", "result", "tested"),
+        ("adjust", "validation", "problem"),
         ("pipeline", "files", "results"),
         ("pipeline", "adjusting", "measuring"),
     ],
@@ -54,10 +68,20 @@ def test_the_rooms_of_a_package_use_one_another_in_no_circle(package: str, user:
     TopologicalSorter(uses).prepare()
 
 
-def test_the_formulas_of_adjust_know_no_network() -> None:
-    linear_algebra, functional_model = (ROOT / "adjust" / name for name in ("linear_algebra", "functional_model"))
-    assert rooms_used(linear_algebra, "adjust") == {"linear_algebra"}
-    assert rooms_used(functional_model, "adjust") == {"linear_algebra", "functional_model"}
+def test_each_room_of_adjust_knows_only_those_below_it() -> None:
+    rooms = [path for path in (ROOT / "adjust").iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()]
+    assert {room.stem for room in rooms} == {*ADJUST_FROM_THE_GROUND_UP, "__init__"}
+    upward = {
+        room.stem: above
+        for room in rooms
+        if room.stem != "__init__"
+        and (above := rooms_used(room, "adjust") - set(ADJUST_FROM_THE_GROUND_UP[: level(room) + 1]))
+    }
+    assert not upward
+
+
+def level(room: Path) -> int:
+    return ADJUST_FROM_THE_GROUND_UP.index(room.stem)
 
 
 def test_the_ground_and_the_formats_of_pipeline_know_no_project() -> None:
@@ -67,12 +91,14 @@ def test_the_ground_and_the_formats_of_pipeline_know_no_project() -> None:
 
 
 def rooms_used(room: Path, package: str) -> set[str]:
-    """The rooms of a package from which the files of one import."""
-    files = room.glob("*.py") if room.is_dir() else [room]
-    modules = {
-        node.module or ""
-        for file in files
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ImportFrom)
-    }
-    return {name.split(".")[1] for name in modules if name.startswith(f"{package}.")}
+    """The rooms of a package from which the files of one import; the package's face is a room, too."""
+    files = room.rglob("*.py") if room.is_dir() else [room]
+    modules = set[str]()
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                named = node.module or ""
+                modules |= {f"{named}.{alias.name}" for alias in node.names} if named == package else {named}
+            elif isinstance(node, ast.Import):
+                modules |= {alias.name for alias in node.names}
+    return {f"{name}.__init__".split(".")[1] for name in modules if name.split(".")[0] == package}

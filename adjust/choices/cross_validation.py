@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.adjustment import Options, with_datum
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
-from adjust.images import approximate_image
 from adjust.initial_values.intersection import intersect
-from adjust.network import Approximations, Network
-from adjust.problem import number
-from adjust.result import Adjustment
-from adjust.runs import run
+from adjust.problem.images import approximate_image
+from adjust.problem.network import Approximations, Network
+from adjust.problem.problem import number
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, with_datum
+from adjust.solution.runs import run
 from adjust.validation import validate
 
 Array = NDArray[np.float64]

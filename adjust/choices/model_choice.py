@@ -11,16 +11,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from adjust.adjustment import Options, adjust
 from adjust.choices.candidates import Candidate, Nested, nested_tests, simplest_sufficient
 from adjust.choices.choice_reasons import reasons, verdict
 from adjust.choices.cross_validation import approximations_of, cross_validate, folds
 from adjust.choices.models import Model, given_model, lenses, transformations
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.network import Network, Transformation
+from adjust.problem.network import Network, Transformation
+from adjust.problem.result import Adjustment
 from adjust.quality.reweighting import NO_WEIGHT
-from adjust.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 from adjust.undetermined.datum_choice import with_held
 
 HIGH_CORRELATION = 0.95

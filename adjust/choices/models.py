@@ -7,7 +7,7 @@ import numpy as np
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import marks_needed
-from adjust.network import Calibration, Network, Prior, Transformation
+from adjust.problem.network import Calibration, Network, Prior, Transformation
 
 # A transformation and the simpler ones that it contains, simplest first.
 TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {

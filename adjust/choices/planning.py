@@ -7,17 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from adjust.adjustment import Options, adjust_problem, with_datum
 from adjust.errors import AdjustmentError
-from adjust.functions import blind_mark, computed_observations
-from adjust.further_observations import at_computed
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
-from adjust.network import Approximations, Network
-from adjust.problem import Problem, number
+from adjust.problem.functions import blind_mark, computed_observations
+from adjust.problem.further_observations import at_computed
+from adjust.problem.network import Approximations, Network
+from adjust.problem.problem import Problem, number
+from adjust.problem.result import Adjustment, NullDirection
 from adjust.quality.cofactor import free_cofactor
-from adjust.result import Adjustment, NullDirection
+from adjust.solution.adjustment import Options, adjust_problem, with_datum
 from adjust.undetermined.null_space import null_vectors
 from adjust.validation import validate
 

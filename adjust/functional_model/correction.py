@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class Settings(Protocol):
-    """What a family is told beside its parameters; see `adjust.network.Distortion`."""
+    """What a family is told beside its parameters; see `adjust.problem.network.Distortion`."""
 
     @property
     def decentering(self) -> str: ...

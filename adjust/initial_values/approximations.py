@@ -16,7 +16,7 @@ from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.initial_values.orientation import orient
 from adjust.initial_values.principal_distance import KnownField, find_principal_distance
 from adjust.initial_values.resection import Pose
-from adjust.network import Approximations, Camera, Image, Network
+from adjust.problem.network import Approximations, Camera, Image, Network
 from adjust.validation import validate
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from adjust.functional_model.sight import Sight, freed_sight
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.intersection import intersect
 from adjust.initial_values.resection import Pose, image_distances
-from adjust.problem import Problem
+from adjust.problem.problem import Problem
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.film_kinds import Congruent, FilmKind, Identity, Projective, marks_of
 from adjust.functional_model.transformation import film_kind, marks_needed, simpler
-from adjust.network import Transformation
+from adjust.problem.network import Transformation
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

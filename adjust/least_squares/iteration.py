@@ -6,14 +6,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functions import compute, computed_observations, derivatives
-from adjust.further_observations import square_sum
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, of_cameras, prior_differences, prior_root_weights, whitened_rows
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Factor
-from adjust.problem import Problem, State
-from adjust.result import Iteration, Termination
+from adjust.problem.functions import compute, computed_observations, derivatives
+from adjust.problem.further_observations import square_sum
+from adjust.problem.problem import Problem, State
+from adjust.problem.result import Iteration, Termination
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 
 from adjust.linear_algebra.fronts import Fronts, band_order, fronts_of
 from adjust.linear_algebra.normal_equations import Groups
-from adjust.problem import ABSENT, Problem, side_by_side
+from adjust.problem.problem import ABSENT, Problem, side_by_side
 
 Indices = NDArray[np.intp]
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functions import Derivatives
-from adjust.further_observations import FurtherObservation
 from adjust.least_squares.numbering import Numbering, Touched
 from adjust.linear_algebra.elimination import Sums
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
-from adjust.problem import ABSENT, Problem, State
+from adjust.problem.functions import Derivatives
+from adjust.problem.further_observations import FurtherObservation
+from adjust.problem.problem import ABSENT, Problem, State
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from adjust.functional_model.rotation import vector_by_angles
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
-from adjust.problem import Problem, State
+from adjust.problem.problem import Problem, State
 from adjust.undetermined.datum import free_motion
 
 Array = NDArray[np.float64]

@@ -13,16 +13,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.further_observations import FurtherObservation
 from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_differences
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.small_matrices import applied, eigen, inverse, laid_out, product
-from adjust.probabilities import Probabilities
-from adjust.problem import ABSENT, Problem
-from adjust.result import OuterEffect, Reliability
-from adjust.tested import Tested, TestedUnits
+from adjust.problem.further_observations import FurtherObservation
+from adjust.problem.probabilities import Probabilities
+from adjust.problem.problem import ABSENT, Problem
+from adjust.problem.result import OuterEffect, Reliability
+from adjust.problem.tested import Tested, TestedUnits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

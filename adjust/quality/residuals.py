@@ -5,14 +5,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.further_observations import square_sum
 from adjust.least_squares.rows import prior_differences
 from adjust.linear_algebra.factor import Blocks, Factor
-from adjust.problem import ABSENT, Problem, State
+from adjust.problem.further_observations import square_sum
+from adjust.problem.problem import ABSENT, Problem, State
+from adjust.problem.result import FurtherResidual, Group, Residuals
+from adjust.problem.tested import TestedUnits
 from adjust.quality.reliability import UNCHECKED, Misfits, redundancies, statistics
 from adjust.quality.reweighting import Weighting
-from adjust.result import FurtherResidual, Group, Residuals
-from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.linear_algebra.small_matrices import laid_out
-from adjust.problem import Problem
-from adjust.tested import TestedUnits
+from adjust.problem.problem import Problem
+from adjust.problem.tested import TestedUnits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

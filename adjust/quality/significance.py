@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
 from adjust.functional_model.families import family
-from adjust.network import Camera, Prior, Scanner
-from adjust.result import Adjustment
+from adjust.problem.network import Camera, Prior, Scanner
+from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
 

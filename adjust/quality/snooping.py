@@ -18,11 +18,11 @@ from adjust.least_squares.iteration import Linearised
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
 from adjust.linear_algebra.small_matrices import applied, eigen
-from adjust.probabilities import Probabilities
+from adjust.problem.probabilities import Probabilities
+from adjust.problem.result import Reliability, Suspect
+from adjust.problem.tested import TestedUnits
 from adjust.quality.reliability import UNCHECKED, Misfits, statistics, unit_rows
 from adjust.quality.reweighting import Weighting, robust_scale
-from adjust.result import Reliability, Suspect
-from adjust.tested import TestedUnits
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

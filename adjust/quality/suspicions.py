@@ -5,8 +5,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import Observations
-from adjust.result import Residuals
+from adjust.problem.network import Observations
+from adjust.problem.result import Residuals
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import angles_near, rotation_from_vector
-from adjust.problem import Problem, State
+from adjust.problem.problem import Problem, State
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

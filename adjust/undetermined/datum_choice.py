@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
-from adjust.network import Network, ObjectPoint, Prior
-from adjust.problem import Problem
+from adjust.problem.network import Network, ObjectPoint, Prior
+from adjust.problem.problem import Problem
 from adjust.undetermined.datum import FLAT, ObjectDatum, free_coordinates, object_datum
 from adjust.undetermined.directions import DATUM_LEADS
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.linear_algebra.factor import Factor
-from adjust.problem import Problem, State
-from adjust.result import NullDirection
+from adjust.problem.problem import Problem, State
+from adjust.problem.result import NullDirection
 from adjust.undetermined.datum import free_coordinates, object_datum
 from adjust.undetermined.directions import camera_leads, datum_sentence, field_of, following
 from adjust.undetermined.null_space import SINGULAR, BlindBlock, blind_blocks, null_space

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import family
 from adjust.functional_model.transformation import follows_tilts
-from adjust.problem import Problem, State
+from adjust.problem.problem import Problem, State
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

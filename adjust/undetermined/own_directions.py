@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem import Problem, State
+from adjust.problem.problem import Problem, State
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.scanner import degree_of, is_left
 from adjust.linear_algebra.factor import Factor
-from adjust.problem import Problem, State
-from adjust.result import Cofactor
+from adjust.problem.problem import Problem, State
+from adjust.problem.result import Cofactor
 from adjust.undetermined.directions import Lead
 
 SCANNER_RANK = -2

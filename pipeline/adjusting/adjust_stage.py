@@ -7,10 +7,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.adjustment import Options, adjust
-from adjust.images import adjusted_image
-from adjust.network import Network
-from adjust.result import Adjustment
+from adjust.problem.images import adjusted_image
+from adjust.problem.network import Network
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 from pipeline.adjusting.network import build_network, unmeasured_points
 from pipeline.adjusting.scanners import with_scanners
 from pipeline.files.project_file import Project

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.transformation import marks_needed
-from adjust.network import (
+from adjust.problem.network import (
     Calibration,
     Camera,
     Distance,

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from adjust.choices.scanner_choice import choose_bends, with_bends
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
-from adjust.network import Network
-from adjust.result import Adjustment
+from adjust.problem.network import Network
+from adjust.problem.result import Adjustment
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
 from pipeline.files.project_file import Project

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from adjust.images import adjusted_image
-from adjust.result import Adjustment
+from adjust.problem.images import adjusted_image
+from adjust.problem.result import Adjustment
 from measure.checks.lost_pixels import without_lost
 from measure.errors import MeasurementError
 from measure.results import MarkMeasurement

@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.network import EXTERIOR_NAMES, Image
+from adjust.problem.network import EXTERIOR_NAMES, Image
 from pipeline.design.alternatives import Alternative
 from pipeline.design.expected import Expected, rms
 from pipeline.design.reliability import error_unit

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust import network
 from adjust.functional_model.scanner import smooth_terms
 from adjust.initial_values.fiducial_fit import fit_transformation
-from adjust.network import Approximations, Network, Prior, Transformation
+from adjust.problem import network
+from adjust.problem.network import Approximations, Network, Prior, Transformation
 from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile

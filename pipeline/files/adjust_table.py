@@ -7,10 +7,10 @@ from typing import Literal, cast, get_args
 
 from adjust.functional_model.scanner import is_term
 from adjust.functional_model.transformation import film_kind
-from adjust.network import Transformation
-from adjust.options import MEASURED_KINDS
+from adjust.problem.network import Transformation
+from adjust.problem.tested import PRIOR_GROUPS
 from adjust.quality.reweighting import WeightFunction
-from adjust.tested import PRIOR_GROUPS
+from adjust.solution.options import MEASURED_KINDS
 from pipeline.text.tables import Table
 
 Datum = Literal["control", "minimal", "free"]

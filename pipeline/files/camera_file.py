@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, get_args
 
-from adjust import network
 from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
+from adjust.problem import network
 from measure.marks import shapes
 from pipeline.errors import InputError
 from pipeline.files.camera_units import check_units

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.network import Exterior
+from adjust.problem.network import Exterior
 from pipeline.errors import InputError
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import Row, read_csv

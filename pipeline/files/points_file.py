@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import ObjectPoint, Prior
+from adjust.problem.network import ObjectPoint, Prior
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, read_csv
 

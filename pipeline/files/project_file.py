@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import cast, get_args
 
-from adjust.network import ObjectPoint, Prior
+from adjust.problem.network import ObjectPoint, Prior
 from measure.fiducial_options import Reads
 from measure.film import SCATTER_MM
 from measure.marks.poses import POSES

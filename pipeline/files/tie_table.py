@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from adjust.network import ObjectPoint, Prior
+from adjust.problem.network import ObjectPoint, Prior
 from measure.natural_points.ties import TieOptions
 from pipeline.text.tables import Table
 

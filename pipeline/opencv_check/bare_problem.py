@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.images import adjusted_image
-from adjust.network import (
+from adjust.problem.images import adjusted_image
+from adjust.problem.network import (
     EXTERIOR_NAMES,
     Approximations,
     Camera,
@@ -20,7 +20,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.result import Adjustment
+from adjust.problem.result import Adjustment
 from pipeline.opencv_check.opencv_calibration import ImagePoints, can_begin
 from pipeline.opencv_check.opencv_model import NAMES, Freedom
 

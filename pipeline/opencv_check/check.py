@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from adjust.adjustment import adjust
 from adjust.errors import AdjustmentError
-from adjust.network import Camera
-from adjust.result import Adjustment
+from adjust.problem.network import Camera
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
 from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem, bare_problem, free_parameters, in_opencv_model
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate
 from pipeline.opencv_check.opencv_conversion import Converted, converted

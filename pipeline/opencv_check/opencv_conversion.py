@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.result import Adjustment
+from adjust.problem.result import Adjustment
 from pipeline.opencv_check.bare_problem import BareProblem
 from pipeline.opencv_check.opencv_model import NAMES, Freedom, Refit, image_grid, refit, refit_jacobian
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.projection import ideal_from_observed
-from adjust.network import Distortion
+from adjust.problem.network import Distortion
 
 Array = NDArray[np.float64]
 

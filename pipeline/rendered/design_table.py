@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import cast, get_args
 
-from adjust.network import Transformation
+from adjust.problem.network import Transformation
 from pipeline.files.adjust_table import Datum, ScannerSetting, read_scanner, read_scanner_sigma, read_transformation
 from pipeline.text.tables import Table
 

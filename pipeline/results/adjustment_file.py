@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.images import adjusted_image
-from adjust.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior, Scanner
+from adjust.problem.images import adjusted_image
+from adjust.problem.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior, Scanner
+from adjust.problem.result import Adjustment, FurtherResidual
 from adjust.quality.correlation import correlations
 from adjust.quality.significance import SignificanceTest, group_tests, parameter_tests, scanner_tests
-from adjust.result import Adjustment, FurtherResidual
 from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.results.covariance_arrays import covariance_arrays, covariance_note
 from pipeline.results.fingerprints import of_content

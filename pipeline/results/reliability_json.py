@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from adjust.result import Adjustment, Reliability, Suspect
-from adjust.tested import Tested
+from adjust.problem.result import Adjustment, Reliability, Suspect
+from adjust.problem.tested import Tested
 
 Json = dict[str, Any]
 

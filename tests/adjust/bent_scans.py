@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import Camera, Fiducial, Image, Network, Observations, Prior, Scanner, Transformation
+from adjust.problem.network import Camera, Fiducial, Image, Network, Observations, Prior, Scanner, Transformation
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ import numpy as np
 from setups import CONVERGENT, FREE, HEIGHT, LEVEL_STATIONS, UNKNOWN, Setup, given, vertical
 from simulated import STATIONS, field_points
 
-from adjust.adjustment import Options
-from adjust.network import Approximations, Network, Observations
+from adjust.problem.network import Approximations, Network, Observations
+from adjust.problem.result import Adjustment
 from adjust.quality.correlation import correlations
-from adjust.result import Adjustment
+from adjust.solution.adjustment import Options
 
 
 def sentences(result: Adjustment) -> list[str]:

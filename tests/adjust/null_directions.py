@@ -18,7 +18,7 @@ from setups import (
 )
 from simulated import STATIONS
 
-from adjust.adjustment import Options
+from adjust.solution.adjustment import Options
 
 AXES = ("Shift x", "Shift y", "Rotation", "Scale")
 DEFORMATIONS = ("Affinity", "Shear")

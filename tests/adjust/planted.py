@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.errors import AdjustmentError
-from adjust.network import Exterior, Fiducial, Network, ObjectPoint, Prior
+from adjust.problem.network import Exterior, Fiducial, Network, ObjectPoint, Prior
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.network import (
+from adjust.problem.network import (
     Camera,
     Distortion,
     Fiducial,

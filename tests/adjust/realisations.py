@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from reference_cases import CAMERA, Case, approximations_of, network_of, own_name
 
-from adjust.functions import computed_observations
-from adjust.network import Approximations, Camera, Fiducial, Network, ObjectPoint, Prior
-from adjust.problem import number
+from adjust.problem.functions import computed_observations
+from adjust.problem.network import Approximations, Camera, Fiducial, Network, ObjectPoint, Prior
+from adjust.problem.problem import number
 
 Array = NDArray[np.float64]
 

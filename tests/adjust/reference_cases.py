@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.network import (
+from adjust.problem.network import (
     EXTERIOR_NAMES,
     Approximations,
     Camera,

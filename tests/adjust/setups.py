@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from simulated import STATIONS, Truth, field_points, simulated
 
-from adjust.network import Approximations, Camera, Fiducial, Network, ObjectPoint, Prior, Transformation
+from adjust.problem.network import Approximations, Camera, Fiducial, Network, ObjectPoint, Prior, Transformation
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]

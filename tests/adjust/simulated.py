@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import (
+from adjust.problem.network import (
     Approximations,
     Camera,
     Decentering,

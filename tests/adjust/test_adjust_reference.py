@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from reference_cases import CAMERA, Case, approximations_of, load, network_of, own_name
 
-from adjust.adjustment import Options, adjust
-from adjust.network import Distortion, Network, Observations, Prior
-from adjust.result import Adjustment
+from adjust.problem.network import Distortion, Network, Observations, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 
 CASES = (
     "i_five_images_affine_reduced",

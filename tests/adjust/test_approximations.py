@@ -10,10 +10,9 @@ from projected import C_MM, CONVERGENT, MARKS_MM, VERTICAL, Truth, field, simula
 from reference_cases import load, network_of
 from scipy.spatial.transform import Rotation
 
-from adjust.adjustment import adjust
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.network import (
+from adjust.problem.network import (
     EXTERIOR_NAMES,
     Approximations,
     Distortion,
@@ -24,6 +23,7 @@ from adjust.network import (
     Prior,
     Transformation,
 )
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from real_data import DATA, needs
 from scipy.io import loadmat
 
-from adjust.adjustment import adjust
 from adjust.initial_values.approximations import approximate
-from adjust.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
-from adjust.result import Adjustment
+from adjust.problem.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 

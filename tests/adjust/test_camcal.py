@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from real_data import DATA, needs
 
-from adjust.adjustment import Options, adjust
 from adjust.initial_values.approximations import approximate
-from adjust.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
+from adjust.problem.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
+from adjust.solution.adjustment import Options, adjust
 
 FOLDER = DATA / "coded" / "camcal" / "camcaldemo"
 pytestmark = needs("coded", "camcal", "camcaldemo")

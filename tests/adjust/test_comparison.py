@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.choices.comparison import CameraCalibration, compare
 from adjust.errors import AdjustmentError
-from adjust.network import Distortion
+from adjust.problem.network import Distortion
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from mishaps import MISHAPS, sentences
 from setups import CONVERGENT, FREE, Setup, given, vertical
 from simulated import STATIONS
 
-from adjust.adjustment import adjust
 from adjust.quality.correlation import correlations
+from adjust.solution.adjustment import adjust
 
 LOW_RELIEF = Setup(vertical(0.0, 0.0, 0.0, 0.0), relief=20.0, prior=1.0)
 

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from reference_cases import approximations_of, load, network_of
 from simulated import Truth, rotation, simulated
 
-from adjust.adjustment import Datum, Options, adjust
 from adjust.errors import AdjustmentError
 from adjust.functional_model.rotation import angles_from_rotation
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.initial_values.approximations import approximate
-from adjust.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, ObjectPoint, Prior
-from adjust.result import Adjustment
+from adjust.problem.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, ObjectPoint, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Datum, Options, adjust
 
 Array = NDArray[np.float64]
 

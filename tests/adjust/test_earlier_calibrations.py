@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from simulated import field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.errors import AdjustmentError
-from adjust.network import Approximations, Calibration, Fiducial, Network, Observations, Prior, Transformation
-from adjust.result import Adjustment
+from adjust.problem.network import Approximations, Calibration, Fiducial, Network, Observations, Prior, Transformation
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
 
 
 def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, Approximations], ...]:

@@ -10,15 +10,15 @@ from row_roots import row_roots
 from scipy.sparse import eye_array
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.least_squares.iteration import Linearised, factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
 from adjust.linear_algebra import elimination, multifrontal, triangle
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
-from adjust.network import Approximations, Network, Observations
-from adjust.problem import number
+from adjust.problem.network import Approximations, Network, Observations
+from adjust.problem.problem import number
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 

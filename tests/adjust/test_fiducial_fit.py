@@ -7,7 +7,7 @@ from simulated import Truth, camera_of_film, film_parameters
 
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values.fiducial_fit import fit_transformation
-from adjust.network import Transformation
+from adjust.problem.network import Transformation
 
 Array = NDArray[np.float64]
 

@@ -19,11 +19,11 @@ from simulated import (
     torlegard,
 )
 
-from adjust.adjustment import adjust
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.network import Network, Observations, Prior, Transformation
-from adjust.result import Adjustment
+from adjust.problem.network import Network, Observations, Prior, Transformation
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 

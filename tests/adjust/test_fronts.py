@@ -11,7 +11,6 @@ from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 from simulated import Truth, simulated
 
-from adjust.adjustment import adjust
 from adjust.least_squares.iteration import factorise, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import WhitenedRows, prior_root_weights
@@ -19,8 +18,9 @@ from adjust.linear_algebra import elimination, fronts, triangle
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.linear_algebra.fronts import Fronts, fronts_of
-from adjust.network import Approximations, Fiducial, Network, ObjectPoint, Observations, Prior
-from adjust.problem import number
+from adjust.problem.network import Approximations, Fiducial, Network, ObjectPoint, Observations, Prior
+from adjust.problem.problem import number
+from adjust.solution.adjustment import adjust
 from adjust.undetermined import diagnosis
 
 Array = NDArray[np.float64]

@@ -8,20 +8,20 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from simulated import ATTITUDES, STATIONS, Truth, camera_point, field_points, rotation, simulated
 
-from adjust.adjustment import Options, adjust
 from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
 from adjust.least_squares.numbering import Numbering
-from adjust.network import (
+from adjust.problem.network import (
     Distance,
     Exterior,
     Network,
     ObjectPoint,
     Prior,
 )
-from adjust.problem import number
-from adjust.result import Adjustment
+from adjust.problem.problem import number
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from mishaps import MISHAPS, sentences
 from null_directions import AXES, CATALOGUE, DEFORMATIONS, DISTANCE
 from setups import CONVERGENT, Setup, given
 
-from adjust.adjustment import adjust
-from adjust.network import Approximations, Exterior, Network, Prior, Transformation
-from adjust.result import Adjustment
+from adjust.problem.network import Approximations, Exterior, Network, Prior, Transformation
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
 
 GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
     "Shift x": [

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.initial_values.approximations import approximate
-from adjust.network import Network, ObjectPoint, Prior
-from adjust.options import Options
+from adjust.problem.network import Network, ObjectPoint, Prior
+from adjust.solution.adjustment import adjust
+from adjust.solution.options import Options
 
 TILT = 0.14  # rad
 AROUND = [2 * np.pi * i / 8 for i in range(8)]

@@ -7,14 +7,14 @@ import pytest
 from numpy.typing import NDArray
 from simulated import HALF_MM, Truth, field_points, simulated
 
-from adjust.adjustment import Options, adjust
 from adjust.choices.candidates import Candidate, f_test, nested_tests, simplest_sufficient
 from adjust.choices.cross_validation import CrossValidation, cross_validate, folds
 from adjust.choices.model_choice import Choice, choose, weighed
 from adjust.choices.models import Model, lenses
 from adjust.initial_values.approximations import approximate
-from adjust.network import Distortion, Network, ObjectPoint, Prior, Transformation
+from adjust.problem.network import Distortion, Network, ObjectPoint, Prior, Transformation
 from adjust.quality.reweighting import WeightFunction
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 

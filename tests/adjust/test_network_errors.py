@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from simulated import Truth, simulated
 
-from adjust.adjustment import Datum, Options, adjust
 from adjust.errors import AdjustmentError
-from adjust.network import (
+from adjust.problem.network import (
     Approximations,
     Camera,
     Distortion,
@@ -21,6 +20,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
+from adjust.solution.adjustment import Datum, Options, adjust
 
 Change = Callable[[Network], Network]
 

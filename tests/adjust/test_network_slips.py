@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from planted import KINDS, exchanged, network, outcome, said, with_points
 
-from adjust.adjustment import Options, adjust
 from adjust.errors import AdjustmentError
-from adjust.network_slips import AXES
+from adjust.solution.adjustment import Options, adjust
+from adjust.solution.network_slips import AXES
 
 FAST = (
     "sign of X, approximate orientations",

@@ -6,10 +6,10 @@ from null_directions import AXES, DEFORMATIONS, DISTANCE, POINT
 from setups import UNKNOWN, Array, Setup, vertical
 from simulated import field_points
 
-from adjust.adjustment import Options, adjust
 from adjust.linear_algebra.factor import BlockFactors, Factor
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.triangle import Triangle
+from adjust.solution.adjustment import Options, adjust
 from adjust.undetermined import null_space
 
 

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from simulated import Truth, camera_point, field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ImageModel, camera_from_ray, ideal_from_observed
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.functional_model.transformation import Film
-from adjust.images import adjusted_image, approximate_image
 from adjust.initial_values.approximations import approximate
-from adjust.network import Approximations, Camera, Distortion, Image, Network, ObjectPoint, Observations, Prior
+from adjust.problem.images import adjusted_image, approximate_image
+from adjust.problem.network import Approximations, Camera, Distortion, Image, Network, ObjectPoint, Observations, Prior
+from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,9 @@ import pytest
 from reference_cases import CAMERA, approximations_of, load, network_of, own_name
 from simulated import simulated
 
-from adjust.adjustment import Datum, Options, adjust
 from adjust.choices.planning import plan
 from adjust.errors import AdjustmentError
-from adjust.network import (
+from adjust.problem.network import (
     Approximations,
     Camera,
     Exterior,
@@ -22,6 +21,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
+from adjust.solution.adjustment import Datum, Options, adjust
 
 TARGETS: tuple[ObservationKind, ...] = ("target",) * 5
 FIDUCIALS: tuple[ObservationKind, ...] = ("fiducial",) * 3

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy import special
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import Options, adjust
-from adjust.network import Approximations, Calibration, Camera, Exterior, Network, ObservationKind, Prior
-from adjust.probabilities import Probabilities
-from adjust.result import Adjustment, Reliability
+from adjust.problem.network import Approximations, Calibration, Camera, Exterior, Network, ObservationKind, Prior
+from adjust.problem.probabilities import Probabilities
+from adjust.problem.result import Adjustment, Reliability
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 

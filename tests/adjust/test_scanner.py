@@ -8,14 +8,14 @@ from bent_scans import HALF_MM, MIDDLE_MM, RESEAU_MM, bent, displacement, films,
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import Options, adjust
 from adjust.errors import AdjustmentError
 from adjust.functional_model.scanner import Bend, carriage_terms, smooth_terms
-from adjust.images import adjusted_image
 from adjust.initial_values.approximations import approximate
-from adjust.network import Network, Prior, Scanner, Transformation
+from adjust.problem.images import adjusted_image
+from adjust.problem.network import Network, Prior, Scanner, Transformation
+from adjust.problem.result import Adjustment
 from adjust.quality.significance import scanner_tests
-from adjust.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 

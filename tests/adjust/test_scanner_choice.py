@@ -8,11 +8,11 @@ import pytest
 from bent_scans import MIDDLE_MM, RESEAU_MM, films, in_a_bent_scanner
 from simulated import STATIONS, Truth, field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.choices.scanner_choice import choose_bends, with_bends
 from adjust.initial_values.approximations import approximate
-from adjust.network import Approximations, Network
-from adjust.result import Adjustment
+from adjust.problem.network import Approximations, Network
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
 
 QUARTERS = [0.0, 90.0, 180.0, 270.0]
 

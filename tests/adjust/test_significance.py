@@ -7,10 +7,10 @@ import pytest
 from scipy import stats
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import adjust
-from adjust.network import Network, Prior
+from adjust.problem.network import Network, Prior
+from adjust.problem.result import Adjustment
 from adjust.quality.significance import group_tests, parameter_tests
-from adjust.result import Adjustment
+from adjust.solution.adjustment import adjust
 
 FREE = dict.fromkeys(("k3", "k5", "p1", "p2"), np.inf)
 

@@ -8,9 +8,9 @@ import pytest
 from reference_cases import CAMERA, CAUSES, DROPPED, Case, approximations_of, load, network_of
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import Datum, Options, adjust
-from adjust.network import Network, Observations
-from adjust.result import Adjustment
+from adjust.problem.network import Network, Observations
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Datum, Options, adjust
 
 SINGULAR = ("K2D_vert0", "K3D_conv", "U3D_vert0", "H2D_vertcross")
 

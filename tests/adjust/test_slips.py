@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import Options, adjust
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.network import Network, ObjectPoint, Prior
-from adjust.result import Adjustment
+from adjust.problem.network import Network, ObjectPoint, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import Options, adjust
-from adjust.network import Approximations, Fiducial, Network, Prior
-from adjust.result import Adjustment
+from adjust.problem.network import Approximations, Fiducial, Network, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 

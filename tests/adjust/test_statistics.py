@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import Options, adjust
-from adjust.network import Camera, Exterior, Fiducial, Network, ObservationKind, Observations, Prior
-from adjust.result import Adjustment
+from adjust.problem.network import Camera, Exterior, Fiducial, Network, ObservationKind, Observations, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from simulated import field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.initial_values.approximations import approximate
-from adjust.network import Network, ObjectPoint
+from adjust.problem.network import Network, ObjectPoint
+from adjust.solution.adjustment import adjust
 
 POINTS = 14
 

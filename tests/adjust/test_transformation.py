@@ -13,7 +13,7 @@ from adjust.functional_model.transformation import (
     film_parameter_names,
     marks_needed,
 )
-from adjust.network import Image, Transformation
+from adjust.problem.network import Image, Transformation
 
 Array = NDArray[np.float64]
 

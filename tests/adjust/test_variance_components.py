@@ -7,15 +7,15 @@ import pytest
 from numpy.typing import NDArray
 from simulated import field_points, simulated
 
-from adjust.adjustment import Options, adjust
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.functions import compute, derivatives
 from adjust.least_squares.iteration import linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.least_squares.rows import prior_root_weights
-from adjust.network import Approximations, Network
-from adjust.problem import State, number
-from adjust.result import Adjustment
+from adjust.problem.functions import compute, derivatives
+from adjust.problem.network import Approximations, Network
+from adjust.problem.problem import State, number
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,8 @@ import pytest
 from dense_adjustment import solve_densely
 from simulated import Truth, field_points, simulated
 
-from adjust.adjustment import adjust
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.network import (
+from adjust.problem.network import (
     Approximations,
     Camera,
     Distortion,
@@ -21,6 +20,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
+from adjust.solution.adjustment import adjust
 
 Case = tuple[Network, Approximations]
 

@@ -13,7 +13,7 @@ import numpy as np
 from simulated import Truth, simulated
 from simulated_project import write_project
 
-from adjust.network import Network
+from adjust.problem.network import Network
 from pipeline.cli import run
 
 FILES = ("project.toml", "camera.toml", "points.csv", "images.csv", "distances.csv", "comparator.csv",

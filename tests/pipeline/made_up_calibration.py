@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import (
+from adjust.problem.network import (
     Camera,
     Distortion,
     Exterior,
@@ -22,7 +22,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
-from adjust.result import (
+from adjust.problem.result import (
     Adjustment,
     FurtherResidual,
     Group,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adjust.network import Network, Prior
+from adjust.problem.network import Network, Prior
 
 
 def write_project(network: Network, folder: Path) -> Path:

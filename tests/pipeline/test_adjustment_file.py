@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from setups import Setup, vertical
 
-from adjust.adjustment import adjust
-from adjust.network import ObjectPoint, Prior
-from adjust.result import Adjustment, Residuals
+from adjust.problem.network import ObjectPoint, Prior
+from adjust.problem.result import Adjustment, Residuals
+from adjust.solution.adjustment import adjust
 from pipeline.errors import InputError
 from pipeline.results import covariance_arrays
 from pipeline.results.adjustment_file import write_adjustment

@@ -11,9 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from adjust.adjustment import Options, adjust
 from adjust.initial_values.approximations import approximate
-from adjust.network import (
+from adjust.problem.network import (
     Camera,
     Distortion,
     Fiducial,
@@ -24,6 +23,7 @@ from adjust.network import (
     Observations,
     Prior,
 )
+from adjust.solution.adjustment import Options, adjust
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.opencv_check.opencv_calibration import OpenCvCalibration, calibrate
 from pipeline.results.check_file import CameraCheck, Check

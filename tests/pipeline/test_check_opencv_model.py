@@ -6,7 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.network import Distortion
+from adjust.problem.network import Distortion
 from pipeline.opencv_check.opencv_model import NAMES, Freedom, image_grid, project, refit, refit_jacobian
 
 Array = NDArray[np.float64]

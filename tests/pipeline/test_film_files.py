@@ -8,7 +8,7 @@ import pytest
 from simulated import Truth, field_points, film_parameters, simulated
 
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.network import Network, Transformation
+from adjust.problem.network import Network, Transformation
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from adjust.network import Prior
+from adjust.problem.network import Prior
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.ties import TieOptions, measure_ties
 from measure.status import Status

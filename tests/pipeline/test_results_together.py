@@ -14,7 +14,7 @@ import pytest
 from test_command_line import replaced, results, rewritten_scans
 
 from adjust.errors import AdjustmentError
-from adjust.network import Prior
+from adjust.problem.network import Prior
 from measure.errors import MeasurementError
 from measure.status import Status
 from pipeline import stages

@@ -12,9 +12,9 @@ from bent_scans import films
 from simulated_project import write_project
 from small_scene import OBLIQUE, SCANNER, scene
 
-from adjust.adjustment import adjust
 from adjust.initial_values.approximations import approximate
-from adjust.network import Network, Prior, Scanner
+from adjust.problem.network import Network, Prior, Scanner
+from adjust.solution.adjustment import adjust
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.rendered.scene_file import read_scene
 from pipeline.rendered.scene_project import write_project as write_rendered

@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 
 from adjust.errors import NoImageError
 from adjust.functional_model.families import family
-from adjust.functions import blind_mark
 from adjust.least_squares.iteration import Linearised, Solution, iterate, linearise
 from adjust.least_squares.numbering import Numbering
 from adjust.linear_algebra.factor import Factor
-from adjust.options import Options
-from adjust.problem import Problem, State
+from adjust.problem.functions import blind_mark
+from adjust.problem.problem import Problem, State
+from adjust.problem.result import NullDirection, Termination
+from adjust.problem.tested import TestedUnits
 from adjust.quality.reliability import Misfits, misfits, statistics
 from adjust.quality.reweighting import NO_WEIGHT, WeightFunction, Weighting, robust_weights
 from adjust.quality.snooping import Contradiction, contradictions, limits, search
 from adjust.quality.variance_components import refined_factors
-from adjust.result import NullDirection, Termination
-from adjust.tested import TestedUnits
+from adjust.solution.options import Options
 from adjust.undetermined.diagnosis import singular_directions
 
 ROUNDS = 30  # of robust estimation, of variance components or of data snooping at most

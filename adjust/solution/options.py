@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
-from adjust.probabilities import Probabilities
+from adjust.problem.probabilities import Probabilities
+from adjust.problem.tested import PRIOR_GROUPS
 from adjust.quality.reweighting import WeightFunction
-from adjust.tested import PRIOR_GROUPS
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.rotation import cross_matrix, rotation_from_angles, vector_by_angles
-from adjust.network import Exterior, Network
-from adjust.unknowns import Unknowns
+from adjust.problem.network import Exterior, Network
+from adjust.problem.unknowns import Unknowns
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -7,19 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from adjust.assessment import RunAssessment
 from adjust.errors import AdjustmentError, NoImageError
 from adjust.initial_values.approximations import approximate
 from adjust.initial_values.far_points import far_points
 from adjust.least_squares.kept_memory import keep_freed_memory
-from adjust.network import STRAIGHT, Approximations, Network
-from adjust.network_slips import network_slip, stations_elsewhere
-from adjust.options import Datum, Method, Options
-from adjust.problem import Problem, number
+from adjust.problem.network import STRAIGHT, Approximations, Network
+from adjust.problem.problem import Problem, number
+from adjust.problem.result import Adjustment, Cofactor
 from adjust.quality.cofactor import NoCofactor, free_cofactor, inner_cofactor
-from adjust.result import Adjustment, Cofactor
-from adjust.runs import Run, again, run
-from adjust.slips import Slip, few_points, freed, slips
+from adjust.solution.assessment import RunAssessment
+from adjust.solution.network_slips import network_slip, stations_elsewhere
+from adjust.solution.options import Datum, Method, Options
+from adjust.solution.runs import Run, again, run
+from adjust.solution.slips import Slip, few_points, freed, slips
 from adjust.undetermined.datum import CENTERINGS, EXACT, centered, minimal_datum, object_datum
 from adjust.undetermined.datum_choice import chosen_coordinates, chosen_points, with_held
 from adjust.validation import validate

@@ -11,9 +11,9 @@ from adjust.functional_model.film_kinds import FilmKind
 from adjust.functional_model.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.functional_model.scanner import Bend
 from adjust.functional_model.transformation import film_kind
-from adjust.further_observations import FurtherObservation, further_observations
-from adjust.network import Approximations, Network, Transformation
-from adjust.unknowns import Unknowns, list_unknowns
+from adjust.problem.further_observations import FurtherObservation, further_observations
+from adjust.problem.network import Approximations, Network, Transformation
+from adjust.problem.unknowns import Unknowns, list_unknowns
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

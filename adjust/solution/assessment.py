@@ -7,18 +7,18 @@ from functools import cached_property
 import numpy as np
 
 from adjust.functional_model.transformation import marks_needed
-from adjust.functions import computed_observations
 from adjust.least_squares.iteration import factorise
-from adjust.probabilities import Probabilities
-from adjust.problem import Problem
+from adjust.problem.functions import computed_observations
+from adjust.problem.probabilities import Probabilities
+from adjust.problem.problem import Problem
+from adjust.problem.result import Cofactor, FurtherResidual, Group, Reliability, Residuals, Suspect
+from adjust.problem.tested import TestedUnits
 from adjust.quality.reliability import Misfits, reliability
 from adjust.quality.residuals import further_residuals, groups, residuals
 from adjust.quality.snooping import contradictions, search, suspects
 from adjust.quality.suspicions import is_gross, swapped_numbers, unchecked_orientations
 from adjust.quality.variance_components import factor_sigmas
-from adjust.result import Cofactor, FurtherResidual, Group, Reliability, Residuals, Suspect
-from adjust.runs import ROUNDS, Run
-from adjust.tested import TestedUnits
+from adjust.solution.runs import ROUNDS, Run
 from adjust.undetermined.diagnosis import undetermined, weak_directions
 from adjust.undetermined.scanner_directions import hardly_told
 

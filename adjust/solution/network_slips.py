@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from adjust.network import Camera, Exterior, Fiducial, Network, ObjectPoint, Prior
-from adjust.result import Adjustment
+from adjust.problem.network import Camera, Exterior, Fiducial, Network, ObjectPoint, Prior
+from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.network import EXTERIOR_NAMES, Approximations, Camera, Image, Network, ObjectPoint, Prior
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Camera, Image, Network, ObjectPoint, Prior
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

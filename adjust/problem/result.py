@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.network import Network
-from adjust.probabilities import Probabilities
-from adjust.tested import Tested
+from adjust.problem.network import Network
+from adjust.problem.probabilities import Probabilities
+from adjust.problem.tested import Tested
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

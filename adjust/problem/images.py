@@ -8,8 +8,8 @@ from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND, Bend
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.network import EXTERIOR_NAMES, Approximations, Image, Network
-from adjust.result import Adjustment
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network
+from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem import ABSENT, Problem
+from adjust.problem.problem import ABSENT, Problem
 
 Indices = NDArray[np.intp]
 

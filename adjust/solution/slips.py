@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.initial_values.far_points import FarPoint
-from adjust.network import Approximations, Network, ObjectPoint, Prior
-from adjust.options import Options
-from adjust.result import Adjustment
+from adjust.problem.network import Approximations, Network, ObjectPoint, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.options import Options
 
 Array = NDArray[np.float64]
 
