@@ -16,13 +16,15 @@ Mask = NDArray[np.bool_]
 class LinearFit:
     """residuals (height, width), where used; design (unknowns, height, width): derivatives of the model by the
     unknowns, the first two the place by column and row, the last four gain, offset and slopes of the ground; by_grey,
-    alike: derivatives of the fitted unknowns by the grey values; noise: of these."""
+    alike: derivatives of the fitted unknowns by the grey values; noise: of these. All images are
+    multiplied by steadiness (height, width), so that their noise is alike everywhere."""
 
     residuals: Array
     used: Mask
     design: Array
     by_grey: Array
     noise: NoiseModel
+    steadiness: Array
 
     def covariance(self, by_grey: Array) -> Array:
         """(n, n) that the noise gives to n figures, whose derivatives by the grey values are (n, height, width)."""

@@ -360,7 +360,7 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     if about.frame.any():
         landscape = covariance_of_landscape(about.grey, about.frame, by_grey[:2] * model.design[-GREY])
         place = place.plus(Cause.LANDSCAPE, landscape)
-    linear = LinearFit(model.residuals, used, model.design, by_grey, noise)
+    linear = LinearFit(model.residuals, used, model.design, by_grey, noise, model.steadiness)
     freedom = model.options.freedom
     tells_shape = freedom == "similarity" and not is_round(model.mark)
     return _Precision(
@@ -382,7 +382,7 @@ def _tone(fit: PictureFit, linear: LinearFit) -> ToldTone | None:
         return None
     if model.background_px is not None:
         return untold_tone(linear, model.light, model.detail, coding.tone, coding.full_scale_dn)
-    drawn = model.grey - (model.uncensored if model.is_clipped else model.residuals)
+    drawn = model.drawn
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
     return told_tone(linear, drawn, model.grey, clear, coding.tone, coding.full_scale_dn)
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.clipping import noise_scale
-from measure.fitting.picture_model import BENT, ROUGHLY_BENT, ROUNDING_DN, PictureModel
+from measure.fitting.picture_model import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.fitting.rounding import (
     COARSEST_VARIANCE,
     ROUNDING_VARIANCE,
@@ -22,6 +22,7 @@ from measure.marks.shapes import MarkTemplate
 from measure.noise.noise import NoiseModel, correlated, may_be_noise, robust_scale
 from measure.noise.pixel_sums import combined, products
 from measure.noise.robust import damage, damage_where_lossy, grown, solution, tukey_loss, tukey_weights
+from measure.noise.steadiness import steadiness
 from measure.noise.weighting import weighted
 
 Array = NDArray[np.float64]
@@ -38,6 +39,7 @@ _WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
 _UNSETTLED = "the adjustment did not converge"
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
+_GROUND = 0.1  # of the mark: what shows less is its ground
 EDGE_BLURS = 3.0  # from the frame's border, in which a mark ends: a thousandth of its step is seen farther off
 
 
@@ -68,6 +70,7 @@ class PictureFit:
         if not self.reason:
             self.choose_area()
         if not self.reason:
+            self._steady()
             self._adjust(robust=True, tolerance_px=0.05)
 
     def approach_from_near(self) -> None:
@@ -82,6 +85,7 @@ class PictureFit:
         """Robust from there, then on what is undamaged."""
         self.model.bent = BENT
         if not self.reason:
+            self._steady()
             self._adjust(robust=True, tolerance_px=0.005)
         for round_ in range(self.options.damage_rounds):
             if self.reason:
@@ -108,12 +112,12 @@ class PictureFit:
         steps = None if self.reason or not is_whole else self.coding.steps_dn(ordinary)
         if steps is None:
             return
-        step2 = float(np.mean(steps[ordinary] ** 2))
+        step2 = float(np.mean((steps * model.steadiness)[ordinary] ** 2))
         self.rounding_variance_dn2 = ROUNDING_VARIANCE * step2
         if np.mean(model.residuals[ordinary] ** 2) > COARSEST_VARIANCE * step2:
             return
         for _ in range(_MOST_UNROUNDED):
-            drawn, before = model.grey - model.residuals, model.state.pixel_from_mark[:, 2]
+            drawn, before = model.drawn, model.state.pixel_from_mark[:, 2]
             off = (rounded - drawn) / steps
             sigma = likely_sigma(off[ordinary])
             self.least_variance_dn2 = unrounded_variance(sigma) * step2
@@ -122,6 +126,15 @@ class PictureFit:
             self._adjust(robust=False, tolerance_px=_UNROUNDED_PX)
             if self.reason or np.hypot(*(model.state.pixel_from_mark[:, 2] - before)) < _UNROUNDED_PX:
                 break
+
+    def _steady(self) -> None:
+        """Take into account by how much noise grows with light, as the residuals of the present state show it."""
+        model, coding = self.model, self.coding
+        if coding.tone.is_identity or isinstance(model.mark, MarkTemplate):
+            return
+        drawn, shown = model.drawn, np.abs(model.design[-GREY] / model.steadiness)
+        slopes = coding.tone.slopes(drawn, coding.full_scale_dn)
+        model.take_steadiness(steadiness(model.light - drawn, slopes, shown < _GROUND * shown.max(), self.telling))
 
     def _is_plain(self) -> bool:
         """Whether undamaged pixels far from the mark vary as the nearer ones do."""

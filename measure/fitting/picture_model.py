@@ -65,8 +65,9 @@ class PictureModel:
     values need; tells (height, width): False where a clipped one says nothing of it. slopes and information (height,
     width), 1 where a grey value is ordinary: as `censored` gives them. uncensored (height, width): residuals as if
     none were clipped, where some are.
-    Of a chip (height, width): steadiness, as `chip_steadiness` gives it, which weighs residuals and design; half_tones,
-    as `covariance_of_changed_tone` needs it."""
+    steadiness (height, width): the noise of an ordinary pixel over that of each, a chip's as `chip_steadiness` gives
+    it. Residuals and design are multiplied by it: so their noise is alike everywhere. half_tones (height, width): of a
+    chip, as `covariance_of_changed_tone` needs it."""
 
     border_unknowns = 0
 
@@ -139,12 +140,12 @@ class PictureModel:
         contrast, beyond = self._by_border(shown)
         columns *= -contrast
         self.residuals = self.grey - combined(self.state.greys, greys) - beyond
-        self._censor()
         if isinstance(self.mark, MarkTemplate):
-            self.half_tones = self.state.greys[0] * self.detail(4 * shown.value * (1 - shown.value))
             self.steadiness = chip_steadiness(self.mark, place, width, height)
-            for each in (self.residuals, self.design, self.half_tones):
-                each *= self.steadiness
+            self.half_tones = self.steadiness * self.state.greys[0] * self.detail(4 * shown.value * (1 - shown.value))
+        for each in (self.residuals, self.design):
+            each *= self.steadiness
+        self._censor()
         self._linearised = self.state, self.residuals
 
     def _by_border(self, shown: Rendering) -> tuple[Array | float, Array | float]:
@@ -157,7 +158,7 @@ class PictureModel:
 
     def take_grey(self, grey: Array) -> None:
         """Other grey values (height, width) for the same light."""
-        change, self.grey, self.light = grey - self.grey, grey, grey
+        change, self.grey, self.light = (grey - self.grey) * self.steadiness, grey, grey
         self.residuals = self.residuals + change
         if self._linearised is not None:
             at, residuals = self._linearised
@@ -167,6 +168,10 @@ class PictureModel:
         """Judge clipped grey values by noise of that standard deviation, unless it changes nothing of their part."""
         if abs(noise_dn / self.noise_dn - 1) > _AS_NOISY:
             self.noise_dn, self._linearised = noise_dn, None
+
+    def take_steadiness(self, steadiness: Array) -> None:
+        """Another noise of each pixel (height, width) over that of an ordinary one."""
+        self.steadiness, self._linearised = steadiness, None
 
     def _change(self, before: State) -> Array:
         """(unknowns,) from a state before to the present one, both alike."""
@@ -201,6 +206,11 @@ class PictureModel:
             self.residuals[at], self.slopes[at], self.information[at] = said
             self.design[:, at] *= said.slopes
             self.tells[at] = tells(said.slopes)
+
+    @property
+    def drawn(self) -> Array:
+        """(height, width) the light that the present state draws, with the surroundings if these do not count."""
+        return self.light - (self.uncensored if self.is_clipped else self.residuals) / self.steadiness
 
     @property
     def scores(self) -> Array:

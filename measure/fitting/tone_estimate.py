@@ -33,7 +33,7 @@ def told_tone(fit: LinearFit, drawn: Array, grey: Array, clear: Mask, tone: Tone
 
     What another curve moves the mark by follows from the observed light, with all that the drawing leaves unexplained.
     """
-    changes = tone.changes(drawn, full_scale_dn) * fit.used
+    changes = tone.changes(drawn, full_scale_dn) * fit.used * fit.steadiness
     left = _beside(fit, changes * clear)
     normal = products(left, changes)
     score = -products(left, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
@@ -55,22 +55,24 @@ def untold_tone(
 def _told(fit: LinearFit, said: SaidOfTone, changes: Array, tone: Tone, light: Array, full_scale_dn: float) -> ToldTone:
     """changes (k, height, width): of what was fitted, by the departures; light (height, width): of the picture."""
     codes = tone.code(np.quantile(light[fit.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
-    return ToldTone(said, products(fit.by_grey[:2], changes * fit.used), float(codes[0]), float(codes[1]))
+    return ToldTone(
+        said, products(fit.by_grey[:2], changes * fit.used * fit.steadiness), float(codes[0]), float(codes[1])
+    )
 
 
 def _beside(fit: LinearFit, changes: Array) -> Array:
     """(k, height, width) what is left of changes beside the unknowns, and beside light that is uneven."""
-    uneven = _uneven(fit.design[-GREY]) * fit.used
+    uneven = _uneven(fit.design[-GREY], fit.steadiness) * fit.used
     known = uneven - combined(products(uneven, fit.design), fit.by_grey)
     left = changes - combined(products(changes, fit.design), fit.by_grey)
     shares = np.linalg.pinv(products(known, uneven), rcond=_LEAST_SHOWN, hermitian=False) @ products(uneven, left)
     return np.asarray((left - combined(shares.T, known)) * fit.used)
 
 
-def _uneven(shown: Array) -> Array:
+def _uneven(shown: Array, about: Array) -> Array:
     """(8, height, width) slopes and bends of the light of a mark's picture, and bends of that about it."""
     height, width = shown.shape
     col = np.broadcast_to(np.linspace(-1.0, 1.0, width), shown.shape)
     row = np.broadcast_to(np.linspace(-1.0, 1.0, height)[:, None], shown.shape)
     bends = [col * col, col * row, row * row]
-    return np.stack([*(shown * each for each in (col, row, *bends)), *bends])
+    return np.stack([*(shown * each for each in (col, row, *bends)), *(about * each for each in bends)])

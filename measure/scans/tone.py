@@ -19,6 +19,7 @@ _PIECES = 1024  # of the range of codes, in which a curve is straight
 _NODES = np.linspace(0.0, 1.0, _PIECES + 1)
 _MIDDLES = (_NODES[1:] + _NODES[:-1]) / 2
 _TOE = 0.005  # of full scale: the slope of a power has no logarithm at black
+_DARKEST = 0.02  # of full scale: nearer to black the slope of a power is nearly nothing, and no scanner's noise is
 # What is believed of a curve of which nothing is said: between linear and sRGB, and a scanner may bend it further. The
 # waves are Legendre's polynomials; their standard deviations let S-curves be that a scanner's "contrast" makes.
 _POWER, _POWER_SIGMA = 1.6, 0.6
@@ -192,6 +193,11 @@ class Tone:
     def code(self, light: NDArray[np.floating], full_scale: float) -> Array:
         """The grey value that such light is stored as."""
         return np.asarray(full_scale * np.interp(np.asarray(light) / full_scale, self._table, _NODES))
+
+    def slopes(self, light: NDArray[np.floating], full_scale: float) -> Array:
+        """(...) by how much light grows with the code, 1 for a linear curve, at codes that stand for this light."""
+        share = np.maximum(self.code(light, full_scale) / full_scale, _DARKEST)
+        return np.asarray(np.interp(share, _MIDDLES, np.diff(self._table) * _PIECES))
 
     def changes(self, light: NDArray[np.floating], full_scale: float) -> Array:
         """(k, ...) what light becomes more of for each departure of 1, at codes that stand for this light."""
