@@ -1,13 +1,16 @@
 """What a check of measured fiducial marks finds: why a mark is doubted, and what becomes of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from measure.covariance import Cause
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
+
+Array = NDArray[np.float64]
 
 CHANCE = 0.01  # of doubting any good mark, of each check
 TOLD = np.log(100.0)  # log-odds at which one cause rather than another is taken for what is off
@@ -16,11 +19,20 @@ MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Why a mark is no longer called measured, how far off that puts it, and the cause to which that is counted."""
+    """How far off a check puts a mark, and the cause to which that is counted; reason: why it is no longer called
+    measured, empty where it still is, only less well known."""
 
     reason: str
     off_px: float
     cause: Cause
+
+    @property
+    def px2(self) -> Array:
+        """(2, 2) by which the mark's covariance grows: the mean square, an axis, of how far it is off."""
+        return self.off_px**2 / 2 * np.eye(2)
+
+    def without_reason(self) -> "Doubt":
+        return replace(self, reason="")
 
 
 def observed(frame: FrameMeasurement) -> list[MarkMeasurement]:
@@ -29,27 +41,18 @@ def observed(frame: FrameMeasurement) -> list[MarkMeasurement]:
 
 
 def doubted(frame: FrameMeasurement, doubts: Mapping[str, Doubt]) -> FrameMeasurement:
-    """The frame with those fiducials weak that doubts has, by their names."""
+    """The frame with those fiducials weak, or less well known, that doubts has, by their names."""
     marks = tuple(
-        _weakened(mark, doubts[mark.point]) if mark.kind == "fiducial" and mark.point in doubts else mark
+        _doubted(mark, doubts[mark.point]) if mark.kind == "fiducial" and mark.point in doubts else mark
         for mark in frame.marks
     )
     return replace(frame, marks=marks)
 
 
-def _weakened(mark: MarkMeasurement, doubt: Doubt) -> MarkMeasurement:
-    """Its variance enlarged by the mean square, an axis, of how far it is off."""
+def _doubted(mark: MarkMeasurement, doubt: Doubt) -> MarkMeasurement:
     assert mark.covariance is not None  # an observation has one
+    known = replace(mark, covariance=mark.covariance.plus(doubt.cause, doubt.px2))
+    if not doubt.reason:
+        return known
     reason = f"{mark.reason}; {doubt.reason}" if mark.reason else doubt.reason
-    covariance = mark.covariance.plus(doubt.cause, doubt.off_px**2 / 2 * np.eye(2))
-    return replace(mark, status=Status.WEAK, reason=reason, covariance=covariance)
-
-
-def from_others(off_mm: float, names: Sequence[str]) -> str:
-    """Why one of the marks called names is doubted that lies off_mm from where the camera's other frames have it."""
-    if len(names) == 1:
-        return f"it lies {off_mm:.3f} mm from where the camera's other frames have it, more than they scatter"
-    return (
-        f"one of the marks {', '.join(names)} lies off where the camera's other frames have it, this one by "
-        f"{off_mm:.3f} mm; which one, they do not tell"
-    )
+    return replace(known, status=Status.WEAK, reason=reason)

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
-from measure.checks.doubts import CHANCE, TOLD, Doubt, doubted, from_others, observed
+from measure.checks.doubts import CHANCE, TOLD, Doubt, doubted
 from measure.checks.explanation import Explanation, explained
 from measure.checks.misfits import Misfit, scan_sites
-from measure.checks.triangles import by_given_triangles, by_other_triangles
+from measure.checks.second_places import by_second_places
+from measure.checks.triangles import by_triangles
 from measure.covariance import Cause
 from measure.film import SCATTER_MM
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
@@ -49,36 +49,13 @@ def judged(
 ) -> Judgement:
     """All measured frames of one camera, judged. pitches_um: of each scan, in x and y; film_sigma_mm: what is believed
     beforehand of the scatter of marks by film and scanner."""
-    checked = _doubted(frames, _by_other_method(frames))
+    checked = [doubted(frame, own) for frame, own in zip(frames, by_second_places(frames), strict=True)]
     checked, films = _by_misfits(checked, layout, film_sigma_mm)
-    checked = _doubted(checked, list(by_other_triangles(checked, layout, pitches_um, film_sigma_mm)))
-    checked = _doubted(checked, list(by_given_triangles(checked, layout, pitches_um)))
+    for place, told in by_triangles(checked, layout, pitches_um, film_sigma_mm).items():
+        frame = _with_film(doubted(checked[place], told.doubts), told.film_mm**2)
+        checked[place] = replace(frame, problems=(*frame.problems, *([told.problem] if told.problem else [])))
+        films[place] = float(np.hypot(films[place], told.film_mm))
     return Judgement(tuple(checked), tuple(films))
-
-
-def _doubted(frames: Sequence[FrameMeasurement], doubts: Sequence[Mapping[str, Doubt]]) -> list[FrameMeasurement]:
-    return [doubted(frame, own) for frame, own in zip(frames, doubts, strict=True)]
-
-
-def _by_other_method(frames: Sequence[FrameMeasurement]) -> list[dict[str, Doubt]]:
-    """The place by the mark's edges must not differ from the matched one by more than noise explains."""
-    name = "second_method_sigmas"
-    tests = sum(name in mark.quality for frame in frames for mark in observed(frame))
-    doubts = []
-    for frame in frames:
-        own = {}
-        for mark in observed(frame):
-            sigmas = mark.quality.get(name)
-            if sigmas is not None and chdtrc(2, sigmas**2) * tests < CHANCE:
-                off = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
-                own[mark.point] = Doubt(
-                    f"its edges put it {off:#.2g} px elsewhere, {sigmas:.1f} standard deviations of the difference: "
-                    "it is damaged or unlike its drawing",
-                    off,
-                    Cause.SECOND_METHOD,
-                )
-        doubts.append(own)
-    return doubts
 
 
 def _by_misfits(
@@ -196,9 +173,14 @@ def _doubts(shared: Explanation, place: int, layout: FiducialLayout) -> dict[str
     doubts = {}
     for number, off in frame.off_mm.items():
         name = layout.marks[frame.misfit.index[number]].id
-        from_given = f"it lies {off:.3f} mm from where the other marks have it, more than film and given places explain"
-        reason = from_given if alone else from_others(off, [name])
-        doubts[name] = Doubt(reason, off / frame.misfit.mm, Cause.GIVEN_PLACES if alone else Cause.OTHER_FRAMES)
+        has_it = "the other marks have it, more than film and given places explain"
+        if not alone:
+            has_it = "the camera's other frames have it, more than they scatter"
+        doubts[name] = Doubt(
+            f"it lies {off:.3f} mm from where {has_it}",
+            off / frame.misfit.mm,
+            Cause.GIVEN_PLACES if alone else Cause.OTHER_FRAMES,
+        )
     return doubts
 
 

@@ -1,32 +1,57 @@
 """Frames of three marks: whether their triangle is one that film and scanner can have made of the camera's.
 
 An affine transformation goes through any three marks, so none of them is checked by the others. But a triangle has a
-size and a shape, and these are known: from the camera's file and the scan's pitch, to what film and scanner stretch,
-and from the camera's other frames, to what these scatter. A triangle that contradicts them at a stated probability
-(Bonferroni: divided by the number of tests) has a mark that is off, unless the pitch explains it far better.
+size and a shape, and these are known: from the camera's other frames, to what these scatter, and from the camera's
+file and the scan's pitch, to what film and scanner stretch. A triangle that contradicts them at a stated probability
+(Bonferroni: divided by the number of tests) is explained by one of its marks, where that alone does it far better than
+all else, by stretched film or wrong pitches likewise, or by neither: then it is a problem of its frame.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.special import chdtrc, chdtri, fdtrc
+from scipy.special import chdtrc, chdtri, fdtrc, logsumexp
 
-from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, TOLD, Doubt, from_others, observed
+from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, TOLD, Doubt, observed
 from measure.covariance import Cause
-from measure.film import AFFINITY_SIGMA
+from measure.film import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_MM
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement
 
 Array = NDArray[np.float64]
-_Reason = Callable[[float, Sequence[str]], str]  # from how far a mark is off, mm, and the marks of which it is one
 
+_MARKS = 3
 _LEAST_OTHERS = 2  # frames that show a triangle, too: of two alone nobody knows which one is off
 _FORM = 3  # numbers of a triangle's form: one of size, two of shape
 _STRETCH = AFFINITY_SIGMA**2 / 2 * np.eye(_FORM)  # AFFINITY_SIGMA along each axis: half of it squared in each number
+_MOST_STRETCHED = 0.05  # a pitch may be wrong by more than film or scanner stretch
+_WIDTHS = 24  # standard deviations, from the least to the most
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """What follows from a triangle that contradicts what is known of it: doubts of its marks by their names, or a
+    problem of the frame and the standard deviation of film that it adds to its marks."""
+
+    doubts: Mapping[str, Doubt] = field(default_factory=dict)
+    problem: str = ""
+    film_mm: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Against:
+    """What a triangle contradicts: where that has its marks, and the cause that this is."""
+
+    where: str
+    cause: Cause
+
+
+_GIVEN = _Against("where the given places and the scan's pitch have {}", Cause.GIVEN_PLACES)
+_OTHERS = _Against("where the camera's other frames have {}", Cause.OTHER_FRAMES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,50 +73,41 @@ class _Form:
         return np.asarray(np.einsum("kia,kja,k->ij", self.by_mark, self.by_mark, variance))
 
 
-def by_given_triangles(
-    frames: Sequence[FrameMeasurement], layout: FiducialLayout, pitches_um: Sequence[tuple[float, float]]
-) -> Iterator[dict[str, Doubt]]:
-    """The marks of each frame of three that is no triangle of the given places in pixels of the given pitch."""
-    names = [_names(frame) for frame in frames]
-    tests = sum(len(own) == 3 for own in names)
-    given = {mark.id: min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks}
-    for frame, own, pitch_um in zip(frames, names, pitches_um, strict=True):
-        form = _form(frame, own, layout, pitch_um) if len(own) == 3 else None
-        yield _against_given(form, own, np.array([given[name] for name in own]), tests) if form else {}
-
-
-def by_other_triangles(
+def by_triangles(
     frames: Sequence[FrameMeasurement],
     layout: FiducialLayout,
     pitches_um: Sequence[tuple[float, float]],
     film_sigma_mm: float,
-) -> Iterator[dict[str, Doubt]]:
-    """The marks of each frame of three that make another triangle than in the camera's other frames that lie alike."""
-    names = [_names(frame) for frame in frames]
-    three = [place for place, own in enumerate(names) if len(own) == 3]
-    doubts: dict[int, dict[str, Doubt]] = {}
-    for own in sorted({names[place] for place in three}):
+) -> dict[int, Contradiction]:
+    """By frame, of those of three marks, what contradicts the camera's other frames that lie alike, or else the given
+    places in pixels of the given pitch."""
+    names = {place: _names(frame) for place, frame in enumerate(frames) if len(observed(frame)) == _MARKS}
+    found = dict[int, Contradiction]()
+    for own in sorted(set(names.values())):
         seen = [_form(frame, own, layout, pitch_um) for frame, pitch_um in zip(frames, pitches_um, strict=True)]
         forms = {place: form for place, form in enumerate(seen) if form}
+        three = {place for place in forms if names.get(place) == own}
         for pose in {form.pose for form in forms.values()}:
             alike = {place: form for place, form in forms.items() if form.pose == pose}
-            doubts |= _against_others(
-                alike, {place for place in three if names[place] == own}, own, len(three), film_sigma_mm
-            )
-    for place in range(len(frames)):
-        yield doubts.get(place, {})
+            found |= _against_others(alike, three & alike.keys(), own, len(names), film_sigma_mm)
+        given = {mark.id: min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks}
+        for place in three - found.keys():
+            told = _against_given(forms[place], own, np.array([given[name] for name in own]), len(names))
+            found |= {place: told} if told else {}
+    return found
 
 
 def _names(frame: FrameMeasurement) -> tuple[str, ...]:
     return tuple(mark.point for mark in observed(frame))
 
 
-def _against_given(form: _Form, names: Sequence[str], given_mm: Array, tests: int) -> dict[str, Doubt]:
-    """Doubts of the marks called names, whose given places are known to given_mm (3,)."""
+def _against_given(form: _Form, names: Sequence[str], given_mm: Array, tests: int) -> Contradiction | None:
+    """Of the marks called names, whose given places are known to given_mm (3,)."""
     covariance = form.covariance(given_mm) + _STRETCH
-    if chdtrc(_FORM, _misfit(form.stretched, covariance)) * tests >= CHANCE:
-        return {}
-    return _doubts(_off(form, form.stretched, covariance), names, form, _from_given, Cause.GIVEN_PLACES)
+    chance = float(chdtrc(_FORM, _misfit(form.stretched, covariance)))
+    if chance * tests >= CHANCE:
+        return None
+    return _explained(form, form.stretched, covariance, names, _GIVEN, chance)
 
 
 def _against_others(
@@ -100,10 +116,10 @@ def _against_others(
     names: Sequence[str],
     tests: int,
     film_sigma_mm: float,
-) -> dict[int, dict[str, Doubt]]:
-    """Doubts of the marks called names by frame, of those that show these three only. forms: of all that show them,
-    against one another: the one that is worst off first, and without it the others again."""
-    left, doubts = dict(forms), dict[int, dict[str, Doubt]]()
+) -> dict[int, Contradiction]:
+    """Of the marks called names by frame, of those that show these three only. forms: of all that show them, against
+    one another: the one that is worst off first, and without it the others again."""
+    left, found = dict(forms), dict[int, Contradiction]()
     while len(left) > _LEAST_OTHERS and three & left.keys():
         places = list(left)
         stretched = np.array([form.stretched for form in left.values()])
@@ -115,12 +131,12 @@ def _against_others(
         misfits = np.array([_misfit(*each) for each in zip(apart, covariances, strict=True)])
         worst = max((n for n, place in enumerate(places) if place in three), key=lambda n: misfits[n])
         degrees = MEDIAN_EFFICIENCY * _FORM * (len(places) - 1)
-        if fdtrc(_FORM, degrees, misfits[worst] / _FORM) * tests >= CHANCE:
+        chance = float(fdtrc(_FORM, degrees, misfits[worst] / _FORM))
+        if chance * tests >= CHANCE:
             break
         form = left.pop(places[worst])
-        off_mm = _off(form, apart[worst], covariances[worst])
-        doubts[places[worst]] = _doubts(off_mm, names, form, from_others, Cause.OTHER_FRAMES)
-    return doubts
+        found[places[worst]] = _explained(form, apart[worst], covariances[worst], names, _OTHERS, chance)
+    return found
 
 
 def _form(
@@ -168,43 +184,45 @@ def _sigma_px(mark: MarkMeasurement) -> float:
     return float(np.sqrt(np.trace(mark.covariance_px2) / 2))
 
 
+def _explained(
+    form: _Form, stretched: Array, covariance: Array, names: Sequence[str], against: _Against, chance: float
+) -> Contradiction:
+    """What explains a stretch that chance does not: one mark that is off, if that does it far better than all else;
+    pitches or film that are stretched more than is believed, which any affine transformation takes; or nobody knows
+    what, and then all three marks are known no better than the triangle fits."""
+    pitches = _log_density_wider(form.by_pitch, stretched, covariance, (AFFINITY_SIGMA, _MOST_STRETCHED))
+    marks = [_log_density_wider(moved, stretched, covariance, (SCATTER_MM, MOST_BENT_MM)) for moved in form.by_mark]
+    best = int(np.argmax(marks))
+    if marks[best] - max(pitches, *np.delete(marks, best)) > TOLD:
+        weighed = np.linalg.solve(covariance, form.by_mark[best])
+        off_mm = float(np.hypot(*np.linalg.solve(form.by_mark[best].T @ weighed, weighed.T @ stretched)))
+        reason = f"it lies {off_mm:.2f} mm off {against.where.format('it')}: three marks have no other check"
+        return Contradiction({names[best]: Doubt(reason, off_mm / form.mm, against.cause)})
+    off_mm = float(np.sqrt(_misfit(stretched, form.covariance(1.0) - form.covariance(0.0)) / _FORM))
+    problem = (
+        f"its three marks {', '.join(names)} lie off {against.where.format('them')}, by about {off_mm:.2f} mm; film "
+        f"and scanner make as much with a probability of {chance:.1g}, and nothing else checks three marks."
+    )
+    if pitches - max(marks) > TOLD or max(marks) - _log_density(covariance, stretched) < TOLD:
+        told = "Film that is stretched more, or a wrong pitch, explains it best: look whether the pitch is right."
+        return Contradiction(problem=f"{problem} {told}")
+    told = f"One of the marks is off, or the pitch is wrong. They count as known to {1000 * off_mm:.0f} um."
+    return Contradiction(problem=f"{problem} {told}", film_mm=off_mm)
+
+
 def _misfit(stretched: Array, covariance: Array) -> float:
     return float(stretched @ np.linalg.solve(covariance, stretched))
 
 
-def _off(form: _Form, stretched: Array, covariance: Array) -> dict[int, float]:
-    """How far, mm, each mark is off that alone may explain the stretch, as well as any other within odds of a hundred
-    to one; none where wrong pitches explain it better than all of them by as much."""
-    pitches, _ = _explained(form.by_pitch, stretched, covariance)
-    misfits, moves = zip(*(_explained(moved, stretched, covariance) for moved in form.by_mark), strict=True)
-    if pitches + 2 * TOLD < min(misfits):
-        return {}
-    alike = np.flatnonzero(np.array(misfits) - min(misfits) < 2 * TOLD)
-    return {int(mark): float(np.hypot(*moves[mark])) for mark in alike}
+def _log_density(covariance: Array, stretched: Array) -> float:
+    return -float(np.linalg.slogdet(covariance)[1] + _misfit(stretched, covariance)) / 2
 
 
-def _explained(cause: Array, stretched: Array, covariance: Array) -> tuple[float, Array]:
-    """What is left of the misfit when two numbers, times the cause (3, 2), are free, and these numbers."""
-    weighed = np.linalg.solve(covariance, cause)
-    numbers = np.linalg.solve(cause.T @ weighed, weighed.T @ stretched)
-    return _misfit(stretched - cause @ numbers, covariance), np.asarray(numbers)
-
-
-def _doubts(
-    off_mm: Mapping[int, float], names: Sequence[str], form: _Form, told: _Reason, cause: Cause
-) -> dict[str, Doubt]:
-    alike = [names[mark] for mark in off_mm]
-    return {names[mark]: Doubt(told(off, alike), off / form.mm, cause) for mark, off in off_mm.items()}
-
-
-def _from_given(off_mm: float, names: Sequence[str]) -> str:
-    where = "where the given places and the scan's pitch have it"
-    if len(names) == 1:
-        return f"it lies {off_mm:.2f} mm off {where}: three marks have no other check"
-    return (
-        f"one of the marks {', '.join(names)} lies off {where}, this one by {off_mm:.2f} mm, or the pitch is wrong: "
-        "three marks have no other check"
-    )
+def _log_density_wider(cause: Array, stretched: Array, covariance: Array, range_: tuple[float, float]) -> float:
+    """Of what is stretched where two numbers, times the cause (3, 2), vary by a standard deviation of which only the
+    range is known."""
+    spreads = [covariance + width**2 * cause @ cause.T for width in np.geomspace(*range_, _WIDTHS)]
+    return float(logsumexp([_log_density(spread, stretched) for spread in spreads]) - np.log(_WIDTHS))
 
 
 def _scatter(apart: Array, measured: Array) -> float:

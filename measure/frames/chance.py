@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-from measure.fiducial_options import FiducialOptions
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
 from measure.frames.frame_sighter import first_search_px
-from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.search.constellation import sign_of
 from measure.search.frame_search import FrameSearch
@@ -29,6 +27,8 @@ _BESIDE = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
 _FREE = 2  # marks that a similarity goes through wherever they lie
 _SURE = 12  # marks that agree: no speck feigns so many
 _FITTED_PX = 3.0  # the fitted place is no farther from the one that answers
+_REDUCED_PX = 1.5  # of the reduced scan: so near to where it answers there a mark answers in the scan
+_APART = 2.0  # search radii off: beyond what a mark itself answers
 
 
 def doubt(search: FrameSearch, frame: Frame) -> str:
@@ -45,7 +45,7 @@ def doubt(search: FrameSearch, frame: Frame) -> str:
         return ""
     if len(clear) == len(inside):
         return _by_the_scan(search, frame, clear)
-    return _by_places_beside(search.scan, search.layout, frame, search.options, inside, clear)
+    return _by_places_beside(search, frame, inside, clear)
 
 
 def expected_as_good(search: FrameSearch, frame: Frame) -> float:
@@ -65,6 +65,8 @@ def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> 
     if len(clear) <= _FREE or not search.was_everywhere(frame.placement):
         return ""
     expected = expected_where_seen(search, frame, clear)
+    if expected > _LIKELY:
+        expected *= _as_good_in_full(search, frame, clear) ** len(clear)
     if expected <= _LIKELY:
         return ""
     return (
@@ -73,36 +75,51 @@ def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> 
     )
 
 
-def _by_places_beside(
-    scan: Scan,
-    layout: FiducialLayout,
-    frame: Frame,
-    options: FiducialOptions,
-    inside: Sequence[int],
-    clear: dict[int, Array],
-) -> str:
+def _as_good_in_full(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> float:
+    """Of the places that answer as strongly as the marks at reduced size, the share that does so in the scan itself."""
+    marks_px, apart_px = (
+        np.array([*clear.values()]),
+        _APART * first_search_px(frame.placement, search.layout, search.options),
+    )
+    others = [
+        (index, place)
+        for index, seen in clear.items()
+        for place in search.places_as_good(frame.placement, index, seen)[: _PLACES // len(clear)]
+        if np.hypot(*(marks_px - place).T).min() > apart_px
+    ]
+    weakest = min(_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items())
+    radius = _REDUCED_PX * frame.placement.reduction
+    hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in others)
+    return _share(hits, len(others))
+
+
+def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]) -> str:
     """Where some marks were not found: whether places beside them look as much like marks as those that were."""
-    found = len(clear)
-
-    def response(index: int, place: Array, radius_px: float) -> float:
-        mark = layout.marks[index].mark
-        start = np.column_stack([frame.pixel_from_camera[:, :2], place])
-        sign = sign_of(mark, frame.placement.polarity)
-        expected = MarkPrediction(mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)
-        return strongest(scan, expected)[1]
-
-    radius = first_search_px(frame.placement, layout, options)
-    places = _beside(scan, frame, inside, radius)
-    weakest = min((response(index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
-    hits = sum(response(index, place, radius) >= weakest for index, place in places)
-    share = (hits + 1) / (len(places) + 2)  # Laplace: none of sixty does not mean never
-    chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, share))
+    found, radius = len(clear), first_search_px(frame.placement, search.layout, search.options)
+    places = _beside(search.scan, frame, inside, radius)
+    weakest = min((_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
+    hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in places)
+    chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, len(places))))
     if chance <= _LIKELY:
         return ""
     return (
         f"only {found} of {len(inside)} marks were clearly found, and {hits} of {len(places)} places beside them look "
         f"as much like marks: chance finds as many with a probability of {chance:.2f}, and the frame may lie elsewhere"
     )
+
+
+def _response(search: FrameSearch, frame: Frame, index: int, place: Array, radius_px: float) -> float:
+    """How strongly a mark, by index, answers at most within a radius of a place in the scan."""
+    mark = search.layout.marks[index].mark
+    start = np.column_stack([frame.pixel_from_camera[:, :2], place])
+    sign = sign_of(mark, frame.placement.polarity)
+    expected = MarkPrediction(mark, start, radius_px, sign, frame.weights, frame.placement.surroundings)
+    return strongest(search.scan, expected)[1]
+
+
+def _share(hits: int, places: int) -> float:
+    """Laplace: none of sixty does not mean never."""
+    return (hits + 1) / (places + 2)
 
 
 def _beside(scan: Scan, frame: Frame, inside: Sequence[int], radius_px: float) -> list[tuple[int, Array]]:

@@ -145,8 +145,18 @@ class Frame:
             reasons.append(f"its contrast is only {fit.snr:.1f} times the noise")
         if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, _MOST_UNLIKE):
             reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
-        sigma_px = float(np.sqrt(np.linalg.eigvalsh(fit.covariance_px2)[-1]))
+        sigma_px = largest_sigma_px(fit.covariance_px2)
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX
-        if chdtrc(2, (WRONG_PX / sigma_px) ** 2) > WRONG_CHANCE and not is_plain:
+        if may_be_wrong(fit.covariance_px2) and not is_plain:
             reasons.append(f"its standard deviation is {sigma_px:.2f} px")
         return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")
+
+
+def may_be_wrong(covariance_px2: Array) -> bool:
+    """Whether a mark so well known (2, 2) may have an error that one called measured must not have."""
+    return bool(chdtrc(2, (WRONG_PX / largest_sigma_px(covariance_px2)) ** 2) > WRONG_CHANCE)
+
+
+def largest_sigma_px(covariance_px2: Array) -> float:
+    """In the direction in which it is largest."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance_px2)[-1]))

@@ -196,6 +196,19 @@ class FrameSearch:
         kept = [each for each in tolerances if each == widest_px or self._misfit_px(placement, seen_px) <= each]
         return len(tolerances) * min(self._expected(placement, seen_px, inside, each) for each in kept)
 
+    def places_as_good(self, placement: Placement, index: int, seen_px: Array) -> Array:
+        """(n, 2) the strongest places of the scan that at reduced size answer to a mark, by index, as strongly as the
+        one (2,) where it was seen."""
+        searched = self._searched[placement.pitch_mm]
+        sign = sign_of(self.layout.marks[index].mark, placement.polarity)
+        layer, responses = (
+            searched.search.layers[searched.looks[placement.pose][index], sign],
+            searched.search.responses,
+        )
+        height = layer.within(searched.search.tolerance_px).height(responses.reduced_px(seen_px))
+        heights = layer.highest(layer.candidates, 0.0)[1]
+        return responses.scan_px(layer.candidates[heights >= height])
+
     def _misfit_px(self, placement: Placement, seen_px: dict[int, Array]) -> float:
         """How far from its place (px of the reduced scan) the best similarity leaves a mark that was seen."""
         if not seen_px:

@@ -216,22 +216,46 @@ def test_judging_does_not_depend_on_the_order_of_frames() -> None:
     assert [frame.problems for frame in one] == [frame.problems for frame in other[::-1]]
 
 
-def test_what_the_edges_say_counts_against_chance() -> None:
-    rng = np.random.default_rng(5)
-    layout = layout_of(EIGHT)
-    (frame,) = frames_of(layout, 1, rng)
+def with_edges(frame: FrameMeasurement, sigmas: Sequence[float], off_px: float = 0.1) -> FrameMeasurement:
+    """The frame with second places of its marks, so many standard deviations and off_px from the matched ones."""
     marks = [
-        MarkMeasurement(
-            mark.point,
-            "fiducial",
-            mark.center_px,
-            mark.covariance,
-            mark.status,
-            "",
-            {"second_method_sigmas": sigmas, "second_method_col_px": 0.1, "second_method_row_px": 0.0},
+        replace(
+            mark,
+            quality={"second_method_sigmas": own, "second_method_col_px": off_px, "second_method_row_px": 0.0},
         )
-        for mark, sigmas in zip(frame.marks, (0.3, 1.0, 2.0, 3.0, 3.5, 4.5, 1.0, 2.0), strict=True)
+        for mark, own in zip(frame.marks, sigmas, strict=True)
     ]
-    checked = checked_together([replace(frame, marks=tuple(marks))], layout)
+    return replace(frame, marks=tuple(marks))
+
+
+def second_method_px(frame: FrameMeasurement) -> list[float]:
+    return [mark.covariance.sigmas_px.get(Cause.SECOND_METHOD, 0.0) for mark in frame.marks if mark.covariance]
+
+
+def test_a_mark_whose_edges_alone_put_it_elsewhere_is_weak() -> None:
+    layout = layout_of(EIGHT)
+    (frame,) = frames_of(layout, 1, np.random.default_rng(5))
+    checked = checked_together([with_edges(frame, (0.3, 1.0, 2.0, 0.7, 1.5, 9.0, 1.0, 2.0))], layout)
     assert weak(checked) == {("0", "5")}
     assert "its edges put it 0.10 px elsewhere" in checked[0].marks[5].reason
+
+
+def test_where_edges_put_all_marks_elsewhere_their_drawing_is_not_true_and_none_is_weak() -> None:
+    """What noise does not explain makes a mark less well known; weak only where it may be half a pixel off."""
+    layout = layout_of(EIGHT)
+    (frame,) = frames_of(layout, 1, np.random.default_rng(5))
+    sigmas = (3.0, 4.0, 5.0, 4.5, 3.9, 6.0, 4.2, 1.0)
+    (checked,) = checked_together([with_edges(frame, sigmas)], layout)
+    assert weak((checked,)) == set()
+    np.testing.assert_allclose(second_method_px(checked), [0.0] + [0.1 / np.sqrt(2)] * 6 + [0.0])
+    assert len(weak(checked_together([with_edges(frame, sigmas, 0.3)], layout))) == 6
+
+
+def test_good_marks_differ_by_their_edges_no_more_often_than_stated() -> None:
+    rng, layout = np.random.default_rng(8), layout_of(FOUR)
+    (frame,) = frames_of(layout, 1, rng)
+    lost = sum(
+        bool(weak(checked_together([with_edges(frame, np.sqrt(rng.chisquare(2, 4)).tolist())], layout)))
+        for _ in range(200)
+    )
+    assert lost <= 6  # two are expected at most
