@@ -5,7 +5,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +21,7 @@ from pipeline.adjusting.compare_stage import DRIFT, comparison_json, print_compa
 from pipeline.demo import run_demo
 from pipeline.design.run import run_design
 from pipeline.errors import InputError, what_to_do
+from pipeline.exchange.convention import FORMATS, LARGEST_MISFIT_PX, ExportOptions
 from pipeline.files.library import PREFIX, library_json, library_path, print_library, read_library
 from pipeline.files.project_file import FINEST_PITCH_UM, Project, read_project
 from pipeline.measuring.camera_answer import print_identification
@@ -32,6 +33,7 @@ from pipeline.resampling.resample_stage import resample, resampled_json
 from pipeline.results.adjustment_file import without_nan
 from pipeline.summary import Summary, print_summary
 from pipeline.terminal import PlainConsole, plain, spell_out_missing_letters
+from pipeline.text.wording import counted
 
 DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 TEMPLATES = ("project", "camera", "scene")
@@ -164,6 +166,34 @@ def resample_scans(
         clamped = f", {result.clamped} samples clamped to what can be stored" if result.clamped else ""
         typer.echo(f"{plain(result.image)}: {plain(told)}{clamped}")
     return LOOK if any(result.problem for result in results) else DONE
+
+
+@app.command("export")
+def export_project(
+    project: ProjectFile,
+    format: Annotated[str, typer.Argument(metavar="FORMAT", help=f"One of {', '.join(FORMATS)}.", show_default=False)],
+    out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the files go.", show_default=False)],
+    pitch_um: Annotated[
+        float | None,
+        typer.Option("--pitch-um", metavar="UM", min=FINEST_PITCH_UM, help="As given to `reseau resample`."),
+    ] = None,
+    lens: Annotated[bool, typer.Option("--lens", help="For frames of `reseau resample --lens`.")] = False,
+    misfit_px: Annotated[
+        float,
+        typer.Option("--misfit-px", metavar="PX", min=0.0, help="How far another program's lens may be off."),
+    ] = LARGEST_MISFIT_PX,
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """Marks, camera and poses as the files of another program."""
+    from pipeline.exchange.export_stage import run_export
+
+    done = run_export(_read(project, max_pixels), format, out_dir, ExportOptions(pitch_um, lens, misfit_px))
+    if as_json:
+        _echo_json({"folder": str(done.folder), "files": done.files, **asdict(replace(done.written, files={}))})
+    else:
+        typer.echo(plain(f"{done.told}\n{out_dir}: {counted(len(done.files), 'file')}"))
+    return LOOK if done.written.left_out else DONE
 
 
 @app.command()

@@ -40,6 +40,7 @@ class Project:
     cameras: by file name; the first one serves where images.csv names none. scans: by image name, in their order.
     tone: the curve of the scans: auto, one of TONES, or the power of the grey value that light grows as.
     unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
+    crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
     writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
     """
 
@@ -61,6 +62,7 @@ class Project:
     max_pixels: int | None = None
     writing: Reads = "pose"
     images_path: Path | None = None
+    crs: str = ""
 
     def open_scan(self, name: str) -> Scan:
         """The scan of an image. Raises MeasurementError where it cannot be read."""
@@ -171,6 +173,7 @@ def read_project(path: Path) -> Project:
         unit_mm=UNITS_MM[objects.text("unit", "m", tuple(UNITS_MM))],
         adjust=read_adjust(table.table("adjust")),
         writing=cast(Reads, measure.text("writing", "pose", get_args(Reads))),
+        crs=objects.text("crs", ""),
     )
     for each in (table, measure, objects):
         each.done()

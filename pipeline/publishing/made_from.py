@@ -28,7 +28,7 @@ _FILES = {
     "given_distances",
     "images_path",
 }
-_NO_MATTER = {"max_pixels"}
+_NO_MATTER = {"max_pixels", "crs"}
 # Of a camera: what tells where its targets are, but not what its marks are.
 _LENS = {
     "principal_distance_mm", "principal_point_mm", "principal_distance_sigma_mm", "principal_point_sigma_mm",

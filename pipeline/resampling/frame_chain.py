@@ -63,13 +63,20 @@ class FrameChain:
 
 def adjusted_chain(measured: MeasuredScan, adjustment: Json, with_lens: bool) -> FrameChain:
     """The chain of an image of adjustment.json, with the film transformation and the scanner that were adjusted."""
-    image = adjustment["images"][measured.frame.image]
+    return image_chain(measured.frame.image, adjustment, measured.pitch_um, _middle_mm(measured), with_lens)
+
+
+def image_chain(
+    name: str, adjustment: Json, pitch_um: tuple[float, float], middle_mm: Array, with_lens: bool
+) -> FrameChain:
+    """The same. middle_mm (2,): a place about in the middle of the image, in the comparator."""
+    image = adjustment["images"][name]
     stored = image["transformation"]
     names = film_parameter_names(stored["kind"])
     values = [
         stored[name]["value"] if name in stored else stored[f"{name}_deg"]["value"] * _RAD_PER_DEG for name in names
     ]
-    film = Film(stored["kind"], np.array(values, float), _middle_mm(measured), bool(stored.get("mirrored", False)))
+    film = Film(stored["kind"], np.array(values, float), middle_mm, bool(stored.get("mirrored", False)))
     scanner = adjustment.get("scanners", {}).get(image.get("scanner"))
     bend, bend_parameters = NO_BEND, np.empty(0)
     if scanner is not None:
@@ -77,7 +84,7 @@ def adjusted_chain(measured: MeasuredScan, adjustment: Json, with_lens: bool) ->
         bend = Bend(tuple(terms), tuple(scanner["center_mm"]), tuple(scanner["half_mm"]))
         bend_parameters = np.array([term["value"] for term in terms.values()], float)
     lens = Lens(*calibrated_lens(adjustment["cameras"][image["camera"]])) if with_lens else None
-    return FrameChain(measured.pitch_um, film, bend, bend_parameters, lens)
+    return FrameChain(pitch_um, film, bend, bend_parameters, lens)
 
 
 def measured_chain(measured: MeasuredScan) -> FrameChain | None:

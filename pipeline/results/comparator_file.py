@@ -18,6 +18,7 @@ from pipeline.errors import InputError
 from pipeline.text.atomic import write_atomically
 from pipeline.text.csv_table import Row, csv_line, read_csv
 from pipeline.text.image_names import image_name
+from pipeline.text.text_file import read_bytes
 
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
@@ -26,6 +27,7 @@ _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(Observatio
 Array = NDArray[np.float64]
 
 _HEAD = 4096
+_PITCH = re.compile(r'^"?# pitch of (.+): ([0-9.e+-]+) um across, ([0-9.e+-]+) um down"?$', re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,12 @@ def measurement_of(path: Path) -> str:
     with path.open("rb") as file:
         found = re.search(rb"^\W*# measurement ([0-9a-f]{64})\b", file.read(_HEAD), re.MULTILINE)
     return found[1].decode() if found else ""
+
+
+def pitches_of(path: Path) -> dict[str, tuple[float, float]]:
+    """The pitch of every scan in um, across and down, as the lines above the table tell it; of those that they tell."""
+    text = read_bytes(path).decode("utf-8", "replace")
+    return {image: (float(x), float(y)) for image, x, y in _PITCH.findall(text)}
 
 
 def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:

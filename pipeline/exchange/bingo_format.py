@@ -1,0 +1,66 @@
+"""BINGO's image coordinates: mm, refined, that is free of film and lens."""
+
+import numpy as np
+
+from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.convention import Convention, ExportOptions, Written
+
+CONVENTION = Convention(
+    (float("nan"), float("nan")),
+    "no pixels: x right, y up in mm from the centre of the fiducial frame",
+    "support.pix4d.com, article 203590305: a line with image and camera, one a point with x and y in mm from the "
+    "centre of the image, an empty line behind each image. Which way y points it does not say: up, as everywhere in "
+    "photogrammetry",
+)
+
+
+def write(block: Block, options: ExportOptions) -> Written:
+    """bingo.txt with the refined coordinates of every point of every adjusted image."""
+    block.needs_orientation("bingo")
+    texts, left_out = [], []
+    for frame in block.frames:
+        if frame.model is None:
+            left_out.append(f"{frame.image}: it has no part in the adjustment, so its film is not known.")
+            continue
+        text, folded = _image(frame)
+        texts.append(text)
+        left_out += folded
+    assert block.adjustment is not None
+    interior = [
+        f"Camera {_word(name)}: c = {camera['principal_distance_mm']['value']:.5f} mm, principal point "
+        f"{camera['principal_point_mm']['x']['value']:.5f}, {camera['principal_point_mm']['y']['value']:.5f} mm, no "
+        "distortion."
+        for name, camera in block.adjustment["cameras"].items()
+    ]
+    return Written(
+        {"bingo.txt": "\n".join(texts)},
+        (
+            "standard deviations (BINGO takes them by groups)",
+            "poses and object points, whose files no public text describes",
+            "fiducial marks",
+        ),
+        tuple(interior),
+        tuple(left_out),
+    )
+
+
+def _image(frame: OutFrame) -> tuple[str, list[str]]:
+    """The lines of an image, and the points whose lens could not be taken out."""
+    assert frame.model is not None
+    marks = frame.observed(fiducials=False)
+    places = np.array([mark.xy_mm for mark in marks], dtype=float).reshape(-1, 2)
+    refined, found = frame.model.ideal_from_observed(frame.model.camera_from_comparator(places))
+    lines = [f"{_word(frame.image)} {_word(frame.camera)}"]
+    for mark, (x, y), usable in zip(marks, refined.tolist(), found, strict=True):
+        lines += [f"{_word(mark.point)} {x:.6f} {y:.6f}"] if usable else []
+    lost = [
+        f"{frame.image}, point {mark.point}: the lens folds there."
+        for mark, ok in zip(marks, found, strict=True)
+        if not ok
+    ]
+    return "\n".join(lines) + "\n", lost
+
+
+def _word(name: str) -> str:
+    """A name without blanks, which part the words of a line."""
+    return "_".join(name.split())

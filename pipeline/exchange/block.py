@@ -1,0 +1,219 @@
+"""What goes out: the observed marks of every image, and what an adjustment says of it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.line_of_sight import LineOfSight
+from adjust.functional_model.projection import ImageModel
+from adjust.functional_model.rotation import rotation_from_angles
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.project_file import UNITS_MM, Project
+from pipeline.publishing.made_from import adjusted_from, differing
+from pipeline.resampling.frame_chain import FrameChain, Lens, image_chain
+from pipeline.results.adjustment_reader import Covariance, calibrated_lens, read_adjustment, read_covariance
+from pipeline.results.comparator_file import ComparatorPoint, pitches_of, pixel_from_comparator, read_comparator
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+
+ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
+NO_PITCH = (1000.0, 1000.0)  # where pixels are not asked for
+
+
+@dataclass(frozen=True)
+class OutFrame:
+    """One image. marks: those that are observations; scan, pitch_um: None where nothing tells them; model, lens:
+    as they were adjusted, None without a part in an adjustment; is_oriented: whether its exterior
+    orientation was adjusted, too."""
+
+    image: str
+    camera: str
+    scan: Path | None
+    pitch_um: tuple[float, float] | None
+    marks: tuple[ComparatorPoint, ...]
+    model: ImageModel | None
+    lens: Lens | None
+    is_oriented: bool
+
+    def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
+        """Its fiducials, or its points."""
+        return tuple(mark for mark in self.marks if (mark.kind == "fiducial") == fiducials)
+
+    def pixels(self, marks: tuple[ComparatorPoint, ...]) -> Array:
+        """Column and row (n, 2) of marks in the scan. Raises InputError where the pitch is not known."""
+        return pixel_from_comparator(_places_mm(marks), self.known_pitch_um)
+
+    @property
+    def known_pitch_um(self) -> tuple[float, float]:
+        """Raises InputError where it is not known."""
+        if self.pitch_um is None:
+            raise InputError(
+                f"the pitch of image {self.image!r} is not known, and this format counts in pixels. Give pitch_um in "
+                "the project."
+            )
+        return self.pitch_um
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether its scan shows the camera's frame as in a mirror."""
+        if self.model is None:
+            return False
+        return bool(np.linalg.det(self.model.camera_by_comparator(self.model.film.center_mm[None])[0]) < 0.0)
+
+    def chain(self, with_lens: bool) -> FrameChain:
+        """From its scan to its camera's frame."""
+        model = self.model
+        assert model is not None
+        lens = self.lens if with_lens else None
+        return FrameChain(self.known_pitch_um, model.film, model.bend, model.bend_parameters, lens)
+
+    @property
+    def file_name(self) -> str:
+        """Of its scan; its name where there is none."""
+        return self.scan.name if self.scan else f"{self.image}.tif"
+
+    @property
+    def label(self) -> str:
+        """Its name as part of a file's name."""
+        return self.image.replace("/", "_")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A project's images in the order of their names; adjustment: None where there is none that holds."""
+
+    project: Project
+    frames: tuple[OutFrame, ...]
+    adjustment: Json | None
+
+    @cached_property
+    def covariance(self) -> Covariance:
+        return read_covariance(self.project.adjustment_path)
+
+    @cached_property
+    def points(self) -> dict[str, Array]:
+        """Adjusted coordinates (3,) of the object points, in the user's unit."""
+        adjusted = self.adjustment["points"] if self.adjustment else {}
+        return {id: np.array([point[axis]["value"] for axis in "XYZ"]) for id, point in adjusted.items()}
+
+    def camera_file(self, name: str) -> CameraFile:
+        """The file of a camera, by the camera's name."""
+        return next(camera for camera in self.project.cameras.values() if camera.name == name)
+
+    def size_px(self, frame: OutFrame) -> tuple[int, int]:
+        """Width and height of an image's scan. Raises InputError where there is none."""
+        if frame.scan is None:
+            raise InputError(
+                f"the scan of image {frame.image!r} is not known, and this format needs its size. Name the scans in "
+                "the project."
+            )
+        with self.project.open_scan(frame.image) as scan:
+            return scan.width_px, scan.height_px
+
+    def oriented(self) -> Iterator[OutFrame]:
+        return (frame for frame in self.frames if frame.is_oriented)
+
+    def unoriented_note(self) -> tuple[str, ...]:
+        """A sentence an image that has no exterior orientation."""
+        return tuple(
+            f"{frame.image}: it has no adjusted orientation." for frame in self.frames if not frame.is_oriented
+        )
+
+    def needs_orientation(self, format: str) -> None:
+        """Raises InputError where no image is oriented."""
+        if not any(self.oriented()):
+            raise InputError(
+                f"{format} is for oriented images, and {self.project.adjustment_path} has none. Run `reseau adjust` "
+                "first."
+            )
+
+
+def read_block(project: Project) -> Block:
+    """What a project has measured and adjusted.
+
+    Raises InputError where nothing was measured, or where the adjustment is not of what there is now.
+    """
+    if not project.comparator.exists():
+        raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first.")
+    marks = read_comparator(project.comparator)
+    adjustment = _adjustment(project, marks)
+    pitches = pitches_of(project.comparator)
+    by_image: dict[str, list[ComparatorPoint]] = {mark.image: [] for mark in marks}
+    for mark in marks:
+        if mark.status.is_observation:
+            by_image[mark.image].append(mark)
+    frames = [
+        _frame(project, adjustment, image, tuple(own), pitches.get(image, project.pitch_um))
+        for image, own in sorted(by_image.items())
+    ]
+    return Block(project, tuple(frames), adjustment)
+
+
+def _adjustment(project: Project, marks: tuple[ComparatorPoint, ...]) -> Json | None:
+    path = project.adjustment_path
+    if not path.exists():
+        return None
+    adjustment = read_adjustment(path)
+    if not adjustment["converged"]:
+        return None
+    made_from = adjustment.get("made_from")
+    changed = differing(made_from, adjusted_from(project, marks)) if made_from else []
+    if changed:
+        raise InputError(
+            f"{path}: is of other {', '.join(changed)} than there are now. Run `reseau adjust` again before the export."
+        )
+    return adjustment
+
+
+def _frame(
+    project: Project,
+    adjustment: Json | None,
+    image: str,
+    marks: tuple[ComparatorPoint, ...],
+    pitch_um: tuple[float, float] | None,
+) -> OutFrame:
+    known = adjustment["images"].get(image) if adjustment else None
+    camera = project.camera_of(image).name
+    if adjustment is None or known is None:
+        return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, None, None, False)
+    lens = Lens(*calibrated_lens(adjustment["cameras"][known["camera"]]))
+    model = _model(project, adjustment, image, marks, lens)
+    oriented = all(known["exterior"][element]["sigma"] is not None for element in ELEMENTS)
+    return OutFrame(image, camera, project.scans.get(image), pitch_um, marks, model, lens, oriented)
+
+
+def _model(
+    project: Project, adjustment: Json, image: str, marks: tuple[ComparatorPoint, ...], lens: Lens
+) -> ImageModel:
+    """The image as `adjust` has it, from what it wrote."""
+    places = _places_mm(marks)
+    middle_mm = (places.min(axis=0) + places.max(axis=0)) / 2.0 if len(places) else np.zeros(2)
+    chain = image_chain(image, adjustment, NO_PITCH, middle_mm, False)
+    own = adjustment["images"][image]
+    exterior = np.array([own["exterior"][element]["value"] for element in ELEMENTS], dtype=float)
+    return ImageModel(
+        lens.distortion,
+        lens.interior,
+        lens.parameters,
+        rotation_from_angles(np.radians(exterior[3:])),
+        exterior[:3],
+        chain.film,
+        LineOfSight(
+            bool(adjustment.get("earth_curvature", False)),
+            bool(adjustment.get("refraction", False)),
+            project.unit_mm / UNITS_MM["m"],
+        ),
+        chain.bend,
+        chain.bend_parameters,
+    )
+
+
+def _places_mm(marks: tuple[ComparatorPoint, ...]) -> Array:
+    return np.array([mark.xy_mm for mark in marks], dtype=float).reshape(-1, 2)

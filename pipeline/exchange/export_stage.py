@@ -1,0 +1,107 @@
+"""`reseau export`: a project's marks, camera and poses as the files of another program, all of them or none."""
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path, PurePosixPath
+
+from pipeline.errors import InputError
+from pipeline.exchange.block import Block, read_block
+from pipeline.exchange.convention import FORMATS, Convention, ExportOptions, Written
+from pipeline.files.project_file import Project
+from pipeline.text.atomic import write_atomically, writing
+
+README = "README.txt"
+_HEAD = "Written by reseau"
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written where; told: the lines of its README."""
+
+    folder: Path
+    files: tuple[str, ...]
+    written: Written
+    told: str
+
+
+def run_export(project: Project, format: str, folder: Path, options: ExportOptions) -> Exported:
+    """Write a format's files into a folder, in the place of an earlier export.
+
+    Raises InputError for a format that there is not, a folder that holds anything else, and whatever the format itself
+    cannot take.
+    """
+    if format not in FORMATS:
+        raise InputError(f"there is no format {format!r}; possible are {', '.join(FORMATS)}.")
+    check_folder(folder)
+    block = read_block(project)
+    _check_names(block)
+    module = import_module(f"pipeline.exchange.{format}_format")
+    write: Callable[[Block, ExportOptions], Written] = module.write
+    convention: Convention = module.CONVENTION
+    written = write(block, options)
+    told = readme(format, convention, written)
+    publish(folder, {**written.files, README: told})
+    return Exported(folder, tuple(written.files), written, told)
+
+
+def readme(format: str, convention: Convention, written: Written) -> str:
+    """What stands beside the files."""
+    col, row = convention.first_pixel_px
+    pixel = [] if col != col else [f"The centre of the first pixel is ({col:g}, {row:g})."]
+    lines = [f"{_HEAD} {version('reseau')}: {format}", "", *pixel, f"Axes: {convention.axes}."]
+    lines += [f"Source: {convention.source}."]
+    for title, sentences in (("Lost", written.lost), ("Notes", written.notes), ("Left out", written.left_out)):
+        lines += ["", f"{title}:", *(f"- {sentence}" for sentence in sentences or ("nothing",))]
+    return "\n".join(lines) + "\n"
+
+
+def check_folder(folder: Path) -> None:
+    """Raises InputError for a folder that holds something that is no earlier export: nothing of it is overwritten."""
+    if not folder.exists():
+        return
+    earlier = folder / README
+    if not folder.is_dir() or (any(folder.iterdir()) and not _is_own(earlier)):
+        raise InputError(
+            f"{folder}: holds something that is no export of reseau. Name another folder, or an empty one."
+        )
+
+
+def _is_own(path: Path) -> bool:
+    return path.is_file() and re.match(_HEAD.encode(), path.read_bytes()[: len(_HEAD)]) is not None
+
+
+def publish(folder: Path, files: Mapping[str, str | bytes]) -> None:
+    """All files into a folder of their own, which then takes the place of the earlier one."""
+    new = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+    try:
+        for place, content in files.items():
+            write_atomically(new / PurePosixPath(place), content)
+        with writing(folder):
+            if folder.exists():
+                os.replace(folder, old)
+            os.replace(new, folder)
+    except BaseException:
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+        raise
+    finally:
+        for left in (new, old):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _check_names(block: Block) -> None:
+    """Files of other programs are named after the scans' own files, without their folders."""
+    seen: dict[str, str] = {}
+    for frame in block.frames:
+        other = seen.setdefault(frame.file_name, frame.image)
+        if other != frame.image:
+            raise InputError(
+                f"images {other!r} and {frame.image!r} have files of the same name {frame.file_name!r}, and other "
+                "programs know images by it. Export them as projects of their own."
+            )

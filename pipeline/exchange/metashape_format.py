@@ -1,0 +1,170 @@
+"""Metashape: a script for its console that makes film cameras with their fiducials, and calibrations in its XML."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.micmac_format import box_of
+from pipeline.exchange.pinhole import BROWN, FittedLens, check_misfit, nearest_lens, sight_misfit_mm
+from pipeline.exchange.xml_tree import plain_number, read_xml, xml_lines, xml_text
+from pipeline.resampling.canvas import Canvas
+
+CONVENTION = Convention(
+    (0.5, 0.5),
+    "column right, row down, from the outer corner of the first pixel; camera x right, y down, z forward",
+    "Agisoft Metashape Professional manual, appendix Camera models: u = w/2 + cx + x'f + x'B1 + y'B2, v = h/2 + cy + "
+    "y'f, x' = x(...) + P1 (r2 + 2x2) + 2 P2 xy; Python reference: Sensor.film_camera, pixel_size, "
+    "calibrateFiducials(resolution in mm), Marker.Type.Fiducial",
+)
+NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
+
+
+def write(block: Block, options: ExportOptions) -> Written:
+    """reseau_to_metashape.py with its data, and CAMERA.xml where there is an adjustment."""
+    frames, left_out = [], []
+    for frame in block.frames:
+        reason = _hindrance(frame)
+        if reason:
+            left_out.append(f"{frame.image}: {reason}")
+        else:
+            frames.append(frame)
+    if not frames:
+        raise InputError(f"metashape: no image can go out. {' '.join(left_out)}")
+    files: dict[str, str | bytes] = {}
+    notes = []
+    for camera in dict.fromkeys(frame.camera for frame in frames if frame.is_oriented):
+        own = [frame for frame in frames if frame.camera == camera and frame.is_oriented]
+        lens, box = nearest_lens(block, own[0], (BROWN,), _unresampled(options)), box_of(block, own[0], options)
+        misfit = {frame.image: (lens.largest_mm + sight_misfit_mm(block, frame)) / box.pitch_mm for frame in own}
+        check_misfit(misfit, options, "metashape")
+        files[f"{_calibration_name(camera)}.xml"] = _calibration(lens, box)
+        notes.append(f"{camera}: the lens was fitted over the frame: off by {max(misfit.values()):.2g} px at most.")
+    data = {
+        "cameras": {camera: _camera(block, camera, files) for camera in dict.fromkeys(f.camera for f in frames)},
+        "images": [_image(frame) for frame in frames],
+        "points": {id: place.tolist() for id, place in block.points.items()},
+    }
+    files["reseau_to_metashape.json"] = json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+    files["reseau_to_metashape.py"] = Path(__file__).with_name("metashape_script.txt").read_text(encoding="utf-8")
+    notes.append(
+        "The fiducials' y is given downward, as that of the pixels; no public page says which way Metashape takes it. "
+        "Look at its picture after calibrateFiducials: the frame must stand upright."
+    )
+    lost = ("the standard deviations of marks", "the poses but for their stations", "what is not affine in the film")
+    return Written(files, lost, tuple(notes), tuple(left_out))
+
+
+def _unresampled(options: ExportOptions) -> ExportOptions:
+    return ExportOptions(options.pitch_um, False, options.largest_misfit_px)
+
+
+def _hindrance(frame: OutFrame) -> str:
+    """Why an image cannot go out as a film camera's; "" where it can."""
+    if frame.is_mirrored:
+        return (
+            "its scan is mirrored, and Metashape is not known to take that. Resample it (reseau resample) and use the "
+            "opencv or colmap export."
+        )
+    if len(frame.observed(fiducials=True)) < 3:
+        return f"{len(frame.observed(fiducials=True))} of its fiducials are observed, and three are needed."
+    return ""
+
+
+def _camera(block: Block, name: str, files: dict[str, str | bytes]) -> dict[str, Any]:
+    file = block.camera_file(name)
+    adjusted = block.adjustment["cameras"].get(name) if block.adjustment else None
+    fiducials = (
+        {id: (mark["x_mm"]["value"], mark["y_mm"]["value"]) for id, mark in adjusted["fiducials"].items()}
+        if adjusted
+        else {fiducial.id: fiducial.xy_mm for fiducial in file.fiducials}
+    )
+    calibration = f"{_calibration_name(name)}.xml"
+    return {
+        "focal_length_mm": adjusted["principal_distance_mm"]["value"] if adjusted else file.principal_distance_mm,
+        "calibration": calibration if calibration in files else None,
+        "fiducials_mm": {id: [x, -y] for id, (x, y) in fiducials.items()},
+    }
+
+
+def _image(frame: OutFrame) -> dict[str, Any]:
+    pitch = frame.known_pitch_um
+    marks = {
+        key: {
+            mark.point: place.tolist()
+            for mark, place in zip(own, frame.pixels(own) + CONVENTION.first_pixel_px, strict=True)
+        }
+        for key, own in (("fiducials_px", frame.observed(True)), ("points_px", frame.observed(False)))
+    }
+    return {
+        "file": str(frame.scan.resolve()) if frame.scan else frame.file_name,
+        "label": Path(frame.file_name).stem,
+        "camera": frame.camera,
+        "pitch_mm": [pitch[0] / 1000.0, pitch[1] / 1000.0],
+        "station": frame.model.station.tolist() if frame.model is not None and frame.is_oriented else None,
+        **marks,
+    }
+
+
+def _calibration(lens: FittedLens, box: Canvas) -> str:
+    """Of the camera's frame: width and height of the exposed frame, cx and cy from its middle. Metashape's p1 stands
+    where OpenCV's p2 does."""
+    fx, fy, x0, y0 = lens.values[:4]
+    k1, k2, p1, p2, k3 = lens.named(BROWN)
+    middle = box.x_mm + box.width_px * box.pitch_mm / 2.0, box.y_mm - box.height_px * box.pitch_mm / 2.0
+    values = {
+        "f": fy / box.pitch_mm,
+        "cx": (x0 - middle[0]) / box.pitch_mm,
+        "cy": (middle[1] - y0) / box.pitch_mm,
+        "k1": k1,
+        "k2": k2,
+        "k3": k3,
+        "p1": p2,
+        "p2": p1,
+        "b1": (fx - fy) / box.pitch_mm,
+    }
+    head = [*xml_lines("projection", "frame"), *xml_lines("width", str(box.width_px))]
+    content = [*head, *xml_lines("height", str(box.height_px))]
+    for name, value in values.items():
+        content += xml_lines(name, plain_number(value))
+    return xml_text(xml_lines("calibration", content))
+
+
+def _calibration_name(camera: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in camera)
+
+
+@dataclass(frozen=True)
+class MetashapeCalibration:
+    """As its file has it: px, from the middle of the picture."""
+
+    width_px: int
+    height_px: int
+    values: dict[str, float]
+
+
+def read_calibration(path: Path) -> MetashapeCalibration:
+    """Raises InputError for a file of another kind, or of a camera that is no central perspective."""
+    root = read_xml(path)
+    if root.tag != "calibration":
+        raise InputError(f"{path}: its root is <{root.tag}>, not <calibration>. Save it as Agisoft XML.")
+    projection = (root.findtext("projection") or "frame").strip()
+    if projection != "frame":
+        raise InputError(f"{path}: is of a {projection} camera; only frame cameras are read.")
+    texts = {name: root.findtext(name) for name in ("width", "height", *NAMES)}
+    try:
+        numbers = {name: float(text) for name, text in texts.items() if text is not None}
+    except ValueError as error:
+        raise InputError(f"{path}: holds what is no number ({error}).") from None
+    missing = [name for name in ("width", "height", "f") if name not in numbers]
+    if missing or not np.isfinite(list(numbers.values())).all() or numbers["f"] <= 0.0:
+        raise InputError(
+            f"{path}: needs a finite width, height and f; {', '.join(missing) or 'one of them'} is missing."
+        )
+    values = {name: numbers.get(name, 0.0) for name in NAMES}
+    return MetashapeCalibration(int(numbers["width"]), int(numbers["height"]), values)

@@ -1,0 +1,196 @@
+"""A resampled frame as programs know cameras that have no film: a pinhole with OpenCV's distortion, and a pose."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.line_of_sight import STRAIGHT
+from adjust.functional_model.projection import ideal_from_observed
+from measure.errors import MeasurementError
+from pipeline.errors import InputError
+from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.convention import ExportOptions
+from pipeline.opencv_check.opencv_model import NAMES, Freedom, image_grid, project, refit
+from pipeline.resampling.canvas import Canvas, canvas_of
+from pipeline.results.comparator_file import ComparatorPoint
+
+Array = NDArray[np.float64]
+
+INTERIOR = ("fx", "fy", "cx", "cy")
+BROWN = ("k1", "k2", "p1", "p2", "k3")
+RATIONAL = (*BROWN, "k4", "k5", "k6")
+PRISMS = (*BROWN, "s1", "s2", "s3", "s4")
+Y_DOWN_Z_FORWARD = np.diag([1.0, -1.0, -1.0])  # from the camera's axes (y up, looking along -z) to these programs'
+_ONE_SCALE = ("none", "torlegard")  # families that stretch x and y alike
+
+
+@dataclass(frozen=True)
+class FittedLens:
+    """OpenCV's parameters (18,) as `opencv_model` has them, in mm with y up. largest_mm: how far they put a point of
+    the frame beside its place."""
+
+    values: Array
+    largest_mm: float
+
+    def named(self, names: Sequence[str]) -> Array:
+        return np.array([self.values[NAMES.index(name)] for name in names])
+
+
+@dataclass(frozen=True)
+class PinholeFrame:
+    """One image in its resampled frame: pixel (0, 0) is the centre of the first one, the camera's axes are x right, y
+    down, z forward. misfit_px: the largest in its frame."""
+
+    frame: OutFrame
+    canvas: Canvas
+    lens: FittedLens
+    misfit_px: float
+    with_lens: bool
+
+    @property
+    def picture(self) -> str:
+        """The file that `reseau resample` writes."""
+        return f"{self.frame.image}.tif"
+
+    @property
+    def interior_px(self) -> Array:
+        """fx, fy, cx, cy (4,)."""
+        fx, fy, x0, y0 = self.lens.named(INTERIOR)
+        pitch = self.canvas.pitch_mm
+        return np.array([fx, fy, x0 - self.canvas.x_mm, self.canvas.y_mm - y0]) / pitch
+
+    @property
+    def rotation(self) -> Array:
+        """(3, 3) from the object to the camera's axes."""
+        assert self.frame.model is not None
+        return np.asarray(Y_DOWN_Z_FORWARD @ self.frame.model.rotation)
+
+    @property
+    def station(self) -> Array:
+        assert self.frame.model is not None
+        return self.frame.model.station
+
+    @property
+    def translation(self) -> Array:
+        """(3,) of `camera = rotation X + translation`."""
+        return np.asarray(-self.rotation @ self.station)
+
+    def pixels(self, marks: tuple[ComparatorPoint, ...]) -> Array:
+        """Column and row (n, 2) of the marks in the resampled frame."""
+        chain = self.frame.chain(self.with_lens)
+        places, _ = chain.frame_from_scan(self.frame.pixels(marks))
+        first = np.array([self.canvas.x_mm, self.canvas.y_mm])
+        return np.asarray((places - first) * (1.0, -1.0) / self.canvas.pitch_mm)
+
+
+def pinhole_frames(
+    block: Block, options: ExportOptions, models: Sequence[Sequence[str]], format: str
+) -> tuple[list[PinholeFrame], list[str]]:
+    """Every oriented image with its lens in the first of the models, each given by its parameters' names, that is near
+    enough; and why the other images are not among them.
+
+    Raises InputError where no image is oriented, or where the last model, too, is off by more than the options allow.
+    """
+    block.needs_orientation(format)
+    lenses: dict[str, FittedLens] = {}
+    frames, left_out = [], list(block.unoriented_note())
+    for frame in block.oriented():
+        if frame.camera not in lenses:
+            lenses[frame.camera] = nearest_lens(block, frame, models, options)
+        try:
+            frames.append(_pinhole(block, frame, lenses[frame.camera], options))
+        except MeasurementError as error:
+            left_out.append(f"{frame.image}: {error}")
+    check_misfit({frame.frame.image: frame.misfit_px for frame in frames}, options, format)
+    return frames, left_out
+
+
+def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
+    """The lens of an image's camera in the first model that is near enough, or else in the last one."""
+    for names in models:
+        lens = frame_lens(block, frame, names, options.with_lens)
+        if lens.largest_mm <= options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0:
+            break
+    return lens
+
+
+def check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: str) -> None:
+    """Raises InputError where the worst image is off by more than the options allow."""
+    worst = max(misfit_px, key=lambda image: misfit_px[image], default=None)
+    if worst is not None and not misfit_px[worst] <= options.largest_misfit_px:
+        raise InputError(
+            f"{format} has no model that takes this camera: the nearest one is off by up to {misfit_px[worst]:.3g} px "
+            f"in image {worst!r}, and {options.largest_misfit_px:g} px are allowed. Export with --lens, for frames "
+            "that were resampled with --lens, or allow more with --misfit-px."
+        )
+
+
+def frame_lens(block: Block, frame: OutFrame, names: Sequence[str], ideal: bool = False) -> FittedLens:
+    """The lens of an image's camera by parameters of these names. ideal: of a frame that is free of it."""
+    lens = frame.lens
+    assert lens is not None
+    c, x0, y0 = lens.interior
+    start = np.zeros(len(NAMES))
+    start[:4] = c, c, x0, y0
+    family = lens.distortion.family
+    if ideal or family == "none":
+        return FittedLens(start, 0.0)
+    if family == "opencv":
+        given = dict(zip(parameter_names(family), lens.parameters, strict=True))
+        start[0] *= 1.0 + given["b1"]
+        start[4:] = [given[name] if name in names else 0.0 for name in NAMES[4:]]
+        if not any(given[name] for name in NAMES[4:] if name not in names):
+            return FittedLens(start, 0.0)
+    grid = image_grid(frame_corners_mm(block, frame))
+    free = tuple(name for name in INTERIOR if name != "fy" or family not in _ONE_SCALE)
+    fitted = refit(lens.distortion, lens.interior, lens.parameters, grid, Freedom((*free, *names)), start).parameters
+    ideal_mm, found = ideal_from_observed(lens.distortion, lens.interior, lens.parameters, grid)
+    imaged_mm, _ = project(fitted, (ideal_mm[found] - lens.interior[1:]) / c)
+    return FittedLens(fitted, float(np.linalg.norm(imaged_mm - grid[found], axis=1).max()))
+
+
+def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
+    """(2, 2) two opposite corners of what a camera exposes, camera mm: as its file says, or what was observed of it."""
+    camera = block.camera_file(frame.camera)
+    if camera.fiducials and camera.frame_mm is not None:
+        half = np.array(camera.frame_mm) / 2.0
+        return np.array([-half, half])
+    places = [
+        each.model.camera_from_comparator(np.array([mark.xy_mm for mark in each.marks]))
+        for each in block.frames
+        if each.camera == frame.camera and each.model is not None and each.marks
+    ]
+    seen = np.concatenate(places)
+    return np.array([seen.min(axis=0), seen.max(axis=0)])
+
+
+def sight_misfit_mm(block: Block, frame: OutFrame) -> float:
+    """How far refraction and the earth's curvature, which other programs do not know, move an image's points."""
+    model = frame.model
+    assert model is not None
+    points = [block.points[mark.point] for mark in frame.observed(fiducials=False) if mark.point in block.points]
+    if model.line_of_sight.is_straight or not points:
+        return 0.0
+    bent, straight = (
+        each.camera_from_object(np.array(points))[0] for each in (model, replace(model, line_of_sight=STRAIGHT))
+    )
+    return float(np.linalg.norm(bent - straight, axis=1).max())
+
+
+def _pinhole(block: Block, frame: OutFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
+    """Raises MeasurementError where the lens folds within the scan."""
+    pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
+    canvas = canvas_of(frame.chain(options.with_lens), *block.size_px(frame), pitch_um / 1000.0)
+    misfit_mm = lens.largest_mm + sight_misfit_mm(block, frame)
+    return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens)
+
+
+def misfit_note(frames: Sequence[PinholeFrame]) -> str:
+    """How well the cameras could be handed on."""
+    worst = max(frames, key=lambda frame: frame.misfit_px)
+    if worst.misfit_px == 0.0:
+        return "The camera's model is the very same: nothing was fitted."
+    return f"The camera's model was fitted over the frame: it is off by {worst.misfit_px:.2g} px at most."

@@ -1,0 +1,136 @@
+"""Everything that goes out, as tables in this program's own conventions: csv and parquet write the same ones."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pipeline.exchange.block import ELEMENTS, Block, OutFrame
+from pipeline.exchange.convention import Convention
+from pipeline.results.comparator_file import ComparatorPoint
+
+CONVENTION = Convention(
+    (0.0, 0.0),
+    "column right, row down; comparator and camera mm with x right and y up; rotation R3(kappa) R2(phi) R1(omega)",
+    "this program's own, docs/theory.md",
+)
+
+Table = dict[str, list[Any]]
+
+_EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+
+
+def tables(block: Block) -> Mapping[str, Table]:
+    """By name; a cell that has no value is None. Angles in degrees, their covariances in rad as in adjustment.npz."""
+    made = {"marks": _marks(block)}
+    if block.adjustment is not None:
+        made |= {
+            "images": _images(block),
+            "transformations": _transformations(block),
+            "covariances": _covariances(block),
+            "points": _points(block),
+            "cameras": _cameras(block),
+        }
+    return made
+
+
+def _marks(block: Block) -> Table:
+    rows = [_mark(frame, mark) for frame in block.frames for mark in frame.marks]
+    return _table(rows)
+
+
+def _mark(frame: OutFrame, mark: ComparatorPoint) -> dict[str, Any]:
+    assert mark.xy_mm is not None
+    place, sigma = mark.xy_mm, mark.sigma_mm
+    col, row = frame.pixels((mark,))[0].tolist() if frame.pitch_um else (None, None)
+    camera = (None, None) if frame.model is None else frame.model.camera_from_comparator(place[None])[0].tolist()
+    return {
+        "image": mark.image,
+        "camera": frame.camera,
+        "point": mark.point,
+        "kind": mark.kind,
+        "status": str(mark.status),
+        "x_mm": float(place[0]),
+        "y_mm": float(place[1]),
+        "sx_mm": None if sigma is None else float(sigma[0]),
+        "sy_mm": None if sigma is None else float(sigma[1]),
+        "rho": mark.rho,
+        "col_px": col,
+        "row_px": row,
+        "camera_x_mm": camera[0],
+        "camera_y_mm": camera[1],
+        "reason": mark.reason,
+    }
+
+
+def _images(block: Block) -> Table:
+    assert block.adjustment is not None
+    rows = []
+    for frame in block.oriented():
+        exterior = block.adjustment["images"][frame.image]["exterior"]
+        values = {element: exterior[element]["value"] for element in ELEMENTS}
+        sigmas = {f"s{element}": exterior[element]["sigma"] for element in ELEMENTS}
+        rows.append({"image": frame.image, "camera": frame.camera, **values, **sigmas})
+    return _table(rows)
+
+
+def _transformations(block: Block) -> Table:
+    assert block.adjustment is not None
+    rows = []
+    for frame in block.frames:
+        if frame.model is None:
+            continue
+        stored = block.adjustment["images"][frame.image]["transformation"]
+        known = {"image": frame.image, "kind": stored["kind"], "mirrored": bool(stored.get("mirrored", False))}
+        rows += [
+            {**known, "parameter": name, "value": quantity["value"], "sigma": quantity["sigma"]}
+            for name, quantity in stored.items()
+            if isinstance(quantity, dict)
+        ]
+    return _table(rows)
+
+
+def _covariances(block: Block) -> Table:
+    """Of each image's orientation and film transformation: the lower triangle, mm, object units and rad."""
+    known = set(block.covariance.names)
+    rows = []
+    for frame in block.frames:
+        prefixes = (f"EO.{frame.image}.", f"T.{frame.image}.")
+        names = [name for name in block.covariance.names if name.startswith(prefixes) and name in known]
+        matrix = block.covariance.of(names) if names else np.zeros((0, 0))
+        rows += [
+            {"image": frame.image, "first": first, "second": second, "covariance": float(matrix[i, j])}
+            for i, first in enumerate(names)
+            for j, second in enumerate(names[: i + 1])
+        ]
+    return _table(rows)
+
+
+def _points(block: Block) -> Table:
+    assert block.adjustment is not None
+    rows = []
+    for id, point in block.adjustment["points"].items():
+        values = {axis: point[axis]["value"] for axis in "XYZ"}
+        rows.append({"point": id, **values, **{f"s{axis}": point[axis]["sigma"] for axis in "XYZ"}})
+    return _table(rows)
+
+
+def _cameras(block: Block) -> Table:
+    assert block.adjustment is not None
+    rows = []
+    for name, camera in block.adjustment["cameras"].items():
+        point, distortion = camera["principal_point_mm"], camera["distortion"]
+        quantities = {"c_mm": camera["principal_distance_mm"], "x0_mm": point["x"], "y0_mm": point["y"]}
+        quantities |= {key: value for key, value in distortion.items() if isinstance(value, dict)}
+        for id, fiducial in camera["fiducials"].items():
+            quantities |= {f"fiducial {id} x_mm": fiducial["x_mm"], f"fiducial {id} y_mm": fiducial["y_mm"]}
+        known = {"camera": name, "distortion": distortion["family"]}
+        rows += [
+            {**known, "parameter": key, "value": each["value"], "sigma": each["sigma"]}
+            for key, each in quantities.items()
+        ]
+    return _table(rows)
+
+
+def _table(rows: list[dict[str, Any]]) -> Table:
+    return {column: [row[column] for row in rows] for column in (rows[0] if rows else ())}

@@ -1,0 +1,94 @@
+"""XML of other programs: read by a parser that expands no entities, written with two blanks a level."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.parsers import expat
+from xml.sax.saxutils import escape
+
+from pipeline.errors import InputError
+from pipeline.text.text_file import read_bytes
+
+Element = ElementTree.Element
+
+DEEPEST = 100  # elements within one another: no format here has ten
+
+
+def read_xml(path: Path) -> Element:
+    """The root element of a file. Raises InputError for a missing file, broken XML, and any document type, for with it
+    come entities."""
+    try:
+        data = read_bytes(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; an XML file is needed here.") from None
+    try:
+        return _parsed(data, path)
+    except expat.ExpatError as error:
+        raise InputError(f"{path}: is not valid XML ({error}). Export it again from the other program.") from None
+
+
+def _parsed(data: bytes, path: Path) -> Element:
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    depth = 0
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise InputError(
+                f"{path}: its elements stand in one another more than {DEEPEST} deep; no such file is read."
+            )
+        builder.start(name, attributes)
+
+    def end(name: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(name)
+
+    def refuse(*_: object) -> None:
+        raise InputError(
+            f"{path}: has a document type (<!DOCTYPE>), and entities are not expanded here. No program's measurements "
+            "have one: remove it, or export the file again."
+        )
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler = builder.data
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    parser.Parse(data, True)
+    return builder.close()
+
+
+def text_of(element: Element, name: str, path: Path) -> str:
+    """The text of a child element. Raises InputError where there is none."""
+    found = element.find(name)
+    if found is None or found.text is None:
+        raise InputError(f"{path}: <{element.tag}> has no <{name}>. Is it a file of this format?")
+    return found.text.strip()
+
+
+def numbers_of(element: Element, name: str, count: int, path: Path) -> list[float]:
+    """So many numbers in the text of a child element. Raises InputError where there are others."""
+    text = text_of(element, name, path)
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise InputError(f"{path}: <{name}> is {text[:60]!r}; it should be {count} numbers.")
+    return values
+
+
+def xml_lines(name: str, content: str | list[str]) -> list[str]:
+    """An element with text, or around other lines."""
+    if isinstance(content, str):
+        return [f"<{name}>{escape(content)}</{name}>"]
+    return [f"<{name}>", *(f"  {line}" for line in content), f"</{name}>"]
+
+
+def xml_text(lines: list[str]) -> str:
+    return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', *lines]) + "\n"
+
+
+def plain_number(value: float) -> str:
+    return repr(float(value))

@@ -1,0 +1,405 @@
+"""What goes out to other programs, read by readers of their own formulas and held against the truth."""
+
+import csv
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest.mock import MagicMock
+
+import cv2
+import numpy as np
+import pyarrow.parquet
+import pytest
+from exported_project import (
+    IMAGES,
+    LENS,
+    MIRRORED,
+    PITCH_MM,
+    POINTS,
+    TRUTH,
+    adjusted_project,
+    camera_mm,
+    frame_px,
+    ideal_mm,
+    scan_px,
+)
+from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_affine, micmac_px, opencv_px, values
+from numpy.typing import NDArray
+from simulated import affine, rotation
+
+from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
+from pipeline.exchange import asp_format, colmap_format, micmac_format, mmvii_format, opencv_format, pinhole
+from pipeline.exchange.convention import FORMATS
+from pipeline.exchange.map_projection import lon_lat
+
+Array = NDArray[np.float64]
+
+SAME_PX = 1e-6
+PINHOLES: dict[str, tuple[Callable[[Path, str, Array], Array], ModuleType]] = {
+    "opencv": (opencv_px, opencv_format),
+    "colmap": (colmap_px, colmap_format),
+    "asp": (asp_px, asp_format),
+}
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return adjusted_project(tmp_path_factory.mktemp("exported"))
+
+
+def exported(project: Path, format: str, folder: Path, *options: str, code: int = DONE) -> Path:
+    assert run(["export", str(project), format, str(folder / format), *options]) == code
+    return folder / format
+
+
+def told_misfit_px(folder: Path) -> float:
+    """The residual that the README tells."""
+    text = (folder / "README.txt").read_text(encoding="utf-8")
+    return float(text[text.index("off by ") + 7 :].split()[0])
+
+
+@pytest.mark.parametrize("format", PINHOLES)
+def test_frames_without_their_lens_are_the_same_to_a_millionth_of_a_pixel(
+    format: str, project: Path, tmp_path: Path
+) -> None:
+    reader, _ = PINHOLES[format]
+    folder = exported(project, format, tmp_path, "--lens")
+    for i in IMAGES:
+        there = frame_px(i, ideal_mm(i), ideal=True)
+        np.testing.assert_allclose(reader(folder, f"f{i}", POINTS), there, atol=SAME_PX, rtol=0)
+
+
+@pytest.mark.parametrize("format", PINHOLES)
+def test_frames_with_their_lens_are_off_by_no_more_than_is_told(format: str, project: Path, tmp_path: Path) -> None:
+    reader, _ = PINHOLES[format]
+    folder = exported(project, format, tmp_path)
+    told = told_misfit_px(folder)
+    assert 0.0 < told < 0.05
+    for i in IMAGES:
+        off = np.linalg.norm(reader(folder, f"f{i}", POINTS) - frame_px(i, camera_mm(i)), axis=1)
+        assert off.max() < 1.05 * told + SAME_PX  # the told one is of a grid
+
+
+@pytest.mark.parametrize("format", PINHOLES)
+def test_half_a_pixel_and_the_y_axis_are_seen(
+    format: str, project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, module = PINHOLES[format]
+    there = frame_px(0, ideal_mm(0), ideal=True)
+    wrong = replace(module.CONVENTION, first_pixel_px=tuple(c + 0.5 for c in module.CONVENTION.first_pixel_px))
+    with monkeypatch.context() as broken:
+        broken.setattr(module, "CONVENTION", wrong)
+        off = reader(exported(project, format, tmp_path, "--lens"), "f0", POINTS) - there
+    np.testing.assert_allclose(off, 0.5, atol=SAME_PX)
+    with monkeypatch.context() as broken:
+        broken.setattr(pinhole, "Y_DOWN_Z_FORWARD", np.diag([1.0, 1.0, 1.0]))
+        off = reader(exported(project, format, tmp_path, "--lens"), "f0", POINTS) - there
+    assert not np.abs(off).max() < 10.0  # NaN, too: COLMAP projects nothing that is behind it
+
+
+def test_the_pitch_of_the_resampled_frames_can_be_set(project: Path, tmp_path: Path) -> None:
+    fine = exported(project, "opencv", tmp_path, "--lens", "--pitch-um", "50")
+    coarse = exported(project, "opencv", tmp_path / "b", "--lens", "--pitch-um", "100")
+    apart = [np.diff(opencv_px(folder, "f1", POINTS), axis=0) for folder in (fine, coarse)]
+    np.testing.assert_allclose(apart[0], 2.0 * apart[1], atol=1e-5)
+
+
+def test_colmap_has_the_tracks_of_the_marks(project: Path, tmp_path: Path) -> None:
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(exported(project, "colmap", tmp_path) / "sparse"))
+    assert (model.num_points3D(), model.num_images(), model.compute_num_observations()) == (100, 4, 400)
+    image = next(each for each in model.images.values() if each.name == "f0.tif")
+    marks = [point.xy - 0.5 for point in image.points2D]
+    np.testing.assert_allclose(marks, frame_px(0, camera_mm(0)), atol=SAME_PX)
+    assert model.compute_mean_track_length() == 4.0
+    assert model.compute_mean_reprojection_error() < 0.01
+
+
+def test_micmac_makes_the_frames_that_its_camera_is_for(project: Path, tmp_path: Path) -> None:
+    """From the scan's pixels through MicMac's own fit and ReSampFid's box to the pixels of camera and pose."""
+    folder = exported(project, "micmac", tmp_path)
+    told = told_misfit_px(folder)
+    text = (folder / "README.txt").read_text(encoding="utf-8")
+    box = [float(value) for value in text[text.index("BoxCh=[") + 7 :].split("]")[0].split(",")]
+    assert box == [-114.0, -114.0, 114.0, 114.0]
+    for i in IMAGES:
+        matrix, shift = micmac_affine(folder, f"f{i}")
+        made = (scan_px(i, camera_mm(i)) @ matrix.T + shift - box[:2]) / PITCH_MM
+        np.testing.assert_allclose(made, (camera_mm(i) * (1, -1) - box[:2]) / PITCH_MM, atol=1e-5)
+        off = np.linalg.norm(micmac_px(folder, f"f{i}", POINTS) - made, axis=1)
+        assert off.max() < 1.05 * told + 1e-5
+
+
+def test_micmac_with_half_a_pixel_or_y_up_is_seen(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = replace(micmac_format.CONVENTION, first_pixel_px=(0.5, 0.5))
+    with monkeypatch.context() as broken:
+        broken.setattr(micmac_format, "CONVENTION", wrong)
+        matrix, shift = micmac_affine(exported(project, "micmac", tmp_path), "f0")
+    off = scan_px(0, camera_mm(0)) @ matrix.T + shift - camera_mm(0) * (1, -1)
+    assert np.linalg.norm(off, axis=1).min() > 0.4 * PITCH_MM
+    with monkeypatch.context() as broken:
+        broken.setattr(micmac_format, "_Y_DOWN", np.array([1.0, 1.0]))
+        matrix, _ = micmac_affine(exported(project, "micmac", tmp_path), "f0")
+    assert np.linalg.det(matrix) < 0.0  # a mirror, which MicMac would take in silence
+
+
+def test_mmvii_has_the_whole_covariance(project: Path, tmp_path: Path) -> None:
+    from xml.etree import ElementTree
+
+    comparator = project.parent / "comparator.csv"
+    rows = list(csv.DictReader(comparator.read_text(encoding="utf-8").splitlines()[1:]))
+    folder = exported(project, "mmvii", tmp_path) / "MMVII-PhgrProj" / "PointsMeasure"
+    root = ElementTree.parse(folder / "Targets" / "MesIm-f1.tif.xml").getroot()
+    elements = root.findall("Data/SetMesIm/Measures/el")
+    assert [element.findtext("Name") for element in elements] == [f'"{j}"' for j in range(100)]
+    np.testing.assert_allclose([values(e, "Pt") for e in elements], scan_px(1, camera_mm(1)), atol=SAME_PX)
+    mark = next(row for row in rows if row["image"] == "f1" and row["kind"] == "target")
+    sx, sy = (float(mark[name]) / PITCH_MM for name in ("sx_mm", "sy_mm"))
+    np.testing.assert_allclose(values(elements[0], "Sigma2"), [sx**2, 0.0, sy**2], rtol=1e-9)
+    assert len(list((folder / "Fiducials").iterdir())) == 4
+
+
+def test_rho_changes_its_sign_where_rows_run_down(project: Path) -> None:
+    from pipeline.exchange.block import read_block
+    from pipeline.files.project_file import read_project
+
+    mark = replace(read_block(read_project(project)).frames[0].marks[0], rho=0.3, sigma_mm=np.array([0.002, 0.004]))
+    xx, xy, yy = mmvii_format._sigma2(mark, (20.0, 20.0))
+    assert (xx, yy) == pytest.approx((0.01, 0.04))
+    assert xy == pytest.approx(-0.3 * 0.1 * 0.2)
+
+
+def test_metashape_script_makes_film_cameras(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The script against a stub of Metashape's module; the calibration by its manual's formulas."""
+    folder = exported(project, "metashape", tmp_path, code=LOOK)
+    told = told_misfit_px(folder)
+    for i in (0, 1, 3):
+        in_camera = (np.diag([1, -1, -1]) @ rotation(*TRUTH.attitudes[i]) @ (POINTS - np.array(TRUTH.stations[i])).T).T
+        off = np.linalg.norm(metashape_mm(folder / "K.xml", PITCH_MM, in_camera) - camera_mm(i), axis=1)
+        assert off.max() / PITCH_MM < 1.05 * told + SAME_PX
+
+    class Photo:
+        def __init__(self, path: str) -> None:
+            self.label, self.sensor, self.reference = Path(path).stem, MagicMock(), MagicMock()
+
+    class Chunk(MagicMock):
+        markers: list[Any]
+
+        def addPhotos(self, paths: list[str]) -> None:
+            self.cameras = [Photo(path) for path in paths]
+
+        def addSensor(self, _: object) -> Any:
+            self.sensor = MagicMock()
+            return self.sensor
+
+        def addMarker(self) -> Any:
+            marker = MagicMock(projections={})
+            self.markers.append(marker)
+            return marker
+
+    chunk = Chunk(markers=[])
+    stub = MagicMock(app=MagicMock(document=MagicMock(addChunk=lambda: chunk)))
+    stub.Vector = list
+    stub.Marker.Projection = lambda place, pinned: (place, pinned)
+    monkeypatch.setitem(sys.modules, "Metashape", stub)
+    script = folder / "reseau_to_metashape.py"
+    exec(compile(script.read_text(encoding="utf-8"), str(script), "exec"), {"__file__": str(script)})
+    assert chunk.sensor.film_camera is True
+    chunk.sensor.calibrateFiducials.assert_called_once_with(PITCH_MM)
+    by_label = {marker.label: marker for marker in chunk.markers}
+    assert by_label["1"].reference.location == pytest.approx(POINTS[1], abs=1e-6)  # a point, and no fiducial
+    pixels = {camera.label: place for camera, (place, _) in by_label["17"].projections.items()}
+    assert sorted(pixels) == ["f0", "f1", "f3"]
+    np.testing.assert_allclose(pixels["f1"], scan_px(1, camera_mm(1))[17] + 0.5, atol=1e-5)
+    assert "f2: its scan is mirrored" in (folder / "README.txt").read_text(encoding="utf-8")
+
+
+def test_bingo_is_free_of_film_and_lens(project: Path, tmp_path: Path) -> None:
+    text = (exported(project, "bingo", tmp_path) / "bingo.txt").read_text(encoding="utf-8")
+    blocks = text.strip().split("\n\n")
+    assert [block.splitlines()[0] for block in blocks] == ["f0 K", "f1 K", "f2 K", "f3 K"]
+    for i, block in enumerate(blocks):
+        rows = [line.split() for line in block.splitlines()[1:]]
+        assert [row[0] for row in rows] == [str(j) for j in range(100)]
+        np.testing.assert_allclose([[float(x), float(y)] for _, x, y in rows], ideal_mm(i), atol=2e-6)
+
+
+def test_footprints_hold_what_the_frames_show(tmp_path: Path) -> None:
+    """In degrees as object coordinates the outline is seen by the camera at its frame's border."""
+    upright = replace(
+        TRUTH, attitudes=((0.01, -0.02, 0.1), (-0.08, 0.06, 1.6), (-0.05, -0.09, 3.0), (-0.05, 0.03, -1.5))
+    )
+    project = adjusted_project(tmp_path, upright, "EPSG:4326")
+    content = json.loads((exported(project, "geojson", tmp_path) / "footprints.geojson").read_text(encoding="utf-8"))
+    assert [feature["properties"]["image"] for feature in content["features"]] == ["f0", "f1", "f2", "f3"]
+    for i, feature in enumerate(content["features"]):
+        ring = np.array(feature["geometry"]["coordinates"][0])
+        assert ring[0].tolist() == ring[-1].tolist()
+        x, y = ring[:-1].T
+        assert (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() > 0.0
+        from simulated import camera_point
+
+        ground = np.column_stack([ring[:-1], np.full(len(x), feature["properties"]["ground"])])
+        seen = camera_point(upright, i, ground)
+        np.testing.assert_allclose(np.abs(seen).max(axis=1), 114.0, atol=1e-4)
+
+
+def test_utm_is_the_conformal_map_of_its_meridian() -> None:
+    """On the central meridian the northing is the arc's length, integrated here; beside it the map is conformal."""
+    e2 = (2.0 - 1.0 / 298.257222101) / 298.257222101
+    lat = np.radians(48.5)
+    steps = (np.arange(200_000) + 0.5) / 200_000 * lat
+    arc_m = 6378137.0 * (1 - e2) * ((1 - e2 * np.sin(steps) ** 2) ** -1.5).mean() * lat
+    on_it = lon_lat(np.array([[500_000.0, 0.9996 * arc_m]]), "EPSG:25832")
+    np.testing.assert_allclose(on_it, [[9.0, 48.5]], atol=1e-9)
+    at, h = np.array([[650_000.0, 5_300_000.0]]), 50.0
+    d = [(lon_lat(at + step, "EPSG:32632") - lon_lat(at - step, "EPSG:32632"))[0] for step in ((h, 0.0), (0.0, h))]
+    phi = np.radians(lon_lat(at, "EPSG:32632")[0, 1])
+    isometric = (1 - e2) / (1 - e2 * np.sin(phi) ** 2) / np.cos(phi)  # of a step in latitude
+    (lon_e, lat_e), (lon_n, lat_n) = ((lon, lat * isometric) for lon, lat in d)
+    assert lon_e == pytest.approx(lat_n, rel=1e-7)
+    assert lon_n == pytest.approx(-lat_e, rel=1e-6)
+    south = lon_lat(np.array([[500_000.0, 10_000_000.0 - 0.9996 * arc_m]]), "EPSG:32733")
+    np.testing.assert_allclose(south, [[15.0, -48.5]], atol=1e-9)
+
+
+def test_tables_tell_what_the_adjustment_says(project: Path, tmp_path: Path) -> None:
+    adjustment = json.loads((project.parent / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    texts, binary = exported(project, "csv", tmp_path), exported(project, "parquet", tmp_path)
+    for path in sorted(texts.glob("*.csv")):
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()[1:]))
+        table = pyarrow.parquet.read_table(binary / f"{path.stem}.parquet").to_pylist()
+        assert len(rows) == len(table) > 0
+        for row, other in zip(rows, table, strict=True):
+            assert row.keys() == other.keys()
+            assert [float(v) for k, v in row.items() if isinstance(other[k], float)] == [
+                v for v in other.values() if isinstance(v, float)
+            ]
+    images = {row["image"]: row for row in pyarrow.parquet.read_table(binary / "images.parquet").to_pylist()}
+    exterior = adjustment["images"]["f2"]["exterior"]
+    assert images["f2"]["kappa_deg"] == exterior["kappa_deg"]["value"]
+    assert images["f2"]["sZ0"] == exterior["Z0"]["sigma"]
+    covariances = pyarrow.parquet.read_table(binary / "covariances.parquet").to_pylist()
+    own = [row for row in covariances if row["first"] == row["second"] == "EO.f2.Z0"]
+    assert own[0]["covariance"] == pytest.approx(exterior["Z0"]["sigma"] ** 2, rel=1e-9)
+    marks = [row for row in pyarrow.parquet.read_table(binary / "marks.parquet").to_pylist() if row["image"] == "f1"]
+    seen = [[row["camera_x_mm"], row["camera_y_mm"]] for row in marks if row["kind"] == "target"]
+    np.testing.assert_allclose(seen, camera_mm(1), atol=1e-7)
+
+
+def test_only_observations_go_out(tmp_path: Path) -> None:
+    project = adjusted_project(tmp_path)
+    comparator = tmp_path / "comparator.csv"
+    lines = comparator.read_text(encoding="utf-8").splitlines()
+    head, *rows = lines[1:]
+    states = ["predicted", "rejected", "weak", *["measured"] * (len(rows) - 3)]
+    rows = [f"{row},{state}" for row, state in zip(rows, states, strict=True)]
+    comparator.write_text("\n".join([lines[0], f"{head},status", *rows]) + "\n", encoding="utf-8")
+    assert (
+        run(["export", str(project), "mmvii", str(tmp_path / "o")]) == WRONG_INPUT
+    )  # the adjustment is of other marks
+    assert run(["adjust", str(project)]) in (DONE, LOOK)
+    folder = exported(project, "micmac", tmp_path)
+    text = (folder / "Ori-InterneScan" / "MeasuresIm-f0.tif.xml").read_text(encoding="utf-8")
+    assert text.count("<OneMesureAF1I>") == 3  # of five fiducials
+
+
+def test_what_cannot_go_out_is_refused_with_its_reason(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["export", str(project), "orima", str(tmp_path / "a")]) == WRONG_INPUT
+    assert f"possible are {', '.join(FORMATS)}" in capsys.readouterr().err
+    assert run(["export", str(project), "geojson", str(tmp_path / "a")]) == WRONG_INPUT
+    assert "Give crs in [object]" in capsys.readouterr().err
+    assert run(["export", str(project), "opencv", str(tmp_path / "a"), "--misfit-px", "0"]) == WRONG_INPUT
+    assert "no model that takes this camera" in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+    assert list(tmp_path.iterdir()) == []
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "mine.txt").write_text("mine", encoding="utf-8")
+    assert run(["export", str(project), "csv", str(full)]) == WRONG_INPUT
+    assert "holds something that is no export" in capsys.readouterr().err
+    assert [path.name for path in full.iterdir()] == ["mine.txt"]
+
+
+def test_a_strong_lens_is_refused_unless_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    strong = replace(TRUTH, distortion={**LENS, "k3": 4e-6, "k5": -2e-10})
+    project = adjusted_project(tmp_path, strong)
+    assert run(["export", str(project), "asp", str(tmp_path / "a")]) == WRONG_INPUT
+    assert "allow more with --misfit-px" in capsys.readouterr().err
+    folder = exported(project, "asp", tmp_path, "--misfit-px", "100")
+    told = told_misfit_px(folder)
+    assert told > 0.05
+    off = np.linalg.norm(asp_px(folder, "f0", POINTS) - frame_px(0, camera_mm(0, strong), truth=strong), axis=1)
+    assert off.max() < 1.05 * told
+
+
+def test_an_export_takes_the_place_of_an_earlier_one_whole(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = exported(project, "opencv", tmp_path)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def full(path: Path, content: object) -> None:
+        if path.name == "f2.yml":
+            raise OSError(28, "No space left on device")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+    with monkeypatch.context() as broken:
+        broken.setattr("pipeline.exchange.export_stage.write_atomically", full)
+        assert run(["export", str(project), "opencv", str(folder)]) == WRONG_INPUT
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["opencv"]
+    assert run(["export", str(project), "opencv", str(folder), "--lens"]) == DONE
+    assert (folder / "f2.yml").read_bytes() != before["f2.yml"]
+
+
+def test_a_mirrored_scan_goes_out_resampled(project: Path, tmp_path: Path) -> None:
+    _, a2, a3, _, b2, b3 = affine(TRUTH, MIRRORED, "affine")
+    assert a2 * b3 - a3 * b2 < 0.0
+    folder = exported(project, "opencv", tmp_path, "--lens")
+    storage = cv2.FileStorage(str(folder / f"f{MIRRORED}.yml"), cv2.FILE_STORAGE_READ)
+    assert np.linalg.det(storage.getNode("R").mat()) == pytest.approx(1.0)
+
+
+def test_without_an_adjustment_the_marks_go_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = adjusted_project(tmp_path)
+    (tmp_path / "out" / "adjustment.json").unlink()
+    folder = exported(project, "micmac", tmp_path)
+    assert not (folder / "Ori-Reseau").exists()
+    assert len(list((folder / "Ori-InterneScan").iterdir())) == 5
+    assert sorted(path.name for path in exported(project, "csv", tmp_path).iterdir()) == ["README.txt", "marks.csv"]
+    capsys.readouterr()
+    assert run(["export", str(project), "colmap", str(tmp_path / "c")]) == WRONG_INPUT
+    assert "Run `reseau adjust` first" in capsys.readouterr().err
+
+
+@pytest.mark.xdist_group("demonstration")
+def test_resampled_frames_lie_where_the_export_says(finished: tuple[Path, int], tmp_path: Path) -> None:
+    """The demonstration's frames, turned and mirrored: the first pixel of `reseau resample` and that of the export."""
+    import tifffile
+
+    project = finished[0] / "project.toml"
+    assert run(["resample", str(project), str(tmp_path / "frames"), "--fast"]) == DONE
+    folder = exported(project, "opencv", tmp_path)
+    adjustment = json.loads((finished[0] / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    camera = next(iter(adjustment["cameras"].values()))
+    point = np.array([camera["principal_point_mm"][axis]["value"] for axis in "xy"])
+    for frame in sorted((tmp_path / "frames").glob("*.tif")):
+        with tifffile.TiffFile(frame) as file:
+            said, shape = json.loads(file.pages.first.description), file.pages.first.shape
+        storage = cv2.FileStorage(str(folder / f"{frame.stem}.yml"), cv2.FILE_STORAGE_READ)
+        matrix = storage.getNode("camera_matrix").mat()
+        there = (point - (said["x_mm"], said["y_mm"])) * (1, -1) / said["pitch_mm"]
+        np.testing.assert_allclose(matrix[:2, 2], there, atol=0.01)  # the fit may move it a little
+        size = [int(storage.getNode(f"image_{side}").real()) for side in ("height", "width")]
+        assert size == list(shape[:2])
