@@ -123,6 +123,8 @@ def ideal_from_observed(
     distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array
 ) -> tuple[Array, Mask]:
     """Camera coordinates (n, 2) in mm free of distortion, of observed ones (n, 2); which were found."""
+    if not parameters.any():  # of every family: it corrects nothing
+        return xy_mm, np.asarray(np.isfinite(xy_mm).all(axis=1))
     ray = (xy_mm - interior[1:]) / interior[0]
     found = np.zeros(len(ray), dtype=bool)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -139,6 +141,8 @@ def ideal_from_observed(
 def folded_over(distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array) -> Mask:
     """Which observed camera points (n, 2) in mm lie beyond where the distortion turns the image back on itself."""
     ideal_mm, found = ideal_from_observed(distortion, interior, parameters, xy_mm)
+    if not parameters.any():
+        return ~found
     with np.errstate(over="ignore", invalid="ignore"):
         at = image_equations(distortion, interior, parameters, xy_mm, (ideal_mm - interior[1:]) / interior[0])
         sides = determinant(at.by_xy), determinant(at.imaged.by_ray)

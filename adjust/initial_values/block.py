@@ -1,12 +1,13 @@
 """A block of images being oriented: resection, intersection, and again."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.sight import Sight
+from adjust.initial_values.closed_form import KnownField, orient_together
 from adjust.initial_values.intersection import intersect
 from adjust.initial_values.resection import Pose, resect, three_point_poses
 
@@ -34,7 +35,9 @@ def extend(block: Block) -> None:
         block.points = intersected(block, WELL_DETERMINED)
         waiting = [name for name in sorted(block.sights) if name not in block.poses]
         for fewest in (SURE_RESECTION, 4, 3):
-            new = {name: pose for name in waiting if (pose := _pose_of(block, name, fewest)) is not None}
+            new = resected_together(block, waiting) if fewest == SURE_RESECTION else {}
+            others = (name for name in waiting if name not in new)
+            new |= {name: pose for name in others if (pose := _pose_of(block, name, fewest)) is not None}
             if new:
                 break
         if not new:
@@ -60,6 +63,21 @@ def resected(sight: Sight, xyz: Array, xy_mm: Array) -> Pose | None:
         return poses[0] if len(poses) == 1 else None
     resection = resect(xyz, xy_mm, c, np.random.default_rng(0), sight.sigma_mm)
     return None if resection is None or resection.sigma_mm > IMPLAUSIBLE * c else resection.pose
+
+
+def resected_together(block: Block, images: Sequence[str]) -> dict[str, Pose]:
+    """The poses of those images whose points agree on one: the firm ones where these are enough."""
+    fields = {}
+    coordinates = {**block.rough, **block.points}
+    for name in images:
+        sight = block.sights[name]
+        xyz, xy_mm = known_field(sight, block.firm)
+        if len(xyz) < SURE_RESECTION:
+            xyz, xy_mm = known_field(sight, coordinates)
+        if len(xyz) >= SURE_RESECTION:
+            fields[name] = KnownField(xyz, xy_mm, sight.sigma_mm)
+    together = orient_together(list(fields.values()), [block.sights[name].principal_distance_mm for name in fields])
+    return {name: pose for name, pose in zip(fields, together, strict=True) if pose is not None}
 
 
 def known_field(sight: Sight, coordinates: Mapping[str, Array]) -> tuple[Array, Array]:

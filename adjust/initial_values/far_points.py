@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.sight import Sight, freed_sight
-from adjust.functional_model.transformation import film_kind
+from adjust.functional_model.sight import Sight
+from adjust.initial_values.frames import frames_of
 from adjust.initial_values.intersection import intersect
 from adjust.initial_values.resection import Pose, image_distances
 from adjust.problem.problem import Problem
@@ -104,24 +104,12 @@ def _rays_of_given(problem: Problem, sights: Mapping[str, Sight]) -> dict[str, l
 def _sights(problem: Problem) -> dict[str, Sight]:
     """By image name, of those that show object points: freed of the distortion as far as it is known beforehand."""
     network, unknowns = problem.network, problem.unknowns
+    transformation = {name: unknowns.start[at] for name, at in unknowns.transformation.items()}
+    frames = frames_of(network, transformation, problem.mirrored)
     sights = {}
-    by_image = np.argsort(problem.image_numbers, kind="stable")
-    ends = np.cumsum(np.bincount(problem.image_numbers, minlength=len(network.images)))[:-1]
-    for image, of_image in zip(network.images, np.split(by_image, ends), strict=True):
-        rows = of_image[~problem.is_fiducial[of_image]]
-        if len(rows):
-            film = film_kind(image.transformation, image.name in problem.mirrored)
-            xy_mm = film.apply(unknowns.start[unknowns.transformation[image.name]], network.straight_xy_mm[rows])
-            interior, known = np.split(unknowns.start[unknowns.camera[image.camera]], [3])
-            variances = np.trace(network.observations.covariance_mm2[rows], axis1=1, axis2=2) / 2.0
-            sights[image.name] = freed_sight(
-                tuple(network.observations.point[row] for row in rows),
-                xy_mm,
-                float(np.sqrt(np.median(variances))),
-                interior,
-                network.camera_by_name[image.camera].distortion,
-                known,
-            )
+    for name, at in unknowns.camera.items():
+        interior, known = np.split(unknowns.start[at], [3])
+        sights.update(frames.sights(network.camera_by_name[name], interior, known))
     return sights
 
 

@@ -1,12 +1,12 @@
 """An approximate principal distance from images of known points, where the camera brings none."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from adjust.initial_values.closed_form import KnownField, principal_distance_together
 from adjust.initial_values.resection import Resection, refine, resect
 
 Array = NDArray[np.float64]
@@ -17,25 +17,20 @@ FINE_IMAGES = 12
 LARGEST_RELATIVE_SIGMA = 0.15
 
 
-@dataclass(frozen=True)
-class KnownField:
-    """What one image shows of known points: xyz (n, 3), xy_mm (n, 2) about the principal point, their sigma in mm."""
-
-    xyz: Array
-    xy_mm: Array
-    sigma_mm: float
-
-
 def find_principal_distance(fields: Sequence[KnownField]) -> float | None:
     """The principal distance in mm with which resections of all images leave the least; None where they do not tell.
 
-    Every image is resected with principal distances on a logarithmic grid, and the sum of the squared residuals is
-    then minimised about the best. They do not tell when the minimum is so flat that the principal distance has a
-    standard deviation above 15 %: a flat field parallel to the image, where a change of it is a change of the height.
+    In closed form, where all points agree. Otherwise every image is resected with principal distances on a logarithmic
+    grid, and the sum of the squared residuals is then minimised about the best. They do not tell when the minimum is so
+    flat that the principal distance has a standard deviation above 15 %: a flat field parallel to the image, where a
+    change of it is a change of the height.
     """
     fields = sorted((f for f in fields if len(f.xyz) >= 4), key=lambda f: -len(f.xyz))[:FINE_IMAGES]
     if not fields:
         return None
+    together = principal_distance_together(fields)
+    if together is not None and together[1] < LARGEST_RELATIVE_SIGMA:
+        return together[0]
     radius = max(float(np.linalg.norm(f.xy_mm, axis=1).max()) for f in fields)
     costs = [_trimmed_cost(fields[:COARSE_IMAGES], c) for c in GRID * radius]
     found = float(GRID[int(np.argmin(costs))] * radius)

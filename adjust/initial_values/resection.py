@@ -3,21 +3,20 @@
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.rotation import rotation_from_vector
+from adjust.initial_values.pose_refinement import BEHIND, refined_poses, squared_residuals
 from adjust.initial_values.three_points import triple_poses
 
 Array = NDArray[np.float64]
+Count = TypeVar("Count", int, NDArray[np.intp])
 
 MAX_TRIPLES = 120  # enough for one free of gross errors among them when every third point is wrong
 MAX_SCORED_POINTS = 200
 REFINED_CANDIDATES = 16  # poses kept for the refinement: the two minima of a flat field must both be among them
-LM_ITERATIONS = 12
-SETTLED = 1e-9  # relative change of a sum of squares that is none
-BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
 EXACT = 1e-12  # squared residual of three points that are met
 SAME_PLACE = 1e-4  # poses nearer than this, in extents of the points, are one
 LINE = 1e-5  # width over length of points that lie on a line, about which a camera may turn
@@ -62,8 +61,9 @@ def resect(
         return None
     scored = rng.permutation(len(xyz))[:MAX_SCORED_POINTS] if len(xyz) > MAX_SCORED_POINTS else np.arange(len(xyz))
     rotations, shifts = _best_of(rotations, shifts, field.points[scored], field.tangents[scored])
-    sigma = max(_robust_sigma(_squared(rotations, shifts, field.points, field.tangents)[0]), floor_mm / field.c)
-    inliers = _squared(rotations, shifts, field.points, field.tangents)[0] < REJECTION * sigma**2
+    squared = squared_residuals(rotations, shifts, field.points, field.tangents)
+    sigma = max(float(robust_sigmas(squared, np.array([len(xyz)]))[0]), floor_mm / field.c)
+    inliers = squared[0] < REJECTION * sigma**2
     if _on_a_line(field.points[inliers]):
         return None
     return _fitted(rotations, shifts, field, inliers, sigma * field.c)
@@ -82,7 +82,7 @@ def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) ->
     field = _Field.of(xyz, xy_mm, principal_distance_mm)
     rotations, shifts, _ = triple_poses(field.points[None], field.tangents[None])
     rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, np.ones((len(rotations), 3)))
-    exact = _squared(rotations, shifts, field.points, field.tangents).max(axis=1) < EXACT
+    exact = squared_residuals(rotations, shifts, field.points, field.tangents).max(axis=1) < EXACT
     poses: list[Pose] = []
     for rotation, shift in zip(rotations[exact], shifts[exact], strict=True):
         pose = field.pose(rotation, shift)
@@ -94,7 +94,7 @@ def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) ->
 def image_distances(pose: Pose, xyz: Array, xy_mm: Array, principal_distance_mm: float) -> Array:
     """Distances (n,) in mm from observed to projected points; inf behind the camera."""
     shift = -pose.rotation @ pose.center
-    squared = _squared(pose.rotation[None], shift[None], xyz, xy_mm / principal_distance_mm)[0]
+    squared = squared_residuals(pose.rotation[None], shift[None], xyz, xy_mm / principal_distance_mm)[0]
     return _distances(squared, principal_distance_mm)
 
 
@@ -133,33 +133,18 @@ def _triples(tangents: Array, rng: np.random.Generator) -> NDArray[np.intp]:
     return np.asarray(triples[large][:MAX_TRIPLES])
 
 
-def _squared(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
-    """Squared residuals (k, n) in units of the principal distance."""
-    u, v, w = _in_camera(rotations, shifts, points)
-    x, y = np.moveaxis(tangents, -1, 0)
-    seen = w < 0.0
-    depth = np.where(seen, w, -1.0)
-    squared = (u / depth + x) ** 2 + (v / depth + y) ** 2
-    return np.asarray(np.where(seen & (squared < BEHIND), squared, BEHIND))
-
-
-def _in_camera(rotations: Array, shifts: Array, points: Array) -> Array:
-    """U, V, W (3, k, n) of points (n, 3), or (k, n, 3), in the axes of k cameras."""
-    return np.asarray(np.moveaxis(rotations @ np.swapaxes(points, -1, -2) + shifts[..., None], 1, 0))
-
-
 def _best_of(rotations: Array, shifts: Array, points: Array, tangents: Array) -> tuple[Array, Array]:
     """The pose (1, 3, 3), (1, 3) of the least trimmed squares, the most promising ones refined first."""
     order = np.argsort(_trimmed_cost(rotations, shifts, points, tangents), kind="stable")[:REFINED_CANDIDATES]
     rotations, shifts = rotations[order], shifts[order]
     for _ in range(2):
-        kept = _smallest_half(_squared(rotations, shifts, points, tangents))
+        kept = _smallest_half(squared_residuals(rotations, shifts, points, tangents))
         rotations, shifts = refined_poses(rotations, shifts, points, tangents, kept)
     best = int(np.argmin(_trimmed_cost(rotations, shifts, points, tangents)))
     return rotations[[best]], shifts[[best]]
 
 
-def _half(n: int) -> int:
+def _half(n: Count) -> Count:
     """The number of residuals that least trimmed squares keeps, for poses of three points."""
     return (n + 4) // 2
 
@@ -174,61 +159,21 @@ def _smallest_half(squared: Array) -> Array:
 
 def _trimmed_cost(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
     half = _half(len(points))
-    squared = _squared(rotations, shifts, points, tangents)
+    squared = squared_residuals(rotations, shifts, points, tangents)
     return np.asarray(np.partition(squared, half - 1, axis=1)[:, :half].sum(axis=1))
 
 
-def refined_poses(
-    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
-) -> tuple[Array, Array]:
-    """Levenberg-Marquardt on a rotation vector and a shift, for all poses (k) at once; weights (k, n).
+def robust_sigmas(squared: Array, counts: NDArray[np.intp]) -> Array:
+    """Standard deviations (k,) of a coordinate from the smallest half of chi-square (2) distributed squares (k, n).
 
-    points (n, 3) and tangents (n, 2) are the same for all, or (k, n, 3) and (k, n, 2).
+    Of these, counts (k,) are there, the others are infinite.
     """
-    damping = np.full(len(rotations), 1e-4)
-    cost = (weights * _squared(rotations, shifts, points, tangents)).sum(axis=1)
-    for _ in range(LM_ITERATIONS):
-        normal, right = _normal_equations(rotations, shifts, points, tangents, weights)
-        diagonal = np.einsum("kii->ki", normal)
-        diagonal += damping[:, None] * diagonal + 1e-14  # the constant keeps a pose without a solution harmless
-        step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
-        turn = rotation_from_vector(step[:, :3])
-        new_rotations, new_shifts = turn @ rotations, np.einsum("kij,kj->ki", turn, shifts) + step[:, 3:]
-        new_cost = (weights * _squared(new_rotations, new_shifts, points, tangents)).sum(axis=1)
-        better = new_cost < cost
-        settled = np.abs(cost - new_cost) <= SETTLED * cost
-        rotations = np.where(better[:, None, None], new_rotations, rotations)
-        shifts = np.where(better[:, None], new_shifts, shifts)
-        cost, damping = np.where(better, new_cost, cost), np.where(better, damping / 10, damping * 10)
-        if settled.all():
-            break
-    return rotations, shifts
-
-
-def _normal_equations(
-    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
-) -> tuple[Array, Array]:
-    """J'WJ (k, 6, 6) and J'Wr (k, 6) for a small turn of the camera and a shift in its frame."""
-    u, v, w = _in_camera(rotations, shifts, points)
-    inverse = -1.0 / np.minimum(w, -1e-9)
-    p, q = u * inverse, v * inverse
-    (x, y), n = np.moveaxis(tangents, -1, 0), w.shape[1]
-    jacobian = np.zeros((len(w), 6, 2 * n))  # first all x, then all y
-    for k, (by_p, by_q) in enumerate(
-        ((p * q, 1 + q * q), (-1 - p * p, -p * q), (-q, p), (inverse, 0.0), (0.0, inverse), (p * inverse, q * inverse))
-    ):
-        jacobian[:, k, :n], jacobian[:, k, n:] = by_p, by_q
-    residual = np.concatenate([x - p, y - q], axis=1)[..., None]
-    weighted = jacobian * np.concatenate([weights, weights], axis=1)[:, None]
-    return weighted @ jacobian.swapaxes(1, 2), (weighted @ residual)[..., 0]
-
-
-def _robust_sigma(squared: Array) -> float:
-    """Standard deviation of one coordinate from the smallest half of chi-square (2) distributed squares."""
-    n, h = len(squared), _half(len(squared))
-    left_out = 1 - h / n
-    truncation = 1 + (left_out * np.log(left_out) / (1 - left_out) if left_out > 0 else 0.0)
-    return float(np.sqrt(np.sort(squared)[:h].sum() / max(2 * h - 6, 1) / truncation))
+    half = _half(counts)
+    left_out = 1 - half / counts
+    with np.errstate(divide="ignore", invalid="ignore"):
+        truncation = 1 + np.where(left_out > 0, left_out * np.log(left_out) / (1 - left_out), 0.0)
+    sums = np.take_along_axis(np.cumsum(np.sort(squared, axis=1), axis=1), half[:, None] - 1, axis=1)[:, 0]
+    return np.asarray(np.sqrt(sums / np.maximum(2 * half - 6, 1) / truncation))
 
 
 def _on_a_line(points: Array) -> bool:
@@ -239,6 +184,6 @@ def _on_a_line(points: Array) -> bool:
 def _fitted(rotations: Array, shifts: Array, field: _Field, inliers: NDArray[np.bool_], sigma_mm: float) -> Resection:
     """The one pose (1, 3, 3), (1, 3) fitted to its inliers, back in object units."""
     rotations, shifts = refined_poses(rotations, shifts, field.points, field.tangents, inliers[None].astype(np.float64))
-    squared = _squared(rotations, shifts, field.points, field.tangents)[0]
+    squared = squared_residuals(rotations, shifts, field.points, field.tangents)[0]
     pose = field.pose(rotations[0], shifts[0])
     return Resection(pose, _distances(squared, field.c), inliers, sigma_mm)

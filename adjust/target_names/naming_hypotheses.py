@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from adjust.initial_values.resection import refined_poses
+from adjust.initial_values.pose_refinement import refined_poses
 from adjust.initial_values.three_points import triple_poses
 from adjust.target_names.unnamed_marks import Marks
 

@@ -1,0 +1,287 @@
+"""Orientations of many images of known points at once: in closed form, then refined, then judged.
+
+Fields that are about flat by homographies, others by the direct linear transformation (Hartley and Zisserman 2004,
+sections 4.1 and 7.1), all images in one eigenvalue problem. This knows nothing of gross errors: what does not agree
+is not given, and is left to `resection`.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.rotation import rotation_from_vector
+from adjust.initial_values.pose_refinement import refined_distance, refined_poses, squared_residuals
+from adjust.initial_values.resection import Pose, robust_sigmas
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+FEWEST = 6  # points of an image: fewer do not show whether they agree
+POINTS_AT_ONCE = 100_000
+SHALLOW = 0.25  # relief over width, standard deviations, up to which a homography is nearer than a transformation
+LINE = 1e-4  # width over length of points about on a line
+WORSE = 3.0  # times the usual standard deviation that an image's residuals may have
+GROSS = 100.0  # square of a residual over the image's variance, robustly, that errors of measurement do not reach
+TYPICAL = 10  # images from which on their median tells what a lens that is not known yet leaves everywhere
+LARGEST_TYPICAL = 0.01  # of that, in principal distances: where most images leave more, all may be wrong
+NEARLY_ALIKE = 1e3  # times the squares of a pose up to which its rival as it stands may leave less once it is refined
+ANOTHER = 1e-3  # difference of rotations, in any element, from which on two poses are not one
+ALIKE = 4.0  # times the squares of a pose that a rival, refined, leaves where nothing tells which of the two it is
+
+
+@dataclass(frozen=True, eq=False)
+class KnownField:
+    """What one image shows of known points: xyz (n, 3), xy_mm (n, 2) about the principal point, their sigma in mm."""
+
+    xyz: Array
+    xy_mm: Array
+    sigma_mm: float
+
+
+def orient_together(fields: Sequence[KnownField], principal_distances_mm: Sequence[float]) -> list[Pose | None]:
+    """The poses of the images whose points agree on one; None for the others.
+
+    They agree where no residual is gross and all are as large as the standard deviations say, or as those of most
+    images are: a lens that is not known yet leaves some everywhere.
+    """
+    poses: list[Pose | None] = [None] * len(fields)
+    c = np.array(principal_distances_mm)
+    several = [(some, _Fields.of([fields[i] for i in some])) for some in _batches(fields)]
+    oriented = [batch.oriented(*batch.approximate(c[some]), c[some]) for some, batch in several]
+    if not oriented:
+        return poses
+    typical = _typical(np.concatenate([each.sigma for each in oriented]))
+    for (some, batch), found in zip(several, oriented, strict=True):
+        for k in np.flatnonzero(found.agree(batch.sigma_mm / c[some], typical)):
+            poses[some[k]] = batch.pose(int(k), found)
+    return poses
+
+
+def principal_distance_together(fields: Sequence[KnownField]) -> tuple[float, float] | None:
+    """The principal distance in mm of all images together, and the standard deviation of its logarithm; None where not
+    all images agree on it.
+
+    Of flat fields from the orthogonality of their homographies' axes (Zhang 2000), with a principal point that is
+    known and pixels that are square; then by least squares with all poses.
+    """
+    some = [field for field in fields if len(field.xyz) >= FEWEST]
+    batch = _Fields.of(some) if some else None
+    start = batch.principal_distance() if batch is not None else None
+    if batch is None or start is None:
+        return None
+    poses = batch.approximate(np.full(len(some), start))
+    if not np.isfinite(poses[1]).all():
+        return None
+    sigma_mm = float(batch.sigma_mm.max())
+    fields_mm = batch.points, batch.xy_mm, batch.weights
+    try:
+        rotations, shifts, c, sigma = refined_distance(*poses, *fields_mm, start, sigma_mm)
+    except np.linalg.LinAlgError:  # points behind the camera, for gross errors
+        return None
+    found = batch.oriented(rotations, shifts, np.full(len(some), c))
+    return (c, sigma) if found.agree(batch.sigma_mm / c, _typical(found.sigma)).all() else None
+
+
+def _batches(fields: Sequence[KnownField]) -> Iterator[Indices]:
+    """Images of about as many points, some at a time."""
+    counts = np.array([len(field.xyz) for field in fields], dtype=np.intp)
+    order = np.argsort(-counts, kind="stable")
+    order = order[counts[order] >= FEWEST]
+    while len(order):
+        largest = int(counts[order[0]])
+        alike = counts[order[: max(1, POINTS_AT_ONCE // largest)]] > largest // 2
+        yield order[: int(alike.sum())]
+        order = order[int(alike.sum()) :]
+
+
+def _typical(sigmas: Array) -> float:
+    """What most images leave, in principal distances, 0 where that tells nothing."""
+    typical = float(np.median(sigmas)) if len(sigmas) >= TYPICAL else 0.0
+    return typical if typical < LARGEST_TYPICAL else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Oriented:
+    """Rotations (k, 3, 3), shifts (k, 3), robust standard deviations (k,) and largest squares (k,) in squared principal
+    distances; rivals (k,): whose mirror image about the line of sight leaves about as little.
+    """
+
+    rotations: Array
+    shifts: Array
+    sigma: Array
+    largest: Array
+    rivals: Mask
+
+    def agree(self, given: Array, typical: float) -> Mask:
+        """Which images agree with their standard deviations (k,) or with what is typical."""
+        usual = self.sigma <= WORSE * np.maximum(given, typical)
+        return np.asarray(usual & (self.largest < GROSS * np.maximum(self.sigma, given) ** 2) & ~self.rivals)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fields:
+    """Fields of k images: points (k, n, 3) in units of their extent about their mean, along the axes of their extent,
+    the longest first; places xy_mm (k, n, 2) with weights (k, n), 0 behind the counts (k,) of those that have less.
+
+    origin (k, 3), size (k,), axes (k, 3, 3): the way back; flat (k,); sigma_mm (k,).
+    """
+
+    points: Array
+    xy_mm: Array
+    weights: Array
+    counts: Indices
+    origin: Array
+    size: Array
+    axes: Array
+    flat: Mask
+    on_a_line: Mask
+    sigma_mm: Array
+
+    @classmethod
+    def of(cls, fields: Sequence[KnownField]) -> "_Fields":
+        counts = np.array([len(field.xyz) for field in fields], dtype=np.intp)
+        xyz, xy_mm = np.zeros((len(fields), counts.max(), 3)), np.zeros((len(fields), counts.max(), 2))
+        for k, field in enumerate(fields):
+            xyz[k, : counts[k]], xy_mm[k, : counts[k]] = field.xyz, field.xy_mm
+        weights = (np.arange(counts.max()) < counts[:, None]).astype(np.float64)
+        origin = xyz.sum(axis=1) / counts[:, None]
+        about = (xyz - origin[:, None]) * weights[..., None]
+        variances, axes = np.linalg.eigh(about.swapaxes(1, 2) @ about / counts[:, None, None])
+        axes = axes[..., ::-1]  # which may have made them left-handed
+        axes = axes * np.sign(np.linalg.det(axes))[:, None, None]
+        thick, wide, long = np.sqrt(np.maximum(variances, 0.0)).T
+        size = np.maximum(long, np.finfo(float).tiny)
+        points = about @ axes / size[:, None, None]
+        sigma_mm = np.array([field.sigma_mm for field in fields])
+        shape = np.asarray(thick <= SHALLOW * wide), np.asarray(wide <= LINE * size)
+        return cls(points, xy_mm, weights, counts, origin, size, axes, *shape, sigma_mm)
+
+    def pose(self, k: int, found: _Oriented) -> Pose:
+        """Of one image, in the axes and units of the object."""
+        rotation = found.rotations[k] @ self.axes[k].T
+        return Pose(rotation, self.origin[k] - self.size[k] * rotation.T @ found.shifts[k])
+
+    def principal_distance(self) -> float | None:
+        """In closed form, the median or mean of what all images say."""
+        flat = self.flat & ~self.on_a_line
+        if flat.any():
+            a, b = _orthogonality(self._images(flat, 3))
+            squared = -float((a * a).sum()) / min(float((a * b).sum()), -np.finfo(float).tiny)
+            return float(np.sqrt(squared)) * self._unit_mm if (a * b).sum() < 0.0 else None
+        deep = self._images(~self.flat, 4)[..., :3]
+        squared_norms = (deep**2).sum(axis=2)
+        along = (deep[:, :2] * deep[:, 2:]).sum(axis=2)
+        squares = (squared_norms[:, :2] * squared_norms[:, 2:] - along**2) / squared_norms[:, 2:] ** 2
+        return float(np.sqrt(np.median(squares))) * self._unit_mm if len(deep) else None
+
+    def approximate(self, c_mm: Array) -> tuple[Array, Array]:
+        """Rotations and shifts; nan where there are none."""
+        rotations, shifts = np.full((len(c_mm), 3, 3), np.nan), np.full((len(c_mm), 3), np.nan)
+        for members, columns, poses in ((self.flat, 3, _pose_of_plane), (~self.flat, 4, _pose_in_space)):
+            some = members & ~self.on_a_line
+            if some.any():
+                images = self._images(some, columns)
+                images[:, :2] *= self._unit_mm / c_mm[some, None, None]
+                front = np.einsum("kc,knc->kn", images[:, 2], self._homogeneous(some, columns))
+                behind = (front * self.weights[some]).sum(axis=1) > 0.0
+                rotations[some], shifts[some] = poses(images * np.where(behind, -1.0, 1.0)[:, None, None])
+        return rotations, shifts
+
+    def oriented(self, rotations: Array, shifts: Array, c_mm: Array) -> _Oriented:
+        """Refined from an approximation."""
+        tangents = self.xy_mm / c_mm[:, None, None]
+        known = np.asarray(np.isfinite(shifts).all(axis=1))
+        rotations = np.where(known[:, None, None], rotations, np.eye(3))
+        shifts = np.where(known[:, None], shifts, np.array([0.0, 0.0, -10.0]))
+        rotations, shifts = refined_poses(rotations, shifts, self.points, tangents, self.weights)
+        squared = squared_residuals(rotations, shifts, self.points, tangents)
+        squares = (self.weights * squared).sum(axis=1)
+        sigma = robust_sigmas(np.where(self.weights > 0.0, squared, np.inf), self.counts)
+        rivals = self._has_rival(rotations, shifts, tangents, squares)
+        largest = (self.weights * squared).max(axis=1)
+        return _Oriented(rotations, shifts, np.where(known, sigma, np.inf), largest, rivals)
+
+    def _has_rival(self, rotations: Array, shifts: Array, tangents: Array, squares: Array) -> Mask:
+        """Where a plane that is mirrored about the line of sight to its middle leaves about as little.
+
+        Seen from far away it looks the same (Schweighofer and Pinz 2006).
+        """
+        sight = shifts / np.linalg.norm(shifts, axis=1, keepdims=True)
+        mirrored = rotation_from_vector(np.pi * sight) @ rotations @ np.diag([-1.0, -1.0, 1.0])
+        rivals = self.flat.copy()
+        for likeness, is_refined in ((NEARLY_ALIKE, False), (ALIKE, True)):
+            some = np.flatnonzero(rivals)
+            at, fields = (mirrored[some], shifts[some]), (self.points[some], tangents[some])
+            if is_refined and len(some):
+                at = refined_poses(*at, *fields, self.weights[some])
+            left = (self.weights[some] * squared_residuals(*at, *fields)).sum(axis=1)
+            is_another = np.abs(at[0] - rotations[some]).max(axis=(1, 2)) > ANOTHER
+            rivals[some] = (left < likeness * squares[some]) & is_another
+        return rivals
+
+    @property
+    def _unit_mm(self) -> float:
+        """In which image coordinates are about 1."""
+        return float(np.sqrt((self.xy_mm**2).sum() / self.weights.sum())) or 1.0
+
+    def _homogeneous(self, some: Mask, columns: int) -> Array:
+        """Points (k, n, columns) with a 1 behind: in the plane of the field, or in space."""
+        return np.concatenate([self.points[some][..., : columns - 1], self.weights[some][..., None]], axis=2)
+
+    def _images(self, some: Mask, columns: int) -> Array:
+        """The matrices (k, 3, columns) that take homogeneous points to U, V, W: image = -U/W, -V/W, in the unit.
+
+        Of least algebraic error under the norm 1, with image coordinates about their mean and of the size 1.
+        """
+        weights, counts = self.weights[some], self.counts[some, None]
+        xy = self.xy_mm[some] / self._unit_mm
+        middle = xy.sum(axis=1) / counts
+        about = (xy - middle[:, None]) * weights[..., None]
+        size = np.sqrt((about**2).sum(axis=(1, 2)) / counts[:, 0])
+        x, y = np.moveaxis(about / size[:, None, None], -1, 0)
+        points = self._homogeneous(some, columns)
+        products = (points[..., :, None] * points[..., None, :]).reshape(*weights.shape, columns**2)
+        sums = np.stack([weights, x, y, x * x + y * y], axis=1) @ products
+        one, by_x, by_y, by_both = sums.reshape(-1, 4, columns, columns).swapaxes(0, 1)
+        nothing = np.zeros_like(one)
+        normal = np.block([[one, nothing, by_x], [nothing, one, by_y], [by_x, by_y, by_both]])
+        images = np.linalg.eigh(normal)[1][..., 0].reshape(-1, 3, columns)
+        images[:, :2] *= size[:, None, None]
+        images[:, :2] -= middle[..., None] * images[:, 2:]
+        return np.asarray(images)
+
+
+def _orthogonality(images: Array) -> tuple[Array, Array]:
+    """Of homographies (k, 3, 3): what a / c² + b = 0 says of the principal distance, a and b (2 k,).
+
+    The axes of the plane, in the camera, are at right angles and of one length.
+    """
+    first, second = np.moveaxis(images[..., :2], -1, 0)
+    norm = (first[:, :2] ** 2).sum(axis=1) + (second[:, :2] ** 2).sum(axis=1)
+    products = np.stack([first * second, (first**2 - second**2) / 2.0], axis=1) / norm[:, None, None]
+    return products[..., :2].sum(axis=2).ravel(), products[..., 2].ravel()
+
+
+def _pose_of_plane(images: Array) -> tuple[Array, Array]:
+    """Of homographies (k, 3, 3) to U, V, W."""
+    axes = images[..., :2]
+    scale = np.sqrt((axes**2).sum(axis=(1, 2)) / 2.0)[:, None, None]
+    first, second = np.moveaxis(axes / scale, -1, 0)
+    rotations = _nearest_rotations(np.stack([first, second, np.cross(first, second)], axis=2))
+    return rotations, images[..., 2] / scale[..., 0]
+
+
+def _pose_in_space(images: Array) -> tuple[Array, Array]:
+    """Of direct linear transformations (k, 3, 4) to U, V, W; a mirrored one is none, and its residuals tell."""
+    linear = images[..., :3]
+    scale = np.sqrt((linear**2).sum(axis=(1, 2)) / 3.0)[:, None, None]
+    return _nearest_rotations(linear / scale), images[..., 3] / scale[..., 0]
+
+
+def _nearest_rotations(matrices: Array) -> Array:
+    left, _, right = np.linalg.svd(matrices)
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+    return np.asarray(left @ right)

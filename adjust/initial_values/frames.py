@@ -1,0 +1,93 @@
+"""What the images of a network show of object points: in the camera frame, and freed of what is known of the lens."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.projection import ideal_from_observed
+from adjust.functional_model.sight import Sight
+from adjust.functional_model.transformation import film_kind
+from adjust.network import Camera, Network
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """The object points of all images in the camera frame, image after image, those of one by name.
+
+    rows (n,): their observations; xy_mm (n, 2); starts (images + 1,): where those of every image begin; sigma_mm
+    (images,): their typical standard deviation, 0 where there are none.
+    """
+
+    network: Network
+    rows: Indices
+    xy_mm: Array
+    starts: Indices
+    sigma_mm: Array
+
+    def part(self, image: int) -> slice:
+        return slice(int(self.starts[image]), int(self.starts[image + 1]))
+
+    def of_camera(self, camera: str) -> list[int]:
+        """The images of a camera that show object points, by number."""
+        images = enumerate(self.network.images)
+        return [i for i, image in images if image.camera == camera and self.starts[i] < self.starts[i + 1]]
+
+    def places(self, images: list[int]) -> Indices:
+        """Where the points of some images stand, one image after the other."""
+        return np.concatenate([np.arange(self.starts[i], self.starts[i + 1]) for i in images])
+
+    def sights(self, camera: Camera, interior: Array, parameters: Array) -> dict[str, Sight]:
+        """The images of a camera, by name, freed of the principal point and of a distortion with these parameters.
+
+        A coordinate that the distortion cannot have produced stays as it is. interior: c, x0', y0' (3,).
+        """
+        images, names = self.of_camera(camera.name), self.network.observations.point
+        if not images:
+            return {}
+        at = self.places(images)
+        ideal, found = ideal_from_observed(camera.distortion, interior, parameters, self.xy_mm[at])
+        freed_mm = np.empty_like(self.xy_mm)
+        freed_mm[at] = np.where(found[:, None], ideal, self.xy_mm[at]) - interior[1:]
+        return {
+            self.network.images[i].name: Sight(
+                tuple(names[row] for row in self.rows[self.part(i)]),
+                freed_mm[self.part(i)],
+                float(interior[0]),
+                float(self.sigma_mm[i]),
+            )
+            for i in images
+        }
+
+
+def frames_of(network: Network, transformation: Mapping[str, Array], mirrored: frozenset[str]) -> Frames:
+    """The object points of all images through their film transformations, parameters by image name."""
+    observations, count = network.observations, len(network.images)
+    names, number = observations.numbered_points
+    rank = np.empty(len(names), dtype=np.intp)
+    rank[np.argsort(np.array(names), kind="stable")] = np.arange(len(names))
+    rows = np.flatnonzero(~observations.is_fiducial)
+    rows = rows[np.lexsort((rank[number[rows]], network.image_numbers[rows]))]
+    images = network.image_numbers[rows]
+    starts = np.searchsorted(images, np.arange(count + 1))
+    variances = np.trace(observations.covariance_mm2[rows], axis1=1, axis2=2) / 2.0
+    xy_mm = network.straight_xy_mm[rows]
+    for i, image in enumerate(network.images):
+        if image.transformation != "none":
+            part, kind = slice(starts[i], starts[i + 1]), film_kind(image.transformation, image.name in mirrored)
+            xy_mm[part] = kind.apply(transformation[image.name], xy_mm[part])
+    return Frames(network, rows, xy_mm, starts, np.sqrt(_medians(variances, images, starts)))
+
+
+def _medians(values: Array, group: Indices, starts: Indices) -> Array:
+    """The medians (g,) of values (n,), group after group; 0 of an empty one."""
+    if not len(values):
+        return np.zeros(len(starts) - 1)
+    ordered = values[np.lexsort((values, group))]
+    counts = np.diff(starts)
+    middle = np.minimum([starts[:-1] + (counts - 1) // 2, starts[:-1] + counts // 2], len(values) - 1)
+    return np.asarray(np.where(counts > 0, ordered[middle].mean(axis=0), 0.0))

@@ -1,0 +1,116 @@
+"""Poses of many images at once by least squares: Levenberg and Marquardt on a rotation vector and a shift each.
+
+Object points are in units of their extent about their mean, image coordinates are tangents: over c.
+Arrays (k, n) hold n points of k images; those that an image does not have are there with the weight 0.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.rotation import rotation_from_vector
+
+Array = NDArray[np.float64]
+
+LM_ITERATIONS = 12
+SETTLED = 1e-9  # relative change of a sum of squares that is none
+BEHIND = 1e6  # squared residual, in squared principal distances, of a point behind the camera
+LARGEST_CHANGE = 0.5  # of a principal distance's logarithm in a step
+USUAL_BEND = 0.3  # standard deviation of a lens's third-degree distortion, at an angle of 45 degrees
+
+
+def refined_poses(
+    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array
+) -> tuple[Array, Array]:
+    """Rotations (k, 3, 3) and shifts (k, 3), camera = R X + t, of least weighted squares; weights (k, n).
+
+    points (n, 3) and tangents (n, 2) are the same for all, or (k, n, 3) and (k, n, 2).
+    """
+    damping = np.full(len(rotations), 1e-4)
+    cost = (weights * squared_residuals(rotations, shifts, points, tangents)).sum(axis=1)
+    for _ in range(LM_ITERATIONS):
+        normal, right = _normal_equations(rotations, shifts, points, tangents, weights)
+        diagonal = np.einsum("kii->ki", normal)
+        diagonal += damping[:, None] * diagonal + 1e-14  # the constant keeps a pose without a solution harmless
+        step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
+        new_rotations, new_shifts = _moved(rotations, shifts, step)
+        new_cost = (weights * squared_residuals(new_rotations, new_shifts, points, tangents)).sum(axis=1)
+        better = new_cost < cost
+        settled = np.abs(cost - new_cost) <= SETTLED * cost
+        rotations = np.where(better[:, None, None], new_rotations, rotations)
+        shifts = np.where(better[:, None], new_shifts, shifts)
+        cost, damping = np.where(better, new_cost, cost), np.where(better, damping / 10, damping * 10)
+        if settled.all():
+            break
+    return rotations, shifts
+
+
+def refined_distance(
+    rotations: Array, shifts: Array, points: Array, xy_mm: Array, weights: Array, distance_mm: float, sigma_mm: float
+) -> tuple[Array, Array, float, float]:
+    """Poses together with the principal distance in mm of all images, and the standard deviation of its logarithm.
+
+    points (k, n, 3), image coordinates xy_mm (k, n, 2) of standard deviation sigma_mm at least. Gauss-Newton steps from
+    nearby, with the poses eliminated. A radial distortion of the third degree, about 0, is estimated besides and
+    forgotten: without it a principal distance would take its place.
+    """
+    c, bend, noise = distance_mm, 0.0, sigma_mm / distance_mm
+    by_bend_mm = xy_mm * ((xy_mm / c) ** 2).sum(axis=2, keepdims=True)
+    prior = np.array([1e-14, (noise / USUAL_BEND) ** 2])
+    for _ in range(LM_ITERATIONS):
+        lens = xy_mm / c, by_bend_mm / c
+        normal, right = _normal_equations(rotations, shifts, points, lens[0] - bend * lens[1], weights, lens[1])
+        both = np.concatenate([normal[:, :6, 6:], right[:, :6, None]], axis=2)
+        through = np.linalg.solve(normal[:, :6, :6] + 1e-14 * np.eye(6), both)
+        left = (normal[:, 6:, :] @ np.concatenate([through, np.zeros((len(normal), 2, 3))], axis=1)).sum(axis=0)
+        reduced = normal[:, 6:, 6:].sum(axis=0) - left[:, :2] + np.diag(prior)
+        change = np.linalg.solve(reduced, right[:, 6:].sum(axis=0) - left[:, 2] - prior * [0.0, bend])
+        change = np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
+        rotations, shifts = _moved(rotations, shifts, through[..., 2] - through[..., :2] @ change)
+        c, bend = c * float(np.exp(change[0])), bend + float(change[1])
+        if abs(change[0]) < np.sqrt(SETTLED):
+            break
+    tangents = (xy_mm - bend * by_bend_mm) / c
+    squares = float((weights * squared_residuals(rotations, shifts, points, tangents)).sum())
+    variance = max(squares / max(2.0 * float(weights.sum()) - 6 * len(points) - 2, 1.0), noise**2)
+    return rotations, shifts, c, float(np.sqrt(variance * np.linalg.inv(reduced)[0, 0]))
+
+
+def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:
+    """Squared residuals (k, n) in units of the principal distance."""
+    u, v, w = _in_camera(rotations, shifts, points)
+    x, y = np.moveaxis(tangents, -1, 0)
+    seen = w < 0.0
+    depth = np.where(seen, w, -1.0)
+    squared = (u / depth + x) ** 2 + (v / depth + y) ** 2
+    return np.asarray(np.where(seen & (squared < BEHIND), squared, BEHIND))
+
+
+def _moved(rotations: Array, shifts: Array, step: Array) -> tuple[Array, Array]:
+    turn = rotation_from_vector(step[:, :3])
+    return turn @ rotations, np.einsum("kij,kj->ki", turn, shifts) + step[:, 3:]
+
+
+def _in_camera(rotations: Array, shifts: Array, points: Array) -> Array:
+    """U, V, W (3, k, n) of points (n, 3), or (k, n, 3), in the axes of k cameras."""
+    return np.asarray(np.moveaxis(rotations @ np.swapaxes(points, -1, -2) + shifts[..., None], 1, 0))
+
+
+def _normal_equations(
+    rotations: Array, shifts: Array, points: Array, tangents: Array, weights: Array, by_bend: Array | None = None
+) -> tuple[Array, Array]:
+    """J'WJ (k, 6, 6) and J'Wr (k, 6) for a small turn of the camera and a shift in its frame; by_bend (k, n, 2): and
+    two more, for the logarithm of the principal distance and for what these tangents are multiplied with."""
+    u, v, w = _in_camera(rotations, shifts, points)
+    inverse = -1.0 / np.minimum(w, -1e-9)
+    p, q = u * inverse, v * inverse
+    (x, y), n = np.moveaxis(tangents, -1, 0), w.shape[1]
+    columns = [(p * q, 1 + q * q), (-1 - p * p, -p * q), (-q, p), (inverse, 0.0), (0.0, inverse)]
+    columns.append((p * inverse, q * inverse))
+    if by_bend is not None:
+        columns += [(p, q), (by_bend[..., 0], by_bend[..., 1])]
+    jacobian = np.zeros((len(w), len(columns), 2 * n))  # first all x, then all y
+    for k, (by_p, by_q) in enumerate(columns):
+        jacobian[:, k, :n], jacobian[:, k, n:] = by_p, by_q
+    residual = np.concatenate([x - p, y - q], axis=1)[..., None]
+    weighted = jacobian * np.concatenate([weights, weights], axis=1)[:, None]
+    return weighted @ jacobian.swapaxes(1, 2), (weighted @ residual)[..., 0]
