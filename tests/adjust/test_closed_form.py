@@ -8,8 +8,10 @@ from projected import simulated as simulated_network
 from test_approximations import without_interior
 from test_resection import C_MM, FIELDS, ORIGIN, simulated
 
+from adjust.functional_model.sight import Sight
 from adjust.initial_values import block
 from adjust.initial_values.approximations import approximate
+from adjust.initial_values.block import resected
 from adjust.initial_values.closed_form import KnownField, orient_together, principal_distance_together
 from adjust.initial_values.resection import Pose
 
@@ -72,9 +74,13 @@ def test_a_plane_parallel_to_the_images_does_not_tell_the_principal_distance() -
 
 
 def test_the_search_is_for_images_that_do_not_agree_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    searched = []
-    resect = block.resect
-    monkeypatch.setattr(block, "resect", lambda *given: (searched.append(len(given[0])), resect(*given))[1])
+    searched: list[str] = []
+
+    def search(sight: Sight, xyz: Array, xy_mm: Array) -> Pose | None:
+        searched.extend(sight.points[:1])
+        return resected(sight, xyz, xy_mm)
+
+    monkeypatch.setattr(block, "resected", search)
     truth = simulated_network(BOARD, STATIONS, kind="none")
     approximate(truth.network)
     assert searched == []
