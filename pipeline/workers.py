@@ -1,16 +1,30 @@
-"""The processes that scans are shared among."""
+"""The processes that scans are shared among, on this machine: a pool that survives the death of any of them."""
 
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import cv2
 
 from adjust.least_squares.kept_memory import keep_freed_memory
+
+KILLS = 2  # of its process, after which a task is given up: once may be chance, or another program's doing
+
+
+class WorkerKilled(Exception):
+    """The process of a task was ended from outside, each time that it was tried."""
+
+    def __init__(self, what: str = "its process was ended, most likely because the memory was full") -> None:
+        super().__init__(what)
 
 
 def processes(scans: int) -> int:
@@ -19,27 +33,137 @@ def processes(scans: int) -> int:
 
 
 @contextmanager
-def worker_pool(scans: int) -> Iterator[Executor]:
+def worker_pool(scans: int, workers: int | None = None) -> Iterator[Executor]:
     """A process a core, of one thread: a scan is measured alone, so the result does not depend on their number.
 
     Whatever ends the block early ends the processes too: nobody waits for scans whose results are not wanted any more.
+    workers: how many processes, if not one a core.
     """
-    pool = ProcessPoolExecutor(processes(scans), multiprocessing.get_context("spawn"), initializer=_prepare)
+    pool = LocalPool(min(max(scans, 1), workers) if workers else processes(max(scans, 1)))
     try:
         yield pool
     except BaseException:
-        for process in multiprocessing.active_children():
-            process.terminate()
+        pool.end()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _prepare() -> None:
+@dataclass(eq=False)
+class _Task:
+    call: Callable[[], Any]
+    future: Future[Any] = field(default_factory=Future)
+    kills: int = 0
+
+
+class LocalPool(Executor):
+    """Processes with one task each at a time. Each is a pool of its own, so that it is known in whose hand a task was
+    whose process was killed: that one alone is begun again, in a new process, and given up when it kills that too."""
+
+    def __init__(self, workers: int) -> None:
+        self._lock = threading.Lock()
+        self._waiting: deque[_Task] = deque()
+        self._idle = [_process() for _ in range(workers)]
+        self._pools = set(self._idle)
+        self._ended = False
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        task = _Task(partial(fn, *args, **kwargs))
+        with self._lock:
+            if self._ended:
+                raise RuntimeError("the pool has been shut down")
+            self._waiting.append(task)
+        self._feed()
+        return task.future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        with self._lock:
+            self._ended = self._ended or cancel_futures
+            left = list(self._waiting) if cancel_futures else []
+            self._waiting = self._waiting if not cancel_futures else deque()
+        for task in left:
+            task.future.cancel()
+        for pool in list(self._pools):
+            pool.shutdown(wait, cancel_futures=cancel_futures)
+
+    def end(self) -> None:
+        """End the processes, whatever they have in hand."""
+        with self._lock:
+            self._ended = True
+        for process in multiprocessing.active_children():
+            process.terminate()
+
+    def _feed(self) -> None:
+        """Give waiting tasks to idle processes."""
+        while True:
+            with self._lock:
+                if not (self._waiting and self._idle):
+                    return
+                task, pool = self._waiting.popleft(), self._idle.pop()
+            if task.future.set_running_or_notify_cancel():
+                self._start(pool, task)
+            else:
+                self._is_idle(pool)
+
+    def _start(self, pool: ProcessPoolExecutor, task: _Task) -> None:
+        try:
+            working = pool.submit(task.call)
+        except BrokenProcessPool:  # killed while it had nothing in hand
+            pool = self._replaced(pool)
+            working = pool.submit(task.call)
+        except RuntimeError as error:  # shut down meanwhile
+            task.future.set_exception(error)
+            return
+        working.add_done_callback(partial(self._done, pool, task))
+
+    def _done(self, pool: ProcessPoolExecutor, task: _Task, done: Future[Any]) -> None:
+        error = CancelledBeforeStart() if done.cancelled() else done.exception()
+        if isinstance(error, BrokenProcessPool):
+            task.kills += 1
+            error = WorkerKilled()
+            if not self._ended:
+                pool = self._replaced(pool)
+                if task.kills < KILLS:
+                    self._start(pool, task)
+                    return
+        self._is_idle(pool)
+        if error is None:
+            task.future.set_result(done.result())
+        else:
+            task.future.set_exception(error)
+        self._feed()
+
+    def _is_idle(self, pool: ProcessPoolExecutor) -> None:
+        with self._lock:
+            self._idle.append(pool)
+
+    def _replaced(self, broken: ProcessPoolExecutor) -> ProcessPoolExecutor:
+        broken.shutdown(wait=False)
+        pool = _process()
+        with self._lock:
+            self._pools.discard(broken)
+            self._pools.add(pool)
+        return pool
+
+
+class CancelledBeforeStart(Exception):
+    """The pool was shut down before the task was begun."""
+
+
+def _process() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=prepare)
+
+
+def prepare() -> None:
     """An interrupt from the terminal reaches every process; the one that started this one answers it for all, and when
     it ends, however that is, so does this one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    work_alone()
+
+
+def work_alone() -> None:
+    """One thread for a scan: as many are measured at a time as there are cores."""
     cv2.setNumThreads(1)
     keep_freed_memory()  # one mark asks for arrays as large as the last one's: a twentieth of a scan's time
 

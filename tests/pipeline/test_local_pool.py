@@ -1,0 +1,60 @@
+"""A process that is killed costs its own scan at most, and only when it is killed with it again."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.workers import WorkerKilled, worker_pool
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def killed_times(times: int, folder: Path, number: int) -> int:
+    """Ends its process the first times that it is called."""
+    marks = len(list(folder.iterdir()))
+    if marks < times:
+        (folder / f"{marks}").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def process() -> int:
+    return os.getpid()
+
+
+def test_a_killed_process_is_replaced_and_its_task_begun_again(tmp_path: Path) -> None:
+    with worker_pool(2, workers=2) as pool:
+        others = [pool.submit(square, number) for number in range(6)]
+        assert pool.submit(killed_times, 1, tmp_path, 7).result(60) == 7
+        assert [other.result(60) for other in others] == [0, 1, 4, 9, 16, 25]
+        assert list(pool.map(square, range(4))) == [0, 1, 4, 9]
+
+
+def test_a_task_that_kills_its_process_twice_is_given_up_and_none_else(tmp_path: Path) -> None:
+    with worker_pool(2, workers=2) as pool:
+        bad = pool.submit(killed_times, 99, tmp_path, 7)
+        others = [pool.submit(square, number) for number in range(6)]
+        with pytest.raises(WorkerKilled, match="its process was ended, most likely because the memory was full"):
+            bad.result(60)
+        assert [other.result(60) for other in others] == [0, 1, 4, 9, 16, 25]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_process_killed_without_a_task_is_replaced() -> None:
+    with worker_pool(1, workers=1) as pool:
+        first = pool.submit(process).result(60)
+        os.kill(first, signal.SIGKILL)
+        time.sleep(0.2)
+        assert pool.submit(process).result(60) != first
+
+
+def test_what_a_task_raises_is_its_own() -> None:
+    with worker_pool(1, workers=1) as pool:
+        with pytest.raises(TypeError):
+            pool.submit(square, "a").result(60)
+        assert pool.submit(square, 3).result(60) == 9
