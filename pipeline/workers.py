@@ -6,7 +6,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ from adjust.least_squares.kept_memory import keep_freed_memory
 KILLS = 2  # of its process, after which a task is given up: once may be chance, or another program's doing
 
 
-class WorkerKilled(Exception):
+class WorkerKilled(BrokenExecutor):
     """The process of a task was ended from outside, each time that it was tried."""
 
     def __init__(self, what: str = "its process was ended, most likely because the memory was full") -> None:

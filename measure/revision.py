@@ -1,0 +1,3 @@
+"""The revision of how scans are measured."""
+
+MEASURE_REVISION = 1

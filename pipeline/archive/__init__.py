@@ -1,0 +1,1 @@
+"""The archive of measured scans: what is kept of each, by which key, and what is still to be measured."""

@@ -1,0 +1,179 @@
+"""Scans measured by a cluster: Dask's scheduler as an ordinary executor, asked first whether its workers can do it."""
+
+import platform
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from measure.revision import MEASURE_REVISION
+from pipeline.errors import InputError
+from pipeline.workers import KILLS, WorkerKilled, processes, work_alone
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+LOCAL = "local"
+_RETRIES = 2
+_ANSWER_S = 30.0
+_LIBRARIES = ("reseau", "numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs", "scikit-image")
+_NAMED = 3
+
+
+@contextmanager
+def cluster_executor(address: str, scans: Sequence[str], workers: int | None = None) -> Iterator[Executor]:
+    """The executor of a scheduler that is there, or of one that is started here for as long as the block lasts.
+
+    address: such as tcp://host:8786, or `local`. scans: paths, of which one a folder is looked for by every worker.
+    Raises InputError where Dask is not installed, nobody answers, or a worker has other versions or cannot read them.
+    """
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise InputError(
+            "--cluster needs Dask, which is not installed here. Install it: pip install 'reseau[cluster]'."
+        ) from None
+    with ExitStack() as stack:
+        if address == LOCAL:
+            count = workers or processes(len(scans) or 1)
+            cluster = LocalCluster(  # type: ignore[no-untyped-call]
+                n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+            )
+            stack.callback(cluster.close)
+            client = Client(cluster, timeout=_ANSWER_S)  # type: ignore[no-untyped-call]
+        else:
+            client = _client(Client, address)
+        stack.callback(client.close)
+        _check_workers(client, address, _one_a_folder(scans))
+        client.register_plugin(_alone_plugin(), name="reseau")
+        executor = client.get_executor(retries=_RETRIES, pure=False)  # type: ignore[no-untyped-call]
+        yield SubmittedAgain(executor)
+
+
+class SubmittedAgain(Executor):
+    """Hands to another executor, and again what that lost: a task that raises nothing itself has an exception only
+    where its worker is gone. Lost as often as a process may be killed, it is given up."""
+
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        outer: Future[Any] = Future()
+        self._begin(outer, partial(fn, *args, **kwargs), 0)
+        return outer
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._executor.shutdown(wait, cancel_futures=cancel_futures)
+
+    def _begin(self, outer: Future[Any], call: Callable[[], Any], losses: int) -> None:
+        try:
+            inner = self._executor.submit(call)
+        except Exception as error:  # of the connection
+            outer.set_exception(BrokenExecutor(str(error)))
+            return
+        inner.add_done_callback(partial(self._done, outer, call, losses))
+
+    def _done(self, outer: Future[Any], call: Callable[[], Any], losses: int, inner: Future[Any]) -> None:
+        if outer.cancelled():
+            return
+        error = None if inner.cancelled() else inner.exception()
+        if error is None and not inner.cancelled():
+            outer.set_result(inner.result())
+        elif losses + 1 < KILLS:
+            self._begin(outer, call, losses + 1)
+        else:
+            outer.set_exception(WorkerKilled())
+
+
+def _client(client: "type[Client]", address: str) -> "Client":
+    try:
+        return client(address, timeout=_ANSWER_S)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--cluster {address}: no scheduler answers there ({' '.join(str(error).split())}). Start one, such as "
+            "`dask scheduler` with `dask worker`s, and give its address, such as tcp://host:8786."
+        ) from None
+
+
+def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None:
+    """Before the first task, not in the middle of the night."""
+    try:
+        client.wait_for_workers(1, timeout=_ANSWER_S)
+    except TimeoutError:
+        raise InputError(f"--cluster {address}: the scheduler has no workers. Start `dask worker {address}`.") from None
+    answers: Mapping[str, Any] = client.run(_versions_and_unreachable, list(scans), on_error="return")
+    here = versions()
+    complaints = []
+    for worker, answer in sorted(answers.items()):
+        if isinstance(answer, BaseException):
+            complaints.append(f"{worker}: cannot be asked ({answer}): is reseau installed there?")
+            continue
+        there, missing = answer
+        other = [
+            f"{name} {there.get(name, 'none')}, here {own}" for name, own in here.items() if there.get(name) != own
+        ]
+        if other:
+            complaints.append(f"{worker}: has {'; '.join(other)}. Install the same there.")
+        if missing:
+            complaints.append(
+                f"{worker}: cannot read {', '.join(missing[:_NAMED])}. Give it the same path to the scans."
+            )
+    if complaints:
+        more = f"\n... and {len(complaints) - _NAMED} more workers" if len(complaints) > _NAMED else ""
+        raise InputError(
+            "--cluster: not every worker can measure these scans.\n" + "\n".join(complaints[:_NAMED]) + more
+        )
+
+
+def versions() -> dict[str, str]:
+    """What a result depends on beside scan and options: the same on every machine, or it is not the same result."""
+    return {
+        "Python": platform.python_version(),
+        **{name: version(name) for name in _LIBRARIES if _is_installed(name)},
+        "the revision of measuring": str(MEASURE_REVISION),
+    }
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        version(name)
+    except ModuleNotFoundError:
+        return False
+    return True
+
+
+def _versions_and_unreachable(scans: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Asked of a worker: its versions, and which of these scans it cannot read."""
+    return versions(), [scan for scan in scans if not _is_readable(scan)]
+
+
+def _is_readable(scan: str) -> bool:
+    try:
+        with Path(scan).open("rb") as file:
+            file.read(1)
+            return True
+    except OSError:
+        return False
+
+
+def _one_a_folder(scans: Sequence[str]) -> list[str]:
+    """The first scan of each folder that is there for us: one that nobody has says nothing of a worker."""
+    firsts: dict[Path, str] = {}
+    for scan in scans:
+        if scan and "://" not in scan and Path(scan).parent not in firsts and _is_readable(scan):
+            firsts[Path(scan).parent] = str(Path(scan).absolute())
+    return list(firsts.values())
+
+
+def _alone_plugin() -> Any:
+    """Every worker, also one that takes another's place, works in one thread."""
+    from distributed.diagnostics.plugin import WorkerPlugin
+
+    class WorkAlone(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            work_alone()
+
+    return WorkAlone()

@@ -1,0 +1,111 @@
+"""What tells a scan from any other: where it stands, how large and old its file is, and what stands in the telling
+parts of it."""
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tifffile import TiffFile
+
+from measure.errors import MeasurementError
+from measure.scans.broken import DECODING_ERRORS
+from measure.scans.scan import Scan, open_scan
+
+_HEAD_BYTES = 1 << 16
+_MIDDLE_PX = 256
+_PIECE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class FileState:
+    """What is known of a scan's file without reading it.
+
+    uri: its path relative to the project's folder with `/`, or its address. bytes: its size, -1 where it is not there.
+    mtime_ns: when it was last changed, local files; etag: the same of objects.
+    """
+
+    uri: str
+    bytes: int
+    mtime_ns: int = 0
+    etag: str = ""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """state: of the file. parts_hash: SHA-256 of its telling parts."""
+
+    state: FileState
+    parts_hash: str
+
+
+def file_state(path: Path, folder: Path) -> FileState:
+    """The state of a local file. folder: that of the project, which may be moved as a whole."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return FileState(uri_of(path, folder), -1)
+    return FileState(uri_of(path, folder), stat.st_size, stat.st_mtime_ns)
+
+
+def uri_of(path: Path, folder: Path) -> str:
+    """Relative to the folder, where that is possible, with `/`."""
+    try:
+        return Path(os.path.relpath(os.path.abspath(path), os.path.abspath(folder))).as_posix()
+    except ValueError:  # on another drive
+        return path.absolute().as_posix()
+
+
+def parts_hash(path: Path, max_pixels: int | None = None) -> str:
+    """SHA-256 (hexadecimal) of the first 64 KiB, of the tables of tile offsets and byte counts, and of the 256 x 256 px
+    in the middle. Head and tables alone would not do: uncompressed scans of one scanner share them.
+
+    A file that cannot be opened as a scan has a hash of its first bytes; "" where not even these can be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            digest.update(file.read(_HEAD_BYTES))
+    except OSError:
+        return ""
+    try:
+        with open_scan(path, max_pixels) as scan:
+            digest.update(_tables(path))
+            digest.update(_middle(scan))
+    except (MeasurementError, *DECODING_ERRORS):
+        digest.update(b"cannot be opened")
+    return digest.hexdigest()
+
+
+def content_hash(path: Path) -> str:
+    """SHA-256 (hexadecimal) of the whole file; "" where it cannot be read. It takes 0.6 s of CPU a GB, so it is made
+    where it decides, and not of every scan."""
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while piece := file.read(_PIECE_BYTES):
+                digest.update(piece)
+    except OSError:
+        return ""
+    return digest.hexdigest()
+
+
+def _tables(path: Path) -> bytes:
+    """Where the tiles or strips of all its pictures stand in a TIFF file; empty for other files, which have none."""
+    if not _is_tiff(path):
+        return b""
+    with TiffFile(path) as file:
+        pages = [page.aspage() for page in file.pages]
+        tables = [np.array([*page.dataoffsets, *page.databytecounts], dtype="<u8") for page in pages]
+    return b"".join(table.tobytes() for table in tables)
+
+
+def _is_tiff(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) in (b"II", b"MM")
+
+
+def _middle(scan: Scan) -> bytes:
+    width, height = min(_MIDDLE_PX, scan.width_px), min(_MIDDLE_PX, scan.height_px)
+    return scan.samples((scan.width_px - width) // 2, (scan.height_px - height) // 2, width, height).tobytes()

@@ -1,0 +1,80 @@
+"""Stores of shards joined: a result has the same key on every machine."""
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.archive.schema import opened
+from pipeline.archive.store import Store
+from pipeline.errors import InputError
+
+_SCAN = (
+    "uri, bytes, mtime_ns, etag, identity_hash, content_hash, width_px, height_px, bits, pitch_x_um, pitch_y_um, camera"
+)
+_RESULT = "pose, pose_decided, a, b, c, d, e, f, pitch_x_um, pitch_y_um, verdict, seconds, bytes_read, finished, detail"
+_MARK = "number, point, kind, col_px, row_px, var_col, var_row, cov, causes, status, reason_code, reason, quality"
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Of one store: its results, and how many of them were new here."""
+
+    path: Path
+    results: int
+    new: int
+
+
+def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
+    """Take in what other stores hold and this one does not. Each is taken whole or not at all, and none is changed but
+    to bring it to this version. Raises InputError for a file that is no store, before anything is taken."""
+    for path in others:
+        if not path.is_file():
+            raise InputError(f"{path}: there is no such store. Name the out/measurement.db of each shard.")
+        if path.resolve() == store.path.resolve():
+            raise InputError(f"{path}: is the store that the others are to be joined in. Name the others only.")
+        opened(path).close()
+    return [_taken(store, path) for path in others]
+
+
+def _taken(store: Store, path: Path) -> Merged:
+    db = store.connection
+    db.execute("attach ? as other", (str(path),))
+    try:
+        results = db.execute("select count(*) from other.result").fetchone()[0]
+        with store.writing():
+            new = _insert(db)
+    finally:
+        db.execute("detach other")
+    return Merged(path, results, new)
+
+
+def _insert(db: sqlite3.Connection) -> int:
+    """Every table in the order in which they refer to one another; rows that are there stay as they are."""
+    before = db.execute("select coalesce(max(id), 0) from main.result").fetchone()[0]
+    db.execute(
+        f"insert into main.scan ({_SCAN}, name) select {_SCAN}, null from other.scan where true "
+        "on conflict (uri) do update set bytes = excluded.bytes, mtime_ns = excluded.mtime_ns, etag = excluded.etag, "
+        "identity_hash = excluded.identity_hash, content_hash = excluded.content_hash "
+        "where excluded.mtime_ns > mtime_ns"  # a file that was changed meanwhile
+    )
+    for table, columns in (("program", "version, measure_revision, python, libraries"), ("options", "hash, json")):
+        db.execute(f"insert or ignore into main.{table} ({columns}) select {columns} from other.{table}")
+    columns = ", ".join(f"r.{column.strip()}" for column in _RESULT.split(","))
+    db.execute(
+        f"insert or ignore into main.result (scan, fingerprint, program, options, {_RESULT}) "
+        f"select scan.id, r.fingerprint, program.id, options.id, {columns} from other.result r "
+        "join other.scan s on s.id = r.scan join main.scan scan on scan.uri = s.uri "
+        "join other.program p on p.id = r.program join main.program program on (program.version, "
+        "program.measure_revision, program.python, program.libraries) = "
+        "(p.version, p.measure_revision, p.python, p.libraries) "
+        "join other.options o on o.id = r.options join main.options options on options.hash = o.hash order by r.id"
+    )
+    db.execute(
+        f"insert into main.mark (result, {_MARK}) select result.id, {_MARK} from main.result result "
+        "join other.result r on r.fingerprint = result.fingerprint join other.mark m on m.result = r.id "
+        "where result.id > ?",
+        (before,),
+    )
+    db.execute("insert or ignore into main.kept (key, value) select key, value from other.kept")
+    return int(db.execute("select count(*) from main.result where id > ?", (before,)).fetchone()[0])

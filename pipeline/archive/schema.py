@@ -1,0 +1,152 @@
+"""The tables of out/measurement.db, and how files of earlier versions become files of this one: forward only.
+
+The number of the version stands in the file (`pragma user_version`). A change of the tables is a new entry at the end
+of MIGRATIONS, and none that stands there is changed any more.
+"""
+
+import math
+import sqlite3
+from pathlib import Path
+
+from pipeline.errors import InputError
+
+APPLICATION = 0x52455345  # "RESE": `file` and this program know the file by it
+
+_FIRST = """
+create table scan (
+    id integer primary key,
+    name text unique,                        -- the image's; null: no scan of the project any more
+    uri text not null unique,                -- its path relative to the project's folder, or its address
+    bytes integer not null, mtime_ns integer not null, etag text not null,
+    identity_hash text not null,             -- SHA-256 of the telling parts of its file
+    content_hash text not null default '',   -- SHA-256 of the whole file, where it was needed
+    width_px integer, height_px integer, bits integer, pitch_x_um real, pitch_y_um real, camera text,
+    result integer,                          -- of the last time that it was measured as a scan of the project
+    is_current integer not null default 0,   -- whether that is by today's file and options
+    duplicate_of integer references scan
+);
+create table program (
+    id integer primary key, version text not null, measure_revision integer not null, python text not null,
+    libraries text not null, unique (version, measure_revision, python, libraries)
+);
+create table options (id integer primary key, hash text not null unique, json text not null);
+create table result (
+    id integer primary key,
+    scan integer not null references scan,
+    fingerprint text not null unique,        -- SHA-256 of the scan's identity, the options and the revision of measure
+    program integer not null references program,
+    options integer not null references options,
+    pose text, pose_decided integer,
+    a real, b real, c real, d real, e real, f real,   -- pixel_from_camera: col = a x' + b y' + c, row = d x' + e y' + f
+    pitch_x_um real, pitch_y_um real,
+    verdict text not null, seconds real not null, bytes_read integer not null, finished text not null,
+    detail text not null                     -- JSON: all else that the scan gave
+);
+create index result_of_scan on result (scan);
+create table mark (
+    result integer not null references result, number integer not null,
+    point text not null, kind text not null, col_px real, row_px real,
+    var_col real, var_row real, cov real, causes text,
+    status text not null, reason_code text not null, reason text not null, quality text not null,
+    primary key (result, number)
+) without rowid;
+create table judging (
+    id integer primary key,
+    digest text not null unique,             -- of all that it says: comparator.csv names it
+    made_from text not null,                 -- JSON: fingerprints of what it was made from
+    input text not null                      -- SHA-256 of the results that were judged, and by what
+);
+create table judged_frame (
+    judging integer not null references judging on delete cascade,
+    scan integer not null references scan, result integer not null references result,
+    name text not null, verdict text not null, own_marks integer not null,
+    detail text,                             -- JSON: what of the result is another now; null: nothing
+    primary key (judging, scan)
+) without rowid;
+create table judged (
+    judging integer not null references judging on delete cascade,
+    result integer not null references result, number integer not null,
+    point text not null, kind text not null, col_px real, row_px real,
+    var_col real, var_row real, cov real, causes text,
+    status text not null, reason_code text not null, reason text not null, quality text not null,
+    primary key (judging, result, number)
+) without rowid;
+create table kept (key text primary key, value text not null);   -- what scans of a project tell all others
+create view mark_view as
+with latest as (select max(id) as id from judging),
+frame as (
+    select coalesce(judged_frame.name, scan.name) as image, result.id as result, own_marks, latest.id as judging,
+        result.pitch_x_um / 1000.0 as px_mm, result.pitch_y_um / 1000.0 as py_mm
+    from judged_frame join latest on judged_frame.judging = latest.id
+    join scan on scan.id = judged_frame.scan join result on result.id = judged_frame.result
+),
+seen as (
+    select image, px_mm, py_mm, number, point, kind, col_px, row_px, var_col, var_row, cov, status, reason
+    from frame join mark on mark.result = frame.result where not own_marks
+    union all
+    select image, px_mm, py_mm, number, point, kind, col_px, row_px, var_col, var_row, cov, status, reason
+    from frame join judged on judged.judging = frame.judging and judged.result = frame.result where own_marks
+)
+select image, point, kind, col_px * px_mm as x_mm, -row_px * py_mm as y_mm,
+    sqrt(var_col) * px_mm as sx_mm, sqrt(var_row) * py_mm as sy_mm,
+    case when var_col > 0 and var_row > 0 then -cov / sqrt(var_col) / sqrt(var_row) end as rho,
+    col_px, row_px, status, reason
+from seen order by image, number;
+"""
+
+MIGRATIONS: tuple[str, ...] = (_FIRST,)
+VERSION = len(MIGRATIONS)
+
+
+def opened(path: Path) -> sqlite3.Connection:
+    """The store, brought to this version; made where there is none. Raises InputError for a file of another kind, or of
+    a later version."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    connection = sqlite3.connect(path, timeout=60.0, isolation_level=None)
+    try:
+        _check(connection, path)
+        connection.execute("pragma journal_mode = wal")
+        connection.execute("pragma synchronous = normal")
+        connection.execute("pragma foreign_keys = on")
+        migrate(connection)
+        connection.create_function("sqrt", 1, _sqrt, deterministic=True)  # not every SQLite is built with it
+    except sqlite3.DatabaseError as error:
+        connection.close()
+        raise InputError(f"{path}: cannot be used as a store of measurements ({error}). {_MOVE}") from error
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def migrate(connection: sqlite3.Connection) -> None:
+    """To this version from any earlier one, each step whole or not at all."""
+    version = connection.execute("pragma user_version").fetchone()[0]
+    for number, script in enumerate(MIGRATIONS[version:], version + 1):
+        marks = f"pragma application_id = {APPLICATION}; pragma user_version = {number}"
+        try:
+            connection.executescript(f"begin immediate; {script}; {marks}; commit;")
+        except sqlite3.Error:
+            if connection.in_transaction:
+                connection.execute("rollback")
+            raise
+
+
+_MOVE = "Move it away, and run `reseau measure` again."
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> None:
+    version = connection.execute("pragma user_version").fetchone()[0]
+    application = connection.execute("pragma application_id").fetchone()[0]
+    tables = connection.execute("select count(*) from sqlite_master").fetchone()[0]
+    if tables and application != APPLICATION:
+        raise InputError(f"{path}: is an SQLite file that was not written by reseau. {_MOVE}")
+    if version > VERSION:
+        raise InputError(
+            f"{path}: is of version {version}, written by a later reseau than this one, which knows up to {VERSION}. "
+            "Install that, or move the file away."
+        )
+
+
+def _sqrt(value: float | None) -> float | None:
+    return None if value is None or value < 0 else math.sqrt(value)

@@ -1,0 +1,244 @@
+"""out/measurement.db: what every scan gave, kept by its key, and what all of them together make of it.
+
+One process writes it, each scan in a transaction of its own; any other may read meanwhile.
+"""
+
+import json
+import platform
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Self
+
+from measure.revision import MEASURE_REVISION
+from pipeline.archive.identity import FileState, Identity
+from pipeline.archive.key import fingerprint, options_hash
+from pipeline.archive.schema import opened
+from pipeline.archive.verdicts import Verdict, verdict_of
+
+Json = dict[str, Any]
+
+_MARK = (
+    "point", "kind", "col_px", "row_px", "var_col", "var_row", "cov", "causes", "status", "reason_code", "reason",
+    "quality",
+)  # fmt: skip
+MARK_COLUMNS = ", ".join(_MARK)
+_LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs")
+_NO_NUMBER = (None, None, None)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A result to be kept: of which scan, by which options, its record as `measured_record` has it, and what it took.
+    camera: the name of the camera's file."""
+
+    identity: Identity
+    options_json: str
+    record: Json
+    seconds: float = 0.0
+    bytes_read: int = 0
+    camera: str = ""
+    bits: int | None = None
+
+    @property
+    def fingerprint(self) -> str:
+        return fingerprint(self.identity, options_hash(self.options_json))
+
+
+class Store:
+    """The store of a project, open. Closed behind the `with` block."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError for a file that is no such store."""
+        self.path = path
+        self._db = opened(path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._db.close()
+
+    # --- scans
+
+    def identities(self) -> dict[str, Identity]:
+        """Of every scan that was ever measured, by uri, as it was then."""
+        rows = self._db.execute("select uri, bytes, mtime_ns, etag, identity_hash from scan")
+        return {uri: Identity(FileState(uri, *state), parts) for uri, *state, parts in rows}
+
+    def fingerprints(self) -> dict[str, int]:
+        """Every result's row by its fingerprint."""
+        return dict(self._db.execute("select fingerprint, id from result"))
+
+    def set_project(self, names: Mapping[str, str]) -> None:
+        """names: of the images that the project has now, by uri. None of them is current until it is said."""
+        with self.writing():
+            self._db.execute("update scan set name = null, is_current = 0")
+            self._db.executemany("update scan set name = ? where uri = ?", ((n, uri) for uri, n in names.items()))
+
+    def set_current(self, results: Iterable[int]) -> None:
+        """These results are those of their scans by today's file and options."""
+        with self.writing():
+            self._db.executemany(
+                "update scan set result = ?1, is_current = 1 where id = (select scan from result where id = ?1)",
+                ((result,) for result in results),
+            )
+
+    # --- results
+
+    def keep(self, kept: Kept, name: str | None = None) -> int:
+        """Keep a result, whole or not at all, and give its row. name: the image's, where it is one of the project."""
+        with self.writing():
+            return self._result(kept, self._scan(kept, name))
+
+    def record(self, result: int) -> Json:
+        """The record of a result, as it was kept."""
+        (detail,) = self._db.execute("select detail from result where id = ?", (result,)).fetchone()
+        rows = self._db.execute(f"select {MARK_COLUMNS} from mark where result = ? order by number", (result,))
+        return {**json.loads(detail), "marks": [mark_of(row) for row in rows]}
+
+    def seconds(self, result: int) -> float:
+        """What measuring it took."""
+        return float(self._db.execute("select seconds from result where id = ?", (result,)).fetchone()[0])
+
+    def forget_failed(self) -> int:
+        """Of the scans of the project those results that are failures, so that they are tried again; how many."""
+        with self.writing():
+            self._db.execute("delete from judging")
+            failed = f"select id from result where verdict = '{Verdict.FAILED}'"
+            self._db.execute(f"delete from mark where result in ({failed})")
+            self._db.execute(f"update scan set result = null, is_current = 0 where result in ({failed})")
+            return self._db.execute(f"delete from result where id in ({failed})").rowcount
+
+    # --- what scans of a project tell the others
+
+    def told(self, key: str) -> Json | None:
+        """What was kept by `tell`."""
+        row = self._db.execute("select value from kept where key = ?", (key,)).fetchone()
+        return None if row is None else json.loads(row[0])
+
+    def tell(self, key: str, value: Json) -> None:
+        with self.writing():
+            self._db.execute("insert or replace into kept values (?, ?)", (key, json.dumps(value)))
+
+    @property
+    def connection(self) -> sqlite3.Connection:
+        return self._db
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        self._db.execute("begin immediate")
+        try:
+            yield
+        except BaseException:
+            self._db.execute("rollback")
+            raise
+        self._db.execute("commit")
+
+    # --- the inside
+
+    def _scan(self, kept: Kept, name: str | None) -> int:
+        state, record = kept.identity.state, kept.record
+        if name is not None:  # another scan may have had it
+            self._db.execute("update scan set name = null where name = ? and uri <> ?", (name, state.uri))
+        across, down = (_number(value) for value in record["pitch_um"])
+        values = (
+            name, state.uri, state.bytes, state.mtime_ns, state.etag, kept.identity.parts_hash,
+            record["width_px"], record["height_px"], kept.bits, across, down, kept.camera,
+        )  # fmt: skip
+        row = self._db.execute(
+            "insert into scan (name, uri, bytes, mtime_ns, etag, identity_hash, width_px, height_px, bits, pitch_x_um, "
+            "pitch_y_um, camera) values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) on conflict (uri) do update set "
+            "name = coalesce(excluded.name, name), content_hash = case when (bytes, mtime_ns, etag, identity_hash) = "
+            "(excluded.bytes, excluded.mtime_ns, excluded.etag, excluded.identity_hash) then content_hash else '' end, "
+            "bytes = excluded.bytes, mtime_ns = excluded.mtime_ns, etag = excluded.etag, "
+            "identity_hash = excluded.identity_hash, width_px = excluded.width_px, height_px = excluded.height_px, "
+            "bits = excluded.bits, pitch_x_um = excluded.pitch_x_um, pitch_y_um = excluded.pitch_y_um, "
+            "camera = excluded.camera returning id",
+            values,
+        ).fetchone()
+        return int(row[0])
+
+    def _result(self, kept: Kept, scan: int) -> int:
+        record, pose = kept.record, kept.record["pose"]
+        matrix = record["pixel_from_camera"] or ((None,) * 3,) * 2
+        pitch = (_number(value) for value in record["pitch_um"])
+        detail = json.dumps({key: value for key, value in record.items() if key != "marks"}, ensure_ascii=False)
+        values = (
+            scan, kept.fingerprint, self._program, self._options(kept.options_json),
+            pose and pose["name"], pose and pose["decided"], *map(_number, (*matrix[0], *matrix[1])), *pitch,
+            str(verdict_of(record)), kept.seconds, kept.bytes_read, datetime.now(UTC).isoformat(timespec="seconds"),
+            detail,
+        )  # fmt: skip
+        known = self._db.execute("select id from result where fingerprint = ?", (kept.fingerprint,)).fetchone()
+        if known is not None:
+            return int(known[0])
+        result = self._db.execute(
+            "insert into result (scan, fingerprint, program, options, pose, pose_decided, a, b, c, d, e, f, "
+            f"pitch_x_um, pitch_y_um, verdict, seconds, bytes_read, finished, detail) values ({places(19)})",
+            values,
+        ).lastrowid
+        assert result is not None
+        rows = ((result, number, *row_of(mark)) for number, mark in enumerate(record["marks"]))
+        self._db.executemany(f"insert into mark (result, number, {MARK_COLUMNS}) values ({places(14)})", rows)
+        return result
+
+    def _options(self, options_json: str) -> int:
+        told = options_hash(options_json)
+        self._db.execute("insert or ignore into options (hash, json) values (?, ?)", (told, options_json))
+        return int(self._db.execute("select id from options where hash = ?", (told,)).fetchone()[0])
+
+    @cached_property
+    def _program(self) -> int:
+        libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
+        told = (version("reseau"), MEASURE_REVISION, platform.python_version(), libraries)
+        self._db.execute(
+            "insert or ignore into program (version, measure_revision, python, libraries) values (?, ?, ?, ?)", told
+        )
+        where = "version = ? and measure_revision = ? and python = ? and libraries = ?"
+        return int(self._db.execute(f"select id from program where {where}", told).fetchone()[0])
+
+
+def places(count: int) -> str:
+    return ", ".join("?" * count)
+
+
+def _number(value: Any) -> float | None:
+    """SQLite has no number that is not finite: a record has it by its name."""
+    return None if value is None or isinstance(value, str) else float(value)
+
+
+def row_of(mark: Mapping[str, Any]) -> tuple[Any, ...]:
+    """A mark of a record as a row. The sum of the causes is for those who read the table."""
+    covariance = mark["covariance_px2"]
+    variances = _NO_NUMBER if covariance is None else (covariance[0][0], covariance[1][1], covariance[0][1])
+    causes = None if mark["causes_px2"] is None else json.dumps({"sum": covariance, "of": mark["causes_px2"]})
+    code = mark.get("reason_code", "")
+    told = (mark["status"], code, mark["reason"], json.dumps(mark["quality"]))
+    return (mark["point"], mark["kind"], mark["col_px"], mark["row_px"], *map(_number, variances), causes, *told)
+
+
+def mark_of(row: Sequence[Any]) -> Json:
+    told = dict(zip(_MARK, row, strict=True))
+    causes = told["causes"] and json.loads(told["causes"])
+    code = {"reason_code": told["reason_code"]} if told["reason_code"] else {}
+    return {
+        "point": told["point"],
+        "kind": told["kind"],
+        "col_px": told["col_px"],
+        "row_px": told["row_px"],
+        "covariance_px2": causes and causes["sum"],
+        "causes_px2": causes and causes["of"],
+        "status": told["status"],
+        **code,
+        "reason": told["reason"],
+        "quality": json.loads(told["quality"]),
+    }

@@ -1,0 +1,63 @@
+"""What became of a scan, in one table: the documentation and `reseau status` are made from it."""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Any
+
+from measure.status import Status
+
+
+class Verdict(StrEnum):
+    """Of a scan: the worst of its marks and problems. From the best to what is not known yet."""
+
+    GOOD = "good"
+    LOOK = "look"
+    POOR = "poor"
+    FAILED = "failed"
+    WAITING = "waiting"
+    OLD = "old"
+
+
+MEANING = {
+    Verdict.GOOD: "Every mark that was sought is measured, and nothing speaks against any of them.",
+    Verdict.LOOK: "Usable, but a mark is weak, missing or refused, or the frame has a problem: an assumed pose, say.",
+    Verdict.POOR: "Hardly usable: too few marks were found to tell where the frame is, or to check one by another.",
+    Verdict.FAILED: "Nothing was measured: the file is missing, damaged or no scan, or its process was ended.",
+    Verdict.WAITING: "Not measured yet.",
+    Verdict.OLD: "Measured with other options, or before the file was changed; not measured as it is now.",
+}
+
+NEXT_STEP = {
+    Verdict.GOOD: "Nothing.",
+    Verdict.LOOK: "Read the reasons in comparator.csv or the report; correct, or leave as it is: sigmas tell how well.",
+    Verdict.POOR: "Look at the scan: is it of this camera, whole, sharp? Scan it again, or name it in `exclude`.",
+    Verdict.FAILED: "Mend or replace the file, which is noticed; `--retry` after an outage; or name it in `exclude`.",
+    Verdict.WAITING: "Run `reseau measure`.",
+    Verdict.OLD: "Run `reseau measure`: it measures these anew, and no others.",
+}
+
+_OF_MARK = {
+    Status.MEASURED: Verdict.GOOD,
+    Status.WEAK: Verdict.LOOK,
+    Status.PREDICTED: Verdict.LOOK,
+    Status.REJECTED: Verdict.LOOK,
+    Status.ABSENT: Verdict.LOOK,
+}
+_LEAST_FIDUCIALS = 3  # two give a frame, and nothing to check it by
+
+
+def verdict_of(record: Mapping[str, Any]) -> Verdict:
+    """The verdict of a scan's record, as `pipeline.results.measured_record` has it."""
+    if record["failure"]:
+        return Verdict.FAILED
+    marks = record["marks"]
+    fiducials = [mark for mark in marks if mark["kind"] == "fiducial"]
+    observed = [mark for mark in marks if Status(mark["status"]).is_observation]
+    seen = sum(mark["kind"] == "fiducial" for mark in observed)
+    too_few = seen < min(_LEAST_FIDUCIALS, len(fiducials))
+    if not observed or too_few or (fiducials and record["pixel_from_camera"] is None):
+        return Verdict.POOR
+    pose = record["pose"]
+    needs_look = record["problems"] or (pose and not pose["decided"])
+    of_marks = max((_OF_MARK[Status(mark["status"])] for mark in marks), key=list(Verdict).index)
+    return Verdict.LOOK if needs_look else of_marks

@@ -1,0 +1,271 @@
+"""The store gives back what was kept, takes it whole or not at all, and other programs can read it."""
+
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from made_records import dump, failed, kept, record
+
+from pipeline.archive.identity import content_hash, file_state, parts_hash
+from pipeline.archive.judging import JudgedScan, drop_all_but, judge, judged_records, judging_of, latest
+from pipeline.archive.key import fingerprint, options_hash, shard_of
+from pipeline.archive.merge import merge
+from pipeline.archive.schema import MIGRATIONS, VERSION, opened
+from pipeline.archive.store import Store
+from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, verdict_of
+from pipeline.errors import InputError
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "out" / "measurement.db"
+
+
+def test_a_record_comes_back_without_loss(path: Path) -> None:
+    with Store(path) as store:
+        row = store.keep(kept(3), "box/3")
+        other = store.keep(kept(4))
+    with Store(path) as store:
+        assert store.record(row) == record(3)
+        assert store.record(other) == record(4)
+        assert store.fingerprints() == {kept(3).fingerprint: row, kept(4).fingerprint: other}
+        assert store.identities() == {"scans/3.tif": kept(3).identity, "scans/4.tif": kept(4).identity}
+
+
+def test_a_result_that_is_there_is_not_kept_twice(path: Path) -> None:
+    with Store(path) as store:
+        assert store.keep(kept(3)) == store.keep(kept(3))
+        assert store.keep(kept(3, options='{"pose": "90"}')) != store.keep(kept(3))
+        assert len(store.fingerprints()) == 2
+
+
+def test_the_view_has_the_columns_and_numbers_of_comparator_csv(path: Path) -> None:
+    with Store(path) as store:
+        row = store.keep(kept(3), "box/3")
+        judge(store, {}, "input", [JudgedScan("box/3", row, record(3))])
+    with sqlite3.connect(path) as db:
+        view = db.execute("select * from mark_view")
+        names = [column[0] for column in view.description]
+        rows = view.fetchall()
+    assert names == ["image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status",
+                     "reason"]  # fmt: skip
+    mark = record(3)["marks"][0]
+    (variance_x, covariance), (_, variance_y) = mark["covariance_px2"]
+    assert rows[0][:3] == ("box/3", "1", "fiducial")
+    assert rows[0][3:5] == pytest.approx((mark["col_px"] * 0.020, -mark["row_px"] * 0.0205), rel=1e-12)
+    assert rows[0][5:7] == pytest.approx((variance_x**0.5 * 0.020, variance_y**0.5 * 0.0205), rel=1e-12)
+    assert rows[0][7] == pytest.approx(-covariance / (variance_x * variance_y) ** 0.5, rel=1e-12)
+    assert len(rows) == 8
+
+
+def test_a_judging_changes_what_is_seen_and_not_what_was_measured(path: Path) -> None:
+    with Store(path) as store:
+        rows = [store.keep(kept(seed), str(seed)) for seed in (1, 2)]
+        now = [record(1), record(2, problems=["it is the frame of 1."])]
+        now[0]["marks"][2] |= {"status": "weak", "reason": "the others say otherwise"}
+        frames = [JudgedScan(name, row, what) for name, row, what in zip("12", rows, now, strict=True)]
+        digest = judge(store, {"settings": "a"}, "input", frames)
+        judging = judging_of(store, digest)
+        assert judging is not None
+        assert judging.made_from == {"settings": "a"}
+        assert list(judged_records(store, judging)) == [("1", now[0]), ("2", now[1])]
+        assert [store.record(row) for row in rows] == [record(1), record(2)]
+        seen = store.connection.execute("select image, status from mark_view where status = 'weak'").fetchall()
+        assert seen == [("1", "weak")]
+        assert store.connection.execute("select count(*) from judged").fetchone() == (8,)  # of the first alone
+
+
+def test_one_judging_takes_the_place_of_another(path: Path) -> None:
+    with Store(path) as store:
+        row = store.keep(kept(1), "1")
+        first = judge(store, {}, "a", [JudgedScan("1", row, record(1))])
+        same = judge(store, {}, "a", [JudgedScan("1", row, record(1))])
+        second = judge(store, {}, "a", [JudgedScan("1", row, record(1, problems=["look"]))])
+        assert first == same != second
+        assert judging_of(store, first) is not None
+        drop_all_but(store, second)
+        assert judging_of(store, first) is None
+        assert (found := latest(store)) is not None
+        assert found.digest == second
+
+
+@pytest.mark.parametrize("version", range(VERSION + 1))
+def test_a_store_of_an_earlier_version_is_brought_to_this_one(path: Path, version: int) -> None:
+    path.parent.mkdir()
+    db = sqlite3.connect(path)
+    for number, script in enumerate(MIGRATIONS[:version], 1):
+        db.executescript(f"{script}; pragma application_id = {0x52455345}; pragma user_version = {number};")
+    if version:
+        db.execute("insert into options (hash, json) values ('h', '{}')")
+        db.commit()
+    db.close()
+    with Store(path) as store:
+        assert store.connection.execute("pragma user_version").fetchone() == (VERSION,)
+        row = store.keep(kept(1), "1")
+        assert store.record(row) == record(1)
+        assert store.connection.execute("select count(*) from options").fetchone() == (1 + bool(version),)
+
+
+def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Store(path) as store:
+        row = store.keep(kept(1), "1")
+    step = "alter table scan add column box text; update scan set box = 'a'"
+    monkeypatch.setattr("pipeline.archive.schema.MIGRATIONS", (*MIGRATIONS, f"{step}; insert into nowhere values (1)"))
+    with pytest.raises(InputError, match="nowhere"):
+        Store(path)
+    monkeypatch.setattr("pipeline.archive.schema.MIGRATIONS", (*MIGRATIONS, step))
+    with Store(path) as store:
+        assert store.connection.execute("select name, box from scan").fetchall() == [("1", "a")]
+        assert store.connection.execute("pragma user_version").fetchone() == (VERSION + 1,)
+        assert store.record(row) == record(1)
+
+
+def test_a_file_of_another_kind_or_of_a_later_version_is_refused(path: Path) -> None:
+    path.parent.mkdir()
+    path.write_text("measured: nothing", encoding="utf-8")
+    with pytest.raises(InputError, match="cannot be used as a store of measurements"):
+        Store(path)
+    path.unlink()
+    with sqlite3.connect(path) as db:
+        db.execute("create table a (b)")
+    with pytest.raises(InputError, match="not written by reseau"):
+        Store(path)
+    path.unlink()
+    opened(path).close()
+    with sqlite3.connect(path) as db:
+        db.execute(f"pragma user_version = {VERSION + 1}")
+    with pytest.raises(InputError, match="a later reseau"):
+        Store(path)
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from made_records import kept
+from pipeline.archive.store import Store
+with Store(Path(sys.argv[1])) as store:
+    for seed in range(100_000):
+        store.keep(kept(seed), str(seed))
+        print(seed, flush=True)
+"""
+
+
+def test_what_was_kept_survives_a_kill_and_nothing_is_half(path: Path) -> None:
+    paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[2])])
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path)], env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE
+    )
+    assert writer.stdout is not None
+    told = [writer.stdout.readline() for _ in range(50)]
+    time.sleep(0.05)
+    writer.send_signal(signal.SIGKILL)
+    told += writer.stdout.readlines()
+    writer.wait()
+    writer.stdout.close()
+    with Store(path) as store:
+        found = store.fingerprints()
+        complete = sum(line.endswith(b"\n") for line in told)
+        assert complete <= len(found) <= complete + 1
+        assert all(store.record(row)["marks"] for row in found.values())
+        assert store.connection.execute("pragma integrity_check").fetchone() == ("ok",)
+
+
+def test_failed_scans_are_tried_again_only_when_asked(path: Path) -> None:
+    with Store(path) as store:
+        store.keep(kept(1), "1")
+        row = store.keep(kept(2, **failed(2)), "2")
+        assert store.connection.execute("select verdict from result where id = ?", (row,)).fetchone() == ("failed",)
+        assert store.forget_failed() == 1
+        assert list(store.fingerprints()) == [kept(1).fingerprint]
+        assert store.forget_failed() == 0
+
+
+def test_stores_of_shards_become_one(tmp_path: Path) -> None:
+    whole, joined, shards = tmp_path / "whole.db", tmp_path / "joined.db", [tmp_path / f"{k}.db" for k in (1, 2)]
+    for seed in range(20):
+        for place in (whole, shards[shard_of(str(seed), 2) - 1]):
+            with Store(place) as store:
+                store.keep(kept(seed, options=f"[{seed % 3}]"), str(seed))
+    with Store(joined) as store:
+        first, second = merge(store, shards)
+        assert first.new + second.new == first.results + second.results == 20
+        assert [again.new for again in merge(store, shards)] == [0, 0]
+    assert dump(joined) == dump(whole)
+    assert min(first.new, second.new) > 3
+
+
+def test_merging_names_what_is_no_store(tmp_path: Path) -> None:
+    with Store(tmp_path / "a.db") as store:
+        with pytest.raises(InputError, match="there is no such store"):
+            merge(store, [tmp_path / "b.db"])
+        with pytest.raises(InputError, match="to be joined in"):
+            merge(store, [tmp_path / "a.db"])
+
+
+def test_shards_are_the_same_everywhere() -> None:
+    """By SHA-256 of the name: another Python, or another start of it, gives the same."""
+    assert [shard_of(name, 8) for name in ("0001", "box1/0001", "Übersicht")] == [4, 7, 2]  # sha256sum's 8th byte
+    counts = [sum(shard_of(str(n), 4) == k for n in range(4000)) for k in (1, 2, 3, 4)]
+    assert min(counts) > 900
+
+
+def test_verdicts_of_scans() -> None:
+    assert verdict_of(record()) == Verdict.GOOD
+    assert verdict_of(record(status="weak")) == Verdict.LOOK
+    assert verdict_of(record(problems=["the pitch is not known"])) == Verdict.LOOK
+    assumed = record()
+    assumed["pose"]["decided"] = False
+    assert verdict_of(assumed) == Verdict.LOOK
+    assert verdict_of(record(status="absent")) == Verdict.POOR
+    assert verdict_of(record(pixel_from_camera=None)) == Verdict.POOR
+    few = record()
+    for mark in few["marks"][2:]:
+        mark["status"] = "rejected"
+    assert verdict_of(few) == Verdict.POOR
+    assert verdict_of(failed()) == Verdict.FAILED
+    assert set(MEANING) == set(NEXT_STEP) == set(Verdict)
+
+
+def test_the_key_depends_on_all_that_it_names() -> None:
+    base = kept(1)
+    others = [kept(1, options="[1]"), kept(1, mtime_ns=2), kept(2)]
+    keys = {base.fingerprint, *(other.fingerprint for other in others)}
+    keys.add(fingerprint(base.identity, options_hash("{}"), revision=-1))
+    assert len(keys) == 5
+    assert base.fingerprint == kept(1, problems=["another result"]).fingerprint
+
+
+def test_parts_tell_scans_apart_that_share_head_and_tables(rendered: Path, tmp_path: Path) -> None:
+    scan = tmp_path / "scan.tif"
+    shutil.copyfile(rendered / "scans" / "frame1.tif", scan)
+    first = parts_hash(scan), content_hash(scan)
+    copy = tmp_path / "copy.tif"
+    shutil.copyfile(scan, copy)
+    assert (parts_hash(copy), content_hash(copy)) == first
+    pixels = tifffile.imread(scan)
+    for place, name in (((pixels.shape[0] // 2, pixels.shape[1] // 2), "middle"), ((0, 0), "corner")):
+        changed = pixels.copy()
+        changed[place] ^= 1
+        tifffile.imwrite(tmp_path / f"{name}.tif", changed)
+    tifffile.imwrite(tmp_path / "same.tif", np.asarray(pixels))
+    hashes = {name: parts_hash(tmp_path / f"{name}.tif") for name in ("same", "middle")}
+    assert hashes["same"] != hashes["middle"]
+    assert content_hash(tmp_path / "corner.tif") != content_hash(tmp_path / "same.tif")
+
+
+def test_the_identity_of_what_is_no_scan(tmp_path: Path) -> None:
+    (tmp_path / "empty.tif").touch()
+    (tmp_path / "text.tif").write_text("no picture", encoding="utf-8")
+    assert parts_hash(tmp_path / "none.tif") == content_hash(tmp_path / "none.tif") == ""
+    assert parts_hash(tmp_path / "empty.tif") != parts_hash(tmp_path / "text.tif") != ""
+    assert file_state(tmp_path / "none.tif", tmp_path).bytes == -1
+    state = file_state(tmp_path / "text.tif", tmp_path / "project")
+    assert (state.uri, state.bytes) == ("../text.tif", 10)
