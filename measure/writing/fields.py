@@ -115,9 +115,9 @@ def is_plate(line: Line) -> bool:
     return any(field.name in CAMERA for field in _fields_of_line(line))
 
 
-def is_title(line: Line) -> bool:
-    """Whether it says what a title is made for."""
-    return any(field.name in STRIP for field in _fields_of_line(line))
+def signs(line: Line) -> int:
+    """How many fields of a plate or a title it says."""
+    return sum(field.name in (*CAMERA, *STRIP) for field in _fields_of_line(line))
 
 
 def is_of_film(line: Line) -> bool:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from measure.writing.fields import fields_of, is_of_film, is_plate, is_title
+from measure.writing.fields import fields_of, is_of_film, is_plate, signs
 from measure.writing.line import Line, Reading
 
 
@@ -65,7 +65,8 @@ def test_the_frames_number_is_the_only_one_among_the_runs() -> None:
 def test_plates_titles_and_the_films_own_name_are_told_apart() -> None:
     assert is_plate(line("Nr13043 152.75"))
     assert not is_plate(line("RUN 20"))
-    assert is_title(line("16.5.68"))
-    assert not is_title(line("AUSTRALIAN"))
+    assert signs(line("16.5.68")) == 1
+    assert signs(line("RUN 7 16.5.68")) == 2
+    assert signs(line("AUSTRALIAN")) == 0
     assert is_of_film(line("KODAK SAFETY FILM"))
     assert not is_of_film(line("ADASTRAPHOTO"))
