@@ -9,6 +9,7 @@ from measure.film import SCATTER_MM
 from measure.marks.poses import POSES
 from measure.marks.shapes import FiducialLayout
 from measure.match_options import MatchOptions
+from measure.writing.line import KnownLine
 
 Reads = Literal["none", "pose", "all"]
 
@@ -23,8 +24,8 @@ class FiducialOptions:
     when it is searched, plus what share of the constellation's span. gate_mm: how far a measured mark may lie from
     where the others put it. film_sigma_mm: scatter of marks by film and scanner. match: of the fit at full resolution;
     a polygon is matched with the rotation and scale of the frame. writing: what is written about the frame is read in
-    "none", where nothing else decides the "pose", or in "all". Raises ValueError, naming the option, for a value that
-    is none.
+    "none", where nothing else decides the "pose", or in "all". known_lines: of the same roll; where one of them is read
+    at its place, the pose asks for no more. Raises ValueError, naming the option, for a value that is none.
     """
 
     pose: str = "auto"
@@ -37,6 +38,7 @@ class FiducialOptions:
     film_sigma_mm: float = SCATTER_MM
     match: MatchOptions = field(default_factory=lambda: MatchOptions(linear_sigma=0.05))
     writing: Reads = "none"
+    known_lines: tuple[KnownLine, ...] = ()
 
     def __post_init__(self) -> None:
         if self.pose != "auto" and self.pose not in POSES:

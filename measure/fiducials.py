@@ -13,7 +13,7 @@ from measure.frames.fiducial_rows import absent_frame, lost_frame, present_frame
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.frame_border import at_border
-from measure.marks.poses import POSES
+from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.pose.pose_decision import decide_pose
 from measure.results import FrameMeasurement, Pose
@@ -23,7 +23,7 @@ from measure.search.constellation import Placement
 from measure.search.correlation import CLOSE
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
-from measure.writing.line import Line
+from measure.writing.line import KnownLine, Line
 from measure.writing.networks import networks
 from measure.writing.reading import read_writing
 
@@ -75,7 +75,7 @@ def measure_fiducials(
         frame = _in_every_pose(search, found, frame)
         pose, placement = _named(search, found, frame, lines or ())
         if options.writing == "pose" and not pose.decided and frame.accepted:
-            lines = _read(scan, layout, frame)
+            lines = _read(scan, layout, frame, options.known_lines)
             pose, placement = _named(search, found, frame, lines or ())
         if pose.name != frame.placement.pose:
             frame = measure_frame(scan, layout, placement, options)
@@ -115,8 +115,11 @@ def _worth(frame: Frame) -> tuple[bool, int, int]:
     return frame.accepted and frame.placement.surroundings != CLOSE, frame.measured, int(frame.belongs.sum())
 
 
-def _read(scan: Scan, layout: FiducialLayout, frame: Frame | None) -> tuple[Line, ...] | None:
-    """What is written about the frame, or along the scan's edges; None where nothing is there that reads."""
+def _read(
+    scan: Scan, layout: FiducialLayout, frame: Frame | None, known_lines: Sequence[KnownLine] = ()
+) -> tuple[Line, ...] | None:
+    """What is written about the frame, or along the scan's edges; None where nothing is there that reads. Where a known
+    line is read at its place, only what stands about it."""
     nets = networks()
     if nets is None:
         return None
@@ -125,7 +128,14 @@ def _read(scan: Scan, layout: FiducialLayout, frame: Frame | None) -> tuple[Line
     half = np.asarray(layout.frame_mm) / 2
     corners_mm = half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
     matrix = frame.pixel_from_camera
-    return read_writing(scan, nets, corners_mm @ matrix[:, :2].T + matrix[:, 2])
+    frame_px = corners_mm @ matrix[:, :2].T + matrix[:, 2]
+    pixel_from_up = matrix[:, :2] @ up_from_camera(frame.placement.pose).T
+    for known in known_lines:
+        outline_px = np.array(known.outline_mm) @ pixel_from_up.T + matrix[:, 2]
+        lines = read_writing(scan, nets, frame_px, (known.side, outline_px))
+        if any(known.is_seen_in(line) for line in lines):
+            return lines
+    return read_writing(scan, nets, frame_px)
 
 
 def _at_first_look(

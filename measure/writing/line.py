@@ -1,9 +1,14 @@
 """A line of writing in a scan: what it says, where it stands, and which way it lies."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import SequenceMatcher
 
 from measure.marks.shapes import Side
+
+_ALIKE = 0.75  # of the characters of a line that is read twice
+_PLAINLY = 5.0  # characters by which one way reads better than any other: a thousand to one
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,39 @@ class Line:
         return self.ways[self.pose].legible
 
     @property
+    def lead(self) -> float:
+        """By how many characters its way reads better than any other."""
+        return self.legible - max((way.legible for pose, way in self.ways.items() if pose != self.pose), default=0.0)
+
+    @property
     def center_px(self) -> tuple[float, float]:
         col, row = (sum(values) / len(self.outline_px) for values in zip(*self.outline_px, strict=True))
         return col, row
+
+
+@dataclass(frozen=True)
+class KnownLine:
+    """A line that stands at one place on frames that lie alike in their scans.
+
+    pose: the way in which it lies in the scan. outline_mm: its corners from the middle of the exposed frame, as the
+    scan shows them, to the right and up.
+    """
+
+    text: str
+    pose: str
+    side: Side
+    outline_mm: tuple[tuple[float, float], ...]
+
+    def is_seen_in(self, line: Line) -> bool:
+        """Whether it is plainly that line, which may say another number."""
+        own, other = without_numbers(self.text), without_numbers(line.text)
+        same = SequenceMatcher(None, own, other).ratio() >= _ALIKE
+        return same and line.pose == self.pose and line.lead >= _PLAINLY
+
+
+def without_numbers(text: str) -> str:
+    """A text of which frames of a roll have the same: every digit is a 0, and only letters count beside them."""
+    return re.sub(r"\d", "0", re.sub(r"[\W_]", "", text.upper()))
 
 
 def of_one_face(lines: Sequence[Line]) -> tuple[Line, ...]:

@@ -27,6 +27,7 @@ _BEYOND = 0.13  # how far outside of the frame writing is looked for: its data s
 _WITHIN = 0.045  # and how far inside: plates and counters reach into it
 _FINE_PX = 2400  # the least length of the frame's longer side in the picture that lines are cut out of
 _FOUND_PX = (1800, 900)  # the same where they are found: plates of 1.5 mm, then handwriting
+_ABOUT = 0.02  # how far about the place of a line it is looked for: titles are set by hand
 _LEAST_PX = 12  # of a strip's sides
 _LONGEST_PX = 1600  # of a line as it is read: what is longer is no line
 _BLACK, _WHITE = 0.5, 99.5  # per cents of the pixels of a strip that are made black and white
@@ -34,20 +35,18 @@ _LEAST_LEGIBLE = 1.5  # characters: less is a speck that looks like a letter
 _READ_WELL = 0.6  # the mean confidence of what need not be looked at again at a coarser scale
 
 
-def read_writing(scan: Scan, networks: Networks, frame_px: Array | None = None) -> tuple[Line, ...]:
+def read_writing(
+    scan: Scan, networks: Networks, frame_px: Array | None = None, about: tuple[Side, Array] | None = None
+) -> tuple[Line, ...]:
     """The lines written on a scan, as they read from the face of the film from which most can be read, those first
     that say most.
 
     frame_px: (n, 2) column and row of the corners of the exposed frame; None where it is not known: then what stands
-    along the edges of the scan is read."""
-    lines = [
-        line
-        for side in get_args(Side)
-        for strip in (_strip(scan, side, frame_px),)
-        if strip is not None
-        for line in strip.lines(networks)
-    ]
-    return of_one_face(lines)
+    along the edges of the scan is read. about: the side and the outline (n, 2) of a line, in px, where only what stands
+    about it is to be read."""
+    places = [(side, None) for side in get_args(Side)] if about is None else [about]
+    strips = [_strip(scan, side, frame_px, outline_px) for side, outline_px in places]
+    return of_one_face([line for strip in strips if strip is not None for line in strip.lines(networks)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +98,12 @@ class _Strip:
         return np.asarray(cut, np.uint8)
 
 
-def _strip(scan: Scan, side: Side, frame_px: Array | None) -> _Strip | None:
-    """What the scan shows at a side of the frame; None where that is nothing."""
+def _strip(scan: Scan, side: Side, frame_px: Array | None, outline_px: Array | None) -> _Strip | None:
+    """What the scan shows at a side of the frame, or about a line there; None where that is nothing."""
     low, high, longer_px = _beside(scan, side, frame_px)
+    if outline_px is not None:
+        low = np.maximum(low, outline_px.min(axis=0) - _ABOUT * longer_px)
+        high = np.minimum(high, outline_px.max(axis=0) + _ABOUT * longer_px)
     factor = max(int(longer_px / _FINE_PX), 1)
     first = np.floor(low / factor).astype(int)
     last = np.minimum(np.ceil(high / factor).astype(int), (scan.width_px // factor, scan.height_px // factor))

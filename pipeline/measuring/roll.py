@@ -6,25 +6,61 @@ is written on each adds to what tells how the camera has it. What is not told ev
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from hashlib import sha256
 
 import numpy as np
 
-from measure.marks.poses import POSES, pose_in_camera
+from measure.marks.poses import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import WrittenPlace
 from measure.pose.pose_decision import DECIDED, TOLD
 from measure.pose.written_pose import bounded, line_score
 from measure.results import FrameMeasurement, Pose
 from measure.status import Status
-from measure.writing.line import Line
+from measure.writing.line import KnownLine, Line, without_numbers
 from pipeline.results.measured_scan import MeasuredScan
 
 _ONE_QUESTION = (
     "the frames are named so that what is written lies alike in all of the camera whose writing was read; nothing says "
     "how the camera has it"
 )
+_READ_FIRST = 4  # frames of a camera
+_WAYS = 2  # in which frames of a roll lie, as far as they are looked for: more take as long as reading all
+_LEAST = 6  # letters and digits of a line by which frames are known
 _TURNS = ("0", "90", "180", "270")  # in which writing may lie in the camera's frame
+
+
+def read_first(images: Iterable[str]) -> frozenset[str]:
+    """Those of a camera's images on which all writing is read, before it is known what stands on all; one image more
+    or less changes few of them."""
+    return frozenset(sorted(images, key=lambda image: sha256(image.encode()).digest())[:_READ_FIRST])
+
+
+def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:
+    """The lines by which to know, on frames that are not read yet, that they lie as some of these do: of each way in
+    which two or more lie in their scans the one that tells itself best."""
+    seen = [(known, line) for frame in frames for line in frame.writing or () if (known := _known(frame, line))]
+    recurring = [
+        (known, line)
+        for known, line in seen
+        if sum(known.side == other.side and known.is_seen_in(again) for other, again in seen) > 1
+    ]
+    best: dict[str, tuple[KnownLine, Line]] = {}
+    for known, line in sorted(recurring, key=lambda each: -each[1].lead):
+        best.setdefault(known.pose, (known, line))
+    return tuple(known for known, _ in list(best.values())[:_WAYS])
+
+
+def _known(frame: FrameMeasurement, line: Line) -> KnownLine | None:
+    """The line as others of its roll may have it; None where too little is written in it."""
+    letters = without_numbers(line.text)
+    if frame.pixel_from_camera is None or frame.pose is None or len(letters) < _LEAST or not letters.strip("0"):
+        return None
+    matrix = frame.pixel_from_camera
+    up_from_pixel = np.linalg.inv(matrix[:, :2] @ up_from_camera(frame.pose.name).T)
+    outline_mm = (np.array(line.outline_px) - matrix[:, 2]) @ up_from_pixel.T
+    return KnownLine(line.text, line.pose, line.side, tuple((float(x), float(y)) for x, y in outline_mm))
 
 
 def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Mapping[str, Pose]:

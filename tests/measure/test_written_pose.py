@@ -16,7 +16,7 @@ from measure.marks.poses import POSES, pose_in_camera, up_from_camera
 from measure.marks.shapes import MarkShape, Side, WrittenPlace
 from measure.pose.written_pose import main_pose, side_in_camera, writing_likelihoods
 from measure.results import FrameMeasurement
-from measure.writing.line import Line, Reading, of_one_face
+from measure.writing.line import KnownLine, Line, Reading, of_one_face
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
 DECIDED = 7.0
@@ -128,11 +128,17 @@ def written_frame() -> Array:
     return np.asarray(grey + 40.0 * np.rot90(letters))
 
 
-def measured(pose: str, folder: Path, places: tuple[WrittenPlace, ...], reads: Reads = "pose") -> FrameMeasurement:
+def measured(
+    pose: str,
+    folder: Path,
+    places: tuple[WrittenPlace, ...],
+    reads: Reads = "pose",
+    known_lines: tuple[KnownLine, ...] = (),
+) -> FrameMeasurement:
     grey = written_frame()
     grey = np.rot90(grey[:, ::-1] if pose.endswith("m") else grey, int(pose.rstrip("m")) // 90)
     with written_scan(np.ascontiguousarray(grey), folder) as scan:
-        options = FiducialOptions(writing=reads)
+        options = FiducialOptions(writing=reads, known_lines=known_lines)
         return measure_fiducials(scan, replace(LAYOUT, writing=places), (PITCH_UM, PITCH_UM), options)
 
 
@@ -159,3 +165,24 @@ def test_nothing_is_read_where_nobody_asks_and_a_mirror_is_not_assumed(tmp_path:
     assert silent.writing is None
     assert silent.pose is not None
     assert (silent.pose.name, silent.pose.decided) == ("0", False)
+
+
+TITLE = KnownLine("RUN 31  CANBERRA  17.6.69", "90", "left", ((-13.9, -9.0), (-13.9, 2.0), (-13.1, 2.0), (-13.1, -9.0)))
+
+
+def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_stands(
+    tmp_path: Path,
+) -> None:
+    alike = measured("0", tmp_path, WILD, known_lines=(TITLE,))
+    assert [(each.side, each.pose) for each in alike.writing or ()] == [("left", "90")]
+    assert alike.pose is not None
+    assert (alike.pose.name, alike.pose.decided) == ("0", True)
+
+
+@pytest.mark.parametrize("pose", ["180", "0m"])
+def test_a_frame_that_lies_otherwise_is_read_as_a_whole(pose: str, tmp_path: Path) -> None:
+    """The plate lies where the title is looked for, or the title itself in a mirror."""
+    other = measured(pose, tmp_path, WILD, known_lines=(TITLE,))
+    assert {each.side for each in other.writing or ()} == {"left", "right"}
+    assert other.pose is not None
+    assert (other.pose.name, other.pose.decided) == (pose, True)

@@ -23,7 +23,7 @@ from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import WRITTEN, fill_images, read_images
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, plate_of, with_plates
-from pipeline.measuring.roll import poses_of_roll
+from pipeline.measuring.roll import known_lines, poses_of_roll, read_first
 from pipeline.rendered.scene_file import render_project
 from pipeline.report.writing import written
 from pipeline.results.frames_file import for_images, with_same_frames, write_frames
@@ -169,6 +169,38 @@ def test_a_frame_that_is_decided_tells_the_others_how_they_lie() -> None:
     known = replace(known, frame=replace(known.frame, pose=replace(known.frame.pose, decided=True)))  # type: ignore[type-var]
     poses = poses_of_roll([known, posed("b", "180", TITLE, name="90", places=())], ())
     assert {image: (pose.name, pose.decided) for image, pose in poses.items()} == {"b": ("180", True)}
+
+
+def frame_of_roll(image: str, pose: str, *texts: str) -> FrameMeasurement:
+    """Pose "0" or "180" of a frame of 10 x 10 mm in the middle of a scan of 100 px, a pixel being 0.1 mm."""
+    scale = 10.0 if pose == "0" else -10.0
+    matrix = np.array([[scale, 0.0, 50.0], [0.0, -scale, 50.0]])
+    frame = scan(image, [line(text, pose) for text in texts], Pose(pose, False)).frame
+    return replace(frame, pixel_from_camera=matrix)
+
+
+def test_frames_are_known_by_the_line_that_all_have_and_that_tells_itself_best() -> None:
+    frames = [frame_of_roll("a", "0", "ROLL OF 1", "DEVELOPMENT 17", "ONLY ON THIS ONE FRAME")]
+    assert known_lines(frames) == ()
+    frames.append(frame_of_roll("b", "0", "DEVELOPMENT 18", "ROLL OF 2"))
+    (known,) = known_lines(frames)
+    assert (known.text, known.pose, known.side) == ("DEVELOPMENT 17", "0", "top")
+    assert np.array(known.outline_mm) == pytest.approx(np.array([[-4.0, 3.0], [0.0, 3.0], [0.0, 2.0], [-4.0, 2.0]]))
+    frames += [frame_of_roll(image, "180", "DEVELOPMENT 19") for image in ("c", "d")]
+    both = known_lines(frames)
+    assert [each.pose for each in both] == ["0", "180"]
+    assert np.array(both[1].outline_mm) == pytest.approx(
+        np.array(known.outline_mm)
+    )  # as the scan shows it, whatever the pose
+    assert known_lines([frame_of_roll(image, "0", "8601 8639") for image in "ab"]) == ()
+
+
+def test_the_frames_that_are_read_first_hardly_change_with_one_scan_more() -> None:
+    images = [f"{number:04d}" for number in range(200)]
+    first = read_first(images)
+    assert len(first) == 4
+    assert read_first(reversed(images)) == first
+    assert max(len(first - read_first([*images, f"more{number}"])) for number in range(50)) <= 1
 
 
 RC10 = parse_camera(
