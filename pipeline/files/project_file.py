@@ -1,8 +1,7 @@
 """project.toml: which camera, which scans, what to measure, how to adjust, where to write."""
 
-import glob
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,10 +19,10 @@ from pipeline.files.distances_file import GivenDistance, read_distances
 from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import camera_path
 from pipeline.files.points_file import GivenPoints, read_points
+from pipeline.files.scan_files import find_scans
 from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 from pipeline.results.adjustment_reader import covariance_path
-from pipeline.text.image_names import image_name
 from pipeline.text.tables import Table, read_toml
 
 FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
@@ -154,6 +153,7 @@ def read_project(path: Path) -> Project:
     objects, measure = table.table("object"), table.table("measure")
     camera = table.path_text("camera")
     patterns = table.path_texts("scans") if "scans" in table else None
+    exclude = table.path_texts("exclude") if "exclude" in table else ()
     named = {key: objects.path_of(key) for key in ("points", "images", "distances") if key in objects}
     antenna = _antenna(objects)
     project = Project(
@@ -182,7 +182,7 @@ def read_project(path: Path) -> Project:
     project = replace(
         project,
         cameras=_cameras(table, camera, images),
-        scans={} if patterns is None else _scans(table, patterns),
+        scans={} if patterns is None else find_scans(table, patterns, exclude),
         given_points=read_points(named["points"]) if "points" in named else None,
         given_images=images,
         given_distances=read_distances(named["distances"]) if "distances" in named else (),
@@ -256,48 +256,6 @@ def _cameras(table: Table, default: str, images: GivenImages | None) -> Mapping[
             )
         titles[camera.name] = name
     return cameras
-
-
-def _scans(table: Table, patterns: Sequence[str]) -> Mapping[str, Path]:
-    """The scan files that the patterns find, by image name."""
-    folder = table.file.parent
-    scans: dict[str, Path] = {}
-    for pattern in patterns:
-        found = _found(pattern, folder)
-        if not found:
-            raise table.error("scans", _nothing_found(pattern, folder / pattern))
-        for file in found:
-            name = image_name(file.name)
-            if not name.isprintable():
-                raise table.error("scans", f"the file name {file.name!a} is not text in UTF-8 on one line. Rename it.")
-            if scans.get(name, file) != file:
-                raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
-            scans[name] = file
-    if not scans:
-        raise table.error("scans", 'is an empty list. Name files or patterns, such as ["scans/*.tif"].')
-    return scans
-
-
-def _found(pattern: str, folder: Path) -> list[Path]:
-    """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
-    that lead nowhere: a scan that is named is opened or refused."""
-    if (folder / pattern).is_file():
-        return [folder / pattern]
-    names = glob.glob(pattern, root_dir=folder)
-    return [path for path in (folder / name for name in sorted(names)) if not path.is_dir()]
-
-
-def _nothing_found(pattern: str, whole: Path) -> str:
-    folder = whole.parent
-    if whole.is_dir():
-        return f"{pattern!r} is a folder. Name the files in it by a pattern, such as {f'{pattern}/*.tif'!r}."
-    if glob.has_magic(str(Path(pattern).parent)):
-        return f"{pattern!r} finds no file. Looked for {whole}."
-    if not folder.is_dir():
-        return f"{pattern!r} finds no file: there is no folder {folder.resolve()}."
-    endings = sorted({file.suffix for file in folder.iterdir() if file.is_file() and file.suffix})
-    holds = f"It holds files that end in {', '.join(endings)}." if endings else "It holds no files."
-    return f"{pattern!r} finds no file in {folder.resolve()}. {holds}"
 
 
 def _pitch(table: Table) -> tuple[float, float] | None:

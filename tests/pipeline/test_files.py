@@ -20,7 +20,7 @@ from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import read_images
 from pipeline.files.points_file import read_points
-from pipeline.files.project_file import read_project
+from pipeline.files.project_file import Project, read_project
 from pipeline.files.template_table import saved_in
 from pipeline.results.comparator_file import (
     comparator_from_pixel,
@@ -329,8 +329,43 @@ def test_trying_whether_a_folder_takes_results_touches_no_file_of_it(tmp_path: P
 
 
 def test_an_image_is_called_as_its_file_without_what_no_table_keeps() -> None:
-    assert image_name("scans/roll 7/ frame 1 .TIF") == "frame 1"
+    assert image_name("roll 7/ frame 1 .TIF") == "roll 7/frame 1"
     assert image_name("frame.2") == "frame.2"
+
+
+def project_of(folder: Path, scans: str, *files: str) -> Project:
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    written(folder, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
+    return read_project(written(folder, "project.toml", f'camera = "camera.toml"\n{scans}\n'))
+
+
+@pytest.mark.parametrize(
+    ("said", "names"),
+    [
+        ('scans = ["box/**/*.tif"]', ["1952/deep/0001", "1952/0001", "1958/0001", "0000"]),
+        ('scans = ["box/1952/*.tif"]', ["0001"]),  # in one flat folder the stem
+        ('scans = ["box/1952/*.tif", "box/1958/0001.tif"]', ["1952/0001", "1958/0001"]),
+        ('scans = ["box/**/*.tif"]\nexclude = ["box/1952/**/*.tif"]', ["1958/0001", "0000"]),
+        (
+            'scans = ["box/**/*.tif"]\nexclude = ["box/1952/0001.tif", "no/such.tif"]',
+            ["1952/deep/0001", "1958/0001", "0000"],
+        ),
+    ],
+)
+def test_images_are_called_by_their_path_below_the_folder_that_all_share(
+    tmp_path: Path, said: str, names: list[str]
+) -> None:
+    files = ("box/1952/0001.tif", "box/1952/deep/0001.tif", "box/1958/0001.tif", "box/0000.tif", "box/notes.txt")
+    assert set(project_of(tmp_path, said, *files).scans) == set(names)
+
+
+def test_two_files_of_one_name_in_a_folder_are_refused_and_so_is_leaving_all_out(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="have the same name 'a/1'"):
+        project_of(tmp_path, 'scans = ["**/*.*g"]', "a/1.jpg", "a/1.png", "b/1.png")
+    with pytest.raises(InputError, match=r"exclude.*leaves no scan of those that scans names"):
+        project_of(tmp_path, 'scans = ["a/*"]\nexclude = ["a/*"]')
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,58 @@
+"""The scans that a project names: files, and patterns of files at any depth; what their images are called."""
+
+import glob
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pipeline.text.image_names import names_below
+from pipeline.text.tables import Table
+
+
+def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) -> Mapping[str, Path]:
+    """The scan files that the patterns find, by image name, without those that `exclude` names or finds. Raises
+    InputError for a pattern that finds nothing, and for files whose images would have the same name."""
+    folder = table.file.parent
+    found = dict[Path, None]()
+    for pattern in patterns:
+        own = _found(pattern, folder)
+        if not own:
+            raise table.error("scans", _nothing_found(pattern, folder / pattern))
+        found |= dict.fromkeys(own)
+    left_out = {file for pattern in exclude for file in _found(pattern, folder)}
+    files = [file for file in found if file not in left_out]
+    if not files:
+        what = "leaves no scan of those that scans names. Shorten it." if found else ""
+        raise table.error(
+            "exclude" if found else "scans",
+            what or 'is an empty list. Name files or patterns, such as ["scans/**/*.tif"].',
+        )
+    scans: dict[str, Path] = {}
+    for file, name in names_below(files).items():
+        if not name.isprintable():
+            raise table.error("scans", f"the file name {file.name!a} is not text in UTF-8 on one line. Rename it.")
+        if name in scans:
+            raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
+        scans[name] = file
+    return scans
+
+
+def _found(pattern: str, folder: Path) -> list[Path]:
+    """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
+    that lead nowhere: a scan that is named is opened or refused. `**` is any number of folders."""
+    if (folder / pattern).is_file():
+        return [folder / pattern]
+    names = glob.glob(pattern, root_dir=folder, recursive=True)
+    return [path for path in (folder / name for name in sorted(names)) if not path.is_dir()]
+
+
+def _nothing_found(pattern: str, whole: Path) -> str:
+    folder = whole.parent
+    if whole.is_dir():
+        return f"{pattern!r} is a folder. Name the files in it by a pattern, such as {f'{pattern}/**/*.tif'!r}."
+    if glob.has_magic(str(Path(pattern).parent)):
+        return f"{pattern!r} finds no file. Looked for {whole}."
+    if not folder.is_dir():
+        return f"{pattern!r} finds no file: there is no folder {folder.resolve()}."
+    endings = sorted({file.suffix for file in folder.iterdir() if file.is_file() and file.suffix})
+    holds = f"It holds files that end in {', '.join(endings)}." if endings else "It holds no files."
+    return f"{pattern!r} finds no file in {folder.resolve()}. {holds}"
