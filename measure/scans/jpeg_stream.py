@@ -85,9 +85,15 @@ def _what_libjpeg_warns_of(data: bytes, tables: bytes | None) -> str:
 
 def picture_size(data: bytes) -> tuple[int, int] | None:
     """Width and height as the frame header says, px; None without one."""
+    form = picture_form(data)
+    return None if form is None else form[:2]
+
+
+def picture_form(data: bytes) -> tuple[int, int, int, int] | None:
+    """Width, height, channels and bits of a sample as the frame header says; None without one."""
     for marker, body in jpeg_headers(data):
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(body) >= 6:
-            return int.from_bytes(body[3:5], "big"), int.from_bytes(body[1:3], "big")
+            return int.from_bytes(body[3:5], "big"), int.from_bytes(body[1:3], "big"), body[5], body[0]
     return None
 
 

@@ -21,7 +21,7 @@ from measure.scans.segments import LostPart, Segments
 from measure.scans.size_limit import check_size
 from measure.scans.tiff_scan import orientation_notes, tag_pitch
 
-_JPEG_START, _PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _PNG_SIZE = slice(16, 25)  # width, height and the bits of a sample: IHDR is the first chunk (PNG specification, 11.2.2)
 _MOST_CHANNELS = 4
 
@@ -32,17 +32,21 @@ def open_picture(path: Path, start: bytes, max_pixels: int | None = None) -> tup
     Raises MeasurementError for a truncated file, for one that is no picture, and for one that claims more than such a
     file can hold.
     """
-    if start.startswith(_JPEG_START):
+    if start.startswith(JPEG_START):
         data = path.read_bytes()
         samples, damage = _jpeg_samples(path, data, max_pixels)
-        return WholePicture(samples, rounding_step_dn(data), damage), _jpeg_pitch(data), _jpeg_notes(data)
-    if not start.startswith(_PNG_START):
-        raise MeasurementError(
-            f"{path} is no TIFF, JPEG or PNG picture (it begins with {start[:8]!r}): "
-            "give the scan itself, or convert it"
-        )
+        return WholePicture(samples, rounding_step_dn(data), damage), jpeg_pitch(data), _jpeg_notes(data)
+    if not start.startswith(PNG_START):
+        raise no_picture(path, start)
     data = path.read_bytes()
-    return WholePicture(_png_samples(path, data, max_pixels)), _png_pitch(data), ()
+    return WholePicture(_png_samples(path, data, max_pixels)), png_pitch(data), ()
+
+
+def no_picture(path: Path, start: bytes) -> MeasurementError:
+    """Of a file that begins so."""
+    return MeasurementError(
+        f"{path} is no TIFF, JPEG or PNG picture (it begins with {start[:8]!r}): give the scan itself, or convert it"
+    )
 
 
 class WholePicture:
@@ -113,7 +117,7 @@ def _as_channels(picture: NDArray[Any]) -> Samples:
     return Radiometry(channels, float(np.iinfo(stored.dtype).max)).apply(stored)
 
 
-def _jpeg_pitch(data: bytes) -> Pitch:
+def jpeg_pitch(data: bytes) -> Pitch:
     """The JFIF density, or the Exif resolution where that has no unit."""
     pitch = NO_TAGS
     for marker, body in jpeg_headers(data):
@@ -147,9 +151,9 @@ def _exif_pitch(exif: bytes, otherwise: Pitch) -> Pitch:
     return pitch if pitch.um is not None or otherwise is NO_TAGS else otherwise
 
 
-def _png_pitch(data: bytes) -> Pitch:
+def png_pitch(data: bytes) -> Pitch:
     """The pHYs chunk, which stands before the picture's data (PNG specification, 11.3.5.3)."""
-    position = len(_PNG_START)
+    position = len(PNG_START)
     while position + 8 <= len(data):
         length, kind = struct.unpack(">I4s", data[position : position + 8])
         if kind == b"pHYs" and length == 9:

@@ -21,7 +21,7 @@ from measure.scans.radiometry import Samples
 from measure.scans.resolution import Pitch
 from measure.scans.segment_cache import SegmentCache
 from measure.scans.segments import LostPart, Segments
-from measure.scans.tiff_scan import open_tiff
+from measure.scans.tiff_scan import TIFF_STARTS, open_tiff
 from measure.scans.tiff_segments import RawRows
 from measure.scans.tone import LINEAR, Tone
 
@@ -319,15 +319,15 @@ def open_scan(path: Path, max_pixels: int | None = None) -> Scan:
     Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture.
     """
     path = Path(path)
-    start = _first_bytes(path)
-    if start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+    start = first_bytes(path)
+    if start[:4] in TIFF_STARTS:
         segments, pitch, notes = open_tiff(path, max_pixels)
     else:
         segments, pitch, notes = open_picture(path, start, max_pixels)
     return Scan(path, segments, pitch, notes)
 
 
-def _first_bytes(path: Path) -> bytes:
+def first_bytes(path: Path) -> bytes:
     """The file's first 16 bytes, or why there are none. A pipe or a device is not opened: either may never end."""
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):

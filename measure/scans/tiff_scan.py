@@ -19,6 +19,7 @@ from measure.scans.tiff_segments import JPEG_COMPRESSIONS, RawRows, TiffSegments
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
 
+TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the first bytes of TIFF and BigTIFF files
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _UNCOMPRESSED = 1
 _LOOKED_AT_BYTES = 1 << 16  # after the last that a file accounts for

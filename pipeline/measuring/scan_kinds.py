@@ -10,8 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from measure.errors import MeasurementError
-from measure.scans.jpeg_stream import picture_size
-from measure.scans.scan import open_scan
+from measure.scans.head import read_head
 from pipeline.errors import InputError
 from pipeline.measuring.camera_answer import Identification
 
@@ -20,7 +19,6 @@ Json = dict[str, Any]
 _ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".png")
 _ALIKE = 0.03  # of their sides: scans of one roll are cut by hand
 _SAMPLES = 3  # scans of each kind
-_HEADERS_BYTES = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -120,10 +118,11 @@ def _alike(paths: Sequence[Path], unread: dict[Path, str]) -> list[tuple[tuple[i
     kinds: list[tuple[str, tuple[int, int], list[Path]]] = []
     for path in paths:
         try:
-            size, ending = _size_px(path), path.suffix.lower()
+            head, ending = read_head(path), path.suffix.lower()
         except MeasurementError as error:
             unread[path] = str(error)
             continue
+        size = (head.width_px, head.height_px)
         alike = (own for other, known, own in kinds if other == ending and np.allclose(size, known, rtol=_ALIKE))
         own = next(alike, None)
         if own is None:
@@ -133,17 +132,6 @@ def _alike(paths: Sequence[Path], unread: dict[Path, str]) -> list[tuple[tuple[i
     if not kinds:
         raise InputError("\n".join(unread.values()))
     return [(size, tuple(own)) for _, size, own in kinds]
-
-
-def _size_px(path: Path) -> tuple[int, int]:
-    """Width and height. A JPEG picture is not decoded for it."""
-    if path.is_file():
-        with path.open("rb") as file:
-            size = picture_size(file.read(_HEADERS_BYTES))
-        if size is not None:
-            return size
-    with open_scan(path) as scan:
-        return scan.width_px, scan.height_px
 
 
 def _spread(paths: Sequence[Path]) -> list[Path]:

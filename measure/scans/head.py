@@ -1,0 +1,84 @@
+"""What a scan's file says of itself in its head, without any pixel of it."""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+from measure.errors import MeasurementError
+from measure.scans.broken import DECODING_ERRORS, broken
+from measure.scans.jpeg_stream import picture_form
+from measure.scans.picture_scan import JPEG_START, PNG_START, jpeg_pitch, no_picture, png_pitch
+from measure.scans.resolution import Pitch
+from measure.scans.scan import first_bytes, open_scan
+from measure.scans.size_limit import check_size
+from measure.scans.tiff_scan import TIFF_STARTS, open_tiff
+
+_HEADERS_BYTES = 1 << 18  # of a JPEG or PNG file, before its picture: profiles and Exif blocks take less
+_END_BYTES = 1 << 16  # in which nearly every JPEG or PNG file that is whole has its end marker
+_PNG_HEADER = ">IIBB"  # width, height, bits and kind of colour (PNG specification, 11.2.2)
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 1, 6: 3}  # by that kind, without transparency; a palette has colours
+
+
+@dataclass(frozen=True)
+class ScanHead:
+    """file_format: TIFF, JPEG or PNG; bits: of a sample, as they are measured; notes: what is unusual, a sentence
+    each."""
+
+    file_format: str
+    width_px: int
+    height_px: int
+    channels: int
+    bits: int
+    pitch: Pitch
+    notes: tuple[str, ...] = ()
+
+
+def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
+    """Some kilobytes are read of the largest file. max_pixels: as `open_scan` takes it.
+
+    Raises MeasurementError for a file that cannot be opened as a scan, as far as its head and its length tell: that a
+    JPEG or PNG picture is damaged shows only when it is decoded.
+    """
+    start = first_bytes(path)
+    if start[:4] in TIFF_STARTS:
+        segments, pitch, notes = open_tiff(path, max_pixels)
+        segments.close()
+        bits = int(segments.full_scale_dn + 1).bit_length() - 1
+        return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, pitch, notes)
+    if not start.startswith((JPEG_START, PNG_START)):
+        raise no_picture(path, start)
+    data, end = _head_and_end(path)
+    if start.startswith(JPEG_START):
+        form, marker, pitch = picture_form(data), b"\xff\xd9", jpeg_pitch(data)
+        file_format = "JPEG"
+    else:
+        form, marker, pitch = _png_form(data), b"IEND", png_pitch(data)
+        file_format = "PNG"
+    if form is None or 0 in form:
+        raise broken(path, "its header is cut short")
+    if marker not in end:
+        open_scan(path, max_pixels).close()  # which says whether it stands before something else
+    width, height, channels, bits = form
+    check_size(path, "a picture", (width, height), width * height * channels, path.stat().st_size, max_pixels)
+    return ScanHead(file_format, width, height, min(channels, 3), bits, pitch)
+
+
+def _head_and_end(path: Path) -> tuple[bytes, bytes]:
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEADERS_BYTES)
+            file.seek(max(path.stat().st_size - _END_BYTES, 0))
+            return head, file.read()
+    except OSError as error:
+        raise MeasurementError(
+            f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
+        ) from error
+
+
+def _png_form(data: bytes) -> tuple[int, int, int, int] | None:
+    """Width, height, channels and bits; the header is the first chunk."""
+    try:
+        width, height, bits, kind = struct.unpack(_PNG_HEADER, data[16:26])
+        return width, height, _PNG_CHANNELS[kind], bits
+    except DECODING_ERRORS:
+        return None
