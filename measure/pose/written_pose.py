@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 _A_CHARACTER = 1.4  # log-odds of a way to lie, a character that is legible in it beyond those of another way
 # Log-odds that a line stands where the camera writes, and not by chance there among four sides with two directions
-# each: on seven real frames no line of 31 that says a field of a title stood elsewhere; in none of the seven did other
+# each: on seven real frames no line of 29 that says a field of a title stood elsewhere; in none of the seven did other
 # words, which are counted by frames, for a stamp may have several; a number may be written by hand at any side.
 _A_FIELD, _A_WORD, _A_NUMBER = 6.2, 4.8, 3.6
 _FEIGNED = 1 / 3000  # that what is written misleads: of so many readings none that was better by 3 characters was wrong
