@@ -48,7 +48,7 @@ def _found(pattern: str, folder: Path) -> list[Path]:
 def _nothing_found(pattern: str, whole: Path) -> str:
     folder = whole.parent
     if whole.is_dir():
-        return f"{pattern!r} is a folder. Name the files in it by a pattern, such as {f'{pattern}/**/*.tif'!r}."
+        return f"{pattern!r} is a folder. Name the files in it by a pattern, such as {f'{pattern}/*.tif'!r}."
     if glob.has_magic(str(Path(pattern).parent)):
         return f"{pattern!r} finds no file. Looked for {whole}."
     if not folder.is_dir():
