@@ -7,3 +7,11 @@ class MeasurementError(Exception):
     The message says what is wrong, in which file, what would be right and what to do. A mark that cannot be measured is
     no error: it is a measurement with a status and a reason.
     """
+
+
+class MissingError(MeasurementError):
+    """There is no such file."""
+
+
+class TooLargeError(MeasurementError):
+    """The file claims more pixels than are read, unless the user allows them."""

@@ -12,7 +12,7 @@ from pipeline.adjusting.second_visit import measure_again
 from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
-from pipeline.measuring.measure_stage import measure_scans
+from pipeline.measuring.measure_stage import measure_project
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.progress import Reporter
 from pipeline.publishing.made_from import MadeFrom, adjusted_from, measured_from
@@ -30,6 +30,7 @@ from pipeline.results.measurement_file import read_measurement, write_measuremen
 from pipeline.summary import Summary, summarise
 from pipeline.text.atomic import write_atomically
 from pipeline.thumbnails import Thumbnails
+from pipeline.workers import worker_pool
 
 
 def run_all(project: Project, reporter: Reporter) -> Summary:
@@ -111,7 +112,8 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
 def _measured_marks(
     project: Project, made_from: MadeFrom, new: Unpublished, reporter: Reporter
 ) -> tuple[MeasuredScan, ...]:
-    scans = measure_scans(project, reporter, new.place(project.output / "learned"))
+    with worker_pool(len(project.scans)) as workers:
+        scans = measure_project(project, reporter, new.place(project.output / "learned"), workers)
     _write_marks(project, scans, made_from, new)
     return scans
 

@@ -43,7 +43,7 @@ class Thumbnails:
         if mark is None or mark.center_px is None:
             return None
         try:
-            return _cut(self._scan(self._scans[image].scan), mark.center_px, _half_px(mark))
+            return _cut(self._scan(Path(self._scans[image].scan)), mark.center_px, _half_px(mark))
         except MeasurementError:
             return None
 

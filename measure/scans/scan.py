@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.errors import MeasurementError
+from measure.errors import MeasurementError, MissingError
 from measure.scans.earlier_compression import earlier_step_dn
 from measure.scans.parallel import side_by_side
 from measure.scans.picture_scan import open_picture
@@ -335,7 +335,7 @@ def first_bytes(path: Path) -> bytes:
         with path.open("rb") as file:
             start = file.read(16)
     except FileNotFoundError:
-        raise MeasurementError(
+        raise MissingError(
             f"there is no scan {path} (looked for {path.absolute()}): check its name and its folder"
         ) from None
     except OSError as error:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from measure.errors import MeasurementError
+from measure.errors import TooLargeError
 
 MOST_PIXELS = 4_000_000_000  # 63,000 px a side: film of 23 cm at 4 um
 MOST_PER_BYTE = 1000  # bytes of a picture for each of its file: deflate cannot do more, and film's grain allows ten
@@ -12,7 +12,7 @@ ALWAYS_BYTES = 128 << 20  # of a picture: a drawn one without any grain may be s
 def check_size(
     path: Path, what: str, size_px: tuple[int, int], decoded_bytes: int, stored_bytes: int, max_pixels: int | None
 ) -> None:
-    """Raises MeasurementError for a picture, or a part of one, that claims more than the stated bounds.
+    """Raises TooLargeError for a picture, or a part of one, that claims more than the stated bounds.
 
     what: the word for it; size_px: (width, height); decoded_bytes, stored_bytes: what it takes in memory and in the
     file; max_pixels: the bound that a user sets, in place of both: pixels in all, and pixels for what is stored.
@@ -30,7 +30,7 @@ def check_size(
         return
     else:
         bound = f"--max-pixels allows {max_pixels}"
-    raise MeasurementError(
+    raise TooLargeError(
         f"{path} claims {what} of {width} x {height} pixels ({decoded_bytes} bytes), stored in {stored_bytes} bytes: "
         f"{bound}. If it is truly so large, give --max-pixels {pixels}; else the file is damaged: copy it anew"
     )

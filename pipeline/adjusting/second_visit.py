@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def _visit(
     ]
     if not missed:
         return scan
-    with open_scan(scan.scan, max_pixels) as opened:
+    with open_scan(Path(scan.scan), max_pixels) as opened:
         grey = opened if settings.code is None else opened.green()
         marks = without_lost(opened, measure_single_targets(grey, missed, settings))
     found = {mark.point: mark for mark in marks if mark.status.is_observation}

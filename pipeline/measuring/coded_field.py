@@ -10,7 +10,7 @@ from measure.scans.scan import Scan
 from measure.single_targets.disk_patches import Candidate
 from measure.single_targets.targets import TargetOptions, TargetPrediction, measure_disks
 from measure.status import Status
-from pipeline.files.project_file import Project
+from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_model import camera_model
 from pipeline.measuring.coded_points import (
     CodedPoints,
@@ -20,7 +20,7 @@ from pipeline.measuring.coded_points import (
     points_read,
     read_numbers,
 )
-from pipeline.measuring.target_field import Field, target_field
+from pipeline.measuring.target_field import Field
 from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.unoriented import NamedField, name_field
 from pipeline.results.measured_scan import MeasuredScan
@@ -28,16 +28,15 @@ from pipeline.text.wording import listed
 
 
 def measure_coded_field(
-    scan: Scan, points: CodedPoints, project: Project, measured: MeasuredScan
+    scan: Scan, points: CodedPoints, field: Field, camera: CameraFile, measured: MeasuredScan
 ) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """A mark for every point of the field, and what is to be said of the whole."""
-    scan, camera = scan.green(), project.camera_of(measured.frame.image)
+    scan = scan.green()
     found = coded_candidates(scan, points)
     numbers = read_numbers(scan, found, points, _is_mirrored(measured))
     read = points_read(numbers, points)
     coded, notes = named_by_code(read, points)
     model = camera_model(camera, measured)
-    field = target_field(project)
     if isinstance(model, str):
         named: NamedField | str = model
     elif not coded:

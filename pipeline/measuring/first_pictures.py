@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
-from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.frames.frame_fit import fit_frame
 from measure.marks import shapes
 from measure.marks.poses import POSES, up_from_camera
+from measure.scans.parallel import mapped
 from measure.scans.scan import Scan
 from measure.special_marks.learned import cut, template_of
 from measure.special_marks.recurring import Recurrence, Window, about, recurrence
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.learned_table import Clicks, LearnedFrom
-from pipeline.files.project_file import Project
+from pipeline.measuring.scan_task import ScanOptions, ScanTask
 
 Array = NDArray[np.float64]
 Places = Mapping[str, Array]  # (2,) px by fiducial
@@ -39,19 +39,22 @@ _NOT_COMMON = (
 )
 
 
-def first_pictures(project: Project, camera: CameraFile, names: Sequence[str], workers: Executor) -> CameraFile:
+def first_pictures(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:
     """The camera with one scan's pictures in the place of marks that are to be learned, and from which scan they are.
-    names: the scans of this camera. Raises InputError or MeasurementError where nothing shows the marks."""
-    return _clicked(project, camera, camera.clicks) if camera.clicks else _in_common(project, camera, names, workers)
+    tasks: to measure the drawn marks of this camera's scans. Raises InputError or MeasurementError where nothing shows
+    the marks."""
+    return _clicked(camera, camera.clicks, tasks) if camera.clicks else _in_common(camera, tasks, workers)
 
 
-def _clicked(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile:
-    if clicks.scan not in project.scans:
+def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> CameraFile:
+    task = next((task for task in tasks if task.name == clicks.scan), None)
+    if task is None:
+        names = [task.name for task in tasks]
         raise InputError(
-            f"{camera.path}: [clicks] scan names {clicks.scan!r}, which is none of the project's scans. "
-            f"They are {', '.join(list(project.scans)[:5])}{', ...' if len(project.scans) > 5 else ''}."
+            f"{camera.path}: [clicks] scan names {clicks.scan!r}, which is none of this camera's scans. "
+            f"They are {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}."
         )
-    with project.open_scan(clicks.scan) as scan:
+    with task.opened() as scan:
         for id, place in clicks.px.items():
             if not (0 <= place[0] < scan.width_px and 0 <= place[1] < scan.height_px):
                 raise InputError(
@@ -59,43 +62,47 @@ def _clicked(project: Project, camera: CameraFile, clicks: Clicks) -> CameraFile
                     f"which has {scan.width_px} x {scan.height_px} px. Give column and row."
                 )
         px = {id: np.array(place) for id, place in clicks.px.items()}
-        placement = _drawn_placement(project, camera, scan)
+        placement = _drawn_placement(task.options, scan)
         if placement is None:
-            placement = _through_clicks(project, camera, scan, px)
-        return _start(camera, scan, placement, px, alike=(scan.name,))
+            placement = _through_clicks(task.options, scan, px)
+        return _start(camera, task, scan, placement, px, alike=(task.name,))
 
 
-def _in_common(project: Project, camera: CameraFile, names: Sequence[str], workers: Executor) -> CameraFile:
+def _in_common(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor | None) -> CameraFile:
     """The marks that recur in all scans near their coordinates."""
-    if len(names) < 2:
+    if len(tasks) < 2:
         raise InputError(
             f"{camera.path}: the marks are to be learned, and with one scan nothing says what is a mark. Show them: "
             'a table [clicks] with scan = "..." and a table [clicks.px] of column and row by fiducial.'
         )
-    compared = [names[round(k)] for k in np.linspace(0, len(names) - 1, min(len(names), _COMPARED))]
-    views = list(workers.map(_view, *zip(*[(project, camera, name) for name in compared], strict=True)))
-    seen = [(name, view) for name, view in zip(compared, views, strict=True) if view is not None]
+    compared = [tasks[round(k)] for k in np.linspace(0, len(tasks) - 1, min(len(tasks), _COMPARED))]
+    views = list(mapped(workers, _view, compared))
+    seen = [(task, view) for task, view in zip(compared, views, strict=True) if view is not None]
     if len(seen) < 2:
         raise MeasurementError(f"{camera.path}: {_NOT_COMMON} the drawn marks were found in {len(seen)} of its scans.")
     jobs = [
         (seen[0][1].windows[one.id], [view.windows[one.id] for _, view in seen[1:]], one.learned_mm)
         for one in camera.learned
     ]
-    found: list[Recurrence] = list(workers.map(recurrence, *zip(*jobs, strict=True)))
+    found = list(mapped(workers, _recurrence, jobs))
     lost = [one.id for one, each in zip(camera.learned, found, strict=True) if each.excess < _LEAST_EXCESS]
     if lost:
         raise MeasurementError(
             f"{camera.path}: {_NOT_COMMON} nothing near the coordinates of fiducial {', '.join(lost)} recurs in all of "
             f"{len(seen)} scans in one place."
         )
-    name, view = seen[0]
+    task, view = seen[0]
     matrix = view.placement
     px = {
         one.id: matrix[:, :2] @ (np.array(one.xy_mm) + each.offset_mm) + matrix[:, 2]
         for one, each in zip(camera.learned, found, strict=True)
     }
-    with project.open_scan(name) as scan:
-        return _start(camera, scan, matrix, px, alike=tuple(names))
+    with task.opened() as scan:
+        return _start(camera, task, scan, matrix, px, alike=tuple(task.name for task in tasks))
+
+
+def _recurrence(job: tuple[Window, list[Window], float]) -> Recurrence:
+    return recurrence(*job)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,54 +113,59 @@ class _View:
     windows: Mapping[str, Window]
 
 
-def _view(project: Project, camera: CameraFile, name: str) -> _View | None:
-    with project.open_scan(name) as scan:
-        placement = _drawn_placement(project, camera, scan)
-        if placement is None and len(camera.drawn) >= 2:
-            return None
-        if placement is None:
-            placement = _in_the_middle(project, camera, scan)
-        windows = {
-            one.id: about(scan, placement, np.array(one.xy_mm), one.learned_mm, _REACH * one.learned_mm)
-            for one in camera.learned
-        }
+def _view(task: ScanTask) -> _View | None:
+    """None where the drawn marks were not found, or the scan cannot be read."""
+    camera = task.options.camera
+    try:
+        with task.opened() as scan:
+            placement = _drawn_placement(task.options, scan)
+            if placement is None and len(camera.drawn) >= 2:
+                return None
+            if placement is None:
+                placement = _in_the_middle(task.options, scan)
+            windows = {
+                one.id: about(scan, placement, np.array(one.xy_mm), one.learned_mm, _REACH * one.learned_mm)
+                for one in camera.learned
+            }
+    except MeasurementError:
+        return None
     return _View(placement, windows)
 
 
-def _drawn_placement(project: Project, camera: CameraFile, scan: Scan) -> Array | None:
+def _drawn_placement(options: ScanOptions, scan: Scan) -> Array | None:
     """The frame as the drawn marks give it."""
-    if len(camera.drawn) < 2:
+    if len(options.camera.drawn) < 2:
         return None
-    pitch = project.pitch_um or scan.pitch_um
-    options = FiducialOptions(project.pose, film_sigma_mm=project.film_sigma_mm)
-    return measure_fiducials(scan, camera.layout(), pitch, options).pixel_from_camera
+    pitch = options.pitch_um or scan.pitch_um
+    return measure_fiducials(scan, options.camera.layout(), pitch, options.fiducials).pixel_from_camera
 
 
-def _in_the_middle(project: Project, camera: CameraFile, scan: Scan) -> Array:
+def _in_the_middle(options: ScanOptions, scan: Scan) -> Array:
     """The frame in the middle of its scan, in the pose that the project gives."""
-    pose = "0" if project.pose == "auto" else project.pose
-    pitch = np.array(_pitch_mm(project, camera, scan))
+    pose = "0" if options.fiducials.pose == "auto" else options.fiducials.pose
+    pitch = np.array(_pitch_mm(options, scan))
     linear = np.diag([1.0, -1.0]) @ up_from_camera(pose) / pitch[:, None]
     return np.column_stack([linear, [(scan.width_px - 1) / 2, (scan.height_px - 1) / 2]])
 
 
-def _pitch_mm(project: Project, camera: CameraFile, scan: Scan) -> tuple[float, float]:
+def _pitch_mm(options: ScanOptions, scan: Scan) -> tuple[float, float]:
     """As the project or the file has it, or as if the frame filled the scan."""
-    pitch_um = project.pitch_um or scan.pitch_um
+    pitch_um = options.pitch_um or scan.pitch_um
     if pitch_um is not None:
         return (pitch_um[0] / 1000, pitch_um[1] / 1000)
-    frame_mm = camera.layout().frame_mm
+    frame_mm = options.camera.layout().frame_mm
     return (max(frame_mm) / max(scan.width_px, scan.height_px),) * 2
 
 
-def _through_clicks(project: Project, camera: CameraFile, scan: Scan, px: Places) -> Array:
+def _through_clicks(options: ScanOptions, scan: Scan, px: Places) -> Array:
     """The frame as the clicks give it: mirrored where that fits better."""
+    camera = options.camera
     if len(px) == 1:
-        matrix = _in_the_middle(project, camera, scan)
+        matrix = _in_the_middle(options, scan)
         xy = next(np.array(one.xy_mm) for one in camera.learned)
         matrix[:, 2] = next(iter(px.values())) - matrix[:, :2] @ xy
         return matrix
-    pitch = np.array(_pitch_mm(project, camera, scan))
+    pitch = np.array(_pitch_mm(options, scan))
     xy = np.array([one.xy_mm for one in camera.learned])
     up = np.array([px[one.id] for one in camera.learned]) * pitch * (1.0, -1.0)
     fits = [fit_frame(xy, up, np.full(len(xy), _CLICK_MM), up_from_camera(pose)) for pose in ("0", "0m")]
@@ -161,7 +173,9 @@ def _through_clicks(project: Project, camera: CameraFile, scan: Scan, px: Places
     return np.asarray(np.diag([1.0, -1.0]) @ best.up_from_camera / pitch[:, None])
 
 
-def _start(camera: CameraFile, scan: Scan, placement: Array, px: Places, alike: tuple[str, ...]) -> CameraFile:
+def _start(
+    camera: CameraFile, task: ScanTask, scan: Scan, placement: Array, px: Places, alike: tuple[str, ...]
+) -> CameraFile:
     """One scan's pictures of the marks, which lie in the layout where this scan has them. alike: the scans that are
     known, or taken, to lie like it."""
     inverse = np.linalg.inv(placement[:, :2])
@@ -174,7 +188,7 @@ def _start(camera: CameraFile, scan: Scan, placement: Array, px: Places, alike: 
         fiducials.append(one)
     given = _up_from_camera(placement)
     pose = min(POSES, key=lambda name: float(np.abs(up_from_camera(name) - given).sum()))
-    learned_from = LearnedFrom(scan.name, digest(scan.path), pose, camera.clicks is not None, alike)
+    learned_from = LearnedFrom(task.name, digest(scan.path), pose, camera.clicks is not None, alike)
     return replace(camera, fiducials=tuple(fiducials), learned_from=learned_from)
 
 

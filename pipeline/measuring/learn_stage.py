@@ -6,16 +6,16 @@ One scan's pictures, its first ones, find the marks in every other, and the mean
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
 
 import numpy as np
 
-from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
 from measure.marks.shapes import MarkTemplate
 from measure.results import FrameMeasurement
+from measure.scans.parallel import mapped
 from measure.special_marks.learned import Chip, cut, template_of
 from measure.special_marks.symmetry import with_common_origins
 from pipeline.files.camera_file import CameraFile, GivenFiducial, read_camera
@@ -23,19 +23,22 @@ from pipeline.files.camera_text import camera_text
 from pipeline.files.project_file import Project
 from pipeline.files.template_table import saved_in
 from pipeline.measuring.first_pictures import digest, first_pictures
+from pipeline.measuring.scan_task import Measure, ScanTask, scan_tasks
 from pipeline.progress import Reporter
 from pipeline.text.atomic import write_atomically
 
 _BY = f"# Marks learned by reseau {version('reseau')}"
 
 
-def learn_marks(project: Project, reporter: Reporter, workers: Executor, folder: Path) -> Project:
+def learn_marks(
+    project: Project, reporter: Reporter, measure: Measure, workers: Executor | None, folder: Path
+) -> Project:
     """The project with templates in the place of marks that are to be learned; the folder then holds the templates
     and a camera file that names them, as they are to stand in out/learned. Raises InputError or MeasurementError where
-    they cannot be learned."""
+    they cannot be learned. A scan that cannot be measured adds nothing to them."""
     files = _file_names([camera.path for camera in project.cameras.values()], _learned_folder(project))
     cameras = {
-        name: _learned(project, camera, folder / f"{files[camera.path]}.toml", reporter, workers)
+        name: _learned(project, camera, folder / f"{files[camera.path]}.toml", reporter, measure, workers)
         if camera.learned
         else _known(project, camera)
         for name, camera in project.cameras.items()
@@ -69,85 +72,86 @@ def _known(project: Project, camera: CameraFile) -> CameraFile:
     return replace(camera, learned_from=None)
 
 
-def _learned(project: Project, camera: CameraFile, place: Path, reporter: Reporter, workers: Executor) -> CameraFile:
+def _learned(
+    project: Project, camera: CameraFile, place: Path, reporter: Reporter, measure: Measure, workers: Executor | None
+) -> CameraFile:
     names = [name for name in project.scans if project.camera_of(name).path == camera.path]
     if not names:
         return camera
     with reporter.stage("learning marks of") as tell:
         tell(f"{camera.name}: their first pictures", 0, 3)
-        start = first_pictures(project, camera, names, workers)
+        start = first_pictures(camera, _tasks(project, camera, names), workers)
         tell(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
-        chips, rivals = _chips(project, camera.learned, names, start, workers)
+        chips, rivals = _chips(camera.learned, start, _tasks(project, start, names), measure, workers)
         if rivals:
             start = _with_common_origins(start, rivals)
-            chips, _ = _chips(project, camera.learned, names, start, workers)
+            chips, _ = _chips(camera.learned, start, _tasks(project, start, names), measure, workers)
         tell(f"{camera.name}: averaged", 2, 3)
         mean = _averaged(start, camera.learned, chips, workers)
     return _stored(mean, place, _learned_folder(project))
 
 
+def _tasks(project: Project, camera: CameraFile, names: Sequence[str]) -> list[ScanTask]:
+    """To measure the fiducials in grey values as they are: chips are pictures in these. camera: as far as it is
+    learned."""
+    own = {name: camera if one.path == camera.path else one for name, one in project.cameras.items()}
+    return [task.fiducials_alone("linear") for task in scan_tasks(replace(project, cameras=own), names)]
+
+
 def _chips(
-    project: Project, learned: Sequence[GivenFiducial], names: Sequence[str], start: CameraFile, workers: Executor
+    learned: Sequence[GivenFiducial],
+    start: CameraFile,
+    tasks: Sequence[ScanTask],
+    measure: Measure,
+    workers: Executor | None,
 ) -> tuple[Mapping[str, list[Chip]], set[str]]:
     """The pictures of every learned mark, by fiducial, and the poses that some frame's marks do not tell apart."""
-    chips, rivals = dict[str, list[Chip]](), set[str]()
-    jobs = [(project, start, learned, name) for name in names]
-    for of_scan, of_frame in workers.map(_chips_of, *zip(*jobs, strict=True)):
-        rivals |= set(of_frame)
+    frames = {scan.frame.image: scan.frame for scan in measure(tasks)}
+    named = [(task, frames[task.name]) for task in tasks if _is_named(frames[task.name], start)]
+    chips = dict[str, list[Chip]]()
+    for of_scan in mapped(workers, partial(_chips_of, learned), named):
         for id, chip in of_scan.items():
             chips.setdefault(id, []).append(chip)
-    return chips, rivals
+    return chips, {rival for frame in frames.values() if frame.pose for rival in frame.pose.rivals}
 
 
-def _chips_of(
-    project: Project, camera: CameraFile, learned: Sequence[GivenFiducial], name: str
-) -> tuple[Mapping[str, Chip], tuple[str, ...]]:
-    """The pictures of learned marks in one scan, as far as they are found, and the poses that they leave possible."""
-    with project.open_scan(name) as scan:
-        pitch = project.pitch_um or scan.pitch_um
-        options = FiducialOptions(pose_of(project, camera, scan.name), film_sigma_mm=project.film_sigma_mm)
-        frame = measure_fiducials(scan, camera.layout(), pitch, options)
-        matrix = frame.pixel_from_camera
-        found = {mark.point: mark.center_px for mark in frame.marks if mark.status.is_observation}
-        rivals = frame.pose.rivals if frame.pose else ()
-        if matrix is None or not _is_named(frame, camera):
-            return {}, rivals
-        chips = {
+def _chips_of(learned: Sequence[GivenFiducial], named: tuple[ScanTask, FrameMeasurement]) -> Mapping[str, Chip]:
+    """The pictures of learned marks in one scan, as far as they were found."""
+    task, frame = named
+    matrix = frame.pixel_from_camera
+    assert matrix is not None
+    found = {mark.point: mark.center_px for mark in frame.marks if mark.status.is_observation}
+    with task.opened() as scan:
+        return {
             one.id: cut(scan, np.column_stack([matrix[:, :2], center]), one.learned_mm, frame.weights)
             for one in learned
             if (center := found.get(one.id)) is not None
         }
-        return chips, rivals
 
 
 def _is_named(frame: FrameMeasurement, start: CameraFile) -> bool:
     """Whether the marks found are those of their names for sure, or but for names that their symmetry leaves equal, or
     at least if the scan lies as the one clicked in."""
     pose, learned = frame.pose, start.learned_from
-    if pose is None or learned is None:
+    if pose is None or learned is None or frame.pixel_from_camera is None:
         return False
     alike = next((one.mark.alike for one in start.fiducials if isinstance(one.mark, MarkTemplate)), ())
     return pose.is_decided_but_for(alike) or pose.name == learned.pose
 
 
-def pose_of(project: Project, camera: CameraFile, scan: str) -> str:
-    """As the project sets it; a scan whose marks were clicked lies as these say, and what recurs in all scans, nobody
-    having clicked, was looked for in one pose."""
-    learned = camera.learned_from
-    if learned is None or project.pose != "auto":
-        return project.pose
-    return learned.pose if scan in learned.alike else "auto"
-
-
 def _averaged(
-    start: CameraFile, learned: Sequence[GivenFiducial], chips: Mapping[str, list[Chip]], workers: Executor
+    start: CameraFile, learned: Sequence[GivenFiducial], chips: Mapping[str, list[Chip]], workers: Executor | None
 ) -> CameraFile:
     found = [one for one in learned if one.id in chips]
-    templates = workers.map(template_of, [chips[one.id] for one in found], [one.learned_mm for one in found])
+    templates = mapped(workers, _template, [(chips[one.id], one.learned_mm) for one in found])
     mean = {one.id: template for one, template in zip(found, templates, strict=True)}
     camera = replace(start, fiducials=tuple(replace(one, mark=mean.get(one.id, one.mark)) for one in start.fiducials))
     alike = {pose for one in start.fiducials if isinstance(one.mark, MarkTemplate) for pose in one.mark.alike}
     return _with_common_origins(camera, alike)
+
+
+def _template(job: tuple[list[Chip], float]) -> MarkTemplate:
+    return template_of(*job)
 
 
 def _with_common_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:

@@ -7,7 +7,7 @@ is written on each adds to what tells how the camera has it. What is not told ev
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from hashlib import sha256
 
 import numpy as np
@@ -19,6 +19,7 @@ from measure.pose.written_pose import bounded, line_score
 from measure.results import FrameMeasurement, Pose
 from measure.status import Status
 from measure.writing.line import KnownLine, Line, without_numbers
+from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
 
 _ONE_QUESTION = (
@@ -29,6 +30,36 @@ _READ_FIRST = 4  # frames of a camera
 _WAYS = 2  # in which frames of a roll lie, as far as they are looked for: more take as long as reading all
 _LEAST = 6  # letters and digits of a line by which frames are known
 _TURNS = ("0", "90", "180", "270")  # in which writing may lie in the camera's frame
+
+
+@dataclass(frozen=True, eq=False)
+class Roll:
+    """What the frames of a camera say of one another's poses. poses: by image, those that change when all are looked at
+    together; tasks: the scans whose marks then have other names, to be measured again in their new pose."""
+
+    poses: Mapping[str, Pose]
+    tasks: tuple[ScanTask, ...]
+
+    def named(self, scans: Sequence[MeasuredScan], again: Mapping[str, MeasuredScan]) -> list[MeasuredScan]:
+        """The scans in these poses, as they were measured or, by image, measured again."""
+        return [self._named(scan, again.get(scan.frame.image, scan)) for scan in scans]
+
+    def _named(self, scan: MeasuredScan, new: MeasuredScan) -> MeasuredScan:
+        if new.failure:  # its file was there before
+            return scan
+        frame = scan.frame
+        pose = self.poses.get(frame.image, frame.pose)
+        return replace(new, frame=replace(new.frame, pose=pose, writing=frame.writing))
+
+
+def roll_of(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Roll:
+    """The roll of one camera's scans, which were measured by these tasks. places: where the camera writes."""
+    both = list(zip(tasks, scans, strict=True))
+    free = [scan for task, scan in both if task.options.fiducials.pose == "auto" and not scan.failure]
+    poses = poses_of_roll(free, places)
+    names = {scan.frame.image: scan.frame.pose.name for scan in free if scan.frame.pose}
+    again = [task.posed(poses[task.name].name) for task in tasks if task.name in poses]
+    return Roll(poses, tuple(task for task in again if task.options.fiducials.pose != names.get(task.name)))
 
 
 def read_first(images: Iterable[str]) -> frozenset[str]:

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
@@ -15,20 +14,18 @@ from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.single_targets.targets import TargetPrediction
 from measure.status import Status
-from pipeline.errors import InputError
-from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.camera_model import camera_model
 from pipeline.measuring.coded_field import measure_coded_field
-from pipeline.measuring.coded_points import CodedPoints
 from pipeline.measuring.coded_sheet import measure_sheet
 from pipeline.measuring.identification import PatternOptions, assign, log10_of_chance, recognise
+from pipeline.measuring.scan_task import ScanOptions
+from pipeline.measuring.sought_targets import LEAST_PAIRS, SoughtTargets
 from pipeline.measuring.target_field import (
     LEAST_DIAMETER_PX,
     Field,
     measure_single_targets,
     target_candidates,
-    target_field,
 )
 from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.unoriented import NamedField, likely_diameters_px, name_field
@@ -41,57 +38,22 @@ _SEED = 1  # of the resection's random triples: a result must not depend on the 
 _GATE_SHARE = 0.01  # of the scan's size: what tilt and relief leave between the pattern laid on and its marks
 _SLACK_PX = 3.0  # beyond what the resection's residuals say, within which a mark is the target predicted there
 _SLACK_SIGMAS = 6.0
-_LEAST_PAIRS = 4
 _MOST_LOG10_CHANCE = -1.0  # of agreements as good by chance: the project says that the pattern is in the scan
 _STRONGEST = 3  # patches a target, by contrast: dust and texture are weaker than what was painted to be seen
 _NEAR = 0.65  # of the scan's size from its middle: targets there may be in it
 _SIZE_SLACK = 1.5  # how wrong the approximate distance may make a target's size
 
 
-def check_targets(project: Project) -> None:
-    """Raises InputError for single targets and rings that nothing in the project could name."""
-    settings = project.targets
-    if settings is None or settings.board is not None:
-        return
-    if settings.code is not None:
-        CodedPoints.of(project, settings)
-        return
-    if project.given_points is None:
-        raise InputError(
-            f"{project.path}: [targets] kind {settings.kind!r} is named by the targets' coordinates, and there is no "
-            '[object] points = "...". Give the file of the points, or leave [targets] out to measure fiducials only.'
-        )
-    known = len(target_field(project).ids)
-    if known < _LEAST_PAIRS:
-        raise InputError(
-            f"{project.path}: [object] points: {known} points with X, Y and Z name no targets; give {_LEAST_PAIRS}, if "
-            "only roughly."
-        )
-    _check_size(project, target_field(project))
-
-
-def _check_size(project: Project, field: Field) -> None:
-    """Raises InputError for targets that would cover one another: coordinates in another unit than the project says."""
-    nearest = cKDTree(field.xyz).query(field.xyz, k=[2])[0]
-    spacing, diameter = float(np.quantile(nearest, 0.9)), 2.0 * field.radius
-    if diameter > spacing:
-        raise InputError(
-            f"{project.path}: [targets] of {diameter * project.unit_mm:g} mm would cover one another: nine of ten "
-            f"points of [object] lie within {spacing * project.unit_mm:.3g} mm of the next one if their coordinates "
-            f'are in {project.unit}. Give the unit that they are in, as [object] unit = "m".'
-        )
-
-
-def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
+def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
     """The scan with its targets beside its fiducials: a mark for each target that could be in it."""
-    settings = project.targets
-    if settings is None:
+    sought = options.targets
+    if sought is None:
         return measured
-    if settings.code is not None:
-        coded = CodedPoints.of(project, settings)
-        if coded.is_flat:
-            return with_targets(measured, *measure_sheet(scan, coded))
-        return with_targets(measured, *measure_coded_field(scan, coded, project, measured))
+    settings, field = sought.settings, sought.field
+    if sought.coded is not None:
+        if sought.coded.is_flat:
+            return with_targets(measured, *measure_sheet(scan, sought.coded))
+        return with_targets(measured, *measure_coded_field(scan, sought.coded, field, options.camera, measured))
     if settings.board is not None:
         board = measure_board(scan, settings.board)
         refused = (
@@ -101,10 +63,9 @@ def measure_targets(project: Project, scan: Scan, measured: MeasuredScan) -> Mea
         if board.ambiguous:
             problems = (f"No point of the board is used: {board.ambiguous}. Cover all but one, or cut the scan.",)
         # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
-        notes = tuple(f"{note}." for note in board.notes) if project.given_points else ()
+        notes = tuple(f"{note}." for note in board.notes) if sought.surveyed else ()
         return with_targets(measured, board.marks, (*problems, *notes))
-    field = target_field(project)
-    found, notes = _oriented_by_targets(project, settings, field, scan, measured)
+    found, notes = _oriented_by_targets(options, sought, scan, measured)
     if isinstance(found, str):
         marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, found) for id in field.ids)
         return with_targets(measured, marks, (*notes, f"No target has a name: {found}."))
@@ -125,16 +86,15 @@ def with_targets(
 
 
 def _oriented_by_targets(
-    project: Project, settings: TargetSettings, field: Field, scan: Scan, measured: MeasuredScan
+    options: ScanOptions, sought: SoughtTargets, scan: Scan, measured: MeasuredScan
 ) -> tuple[tuple[ImageModel, Sequence[TargetPrediction]] | str, tuple[str, ...]]:
     """The image and where each target should be, by the approximate orientation or, without one that fits, by the
     pattern alone; or why not. And what is to be said of the image."""
-    image = measured.frame.image
-    camera = project.camera_of(image)
+    camera, settings, field = options.camera, sought.settings, sought.field
     model = camera_model(camera, measured)
     if isinstance(model, str):
         return model, ()
-    exterior = project.given_images.exterior.get(image) if project.given_images else None
+    exterior = options.exterior
     notes: tuple[str, ...] = ()
     if exterior is not None and camera.principal_distance_mm is not None:
         approximate = replace(model, rotation=rotation_from_angles(exterior.values[3:]), station=exterior.center)
@@ -144,18 +104,19 @@ def _oriented_by_targets(
         notes = (f"Its orientation in images.csv was not used to name the targets: {oriented}.",)
     diameters = likely_diameters_px(field, measured)
     if diameters[1] < LEAST_DIAMETER_PX:
-        return _too_small(project, field, diameters[1]), notes
+        return _too_small(sought, diameters[1]), notes
     found = target_candidates(scan, settings, diameters)
     named = name_field(field, model, camera, measured, found)
     return (named if isinstance(named, str) else (named.model, named.predictions(field, measured))), notes
 
 
-def _too_small(project: Project, field: Field, largest_px: float) -> str:
+def _too_small(sought: SoughtTargets, largest_px: float) -> str:
+    field = sought.field
     extent = float(np.linalg.norm(np.ptp(field.xyz, axis=0)))
     return (
-        f"targets of {2.0 * field.radius * project.unit_mm:g} mm in a field of {extent:g} {project.unit} would have "
+        f"targets of {2.0 * field.radius * sought.unit_mm:g} mm in a field of {extent:g} {sought.unit} would have "
         f"{largest_px:.2g} px at most, and {LEAST_DIAMETER_PX} are needed; is [object] unit the one of the "
-        f'coordinates? "{project.unit}" is taken, "m" being the default'
+        f'coordinates? "{sought.unit}" is taken, "m" being the default'
     )
 
 
@@ -210,7 +171,7 @@ def _resected(
     model: ImageModel, field: Field, named: Sequence[tuple[str, Array]], measured: MeasuredScan
 ) -> tuple[ImageModel, float] | None:
     """The image oriented by named marks, and how far off they may lie from it, px."""
-    if len(named) < _LEAST_PAIRS:
+    if len(named) < LEAST_PAIRS:
         return None
     row = {id: i for i, id in enumerate(field.ids)}
     xyz = field.xyz[[row[id] for id, _ in named]]
@@ -218,7 +179,7 @@ def _resected(
     ideal, _ = model.ideal_from_observed(model.camera_from_comparator(comparator))
     c = float(model.interior[0])
     resection = resect(xyz, ideal - model.interior[1:], c, np.random.default_rng(_SEED))
-    if resection is None or resection.inliers.sum() < _LEAST_PAIRS:
+    if resection is None or resection.inliers.sum() < LEAST_PAIRS:
         return None
     sigma_px = 1000.0 * resection.sigma_mm / min(measured.pitch_um)
     pose = resection.pose

@@ -2,79 +2,69 @@
 all are measured."""
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass, field
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from measure.errors import MeasurementError
-from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, Polygon
 from measure.scans.declared_tone import declared_tone
 from measure.scans.tone import SaidOfTone, Tone, power, srgb
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.learn_stage import pose_of
+from pipeline.measuring.scan_task import Measure, scan_tasks
 from pipeline.progress import Reporter
 
 _SAMPLES = 4  # scans of a scanner that tell its curve to the others
 _SET = "it is set in the project"
 
 
-@dataclass(frozen=True, eq=False)
-class ScannerTones:
-    """What a few scans said of their scanner's curve: by scanner and kind of file, then by image."""
-
-    said: Mapping[str, Mapping[str, SaidOfTone]] = field(default_factory=dict)
-
-    def tone_of(self, project: Project, image: str) -> Tone:
-        """What is believed of the curve of a scan before it is measured: what it says itself is not in it yet."""
-        path = project.scans[image]
-        prior = _prior(project, path)
-        if prior.is_known:
-            return prior
-        others = [said for name, said in self.said.get(_kind(project, image, prior), {}).items() if name != image]
-        return prior.told(others)[0] if others else prior
+def tone_before(setting: float | str, said: Sequence[SaidOfTone], scan: Path) -> Tone:
+    """What is believed of the curve of a scan before it is measured, as the project, the file and other scans say: what
+    it says itself is not in it yet. setting: as the project has it; said: by the others."""
+    prior = _prior(setting, scan)
+    return prior.told(said)[0] if said else prior
 
 
-def scanner_tones(project: Project, reporter: Reporter, workers: Executor) -> ScannerTones:
-    """From some scans of each scanner, where marks of the camera lean on the curve. A scan that cannot be measured says
-    nothing."""
+def said_of_tones(project: Project, reporter: Reporter, measure: Measure) -> Mapping[str, tuple[SaidOfTone, ...]]:
+    """By image what others of its scanner say of the curve: some scans of each, where marks of the camera lean on it. A
+    scan that cannot be measured says nothing."""
     names = [name for name in project.scans if _leans_on_tone(project.camera_of(name))]
     if project.tone != "auto" or len(names) < 2:
-        return ScannerTones()
+        return {}
     kinds: dict[str, list[str]] = {}
     for name in names:
-        kinds.setdefault(_kind(project, name, _prior(project, project.scans[name])), []).append(name)
+        kinds.setdefault(_kind(project, name), []).append(name)
     samples = {kind: _spread(of_kind) for kind, of_kind in kinds.items() if len(of_kind) > 1}
-    count = sum(map(len, samples.values()))
-    said: dict[str, dict[str, SaidOfTone]] = {}
+    tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
+    said = dict[str, SaidOfTone]()
     with reporter.stage("tone curve looked for in") as tell:
-        done = 0
-        for kind, of_kind in samples.items():
-            for name, told in zip(of_kind, workers.map(_said, [project] * len(of_kind), of_kind), strict=True):
-                done += 1
-                tell(name, done, count)
-                if told is not None:
-                    said.setdefault(kind, {})[name] = told
-    return ScannerTones(said)
+        for done, scan in enumerate(measure(tasks), 1):
+            tell(scan.frame.image, done, len(tasks))
+            if scan.frame.tone is not None and scan.frame.tone.said is not None:
+                said[scan.frame.image] = scan.frame.tone.said
+    told = dict[str, tuple[SaidOfTone, ...]]()
+    for kind, of_kind in samples.items():
+        by_others = {name: tuple(said[one] for one in of_kind if one in said and one != name) for name in of_kind}
+        by_all = tuple(said[one] for one in of_kind if one in said)
+        told |= {name: by_others.get(name, by_all) for name in kinds[kind]}
+    return told
 
 
-def _prior(project: Project, scan: Path) -> Tone:
-    if project.tone == "auto":
+def _prior(setting: float | str, scan: Path) -> Tone:
+    if setting == "auto":
         return declared_tone(scan) or Tone.unknown()
-    if project.tone == "srgb":
+    if setting == "srgb":
         return Tone(srgb(), source=_SET)
-    return Tone(power(1.0 if isinstance(project.tone, str) else project.tone), source=_SET)
+    return Tone(power(1.0 if isinstance(setting, str) else setting), source=_SET)
 
 
-def _kind(project: Project, image: str, prior: Tone) -> str:
+def _kind(project: Project, image: str) -> str:
     """One scanner codes light in one way, but for files of another kind or that say another curve."""
-    told = sha256(np.ascontiguousarray(prior.base).tobytes()).hexdigest()[:8]
-    return f"{project.scanner_of(image)} {project.scans[image].suffix.lower()} {told}"
+    scan = project.scans[image]
+    told = sha256(np.ascontiguousarray(_prior(project.tone, scan).base).tobytes()).hexdigest()[:8]
+    return f"{project.scanner_of(image)} {scan.suffix.lower()} {told}"
 
 
 def _leans_on_tone(camera: CameraFile) -> bool:
@@ -92,16 +82,3 @@ def _spread(names: Sequence[str]) -> list[str]:
     """Some of them, from the first to the last."""
     places = np.unique(np.linspace(0, len(names) - 1, min(_SAMPLES, len(names))).round().astype(int))
     return [names[place] for place in places]
-
-
-def _said(project: Project, name: str) -> SaidOfTone | None:
-    """What one scan's marks say of its curve."""
-    camera = project.camera_of(name)
-    try:
-        with project.open_scan(name) as scan:
-            seen = scan.seen_through(_prior(project, project.scans[name]))
-            options = FiducialOptions(pose_of(project, camera, scan.name), film_sigma_mm=project.film_sigma_mm)
-            frame = measure_fiducials(seen, camera.layout(), project.pitch_um or scan.pitch_um, options)
-    except MeasurementError:
-        return None
-    return None if frame.tone is None else frame.tone.said

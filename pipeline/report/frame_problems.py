@@ -67,7 +67,7 @@ def _problems_of(frame: Frame) -> Iterator[Problem]:
             + (" The frame is used; its film transformation is less certain." if found else ""),
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
-    if targets and not any(mark.status.is_observation for mark in targets):
+    if targets and not frame.scan.get("failure") and not any(mark.status.is_observation for mark in targets):
         yield Problem(
             f"none of its {len(targets)} targets was measured.",
             "Look at their reasons in comparator.csv: a wrong pose, diameter or orientation misses them all.",

@@ -11,7 +11,7 @@ from measure.covariance import Covariance
 from measure.status import Status
 from pipeline.report.data import Json, ReportData
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.measurement_file import read_covariance
+from pipeline.results.measured_record import read_covariance
 
 Array = NDArray[np.float64]
 

@@ -113,7 +113,7 @@ def _tasks(
             ResampleTask(
                 image=image,
                 camera=project.camera_of(image).name,
-                scan=measured.scan,
+                scan=Path(measured.scan),
                 chain=chain,
                 pose=measured.frame.pose.name if measured.frame.pose else "0",
                 pitch_mm=pitch_mm,

@@ -48,16 +48,18 @@ class ComparatorPoint:
 def write_comparator(
     path: Path, frames: Sequence[FrameMeasurement], pitch_um: Mapping[str, tuple[float, float]], measurement: str = ""
 ) -> None:
-    """Write every mark of every frame; pitch_um by image. Raises InputError where the file cannot be written.
+    """Write every mark of every frame. Raises InputError where the file cannot be written.
 
-    measurement: the fingerprint of the measurement.json that holds the same marks.
+    pitch_um: by image, NaN of a scan that could not be measured. measurement: the fingerprint of the
+    measurement.json that holds the same marks.
     """
+    known_pitches = [(image, pitch) for image, pitch in sorted(pitch_um.items()) if math.isfinite(pitch[0])]
     lines = [
         f"# comparator coordinates, reseau {version('reseau')}",
         *([f"# measurement {measurement}"] if measurement else []),
         "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
         "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)",
-        *(f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down" for image, (x, y) in sorted(pitch_um.items())),
+        *(f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down" for image, (x, y) in known_pitches),
         "# status: only measured and weak are observations",
         ",".join(COLUMNS),
     ]

@@ -1,7 +1,9 @@
 """Fingerprints: of values, whatever file they came from, of whole files, and of scans, which are too large for that."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence, Set
+import json
+import math
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -14,15 +16,17 @@ _PIECES, _PIECE = 8, 32768  # of a scan, spread evenly from its first byte to it
 
 
 def fingerprint(value: object) -> str:
-    """SHA-256 of a value made of dataclasses, mappings, sequences, arrays, numbers and text.
+    """SHA-256 of a value made of dataclasses, mappings, sequences, arrays, numbers and text."""
+    return of_content(canonical_json(value).encode("utf-8", "surrogateescape"))
+
+
+def canonical_json(value: object) -> str:
+    """Such a value as JSON: equal values give equal text, and any other value gives another.
 
     The order of a mapping does not count, nor where a file stands: a project may be moved, and its files rewritten.
+    Arrays are told by their form and the SHA-256 of their numbers, numbers that are not finite by their names.
     """
-    digest = hashlib.sha256()
-    for part in _parts(value):
-        digest.update(len(part).to_bytes(8, "little"))
-        digest.update(part)
-    return digest.hexdigest()
+    return json.dumps(_json(value), ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
 
 
 def of_content(data: bytes) -> str:
@@ -49,30 +53,27 @@ def of_scan(path: Path) -> str:
     return fingerprint([size, *map(of_content, pieces)])
 
 
-def _parts(value: Any) -> Iterator[bytes]:
+def _json(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
-        yield from _parts({field.name: getattr(value, field.name) for field in fields(value)})
-    elif isinstance(value, Mapping):
-        yield b"{%d" % len(value)
-        for key in sorted(value, key=str):
-            yield from _parts(key)
-            yield from _parts(value[key])
-    elif isinstance(value, np.ndarray):
-        yield f"{value.dtype.str}{value.shape}".encode()
-        yield np.ascontiguousarray(value).tobytes()
-    elif isinstance(value, Set):
-        yield from _parts(sorted(value, key=str))
-    elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        yield b"[%d" % len(value)
-        for item in value:
-            yield from _parts(item)
-    elif isinstance(value, np.generic):
-        yield from _parts(value.item())
-    elif isinstance(value, Path):
-        yield value.name.encode("utf-8", "surrogateescape")
-    elif isinstance(value, str):
-        yield b"'" + str(value).encode("utf-8", "surrogateescape")
-    elif value is None or isinstance(value, bool | int | float | complex):
-        yield repr(value).encode()
-    else:
-        raise TypeError(f"no fingerprint is known of {type(value).__name__}")
+        return {"is": type(value).__name__, **{one.name: _json(getattr(value, one.name)) for one in fields(value)}}
+    if isinstance(value, Mapping):
+        if all(isinstance(key, str) for key in value):
+            return {str(key): _json(item) for key, item in value.items()}
+        return {"pairs": sorted(([_json(key), _json(item)] for key, item in value.items()), key=json.dumps)}
+    if isinstance(value, np.ndarray):
+        return {"array": f"{value.dtype.str}{value.shape}", "sha256": of_content(np.ascontiguousarray(value).tobytes())}
+    if isinstance(value, Set):
+        return _json(sorted(value, key=str))
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [_json(item) for item in value]
+    if isinstance(value, np.generic):
+        return _json(value.item())
+    if isinstance(value, Path):
+        return value.name
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"number": repr(value)}
+    if isinstance(value, str):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    raise TypeError(f"no fingerprint is known of {type(value).__name__}")

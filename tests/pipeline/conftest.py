@@ -72,4 +72,4 @@ class Here(Executor):
 @pytest.fixture
 def in_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small scans are measured sooner than a new process has loaded its modules. The demonstration starts them."""
-    monkeypatch.setattr("pipeline.measuring.measure_stage.worker_pool", lambda _: nullcontext(Here()))
+    monkeypatch.setattr("pipeline.stages.worker_pool", lambda _: nullcontext(Here()))

@@ -9,7 +9,7 @@ from pipeline.files.camera_file import read_camera
 from pipeline.measuring.camera_model import misplaced_principal_point
 from pipeline.results.measured_scan import MeasuredScan
 
-MEASURED = MeasuredScan(Path("v.tif"), 2001, 1801, (20.0, 20.0), FrameMeasurement("v", ()))
+MEASURED = MeasuredScan("v.tif", 2001, 1801, (20.0, 20.0), FrameMeasurement("v", ()))
 FIDUCIALS = '[[fiducial]]\nid = "1"\nxy_mm = [18.0, -16.0]\nmark = "dot"\n[mark.dot]\nkind = "dot"\nradius_mm = 0.2\n'
 
 

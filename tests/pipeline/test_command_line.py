@@ -56,15 +56,6 @@ def no_scans(folder: Path) -> None:
         file.unlink()
 
 
-def text_named_tif(folder: Path) -> None:
-    (folder / "scans" / "frame2.tif").write_text("This is no picture.\n" * 50, encoding="utf-8")
-
-
-def truncated_tiff(folder: Path) -> None:
-    path = folder / "scans" / "frame3.tif"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
 def toml_typo(folder: Path) -> None:
     replaced(folder / "project.toml", 'camera = "camera.toml"', 'camera = "camera.toml')
 
@@ -157,19 +148,12 @@ def points_without_coordinates(folder: Path) -> None:
     (folder / "points.csv").write_text("point,X,Y,Z,sX,sY,sZ\n101,1.0,2.0,0.5,,,\n102,,,,,,\n", encoding="utf-8")
 
 
-def link_to_no_scan(folder: Path) -> None:
-    (folder / "scans" / "frame9.tif").symlink_to("moved away.tif")
-    rewritten_scans(folder, "scans/*.tif")
-
-
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
         (no_project, ["project.toml", "no such file"]),
         (no_camera, ["camera.toml", "no such file"]),
         (no_scans, ["scans/frame1.tif", "finds no file", "It holds no files"]),
-        (text_named_tif, ["frame2.tif"]),
-        (truncated_tiff, ["frame3.tif"]),
         (toml_typo, ["project.toml", "not valid TOML", "line 2"]),
         (misspelt_key, ["project.toml", "diametre_mm", "diameter_mm"]),
         (misspelt_key_and_no_file, ["project.toml, line 4", "comparater", "Did you mean 'comparator'?"]),
@@ -189,7 +173,6 @@ def link_to_no_scan(folder: Path) -> None:
         (no_fiducials, ["transformation is 'affine'", "has no fiducials for it"]),
         (no_points, ["kind 'disk' is named by the targets' coordinates", "there is no [object] points"]),
         (points_without_coordinates, ["[object] points: 1 points with X, Y and Z name no targets; give 4"]),
-        (link_to_no_scan, ["there is no scan", "frame9.tif"]),
         (one_fiducial, ["camera.toml has one fiducial mark", "two or more"]),
     ],
 )

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 from demonstration import FRAMES
+from single_scans import measure_scan
 
 from pipeline.cli import DONE, run
 from pipeline.files.project_file import read_project
-from pipeline.measuring.measure_stage import measure_scan
 from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.results.comparator_file import write_comparator
 

@@ -257,7 +257,7 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
 def test_a_measurement_is_read_back_with_the_causes_of_its_covariances(tmp_path: Path) -> None:
     known = Covariance.of_noise(np.array([[4e-4, 1e-4], [1e-4, 9e-4]])).plus(Cause.TONE, np.diag([1e-4, 0.0]))
     mark = MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), known, Status.MEASURED)
-    scan = MeasuredScan(tmp_path / "a.tif", 300, 400, (20.0, 20.0), FrameMeasurement("a", (mark,)))
+    scan = MeasuredScan(str(tmp_path / "a.tif"), 300, 400, (20.0, 20.0), FrameMeasurement("a", (mark,)))
     write_measurement(tmp_path / "measurement.json", [scan])
     ((back,),) = (one.frame.marks for one in read_measurement(tmp_path / "measurement.json"))
     assert back.covariance is not None

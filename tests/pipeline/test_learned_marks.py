@@ -2,7 +2,6 @@
 
 import json
 import re
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from shutil import copy
@@ -12,6 +11,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 from rich.console import Console
+from single_scans import measure_scan
 
 from measure.marks.shapes import MarkTemplate
 from measure.results import FrameMeasurement
@@ -20,8 +20,9 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring import learn_stage
-from pipeline.measuring.learn_stage import learn_marks, pose_of
-from pipeline.measuring.measure_stage import measure_scan
+from pipeline.measuring.learn_stage import learn_marks
+from pipeline.measuring.measured import measure_scans
+from pipeline.measuring.scan_task import scan_tasks
 from pipeline.progress import Reporter
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
@@ -93,8 +94,8 @@ def clicks(folder: Path) -> str:
 
 
 def learned(project: Project) -> Project:
-    with ThreadPoolExecutor(1) as workers:
-        return learn_marks(project, Reporter(Console(quiet=True)), workers, project.output / "learned")
+    reporter = Reporter(Console(quiet=True))
+    return learn_marks(project, reporter, measure_scans, None, project.output / "learned")
 
 
 def measured(project: Project, *scans: str) -> list[FrameMeasurement]:
@@ -162,7 +163,7 @@ def test_a_scan_that_lies_otherwise_than_the_one_clicked_in_is_told_by_its_pictu
     tifffile.imwrite(tmp_path / "scans" / "f2.tif", np.rot90(upright))  # counter-clockwise
     project = project_of(tmp_path, LEARNED + clicks(rendered), pose="auto")
     known = learned(project)
-    assert pose_of(known, known.default_camera, "f1") == "0"
+    assert scan_tasks(known, ["f1"])[0].options.fiducials.pose == "0"
     turned = measure_scan(known, "f2").frame
     assert turned.pose is not None
     assert (turned.pose.name, turned.pose.decided) == ("90", True), turned.pose.evidence
@@ -236,14 +237,14 @@ def test_what_was_learned_is_stored_whole_and_read_without_it_too(shown: tuple[P
     third = replace(second, scans={**project.scans, "f1": project.scans["f2"]})
     for each, pose in ((second, "0"), (third, "auto")):
         known = learned(each)
-        assert pose_of(known, known.default_camera, "f1") == pose
+        assert scan_tasks(known, ["f1"])[0].options.fiducials.pose == pose
 
 
 def test_clicks_that_cannot_be_are_refused(rendered: Path) -> None:
     with pytest.raises(InputError, match="says nothing of 4"):
         project_of(rendered, LEARNED + clicks(rendered).rsplit("4 =", 1)[0])
     project = project_of(rendered, LEARNED + clicks(rendered).replace("f1.tif", "g1.tif"))
-    with pytest.raises(InputError, match="'g1', which is none of the project's scans"):
+    with pytest.raises(InputError, match="'g1', which is none of this camera's scans"):
         learned(project)
     camera = project.default_camera
     assert camera.clicks is not None

@@ -62,14 +62,14 @@ def one_scan_more(folder: Path) -> MeasuredScan:
     (folder / "scans" / "frame4.tif").write_bytes((folder / "scans" / "frame1.tif").read_bytes() + b"\0")
     rewritten_scans(folder, "scans/frame*.tif")
     first = read_measurement(folder / "out" / "measurement.json")[0]
-    return replace(first, scan=folder / "scans" / "frame4.tif", frame=replace(first.frame, image="frame4"))
+    return replace(first, scan=str(folder / "scans" / "frame4.tif"), frame=replace(first.frame, image="frame4"))
 
 
 @pytest.fixture
 def measured_before(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What measuring gives is known, and given at once."""
     scans = read_measurement(project / "out" / "measurement.json")
-    monkeypatch.setattr(stages, "measure_scans", lambda *_: scans)
+    monkeypatch.setattr(stages, "measure_project", lambda *_: scans)
 
 
 def test_a_finished_project_is_current(finished: tuple[Path, int]) -> None:
@@ -234,7 +234,7 @@ def test_marks_that_cannot_be_adjusted_are_kept_and_the_earlier_adjustment_is_no
     project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     more = (*read_measurement(project / "out" / "measurement.json"), one_scan_more(project))
-    monkeypatch.setattr(stages, "measure_scans", lambda *_: more)
+    monkeypatch.setattr(stages, "measure_project", lambda *_: more)
     monkeypatch.setattr(stages, "adjust_marks", fails_with(AdjustmentError("a wrong point number")))
     assert run(["run", str(project / "project.toml")]) == 2
     assert "frame4" in {point.image for point in read_comparator(project / "comparator.csv")}

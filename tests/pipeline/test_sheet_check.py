@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from single_scans import measure_scan
 
 from measure.covariance import Covariance
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.files.project_file import Project, read_project
-from pipeline.measuring.measure_stage import measure_scan
 from pipeline.measuring.sheet_check import with_checked_sheet
 from pipeline.results.measured_scan import MeasuredScan
 
@@ -62,7 +62,7 @@ def measured(rng: np.random.Generator, project: Project, name: str, wrong: dict[
             MarkMeasurement(id, "target", place + off, Covariance.of_noise(NOISE_PX**2 * np.eye(2)), Status.MEASURED)
         )
     fiducial = MarkMeasurement("r4c4", "fiducial", np.zeros(2), Covariance.of_noise(np.eye(2)), Status.MEASURED)
-    return MeasuredScan(Path(name), WIDTH, HEIGHT, (5.0, 5.0), FrameMeasurement(name, (fiducial, *marks)))
+    return MeasuredScan(name, WIDTH, HEIGHT, (5.0, 5.0), FrameMeasurement(name, (fiducial, *marks)))
 
 
 def status(scans: tuple[MeasuredScan, ...], wanted: Status) -> set[tuple[str, str]]:

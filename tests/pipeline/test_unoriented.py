@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from single_scans import measure_scan
 
 from measure.results import MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
 from pipeline.files.target_table import read_targets
-from pipeline.measuring.measure_stage import measure_scan
-from pipeline.measuring.target_stage import check_targets
+from pipeline.measuring.scan_task import scan_tasks
 from pipeline.rendered.scene_file import render_project
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.tables import read_toml
@@ -154,7 +154,7 @@ def test_coordinates_in_another_unit_than_the_project_says(scenes: dict[str, Pat
     text = project.read_text(encoding="utf-8")
     project.write_text(text.replace('unit = "m"', 'unit = "mm"'), encoding="utf-8")
     with pytest.raises(InputError, match=r"nine of ten points .* if their coordinates are in mm"):
-        check_targets(read_project(project))
+        scan_tasks(read_project(project), ["a"])
     project.write_text(text, encoding="utf-8")
     points = tmp_path / "points.csv"
     header, *rows = (row.split(",") for row in points.read_text(encoding="utf-8").splitlines())

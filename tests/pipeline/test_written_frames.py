@@ -24,9 +24,10 @@ from pipeline.files.images_file import WRITTEN, fill_images, read_images
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, plate_of, with_plates
 from pipeline.measuring.roll import known_lines, poses_of_roll, read_first
+from pipeline.measuring.same_frames import with_same_frames
 from pipeline.rendered.scene_file import render_project
 from pipeline.report.writing import written
-from pipeline.results.frames_file import for_images, with_same_frames, write_frames
+from pipeline.results.frames_file import for_images, write_frames
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.results.measurement_file import read_measurement, write_measurement
 from pipeline.text.tables import Table
@@ -45,7 +46,7 @@ def line(text: str, pose: str = "0", side: Side = "top") -> Line:
 def scan(image: str, lines: Sequence[Line] | None, pose: Pose | None = None) -> MeasuredScan:
     mark = MarkMeasurement("1", "fiducial", np.zeros(2), Covariance({Cause.NOISE: np.eye(2)}), Status.MEASURED)
     frame = FrameMeasurement(image, (mark,), pose, writing=None if lines is None else tuple(lines))
-    return MeasuredScan(Path(f"{image}.tif"), 100, 100, (20.0, 20.0), frame)
+    return MeasuredScan(f"{image}.tif", 100, 100, (20.0, 20.0), frame)
 
 
 def test_frames_csv_has_every_line_with_what_it_says(tmp_path: Path) -> None:
@@ -341,7 +342,7 @@ def test_a_rendered_frame_is_read_and_its_pose_decided(tmp_path: Path, monkeypat
     assert frame["pose"]["decided"]
     assert "a,run," in (tmp_path / "p" / "out" / "frames.csv").read_text(encoding="utf-8")
     assert (tmp_path / "p" / "images.csv").read_text(encoding="utf-8") == "image,run,date\na,7,1968-05-16\n"
-    monkeypatch.setattr("pipeline.measuring.measure_stage.networks", lambda: None)
+    monkeypatch.setattr("pipeline.measuring.measured.networks", lambda: None)
     monkeypatch.setattr("measure.fiducials.networks", lambda: None)
     run(["measure", str(project)])
     frame = json.loads((tmp_path / "p" / "out" / "measurement.json").read_text(encoding="utf-8"))["images"]["a"]

@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ def check_tie_names(project: Project) -> None:
 
 
 def with_ties(
-    project: Project, settings: TieSettings, scans: Sequence[MeasuredScan], count: Count, workers: Executor
+    project: Project, settings: TieSettings, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
     """The scans with the natural points that they share."""
     frames = {scan.frame.image: _tie_frame(project, scan) for scan in scans}
@@ -74,6 +75,5 @@ def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
         middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
         pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
         frame_mm = None
-    return TieFrame(
-        scan.frame.image, scan.scan, pixel_from_camera, frame_mm, np.array(taken).reshape(-1, 3), project.max_pixels
-    )
+    path, marks = Path(scan.scan), np.array(taken).reshape(-1, 3)
+    return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels)

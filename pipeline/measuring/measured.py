@@ -1,0 +1,213 @@
+"""The first step of measuring: each scan by itself, its fiducials and then the targets that they make predictable."""
+
+import os
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from measure.checks.lost_pixels import with_damage
+from measure.checks.pitch_check import pitch_problem
+from measure.errors import MeasurementError, MissingError, TooLargeError
+from measure.fiducials import measure_fiducials
+from measure.marks.rendering import extent_px
+from measure.marks.shapes import FiducialLayout
+from measure.results import FrameMeasurement, MarkMeasurement
+from measure.scans.scan import Scan
+from measure.status import Status
+from measure.writing.networks import MISSING, networks
+from pipeline.errors import InputError, what_to_do
+from pipeline.measuring.camera_model import misplaced_principal_point
+from pipeline.measuring.scan_task import ScanOptions, ScanTask
+from pipeline.measuring.target_stage import measure_targets
+from pipeline.measuring.tone_stage import tone_before
+from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+
+TASKS_A_CORE = 4  # handed out ahead: enough that no process waits, few enough that little is lost
+
+
+class Submits(Protocol):
+    """What shares work out: an executor of `concurrent.futures`, or one like it."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
+        """Have `fn` called with these, some time."""
+
+
+def measure_scans(
+    tasks: Iterable[ScanTask], executor: Submits | None = None, in_flight: int | None = None
+) -> Iterator[MeasuredScan]:
+    """Each scan's result as soon as it is there; of a scan whose process ended, too: then it says so.
+
+    executor: None: here, one after the other. in_flight: how many tasks are handed out at a time.
+    """
+    if executor is None:
+        yield from map(measured_scan, tasks)
+        return
+    window = in_flight or TASKS_A_CORE * (os.cpu_count() or 1)
+    left, running = iter(tasks), dict[Future[MeasuredScan], ScanTask]()
+    try:
+        while True:
+            for task in islice(left, window - len(running)):
+                running[_submitted(executor, task)] = task
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield _result(future, running.pop(future))
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def _submitted(executor: Submits, task: ScanTask) -> "Future[MeasuredScan]":
+    try:
+        return executor.submit(measured_scan, task)
+    except BrokenExecutor as error:
+        future: Future[MeasuredScan] = Future()
+        future.set_exception(error)
+        return future
+
+
+def _result(future: "Future[MeasuredScan]", task: ScanTask) -> MeasuredScan:
+    """`measured_scan` raises nothing: what comes here is of the executor, whose process is gone or out of reach."""
+    try:
+        return future.result()
+    except Exception as error:
+        told = "" if isinstance(error, BrokenExecutor) else f" ({' '.join(str(error).split())})"
+        return failed_scan(
+            task,
+            FailureCode.ENDED,
+            f"{task.scan}: the process that measured it was ended, most likely because the memory was full{told}. "
+            "Close other programs, and measure it again.",
+        )
+
+
+def measured_scan(task: ScanTask) -> MeasuredScan:
+    """Measure one scan: its fiducials, then its targets. A scan that cannot be measured is a result that says why: this
+    raises nothing but interrupts."""
+    start = time.monotonic()
+    try:
+        measured = _opened_and_measured(task)
+    except Exception as error:
+        measured = failed_scan(task, *_failure(task, error))
+    return replace(measured, seconds=time.monotonic() - start)
+
+
+def failed_scan(task: ScanTask, code: FailureCode, sentence: str) -> MeasuredScan:
+    """Of a scan that could not be measured: a row for each mark that would have been sought, all of them absent."""
+    reason = f"the scan could not be measured: {sentence}"
+    fiducials, targets = [mark.id for mark in task.options.camera.drawn], task.options.targets
+    marks = (
+        *(MarkMeasurement(id, "fiducial", None, None, Status.ABSENT, reason) for id in fiducials),
+        *(MarkMeasurement(id, "target", None, None, Status.ABSENT, reason) for id in (targets.ids if targets else ())),
+    )
+    frame = FrameMeasurement(task.name, marks, problems=(sentence,))
+    return MeasuredScan.failed(task.scan, frame, Failure(code, sentence))
+
+
+def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
+    told = " ".join(str(error).split())
+    match error:
+        case TooLargeError():
+            return FailureCode.TOO_LARGE, told
+        case MissingError():
+            return FailureCode.MISSING, told
+        case MeasurementError():
+            return FailureCode.UNREADABLE, told
+        case InputError():
+            return FailureCode.PITCH, told
+        case MemoryError():
+            return FailureCode.MEMORY, f"{task.scan}: the memory was full. Close other programs, and measure it again."
+        case OSError():
+            return FailureCode.UNREADABLE, f"{task.scan}: {error.strerror or told}. {what_to_do(error)}"
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return (
+        FailureCode.FAULT,
+        f"{task.scan}: a fault of reseau itself; please report it: {type(error).__name__}: {told}, in "
+        f"{Path(where.filename).name}, line {where.lineno}.",
+    )
+
+
+def _opened_and_measured(task: ScanTask) -> MeasuredScan:
+    options = task.options
+    with task.opened() as scan:
+        # Fiducials are seen through the curve; targets have edges all round, and are measured as they are.
+        tone = tone_before(options.tone, options.said, scan.path)
+        frame = replace(_fiducials(options, scan.seen_through(tone)), image=task.name)
+        pitch, problems, notes = _pitch(options, scan, frame)
+        frame = replace(frame, problems=(*frame.problems, *problems))
+        curve = (frame.tone.note,) if frame.tone else ()
+        file_notes = (f"{note[0].upper()}{note[1:]}." for note in scan.notes)
+        notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame))
+        measured = MeasuredScan(task.scan, scan.width_px, scan.height_px, pitch, frame, notes)
+        if misplaced := misplaced_principal_point(options.camera, measured):
+            measured = replace(measured, frame=replace(frame, problems=(*frame.problems, misplaced)))
+        measured = measure_targets(options, scan, measured)
+        return replace(measured, frame=with_damage(scan, measured.frame))
+
+
+def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
+    if all(fiducial.passed_over for fiducial in options.camera.fiducials):
+        return FrameMeasurement(scan.name, ())
+    pitch, layout = options.pitch_um or scan.pitch_um, options.camera.layout()
+    measured = measure_fiducials(scan, layout, pitch, options.fiducials)
+    if pitch is not None:
+        source = "the project" if options.pitch_um is not None else "the scan's file"
+        wrong = pitch_problem(measured, layout, pitch, source)
+        measured = replace(measured, problems=(*measured.problems, wrong) if wrong else measured.problems)
+    if options.known_pose is not None and measured.pose is not None:
+        measured = replace(measured, pose=options.known_pose)
+    return replace(measured, marks=_with_sizes(measured, layout, scan, pitch))
+
+
+def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str, ...]:
+    """A note where something would have been read, but nothing is there that reads."""
+    writing = options.fiducials.writing
+    undecided = writing == "pose" and frame.pose is not None and not frame.pose.decided
+    asked = writing == "all" or undecided
+    return (f"{MISSING[0].upper()}{MISSING[1:]}.",) if asked and networks() is None else ()
+
+
+def _with_sizes(
+    measured: FrameMeasurement, layout: FiducialLayout, scan: Scan, pitch_um: tuple[float, float] | None
+) -> tuple[MarkMeasurement, ...]:
+    """The marks with how large each is drawn in the scan, px, for whoever shows a picture of it."""
+    if measured.px_per_mm is not None:
+        px_per_mm = measured.px_per_mm
+    elif pitch_um is not None:
+        px_per_mm = 1000.0 / pitch_um[0]
+    else:
+        px_per_mm = scan.width_px / layout.frame_mm[0]
+    drawn = np.array([[px_per_mm, 0.0, 0.0], [0.0, -px_per_mm, 0.0]])
+    extents = {mark.id: np.ptp(np.stack(extent_px(mark.mark, drawn)), axis=0).max() for mark in layout.marks}
+    return tuple(
+        replace(mark, quality={**mark.quality, "size_px": float(extents[mark.point])}) for mark in measured.marks
+    )
+
+
+def _pitch(
+    options: ScanOptions, scan: Scan, frame: FrameMeasurement
+) -> tuple[tuple[float, float], tuple[str, ...], tuple[str, ...]]:
+    """The pitch of a scan in um, as the project, the file or the marks say it; what needs a look in it, and what is
+    only worth knowing."""
+    if options.pitch_um is not None:
+        return options.pitch_um, (), ()
+    if scan.pitch_um is not None:
+        return scan.pitch_um, (), ()
+    if frame.px_per_mm is not None:
+        pitch = 1000.0 / frame.px_per_mm
+        note = f"The pitch of {pitch:.2f} um is from the marks' separations, for {scan.pitch_note}."
+        return (pitch, pitch), (), (note,)
+    if options.camera.frame_mm is not None:
+        pitch = 1000.0 * max(options.camera.frame_mm) / max(scan.width_px, scan.height_px)
+        note = f"The pitch is not known ({scan.pitch_note}); {pitch:.1f} um is taken, as if the frame filled the scan."
+        return (pitch, pitch), (note,), ()
+    raise InputError(
+        f"pitch_um is missing in the project, and {scan.path.name} does not say it ({scan.pitch_note}). Give the size "
+        "of a pixel in um; for a digital camera that of the sensor's, or any, with the principal distance to match."
+    )

@@ -1,0 +1,148 @@
+"""What one scan's result depends on: the task that a process gets which measures it, without the project."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from adjust.problem.network import Distortion, Exterior, Prior
+from measure.errors import MissingError
+from measure.fiducial_options import FiducialOptions
+from measure.results import Pose
+from measure.scans.scan import Scan, open_scan
+from measure.scans.tone import SaidOfTone
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.project_file import Project
+from pipeline.measuring.sought_targets import SoughtTargets
+from pipeline.results.fingerprints import canonical_json
+from pipeline.results.measured_scan import MeasuredScan
+
+_NO_SCAN = "images.csv names it, and the project has no scan of that name. Look for the file, or take the line out."
+
+
+@dataclass(frozen=True, eq=False)
+class ScanOptions:
+    """How a scan is measured, whichever it is.
+
+    camera: its marks, its frame and, where targets are predicted or nothing else says where the picture is, its lens.
+    pitch_um: as the project gives it; None: the file says it, or the marks. fiducials: pose, film and writing.
+    known_pose: what is told of the pose of a scan from which marks were learned. tone: the curve as the project has it;
+    said: by other scans of the scanner. exterior: an approximate orientation, which targets are named by.
+    """
+
+    camera: CameraFile
+    pitch_um: tuple[float, float] | None
+    fiducials: FiducialOptions
+    known_pose: Pose | None = None
+    tone: float | str = "auto"
+    said: tuple[SaidOfTone, ...] = ()
+    targets: SoughtTargets | None = None
+    exterior: Exterior | None = None
+
+    @cached_property
+    def json(self) -> str:
+        """All of it as canonical JSON."""
+        return canonical_json(self)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanTask:
+    """One scan to be measured.
+
+    name: the image's. scan: the path or the address of its file; "" where images.csv names an image that has none.
+    max_pixels: how many are read, as `open_scan` takes it: it changes nothing of a scan that is read.
+    """
+
+    name: str
+    scan: str
+    options: ScanOptions
+    max_pixels: int | None = None
+
+    def options_json(self) -> str:
+        """Canonical JSON of all that the result depends on beside the scan itself: equal options give equal text, and
+        whatever may change the result changes it."""
+        return self.options.json
+
+    def opened(self) -> Scan:
+        """The scan. Raises MeasurementError where it cannot be read."""
+        if not self.scan:
+            raise MissingError(_NO_SCAN)
+        return open_scan(Path(self.scan), self.max_pixels)
+
+    def posed(self, pose: str) -> "ScanTask":
+        """The same scan in a pose that is known, nothing read in it."""
+        fiducials = replace(self.options.fiducials, pose=pose, writing="none")
+        return replace(self, options=replace(self.options, fiducials=fiducials))
+
+    def fiducials_alone(self, tone: float | str) -> "ScanTask":
+        """The same scan, of which the fiducials alone are sought, seen through that curve."""
+        fiducials = replace(self.options.fiducials, writing="none")
+        options = replace(self.options, fiducials=fiducials, tone=tone, said=(), targets=None, exterior=None)
+        return replace(self, options=options)
+
+
+Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # how tasks get done: `measure_scans`, or from a store
+
+
+def scan_tasks(
+    project: Project, names: Sequence[str], said: Mapping[str, tuple[SaidOfTone, ...]] | None = None
+) -> tuple[ScanTask, ...]:
+    """Tasks of these images, in their order; scans that have all in common share their options. said: by image what
+    other scans say of its scanner's curve. Raises InputError for marks that cannot be sought."""
+    cameras = {name: _sought(project, camera) for name, camera in project.cameras.items()}
+    key_of = {id(camera): name for name, camera in project.cameras.items()}
+    targets = SoughtTargets.of(project) if project.targets else None
+    shared: dict[tuple[object, ...], ScanOptions] = {}
+    tasks = []
+    for name in names:
+        given = project.camera_of(name)
+        pose, known = _pose(project, given, name)
+        told = (said or {}).get(name, ())
+        exterior = project.given_images.exterior.get(name) if project.given_images and targets else None
+        key = (key_of[id(given)], pose, known is None, *map(id, told), id(exterior))
+        if key not in shared:
+            options = FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm, writing=project.writing)
+            camera = cameras[key_of[id(given)]]
+            shared[key] = ScanOptions(camera, project.pitch_um, options, known, project.tone, told, targets, exterior)
+        scan = project.scans.get(name)
+        tasks.append(ScanTask(name, "" if scan is None else str(scan), shared[key], project.max_pixels))
+    return tuple(tasks)
+
+
+def _pose(project: Project, camera: CameraFile, name: str) -> tuple[str, Pose | None]:
+    """As the project sets it; a scan whose marks were clicked lies as these say, and what recurs in all scans, nobody
+    having clicked, was looked for in one pose."""
+    learned = camera.learned_from
+    if learned is None or project.pose != "auto" or name not in learned.alike:
+        return project.pose, None
+    if learned.clicked:
+        return learned.pose, Pose(learned.pose, True, ("the clicks in it say so.",))
+    like = f"it is taken to lie as {learned.scan}, from which its marks were learned: {learned.pose} is assumed."
+    return learned.pose, Pose(learned.pose, False, (like,))
+
+
+def _sought(project: Project, camera: CameraFile) -> CameraFile:
+    """What of a camera the measurement of a scan depends on: no name, no file, and of its lens only values."""
+    if any(not one.passed_over for one in camera.fiducials):
+        camera.layout()  # raises where a mark has no drawing
+    camera = replace(
+        camera,
+        path=Path(),
+        name="",
+        number="",
+        principal_distance_sigma_mm=0.0,
+        principal_point_sigma_mm=(0.0, 0.0),
+        distortion=_values(camera.distortion),
+        calibration=None,
+        source=None,
+        clicks=None,
+        learned_from=None,
+    )
+    if project.targets is not None:
+        return camera
+    camera = replace(camera, principal_distance_mm=None, distortion=Distortion())
+    return replace(camera, principal_point_mm=None) if camera.fiducials else camera
+
+
+def _values(distortion: Distortion) -> Distortion:
+    return replace(distortion, parameters={name: Prior(one.value) for name, one in distortion.parameters.items()})

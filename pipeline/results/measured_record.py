@@ -1,0 +1,211 @@
+"""What one scan gave as JSON, without loss: one writer and one reader, whatever file it stands in.
+
+Numbers that are not finite, which JSON has not, stand there by their names, as `float` reads them.
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.covariance import Cause, Covariance
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.scans.told_tone import FrameTone
+from measure.scans.tone import SaidOfTone, Tone, power, srgb
+from measure.status import Status
+from measure.writing.line import Line, Reading
+from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+
+Json = dict[str, Any]
+Array = NDArray[np.float64]
+
+_SRGB = "srgb"
+
+
+def record_of(measured: MeasuredScan, folder: Path) -> Json:
+    """A scan as JSON. folder: that the paths of scans are relative to, so that a whole project can be moved."""
+    frame = measured.frame
+    return {
+        "scan": measured.scan if _is_address(measured.scan) else _relative(Path(measured.scan), folder),
+        "width_px": measured.width_px,
+        "height_px": measured.height_px,
+        "pitch_um": _numbers(measured.pitch_um),
+        "failure": measured.failure and {"code": str(measured.failure.code), "sentence": measured.failure.sentence},
+        "pose": frame.pose and _pose(frame.pose),
+        "writing": None if frame.writing is None else [_line(line) for line in frame.writing],
+        "pixel_from_camera": _numbers(frame.pixel_from_camera),
+        "weights": _numbers(frame.weights),
+        "tone": frame.tone and _frame_tone(frame.tone),
+        "problems": list(frame.problems),
+        "notes": list(measured.notes),
+        "marks": [_mark(mark) for mark in frame.marks],
+    }
+
+
+def scan_of(image: str, record: Mapping[str, Any], folder: Path) -> MeasuredScan:
+    """The scan of a record; image: its name. Raises KeyError, TypeError or ValueError for what is no such record."""
+    across, down = record["pitch_um"]
+    frame = FrameMeasurement(
+        image=image,
+        marks=tuple(_read_mark(mark) for mark in record["marks"]),
+        pose=record["pose"] and _read_pose(record["pose"]),
+        pixel_from_camera=_array(record["pixel_from_camera"]),
+        problems=tuple(record["problems"]),
+        weights=None if record["weights"] is None else tuple(map(float, record["weights"])),
+        tone=record["tone"] and _read_frame_tone(record["tone"]),
+        writing=None if record["writing"] is None else tuple(_read_line(line) for line in record["writing"]),
+    )
+    failure = record["failure"] and Failure(FailureCode(record["failure"]["code"]), record["failure"]["sentence"])
+    scan = record["scan"] if _is_address(record["scan"]) else str(folder / record["scan"])
+    size = (int(record["width_px"]), int(record["height_px"]))
+    return MeasuredScan(scan, *size, (float(across), float(down)), frame, tuple(record["notes"]), failure)
+
+
+def _is_address(scan: str) -> bool:
+    """Of an object in a store or on a server; "" names none at all."""
+    return "://" in scan or not scan
+
+
+def _relative(scan: Path, folder: Path) -> str:
+    return Path(os.path.relpath(scan.resolve(), folder.resolve())).as_posix()
+
+
+def _numbers(values: Any) -> Any:
+    """Of a number, or of arrays of them."""
+    if values is None:
+        return None
+    if np.ndim(values) > 0:
+        return [_numbers(value) for value in values]
+    number = float(values)
+    return number if np.isfinite(number) else repr(number)
+
+
+def _array(values: Any) -> Array | None:
+    return None if values is None else np.array(values, dtype=np.float64)
+
+
+def _some(values: Any) -> Array:
+    return np.array(values, dtype=np.float64)
+
+
+def _mark(mark: MarkMeasurement) -> Json:
+    col, row = (None, None) if mark.center_px is None else _numbers(mark.center_px)
+    causes = mark.covariance and {str(cause): _numbers(part) for cause, part in mark.covariance.parts.items()}
+    return {
+        "point": mark.point,
+        "kind": mark.kind,
+        "col_px": col,
+        "row_px": row,
+        "covariance_px2": _numbers(mark.covariance_px2),
+        "causes_px2": causes,
+        "status": str(mark.status),
+        "reason": mark.reason,
+        "quality": {name: _numbers(value) for name, value in mark.quality.items()},
+    }
+
+
+def read_covariance(mark: Mapping[str, Any]) -> Covariance | None:
+    """The covariance of an entry of `marks`, by its causes; None where nothing was fitted."""
+    causes = mark.get("causes_px2")
+    return None if causes is None else Covariance({Cause(name): _some(px2) for name, px2 in causes.items()})
+
+
+def _read_mark(mark: Mapping[str, Any]) -> MarkMeasurement:
+    """The sum of the causes is written for others than this reader."""
+    return MarkMeasurement(
+        point=mark["point"],
+        kind=mark["kind"],
+        center_px=None if mark["col_px"] is None else _some([mark["col_px"], mark["row_px"]]),
+        covariance=read_covariance(mark),
+        status=Status(mark["status"]),
+        reason=mark["reason"],
+        quality={name: float(value) for name, value in mark["quality"].items()},
+    )
+
+
+def _pose(pose: Pose) -> Json:
+    return {
+        "name": pose.name,
+        "decided": pose.decided,
+        "evidence": list(pose.evidence),
+        "written": {name: _numbers(value) for name, value in pose.written.items()},
+        "writing": pose.writing,
+        "roll": pose.roll,
+        "rivals": list(pose.rivals),
+    }
+
+
+def _read_pose(pose: Mapping[str, Any]) -> Pose:
+    written = {name: float(value) for name, value in pose["written"].items()}
+    evidence, rivals = tuple(pose["evidence"]), tuple(pose["rivals"])
+    return Pose(pose["name"], pose["decided"], evidence, written, pose["writing"], pose["roll"], rivals)
+
+
+def _line(line: Line) -> Json:
+    """The text of the way that is taken for the right one is written for others than this reader."""
+    ways = {pose: {"text": one.text, "confidence": _numbers(one.confidence), "legible": _numbers(one.legible)}
+            for pose, one in line.ways.items()}  # fmt: skip
+    outline = [_numbers(corner) for corner in line.outline_px]
+    return {"text": line.text, "pose": line.pose, "side": line.side, "outline_px": outline, "ways": ways}
+
+
+def _read_line(line: Mapping[str, Any]) -> Line:
+    ways = {
+        pose: Reading(one["text"], float(one["confidence"]), float(one["legible"]))
+        for pose, one in line["ways"].items()
+    }
+    outline = tuple((float(col), float(row)) for col, row in line["outline_px"])
+    return Line(ways, line["pose"], outline, line["side"])
+
+
+def _frame_tone(tone: FrameTone) -> Json:
+    believed = tone.tone
+    return {
+        "base": _base(believed.base),
+        "mean": _numbers(believed.mean),
+        "covariance": _numbers(believed.covariance),
+        "source": believed.source,
+        "is_declared": believed.is_declared,
+        "said": tone.said and _said(tone.said),
+        "least": _numbers(tone.least),
+        "greatest": _numbers(tone.greatest),
+        "contradiction": _numbers(tone.contradiction),
+    }
+
+
+def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
+    mean, covariance = _some(tone["mean"]), _some(tone["covariance"])
+    believed = Tone(_read_base(tone["base"]), mean, covariance, tone["source"], tone["is_declared"])
+    said = tone["said"] and _read_said(tone["said"])
+    return FrameTone(believed, said, float(tone["least"]), float(tone["greatest"]), float(tone["contradiction"]))
+
+
+def _base(base: Array) -> Any:
+    """The exponent of a power, the name of sRGB's curve, or a thousand numbers."""
+    middle = len(base) // 2
+    exponent = round(float(np.log(base[middle]) / np.log(middle / (len(base) - 1))), 9)
+    if np.array_equal(base, power(exponent)):
+        return exponent
+    return _SRGB if np.array_equal(base, srgb()) else _numbers(base)
+
+
+def _read_base(base: Any) -> Array:
+    if base == _SRGB:
+        return srgb()
+    return _some(base) if isinstance(base, list) else power(float(base))
+
+
+def _said(said: SaidOfTone) -> Json:
+    return {
+        "information": _numbers(said.information),
+        "right": _numbers(said.right),
+        "square": _numbers(said.square),
+        "count": said.count,
+    }
+
+
+def _read_said(said: Mapping[str, Any]) -> SaidOfTone:
+    return SaidOfTone(_some(said["information"]), _some(said["right"]), float(said["square"]), int(said["count"]))

@@ -1,0 +1,273 @@
+"""Scans are measured one by one, each by its own task: what it depends on, and what becomes of those that fail."""
+
+import json
+import os
+import pickle
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drawn_project import CAMERA, PROJECT, write_project
+
+from measure.status import Status
+from pipeline.cli import run
+from pipeline.files.project_file import read_project
+from pipeline.measuring import measured
+from pipeline.measuring.measured import measure_scans, measured_scan
+from pipeline.measuring.scan_task import ScanTask, scan_tasks
+from pipeline.results.comparator_file import read_comparator
+from pipeline.results.measured_scan import FailureCode, MeasuredScan
+from pipeline.results.measurement_file import read_measurement
+
+Changed = Callable[[str, str], tuple[str, str]]  # of project.toml and camera.toml
+SAID = pytest.CaptureFixture[str]
+pytestmark = pytest.mark.usefixtures("in_one_process")
+
+BOARD = '[targets]\nkind = "chessboard"\ncolumns = 5\nrows = 4\nsquare_mm = 10.0\n'
+TARGETS = '[targets]\nkind = "disk"\ndiameter_mm = 30.0\n[object]\npoints = "points.csv"\nimages = "images.csv"\n'
+POINTS = "point,X,Y,Z\n" + "".join(f"{k},{k % 3},{k // 3},{k % 2}\n" for k in range(9))
+IMAGES = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,0,0,9,0,0,0\nb,1,0,9,0,0,0\n"
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_project(tmp_path_factory.mktemp("two"), ["a", "b"])
+
+
+def tasks_of(folder: Path, project: str = PROJECT, camera: str = CAMERA) -> tuple[ScanTask, ...]:
+    """Of a project of two scans with these files; nothing is measured."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("a.tif", "b.tif"):
+        (folder / name).touch()
+    for name, text in {
+        "project.toml": project,
+        "camera.toml": camera,
+        "points.csv": POINTS,
+        "images.csv": IMAGES,
+    }.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return scan_tasks(read_project(folder / "project.toml"), ["a", "b"])
+
+
+def test_scans_that_have_all_in_common_have_equal_options(tmp_path: Path) -> None:
+    a, b = tasks_of(tmp_path / "here")
+    there, _ = tasks_of(tmp_path / "there")
+    assert a.options_json() == b.options_json() == there.options_json()
+    assert pickle.loads(pickle.dumps(a)).options_json() == a.options_json()
+    assert json.loads(a.options_json())
+    assert (a.name, Path(a.scan).name) == ("a", "a.tif")
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda project, camera: (project, camera.replace("ring_line_mm = 0.1", "ring_line_mm = 0.11")),
+        lambda project, camera: (project, camera.replace("xy_mm = [7.0,", "xy_mm = [7.001,")),
+        lambda project, camera: (project, camera.replace("sigma_mm = 0.01", "sigma_mm = 0.02", 1)),
+        lambda project, camera: (project, camera.replace("[17.0, 17.0]", "[17.0, 17.5]")),
+        lambda project, camera: (project, 'writing = ["left"]\n' + camera),
+        lambda project, camera: (project.replace("pitch_um = 50.0", "pitch_um = 50.1"), camera),
+        lambda project, camera: (project.replace('pose = "0"', 'pose = "90"'), camera),
+        lambda project, camera: (project + "tone = 2.2\n", camera),
+        lambda project, camera: (project + 'writing = "all"\n', camera),
+        lambda project, camera: (project + "[adjust]\nfilm_sigma_um = 9.0\n", camera),
+        lambda project, camera: (project + BOARD, camera),
+    ],
+)
+def test_what_may_change_the_result_changes_the_options(changed: Changed, tmp_path: Path) -> None:
+    before, after = tasks_of(tmp_path), tasks_of(tmp_path, *changed(PROJECT, CAMERA))
+    assert before[0].options_json() != after[0].options_json()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda project, camera: (project, camera.replace('name = "K"', 'name = "L"')),
+        lambda project, camera: (project, 'number = "13182"\n' + camera),
+        lambda project, camera: (project, camera.replace("distance_mm = 30.0", "distance_mm = 31.0")),
+        lambda project, camera: (project + "[adjust]\nrobust = true\n", camera),
+        lambda project, camera: (project.replace("scans", 'output = "elsewhere"\nscans'), camera),
+    ],
+)
+def test_what_changes_no_scan_leaves_its_options(changed: Changed, tmp_path: Path) -> None:
+    before, after = tasks_of(tmp_path), tasks_of(tmp_path, *changed(PROJECT, CAMERA))
+    assert before[0].options_json() == after[0].options_json()
+
+
+def test_where_targets_are_sought_the_lens_and_the_orientation_of_the_scan_count(tmp_path: Path) -> None:
+    a, b = tasks_of(tmp_path, PROJECT + TARGETS)
+    longer, _ = tasks_of(tmp_path, PROJECT + TARGETS, CAMERA.replace("distance_mm = 30.0", "distance_mm = 31.0"))
+    larger, _ = tasks_of(tmp_path, PROJECT + TARGETS.replace("30.0", "31.0"))
+    assert len({task.options_json() for task in (a, b, longer, larger)}) == 4
+    assert b"points.csv" not in pickle.dumps(a)  # the project does not travel with it
+
+
+def test_the_marks_of_another_camera_do_not_count(tmp_path: Path) -> None:
+    given = PROJECT + '[object]\nimages = "cameras.csv"\n'
+
+    def both(line_mm: str) -> tuple[ScanTask, ...]:
+        tmp_path.joinpath("other.toml").write_text(
+            CAMERA.replace('"K"', '"L"').replace("line_mm = 0.1", f"line_mm = {line_mm}"), encoding="utf-8"
+        )
+        tmp_path.joinpath("cameras.csv").write_text("image,camera\na,\nb,other.toml\n", encoding="utf-8")
+        return tasks_of(tmp_path, given)
+
+    before, after = both("0.1"), both("0.12")
+    assert before[0].options_json() == after[0].options_json()
+    assert before[1].options_json() != after[1].options_json()
+
+
+class Watched:
+    """An executor that does its work when it is waited for, and counts what it holds at a time."""
+
+    def __init__(self, broken: str = "") -> None:
+        self.broken, self.held, self.most = broken, 0, 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **_: Any) -> "Future[Any]":
+        self.held += 1
+        self.most = max(self.most, self.held)
+        watched, future = self, Future[Any]()
+
+        class Late(Future[Any]):
+            def result(self, timeout: float | None = None) -> Any:
+                watched.held -= 1
+                return super().result(timeout)
+
+        future = Late()
+        if args[0].name == self.broken:
+            future.set_exception(BrokenProcessPool("ended abruptly"))
+        else:
+            future.set_result(fn(*pickle.loads(pickle.dumps(args))))
+        return future
+
+
+def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Path) -> None:
+    a, _ = scan_tasks(read_project(two), ["a", "b"])
+    lost = replace(a, scan="nowhere.tif")
+    asked: list[int] = []
+
+    def tasks() -> Iterator[ScanTask]:
+        for number in range(20):
+            asked.append(number)
+            yield replace(lost, name=str(number))
+
+    watched = Watched()
+    results = measure_scans(tasks(), watched, in_flight=3)
+    first = next(results)
+    assert first.failure is not None
+    assert len(asked) <= 4
+    assert {first.frame.image, *(scan.frame.image for scan in results)} == {str(number) for number in range(20)}
+    assert watched.most == 3
+
+
+def test_a_scan_whose_process_ends_is_a_result(two: Path) -> None:
+    project = read_project(two)
+    tasks = scan_tasks(project, ["a", "b"])
+    results = {scan.frame.image: scan for scan in measure_scans(tasks, Watched("b"))}
+    assert results["a"].failure is None
+    assert results["b"].failure is not None
+    assert results["b"].failure.code is FailureCode.ENDED
+    assert "was ended, most likely because the memory was full" in results["b"].failure.sentence
+
+
+def memory_full(*_: object) -> None:
+    raise MemoryError
+
+
+def a_fault(*_: object) -> None:
+    raise ZeroDivisionError("by nothing")
+
+
+@pytest.mark.parametrize(
+    ("raises", "code", "words"),
+    [(memory_full, "memory", "the memory was full"), (a_fault, "fault", "ZeroDivisionError: by nothing, in test_scan")],
+)
+def test_whatever_happens_in_a_scan_is_a_result(
+    two: Path, monkeypatch: pytest.MonkeyPatch, raises: Callable[..., None], code: str, words: str
+) -> None:
+    monkeypatch.setattr(measured, "measure_fiducials", raises)
+    scan = measured_scan(scan_tasks(read_project(two), ["a"])[0])
+    assert scan.failure is not None
+    assert scan.failure.code == code
+    assert words in scan.failure.sentence
+    assert [(mark.point, mark.status) for mark in scan.frame.marks] == [(id, Status.ABSENT) for id in "1234"]
+
+
+def test_a_failed_scan_has_a_row_for_each_target(tmp_path: Path) -> None:
+    a, _ = tasks_of(tmp_path, PROJECT + BOARD)
+    scan = measured_scan(a)  # an empty file
+    assert scan.failure is not None
+    assert scan.failure.code is FailureCode.UNREADABLE
+    kinds = [mark.kind for mark in scan.frame.marks]
+    assert (kinds.count("fiducial"), kinds.count("target")) == (4, 20)
+
+
+def rows_of(project: Path, images: str) -> list[str]:
+    lines = (project.parent / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line[1:2] == "," and line[0] in images]
+
+
+def test_damaged_and_missing_scans_cost_the_others_nothing(tmp_path: Path, capsys: SAID) -> None:
+    """Of six scans one is damaged, one a text and one a link that leads nowhere; images.csv names another."""
+    whole = write_project(tmp_path / "whole", ["a", "b", "c"])
+    assert run(["run", str(whole)]) == 0
+    listed = PROJECT + '[object]\nimages = "images.csv"\n'
+    four = write_project(tmp_path / "four", ["a", "b", "c", "d"], listed)
+    (four.parent / "images.csv").write_text("image\n" + "\n".join("abcde") + "\n", encoding="utf-8")
+    data = (four.parent / "d.tif").read_bytes()
+    (four.parent / "d.tif").write_bytes(data[: len(data) // 2])
+    (four.parent / "f.tif").write_text("This is no picture.\n" * 50, encoding="utf-8")
+    (four.parent / "g.tif").symlink_to("moved away.tif")
+    capsys.readouterr()
+    assert run(["run", str(four), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["adjustment"]["converged"]
+    whats = [problem["what"] for problem in told["problems"]]
+    assert [what for what in whats if what.startswith("d: ") and "d.tif" in what]
+    assert [what for what in whats if what.startswith("e: images.csv names it, and the project has no scan of")]
+    assert [what for what in whats if what.startswith("g: there is no scan") and "g.tif" in what]
+    assert len(whats) == 4
+    rows = read_comparator(four.parent / "comparator.csv")
+    lines = [
+        line for line in (four.parent / "comparator.csv").read_text().splitlines() if line[:2] in ("a,", "b,", "c,")
+    ]
+    assert lines == [line for line in (whole.parent / "comparator.csv").read_text().splitlines() if line[1:2] == ","]
+    assert {(row.image, row.status) for row in rows if row.image in "de"} == {
+        ("d", Status.ABSENT),
+        ("e", Status.ABSENT),
+    }
+    assert (four.parent / "out" / "report.html").exists()
+    scans = {scan.frame.image: scan for scan in read_measurement(four.parent / "out" / "measurement.json")}
+    assert {name: scan.failure and str(scan.failure.code) for name, scan in scans.items()} == {
+        "a": None, "b": None, "c": None, "d": "unreadable", "e": "missing", "f": "unreadable", "g": "missing",
+    }  # fmt: skip
+
+
+def test_where_no_scan_can_be_measured_the_message_names_each(tmp_path: Path, capsys: SAID) -> None:
+    project = write_project(tmp_path, ["a", "b"])
+    for name in ("a.tif", "b.tif"):
+        (tmp_path / name).write_bytes(b"no picture")
+    assert run(["measure", str(project)]) == 2
+    said = capsys.readouterr().err
+    assert "a.tif" in said
+    assert "b.tif" in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "comparator.csv").exists()
+
+
+def test_a_scan_refused_for_its_size_says_how_to_allow_it(tmp_path: Path, capsys: SAID) -> None:
+    project = write_project(tmp_path, ["a", "b"])
+    shutil.copy(tmp_path / "a.tif", tmp_path / "c.tif")
+    assert run(["measure", str(project), "--max-pixels", "1000"]) == 2
+    assert "--max-pixels" in capsys.readouterr().err
+    (task,) = scan_tasks(replace(read_project(project), max_pixels=1000), ["a"])
+    failed: MeasuredScan = measured_scan(task)
+    assert failed.failure is not None
+    assert failed.failure.code is FailureCode.TOO_LARGE
+    assert task.options_json() == scan_tasks(read_project(project), ["a"])[0].options_json()
+    assert os.path.samefile(failed.scan, tmp_path / "a.tif")
