@@ -21,7 +21,7 @@ from pipeline.adjusting.compare_stage import DRIFT, comparison_json, print_compa
 from pipeline.demo import run_demo
 from pipeline.design.run import run_design
 from pipeline.errors import InputError, what_to_do
-from pipeline.exchange.convention import FORMATS, LARGEST_MISFIT_PX, ExportOptions
+from pipeline.exchange.convention import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
 from pipeline.files.library import PREFIX, library_json, library_path, print_library, read_library
 from pipeline.files.project_file import FINEST_PITCH_UM, Project, read_project
 from pipeline.measuring.camera_answer import print_identification
@@ -194,6 +194,33 @@ def export_project(
     else:
         typer.echo(plain(f"{done.told}\n{out_dir}: {counted(len(done.files), 'file')}"))
     return LOOK if done.written.left_out else DONE
+
+
+@app.command("import")
+def import_files(
+    format: Annotated[str, typer.Argument(metavar="FORMAT", help=f"One of {', '.join(IMPORTED)}.", show_default=False)],
+    paths: Annotated[list[Path], typer.Argument(metavar="FILE... OUT_DIR", show_default=False)],
+    pitch_um: Annotated[
+        float | None, typer.Option("--pitch-um", metavar="UM", min=FINEST_PITCH_UM, help="A pixel of the pictures.")
+    ] = None,
+    sigma_px: Annotated[
+        float | None, typer.Option("--sigma-px", metavar="PX", min=1e-6, help="Of marks that bring none.")
+    ] = None,
+    from_middle: Annotated[
+        bool, typer.Option("--from-middle", help="The principal point counts from the picture's middle.")
+    ] = False,
+    fiducials: Annotated[bool, typer.Option("--fiducials", help="The marks are fiducials.")] = False,
+) -> int:
+    """Marks, cameras, poses and certificates of other programs as files of this one."""
+    from pipeline.exchange.import_stage import run_import
+    from pipeline.exchange.incoming import ImportOptions
+
+    if len(paths) < 2:
+        raise InputError("name at least one FILE, and then OUT_DIR: reseau import FORMAT FILE... OUT_DIR")
+    *files, folder = paths
+    done = run_import(format, files, folder, ImportOptions(pitch_um, sigma_px, from_middle, fiducials))
+    typer.echo(plain(f"{done.told}\n{folder}: {counted(len(done.files), 'file')}"))
+    return DONE
 
 
 @app.command()

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,10 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.foreign_camera import foreign_pose, opencv_camera
+from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.exchange.pinhole import BROWN, INTERIOR, RATIONAL, PinholeFrame, misfit_note, pinhole_frames
+from pipeline.text.image_names import image_name
 
 CONVENTION = Convention(
     (0.5, 0.5),
@@ -76,3 +80,52 @@ def colmap_camera(pycolmap: Any, frame: PinholeFrame, number: int) -> Any:
     return pycolmap.Camera(
         camera_id=number, model=model, width=frame.canvas.width_px, height=frame.canvas.height_px, params=params
     )
+
+
+def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+    """Folders of reconstructions (.bin or .txt): poses as approximations, and cameras of the models that OpenCV has."""
+    pycolmap = imported()
+    cameras, poses, notes = [], [], []
+    for path in paths:
+        folder = path if path.is_dir() else path.parent
+        try:
+            made = pycolmap.Reconstruction(str(folder))
+        except Exception as error:  # whatever pycolmap raises at a broken or missing file
+            told = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+            raise InputError(
+                f"{folder}: is no reconstruction of COLMAP ({told}). Name its folder, as sparse/0."
+            ) from None
+        for number, camera in sorted(made.cameras.items()):
+            known = _parameters(camera)
+            if known is None:
+                notes.append(f"Camera {number} is of the model {camera.model_name}, which is not read.")
+                continue
+            interior, lens = known
+            pixels = tuple(np.array(interior) - np.array([0.0, 0.0, *CONVENTION.first_pixel_px]))
+            size = (camera.width, camera.height)
+            cameras.append(opencv_camera(folder, f"camera{number}", pixels, lens, size, options))
+        for image in made.images.values():
+            if image.has_pose:
+                pose = image.cam_from_world()
+                poses.append(foreign_pose(image_name(image.name), pose.rotation.matrix(), pose.translation))
+    poses.sort(key=lambda pose: pose.image)
+    notes.append("The poses are approximations, in the coordinates of that reconstruction.")
+    return Incoming(cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes))
+
+
+def _parameters(camera: Any) -> tuple[list[float], dict[str, float]] | None:
+    """fx, fy, cx, cy in px and the distortion by OpenCV's names."""
+    values = [float(value) for value in camera.params]
+    names: dict[str, tuple[int, tuple[str, ...]]] = {
+        "SIMPLE_PINHOLE": (1, ()),
+        "PINHOLE": (2, ()),
+        "SIMPLE_RADIAL": (1, ("k1",)),
+        "RADIAL": (1, ("k1", "k2")),
+        "OPENCV": (2, _OPENCV[4:]),
+        "FULL_OPENCV": (2, (*_OPENCV[4:], *_FULL)),
+    }
+    if camera.model_name not in names:
+        return None
+    focals, lens = names[camera.model_name]
+    fx, fy = values[0], values[focals - 1]
+    return [fx, fy, *values[focals : focals + 2]], dict(zip(lens, values[focals + 2 :], strict=True))

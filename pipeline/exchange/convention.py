@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 FORMATS = ("csv", "parquet", "opencv", "colmap", "micmac", "mmvii", "metashape", "asp", "bingo", "geojson")
+IMPORTED = ("micmac", "mmvii", "metashape", "opencv", "colmap", "certificate")
 LARGEST_MISFIT_PX = 0.05  # of a lens in another program's model: a third of a good mark's own standard deviation
 
 

@@ -1,7 +1,7 @@
 """Metashape: a script for its console that makes film cameras with their fiducials, and calibrations in its XML."""
 
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,12 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.foreign_camera import opencv_camera
+from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.exchange.micmac_format import box_of
 from pipeline.exchange.pinhole import BROWN, FittedLens, check_misfit, nearest_lens, sight_misfit_mm
-from pipeline.exchange.xml_tree import plain_number, read_xml, xml_lines, xml_text
+from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, xml_lines, xml_text
+from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas
 
 CONVENTION = Convention(
@@ -139,32 +142,33 @@ def _calibration_name(camera: str) -> str:
     return "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in camera)
 
 
-@dataclass(frozen=True)
-class MetashapeCalibration:
-    """As its file has it: px, from the middle of the picture."""
-
-    width_px: int
-    height_px: int
-    values: dict[str, float]
+def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+    """Calibrations in Agisoft's XML as camera files."""
+    return Incoming(cameras=tuple(_read_camera(path, options) for path in paths))
 
 
-def read_calibration(path: Path) -> MetashapeCalibration:
-    """Raises InputError for a file of another kind, or of a camera that is no central perspective."""
+def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
+    """Raises InputError for a file of another kind, and for what no family of distortion here has."""
     root = read_xml(path)
     if root.tag != "calibration":
         raise InputError(f"{path}: its root is <{root.tag}>, not <calibration>. Save it as Agisoft XML.")
     projection = (root.findtext("projection") or "frame").strip()
     if projection != "frame":
         raise InputError(f"{path}: is of a {projection} camera; only frame cameras are read.")
-    texts = {name: root.findtext(name) for name in ("width", "height", *NAMES)}
-    try:
-        numbers = {name: float(text) for name, text in texts.items() if text is not None}
-    except ValueError as error:
-        raise InputError(f"{path}: holds what is no number ({error}).") from None
-    missing = [name for name in ("width", "height", "f") if name not in numbers]
-    if missing or not np.isfinite(list(numbers.values())).all() or numbers["f"] <= 0.0:
+    names = ("width", "height", "f", *NAMES[1:])
+    given = {name: numbers_of(root, name, 1, path)[0] for name in names if root.find(name) is not None}
+    missing = [name for name in ("width", "height", "f") if not given.get(name, 0.0) > 0.0]
+    if missing:
+        raise InputError(f"{path}: has no positive {missing[0]}. Export the calibration again.")
+    strange = [name for name in ("k4", "b2") if given.get(name, 0.0) != 0.0]
+    if strange:
         raise InputError(
-            f"{path}: needs a finite width, height and f; {', '.join(missing) or 'one of them'} is missing."
+            f"{path}: {strange[0]} is {given[strange[0]]:g}, and no family of distortion here has it. Calibrate again "
+            "with it held at 0."
         )
-    values = {name: numbers.get(name, 0.0) for name in NAMES}
-    return MetashapeCalibration(int(numbers["width"]), int(numbers["height"]), values)
+    of = {name: given.get(name, 0.0) for name in NAMES}
+    size = (given["width"], given["height"])
+    interior = (of["f"] + of["b1"], of["f"], size[0] / 2 + of["cx"], size[1] / 2 + of["cy"])
+    pixels = tuple(np.array(interior) - np.array([0.0, 0.0, *CONVENTION.first_pixel_px]))
+    lens = {name: of[name] for name in ("k1", "k2", "k3")} | {"p1": of["p2"], "p2": of["p1"]}
+    return opencv_camera(path, path.stem, pixels, lens, size, options)

@@ -1,9 +1,10 @@
 """MicMac: marks of unresampled scans for its ReSampFid, and camera and poses for the frames that this makes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from math import ceil, floor
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
-from pipeline.exchange.marks_in import ForeignMark
+from pipeline.exchange.foreign_camera import fiducial_camera
+from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
 from pipeline.exchange.pinhole import (
     BROWN,
     Y_DOWN_Z_FORWARD,
@@ -21,9 +23,10 @@ from pipeline.exchange.pinhole import (
     nearest_lens,
     sight_misfit_mm,
 )
-from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
+from pipeline.exchange.xml_tree import Element, numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.text.image_names import image_name
 
 Array = NDArray[np.float64]
 
@@ -242,18 +245,32 @@ def _numbers(values: Array) -> str:
     return " ".join(plain_number(value) for value in values)
 
 
-def read_marks(path: Path) -> list[ForeignMark]:
-    """The marks of a MeasuresIm file (column and row), or the fiducials of MeasuresCamera (mm, y up), image "Glob"."""
-    root = read_xml(path)
-    images = [root] if root.tag == "MesureAppuiFlottant1Im" else root.findall("MesureAppuiFlottant1Im")
-    if not images:
-        raise InputError(f"{path}: has no <MesureAppuiFlottant1Im>. MeasuresIm-*.xml and MeasuresCamera.xml are read.")
-    marks = []
-    for image in images:
-        name = text_of(image, "NameIm", path)
-        is_camera = path.name == "MeasuresCamera.xml"
-        for mark in image.findall("OneMesureAF1I"):
-            place = np.array(numbers_of(mark, "PtIm", 2, path))
-            place = place * _Y_DOWN if is_camera else place - CONVENTION.first_pixel_px
-            marks.append(ForeignMark("" if is_camera else name, text_of(mark, "NamePt", path), place, None))
-    return marks
+def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+    """Files MeasuresIm-*.xml (fiducials), MeasuresCamera.xml (a camera's, which makes a camera file) and sets of marks
+    (points)."""
+    marks: list[ForeignMark] = []
+    cameras = []
+    for path in paths:
+        root = read_xml(path)
+        alone = root.tag == "MesureAppuiFlottant1Im"
+        images = [root] if alone else root.findall("MesureAppuiFlottant1Im")
+        if not images:
+            raise InputError(f"{path}: has no <MesureAppuiFlottant1Im>. Measures of marks are read, and nothing else.")
+        if path.name == "MeasuresCamera.xml":
+            places = {point: place * _Y_DOWN for point, place, _ in _points(root, path)}
+            cameras.append(fiducial_camera(path.parent.parent.name or "camera", places))
+            continue
+        for image in images:
+            name = image_name(text_of(image, "NameIm", path))
+            for point, place, sigma_px in _points(image, path):
+                covariance = None if sigma_px is None else sigma_px**2 * np.eye(2)
+                kind: Literal["fiducial", "target"] = "fiducial" if alone or options.fiducials else "target"
+                marks.append(ForeignMark(name, point, kind, place - CONVENTION.first_pixel_px, covariance))
+    return Incoming(tuple(marks), tuple(cameras))
+
+
+def _points(image: Element, path: Path) -> Iterator[tuple[str, Array, float | None]]:
+    """Name, place and standard deviation, if there is one, of an image's marks."""
+    for mark in image.findall("OneMesureAF1I"):
+        sigma_px = numbers_of(mark, "PrecPointe", 1, path)[0] if mark.find("PrecPointe") is not None else None
+        yield text_of(mark, "NamePt", path), np.array(numbers_of(mark, "PtIm", 2, path)), sigma_px

@@ -1,5 +1,6 @@
 """MMVII: the marks of unresampled scans with their whole covariances, which it alone of these programs takes."""
 
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -9,9 +10,10 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
-from pipeline.exchange.marks_in import ForeignMark
+from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
 from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
 from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.text.image_names import image_name
 
 Array = NDArray[np.float64]
 
@@ -62,20 +64,27 @@ def _sigma2(mark: ComparatorPoint, pitch_um: tuple[float, float]) -> tuple[float
     return sx * sx, -mark.rho * sx * sy, sy * sy
 
 
-def read_marks(path: Path) -> list[ForeignMark]:
-    """The marks of a MesIm file with their covariances."""
-    root = read_xml(path)
-    measures = root.find("Data/SetMesIm")
+def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+    """Files MesIm-*.xml: marks with their covariances. Those in a folder Fiducials are fiducials."""
+    marks: list[ForeignMark] = []
+    for path in paths:
+        marks += _marks(path, options.fiducials or path.resolve().parent.name == _FOLDERS[True])
+    return Incoming(tuple(marks))
+
+
+def _marks(path: Path, fiducials: bool) -> list[ForeignMark]:
+    measures = read_xml(path).find("Data/SetMesIm")
     if measures is None:
         raise InputError(f"{path}: has no <SetMesIm>. Files MesIm-*.xml are read.")
-    image = _word(text_of(measures, "NameIm", path))
+    image = image_name(_word(text_of(measures, "NameIm", path)))
     marks = []
     for element in measures.iterfind("Measures/el"):
         place = np.array(numbers_of(element, "Pt", 2, path)) - CONVENTION.first_pixel_px
         xx, xy, yy = numbers_of(element, "Sigma2", 3, path)
         known = xx > 0.0 and yy > 0.0 and xx * yy > xy * xy
         covariance = np.array([[xx, xy], [xy, yy]]) if known else None
-        marks.append(ForeignMark(image, _word(text_of(element, "Name", path)), place, covariance))
+        name = _word(text_of(element, "Name", path))
+        marks.append(ForeignMark(image, name, "fiducial" if fiducials else "target", place, covariance))
     return marks
 
 

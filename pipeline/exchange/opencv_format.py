@@ -1,18 +1,32 @@
 """OpenCV's YAML: camera matrix, distortion and pose of every image, of its resampled frame."""
 
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
 
+from pipeline.errors import InputError
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.foreign_camera import foreign_pose, opencv_camera
+from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming
 from pipeline.exchange.pinhole import BROWN, PRISMS, PinholeFrame, misfit_note, pinhole_frames
+from pipeline.files.camera_file import CameraFile
 from pipeline.opencv_check.opencv_model import NAMES
+from pipeline.text.image_names import image_name
+from pipeline.text.text_file import read_bytes
 
 CONVENTION = Convention(
     (0.0, 0.0),
     "column right, row down; camera x right, y down, z forward; camera = R X + t",
     "OpenCV, calib3d: projectPoints, and undistort, whose maps count from the first pixel's centre",
 )
+MOST_MB = 4
+_MATRIX = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix", "M1")
+_LENS = ("distortion_coefficients", "D", "Distortion_Coefficients", "distCoeffs", "D1")
+_WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
 
 def write(block: Block, options: ExportOptions) -> Written:
@@ -40,3 +54,50 @@ def _yaml(frame: PinholeFrame) -> str:
     storage.write("R", frame.rotation)
     storage.write("t", frame.translation.reshape(3, 1))
     return str(storage.releaseAndGetString())
+
+
+def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+    """Files of cv2.FileStorage: matrix, distortion and size as camera files; R and t, where there are, as poses."""
+    found = [_read(path, options) for path in paths]
+    poses = tuple(pose for _, pose in found if pose is not None)
+    return Incoming(cameras=tuple(camera for camera, _ in found), poses=poses)
+
+
+def _read(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose | None]:
+    try:
+        return _camera_and_pose(path, options)
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: there is no such file.") from None
+    except (UnicodeDecodeError, cv2.error, SystemError) as error:
+        told = str(error).splitlines()[0][:80]
+        raise InputError(f"{path}: is no file of cv2.FileStorage with a camera in it ({told}).") from None
+
+
+def _camera_and_pose(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose | None]:
+    text = read_bytes(path, MOST_MB).decode("utf-8")
+    storage: Any = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+
+    def first(names: Sequence[str]) -> Any:
+        nodes = (storage.getNode(name) for name in names)
+        return next((node for node in nodes if not node.empty()), None)
+
+    matrix, lens, size = (first(names) for names in (_MATRIX, _LENS, _WIDTH))
+    if matrix is None or matrix.mat() is None or matrix.mat().shape != (3, 3):
+        raise InputError(f"{path}: has no 3 x 3 matrix {_MATRIX[0]} (or {', '.join(_MATRIX[1:])}).")
+    k = np.array(matrix.mat(), dtype=float)
+    values = np.zeros(0) if lens is None else np.ravel(lens.mat()).astype(float)
+    if values.size > len(NAMES[4:]) or not (np.isfinite(values).all() and np.isfinite(k).all() and k[0, 0] > 0.0):
+        raise InputError(f"{path}: the camera matrix and up to {len(NAMES[4:])} distortion values are to be finite.")
+    if k[0, 1] != 0.0:
+        raise InputError(f"{path}: its camera matrix has a skew of {k[0, 1]:g}, which OpenCV's own model has not.")
+    height = first(_HEIGHT)
+    pixels = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+    extent = (size.real(), height.real()) if size is not None and height is not None else None
+    name = storage.getNode("camera").string() or path.stem
+    picture = image_name(storage.getNode("image").string() or path.stem)
+    given = dict(zip(NAMES[4:], values.tolist(), strict=False))
+    camera = opencv_camera(path, name, pixels, given, extent, options)
+    turn, shift = storage.getNode("R").mat(), storage.getNode("t").mat()
+    if turn is None or shift is None:
+        return camera, None
+    return camera, foreign_pose(picture, np.array(turn, dtype=float), np.ravel(shift).astype(float))

@@ -1,5 +1,6 @@
 """XML of other programs: read by a parser that expands no entities, written with two blanks a level."""
 
+import math
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
@@ -74,7 +75,7 @@ def numbers_of(element: Element, name: str, count: int, path: Path) -> list[floa
         values = [float(part) for part in text.split()]
     except ValueError:
         values = []
-    if len(values) != count:
+    if len(values) != count or not all(map(math.isfinite, values)):
         raise InputError(f"{path}: <{name}> is {text[:60]!r}; it should be {count} numbers.")
     return values
 

@@ -1,0 +1,194 @@
+"""A calibration certificate: its table of radial distortion fitted, and its two principal distances told apart.
+
+A lens images a ray at the angle t from its axis at the radius r. The distortion that a table gives is r - c tan t, and
+so belongs to the c that it was made with: the equivalent principal distance, to which the lens tends near its axis, or
+the calibrated one, which makes the largest positive and negative distortions equal (Manual of Photogrammetry). With
+the model of this program, whose correction k3 r^3 + k5 r^5 + k7 r^7 has no linear term, c is the equivalent one:
+
+    r - C tan t = (c - C) tan t + k3 r^3 + k5 r^5 + k7 r^7        C: what the table refers to
+
+which is linear in c - C, k3, k5, k7.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from adjust.problem.network import Distortion, Prior
+from pipeline.exchange.convention import Convention
+from pipeline.exchange.incoming import ImportOptions, Incoming
+from pipeline.files.camera_file import DEFAULT_SIGMA_MM, CameraFile
+from pipeline.text.tables import read_toml
+
+Array = NDArray[np.float64]
+
+CONVENTION = Convention(
+    (float("nan"), float("nan")),
+    "radial distortion in um, positive away from the centre, at angles from the axis or at radii in mm",
+    "U.S. Geological Survey, Report of Calibration of Aerial Mapping Camera (OSL): Lens Distortion by field angle",
+)
+POWERS = (3, 5, 7)
+_ROUNDED_UM = 1.0 / np.sqrt(12.0)  # the standard deviation of what was rounded to whole um
+_CURVE = 400  # places on the curve whose extremes are balanced
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """As it is printed. radius_mm (n,), tangent (n,) of the angle from the axis, radial_um (n,); sigma_um of one value;
+    principal_distance_mm: that which the table refers to."""
+
+    name: str
+    principal_distance_mm: float
+    principal_point_mm: tuple[float, float]
+    radius_mm: Array
+    tangent: Array
+    radial_um: Array
+    sigma_um: float
+
+
+@dataclass(frozen=True)
+class FittedTable:
+    """equivalent_mm and calibrated_mm: both principal distances; coefficients (3,) of r^3, r^5, r^7; their standard
+    deviations together with that of the equivalent one (4,); residuals_um (n,): the table's values less the curve's."""
+
+    equivalent_mm: float
+    calibrated_mm: float
+    coefficients: Array
+    sigmas: Array
+    residuals_um: Array
+
+
+def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+    """Certificates as TOML files, each a camera file with the equivalent principal distance, and a table of the fit."""
+    certificates = [read_certificate(path) for path in paths]
+    fits = [fit(certificate) for certificate in certificates]
+    pairs = list(zip(certificates, fits, strict=True))
+    tables = {f"{path.stem}-residuals.csv": _residuals(*pair) for path, pair in zip(paths, pairs, strict=True)}
+    notes = tuple(note for pair in pairs for note in _notes(*pair))
+    return Incoming(cameras=tuple(_camera(*pair) for pair in pairs), notes=notes, tables=tables)
+
+
+def read_certificate(path: Path) -> Certificate:
+    """Raises InputError naming the key: no distance, both kinds of places or none, lists of unlike length."""
+    table = read_toml(path)
+    both = ("calibrated_principal_distance_mm", "equivalent_principal_distance_mm")
+    refers = table.text("refers_to", "calibrated", ("calibrated", "equivalent"))
+    distances = {key: table.number(key, above=0.0) for key in both if key in table}
+    key = f"{refers}_principal_distance_mm"
+    if key not in distances:
+        raise table.error(key, f"is missing: the table refers to the {refers} principal distance.")
+    distance = distances[key]
+    radial_um = np.array(table.numbers("radial_um"))
+    places = [key for key in ("angle_deg", "radius_mm") if key in table]
+    if len(places) != 1:
+        raise table.error("angle_deg", "or radius_mm is needed: where the distortions are, one of both.")
+    at = np.array(table.numbers(places[0]))
+    if at.shape != radial_um.shape or at.size < 2 or (at <= 0.0).any() or len(set(at.tolist())) < at.size:
+        raise table.error(places[0], f"must be {radial_um.size} different positive places, one a value of radial_um.")
+    if places[0] == "angle_deg":
+        if (at >= 90.0).any():
+            raise table.error("angle_deg", "must lie below 90 degrees.")
+        tangent = np.tan(np.radians(at))
+        radius_mm = distance * tangent + radial_um / 1000.0
+    else:
+        radius_mm, tangent = at, (at - radial_um / 1000.0) / distance
+    certificate = Certificate(
+        table.text("name", path.stem),
+        distance,
+        table.pair("principal_point_mm") if "principal_point_mm" in table else (0.0, 0.0),
+        radius_mm,
+        tangent,
+        radial_um,
+        table.number("sigma_um", float(_ROUNDED_UM), above=0.0),
+    )
+    table.done()
+    return certificate
+
+
+def fit(certificate: Certificate) -> FittedTable:
+    """By least squares, with as many of the three powers as leave one value over. The standard deviations are those of
+    the values' own, enlarged where the residuals are larger."""
+    radius, tangent = certificate.radius_mm, certificate.tangent
+    count = max(min(len(POWERS), len(radius) - 2), 0)
+    design = np.column_stack([tangent, *(radius**power for power in POWERS[:count])])
+    scale = np.linalg.norm(design, axis=0)
+    observed = certificate.radial_um / 1000.0
+    solution = np.linalg.lstsq(design / scale, observed)[0] / scale
+    residuals = observed - design @ solution
+    redundancy = len(radius) - design.shape[1]
+    sigma = certificate.sigma_um / 1000.0
+    if redundancy > 0:
+        sigma = max(sigma, float(np.sqrt(residuals @ residuals / redundancy)))
+    cofactor = np.linalg.inv((design / scale).T @ (design / scale)) / np.outer(scale, scale)
+    sigmas = np.zeros(1 + len(POWERS))
+    sigmas[: design.shape[1]] = sigma * np.sqrt(np.diag(cofactor))
+    coefficients = np.zeros(len(POWERS))
+    coefficients[:count] = solution[1:]
+    equivalent = certificate.principal_distance_mm + float(solution[0])
+    calibrated = balanced_mm(equivalent, coefficients, float(radius.max()))
+    return FittedTable(equivalent, calibrated, coefficients, sigmas, 1000.0 * residuals)
+
+
+def balanced_mm(equivalent_mm: float, coefficients: Array, largest_radius_mm: float) -> float:
+    """The calibrated principal distance: out to a radius its largest and its least distortion are of one size."""
+    radius = np.linspace(0.0, largest_radius_mm, _CURVE)
+    tangent = (radius - _curve(coefficients, radius)) / equivalent_mm
+
+    def imbalance(distance_mm: float) -> float:
+        distortion = radius - distance_mm * tangent
+        return float(distortion.max() + distortion.min())
+
+    reach = 2.0 * np.abs(_curve(coefficients, radius)).max() / max(float(tangent[-1]), 1e-9) + 1e-6
+    return float(brentq(imbalance, equivalent_mm - reach, equivalent_mm + reach, xtol=1e-9))
+
+
+def _curve(coefficients: Array, radius_mm: Array) -> Array:
+    """The distortion (n,) in mm against the equivalent principal distance."""
+    return np.asarray(sum(k * radius_mm**power for k, power in zip(coefficients, POWERS, strict=True)))
+
+
+def _camera(certificate: Certificate, fitted: FittedTable) -> CameraFile:
+    names = [f"k{power}" for power in POWERS]
+    given = zip(names, fitted.coefficients.tolist(), fitted.sigmas[1:].tolist(), strict=True)
+    return CameraFile(
+        path=Path(certificate.name),
+        name=certificate.name,
+        frame_mm=None,
+        principal_distance_mm=fitted.equivalent_mm,
+        principal_point_mm=certificate.principal_point_mm,
+        principal_distance_sigma_mm=float(fitted.sigmas[0]),
+        principal_point_sigma_mm=(DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM),
+        distortion=Distortion("torlegard", {name: Prior(k, sigma) for name, k, sigma in given if sigma > 0.0}),
+        fiducials=(),
+    )
+
+
+def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
+    largest = float(np.abs(fitted.residuals_um).max())
+    rms = float(np.sqrt((fitted.residuals_um**2).mean()))
+    k3, k5, k7 = fitted.coefficients
+    over = len(certificate.radial_um) - int((fitted.sigmas > 0.0).sum())
+    return [
+        f"{certificate.name}: equivalent principal distance {fitted.equivalent_mm:.4f} mm, its standard deviation "
+        f"{fitted.sigmas[0]:.4f}; calibrated {fitted.calibrated_mm:.4f} mm, by the balance of the fitted curve; the "
+        f"table refers to {certificate.principal_distance_mm:.4f} mm. The camera file has the equivalent one.",
+        f"{certificate.name}: k3 {k3:.4g}, k5 {k5:.4g}, k7 {k7:.4g}; residuals of the table {rms:.2f} um rms, "
+        f"{largest:.2f} um at most, {over} values more than unknowns.",
+    ]
+
+
+def _residuals(certificate: Certificate, fitted: FittedTable) -> str:
+    """The table as printed, and what the curve leaves of it."""
+    lines = [
+        f"# radial distortion of {certificate.name}, against c = {certificate.principal_distance_mm!r} mm",
+        "angle_deg,radius_mm,radial_um,fitted_um,residual_um",
+    ]
+    angles = np.degrees(np.arctan(certificate.tangent))
+    for row in zip(angles, certificate.radius_mm, certificate.radial_um, fitted.residuals_um, strict=True):
+        angle, radius, value, residual = (float(number) for number in row)
+        lines.append(f"{angle:.4f},{radius:.4f},{value:.3f},{value - residual:.3f},{residual:.3f}")
+    return "\n".join(lines) + "\n"

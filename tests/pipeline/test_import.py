@@ -1,0 +1,276 @@
+"""What comes in from other programs: what was exported comes back with the same numbers, and hostile XML is refused."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from exported_project import PITCH_MM, TRUTH, adjusted_project, camera_mm
+from numpy.typing import NDArray
+from simulated import FIDUCIALS
+
+from pipeline.cli import DONE, WRONG_INPUT, run
+from pipeline.exchange.certificate import balanced_mm, fit, read_certificate
+from pipeline.exchange.xml_tree import read_xml
+from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.images_file import read_images
+from pipeline.results.comparator_file import pitches_of, read_comparator
+
+Array = NDArray[np.float64]
+
+PITCH = ("--pitch-um", str(1000.0 * PITCH_MM))
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return adjusted_project(tmp_path_factory.mktemp("exported"))
+
+
+def exported(project: Path, format: str, folder: Path, *options: str) -> Path:
+    assert run(["export", str(project), format, str(folder / f"{format}-out"), *options]) in (0, 1)
+    return folder / f"{format}-out"
+
+
+def imported(format: str, paths: list[Path], folder: Path, *options: str) -> Path:
+    assert run(["import", format, *map(str, paths), str(folder / format), *options]) == DONE
+    return folder / format
+
+
+def lens_of(camera: CameraFile) -> dict[str, float]:
+    return {name: prior.value for name, prior in camera.distortion.parameters.items()}
+
+
+def adjusted(project: Path) -> dict[str, Any]:
+    return dict(json.loads((project.parent / "out" / "adjustment.json").read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("format", ["mmvii", "micmac"])
+def test_marks_come_back_as_they_went(format: str, project: Path, tmp_path: Path) -> None:
+    out = exported(project, format, tmp_path)
+    files = {"mmvii": out.rglob("MesIm-*.xml"), "micmac": (out / "Ori-InterneScan").glob("*.xml")}[format]
+    folder = imported(format, sorted(files), tmp_path, *PITCH)
+    there = {(m.image, m.point, m.kind): m for m in read_comparator(folder / "comparator.csv")}
+    here = {(m.image, m.point, m.kind): m for m in read_comparator(project.parent / "comparator.csv")}
+    assert there.keys() == {key for key in here if format == "mmvii" or key[2] == "fiducial"}
+    for key, mark in there.items():
+        np.testing.assert_allclose(mark.xy_mm, here[key].xy_mm, atol=1e-9)  # type: ignore[arg-type]
+        np.testing.assert_allclose(mark.sigma_mm, here[key].sigma_mm, rtol=1e-9)  # type: ignore[arg-type]
+    assert pitches_of(folder / "comparator.csv")["f3"] == (100.0, 100.0)
+    if format == "micmac":
+        given = {one.id: one.xy_mm for one in read_camera(folder / "camera.toml").fiducials}
+        for id, xy in FIDUCIALS.items():
+            assert given[id] == pytest.approx(xy, abs=1e-6)
+
+
+def test_points_of_a_set_of_marks_are_targets(project: Path, tmp_path: Path) -> None:
+    marks = exported(project, "micmac", tmp_path) / "Measures-S2D.xml"
+    folder = imported("micmac", [marks], tmp_path, *PITCH)
+    found = read_comparator(folder / "comparator.csv")
+    assert {mark.kind for mark in found} == {"target"}
+    assert {mark.image for mark in found} == {f"OIS-Reech_f{i}" for i in range(4)}
+    first = [mark.xy_mm for mark in found if mark.image == "OIS-Reech_f1"]
+    np.testing.assert_allclose(first, camera_mm(1) - (-114.0, 114.0), atol=1e-6)  # type: ignore[arg-type]
+
+
+def test_marks_without_a_sigma_need_one_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "MeasuresIm-a.tif.xml"
+    file.write_text(
+        "<MesureAppuiFlottant1Im><NameIm>a.tif</NameIm><OneMesureAF1I><NamePt>1</NamePt><PtIm>10 20</PtIm>"
+        "</OneMesureAF1I></MesureAppuiFlottant1Im>",
+        encoding="utf-8",
+    )
+    assert run(["import", "micmac", str(file), str(tmp_path / "o"), *PITCH]) == WRONG_INPUT
+    assert "say with --sigma-px" in capsys.readouterr().err
+    assert run(["import", "micmac", str(file), str(tmp_path / "o")]) == WRONG_INPUT
+    assert "say with --pitch-um" in capsys.readouterr().err
+    folder = imported("micmac", [file], tmp_path, *PITCH, "--sigma-px", "0.2")
+    (mark,) = read_comparator(folder / "comparator.csv")
+    assert (mark.image, mark.kind) == ("a", "fiducial")
+    np.testing.assert_allclose(mark.xy_mm, [1.0, -2.0])  # type: ignore[arg-type]
+    np.testing.assert_allclose(mark.sigma_mm, [0.02, 0.02])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("format", ["opencv", "colmap"])
+def test_poses_and_cameras_come_back_as_they_went(format: str, project: Path, tmp_path: Path) -> None:
+    out = exported(project, format, tmp_path, "--lens")
+    paths = {"opencv": [out / "f1.yml"], "colmap": [out / "sparse"]}[format]
+    folder = imported(format, paths, tmp_path, *PITCH)
+    exterior = read_images(folder / "images.csv").exterior["f1"]
+    assert exterior is not None
+    assert not np.isfinite(exterior.sigmas).any()
+    known = adjusted(project)["images"]["f1"]["exterior"]
+    np.testing.assert_allclose(exterior.values[:3], [known[axis]["value"] for axis in ("X0", "Y0", "Z0")], atol=1e-8)
+    angles = [known[f"{angle}_deg"]["value"] for angle in ("omega", "phi", "kappa")]
+    np.testing.assert_allclose(np.degrees(exterior.values[3:]), angles, atol=1e-9)
+    camera = read_camera(folder / ("camera.toml" if format == "opencv" else "camera2.toml"))
+    assert camera.principal_distance_mm == pytest.approx(TRUTH.c, abs=1e-7)
+    storage = cv2.FileStorage(str(exported(project, "opencv", tmp_path, "--lens") / "f1.yml"), cv2.FILE_STORAGE_READ)
+    point = storage.getNode("camera_matrix").mat()[:2, 2] * (PITCH_MM, -PITCH_MM)
+    assert camera.principal_point_mm == pytest.approx(point, abs=1e-9)
+
+
+def test_a_lens_comes_back_as_it_went(project: Path, tmp_path: Path) -> None:
+    """OpenCV's file, COLMAP's and Metashape's give the same lens; Metashape's counts from the middle of the frame."""
+    yml = exported(project, "opencv", tmp_path) / "f1.yml"
+    storage = cv2.FileStorage(str(yml), cv2.FILE_STORAGE_READ)
+    values = storage.getNode("distortion_coefficients").mat().ravel()
+    by_opencv = read_camera(imported("opencv", [yml], tmp_path, *PITCH) / "camera.toml")
+    assert lens_of(by_opencv) == pytest.approx(
+        dict(zip(("k1", "k2", "p1", "p2", "k3"), values, strict=True)), rel=1e-12
+    )
+    sparse = exported(project, "colmap", tmp_path) / "sparse"
+    by_colmap = read_camera(imported("colmap", [sparse], tmp_path, *PITCH) / "camera2.toml")
+    assert lens_of(by_colmap) == pytest.approx(lens_of(by_opencv), rel=1e-12)
+    xml = exported(project, "metashape", tmp_path) / "K.xml"
+    by_metashape = read_camera(imported("metashape", [xml], tmp_path, *PITCH, "--from-middle") / "camera.toml")
+    assert lens_of(by_metashape) == pytest.approx(lens_of(by_opencv), rel=1e-9)
+    assert by_metashape.principal_distance_mm == pytest.approx(TRUTH.c, abs=1e-3)
+    assert by_metashape.principal_point_mm == pytest.approx((TRUTH.x0, TRUTH.y0), abs=1e-3)
+    assert by_metashape.frame_mm == pytest.approx((228.0, 228.0))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c;</a>',
+        '<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]><a>&b;</a>',
+        '<!DOCTYPE a SYSTEM "http://localhost/a.dtd"><a/>',
+    ],
+)
+def test_entities_are_never_expanded(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "MeasuresIm-a.xml"
+    file.write_text(text, encoding="utf-8")
+    for format in ("micmac", "mmvii", "metashape"):
+        assert run(["import", format, str(file), str(tmp_path / "o"), *PITCH, "--sigma-px", "1"]) == WRONG_INPUT
+        assert "entities are not expanded" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("<a>" * 200, "more than 100 deep"),
+        ("<a><b></a>", "is not valid XML"),
+        ("", "is not valid XML"),
+        ("<a/>", "has no <MesureAppuiFlottant1Im>"),
+        ("<MesureAppuiFlottant1Im><NameIm>a</NameIm><OneMesureAF1I><NamePt>1</NamePt><PtIm>1 x</PtIm></OneMesureAF1I>"
+         "</MesureAppuiFlottant1Im>", "should be 2 numbers"),
+        ("<MesureAppuiFlottant1Im><NameIm>a</NameIm><OneMesureAF1I><NamePt>1</NamePt><PtIm>1 nan</PtIm></OneMesureAF1I>"
+         "</MesureAppuiFlottant1Im>", "should be 2 numbers"),
+    ],
+)  # fmt: skip
+def test_broken_xml_gets_a_message(text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "MeasuresIm-a.xml"
+    file.write_text(text, encoding="utf-8")
+    assert run(["import", "micmac", str(file), str(tmp_path / "o"), *PITCH, "--sigma-px", "1"]) == WRONG_INPUT
+    assert words in capsys.readouterr().err
+
+
+def test_an_ordinary_file_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "a.xml"
+    file.write_text('<?xml version="1.0"?><a><!-- a note --><b>1 &amp; 2</b></a>', encoding="utf-8")
+    assert read_xml(file).findtext("b") == "1 & 2"
+
+
+@pytest.mark.parametrize(
+    ("format", "content", "words"),
+    [
+        ("opencv", "%YAML:1.0\n---\nK: 5\n", "with a camera in it"),
+        ("opencv", "no yaml \x01 at all", "cv2.FileStorage"),
+        ("metashape", "<calibration><width>10</width><height>9</height><f>-3</f></calibration>", "no positive f"),
+        ("metashape", "<calibration><width>9</width><height>9</height><f>3</f><k4>1</k4></calibration>", "k4 is 1"),
+        ("metashape", "<calibration><projection>fisheye</projection></calibration>", "only frame cameras"),
+        ("colmap", "", "is no reconstruction"),
+        ("certificate", "radial_um = [1.0]", "calibrated principal distance"),
+    ],
+)
+def test_files_of_another_kind_get_a_message(
+    format: str, content: str, words: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "file"
+    file.write_text(content, encoding="utf-8")
+    assert run(["import", format, str(file), str(tmp_path / "o"), *PITCH]) == WRONG_INPUT
+    assert words in capfd.readouterr().err
+
+
+# A certificate
+
+ANGLES = [7.5, 15.0, 22.7, 30.0, 35.0, 40.0]
+
+
+def printed(path: Path, c: float, radial_um: list[float], **more: str) -> Path:
+    lines = [f"calibrated_principal_distance_mm = {c!r}", f"angle_deg = {ANGLES}", f"radial_um = {radial_um}"]
+    path.write_text("\n".join([*lines, *(f"{key} = {value}" for key, value in more.items())]) + "\n", encoding="utf-8")
+    return path
+
+
+def distortion_um(c: float, equivalent: float, k: tuple[float, float, float], angle_deg: float) -> float:
+    """r - c tan t, where r - k3 r^3 - k5 r^5 - k7 r^7 = equivalent tan t, by fixed-point iteration."""
+    tangent = np.tan(np.radians(angle_deg))
+    r = equivalent * tangent
+    for _ in range(50):
+        r = equivalent * tangent + k[0] * r**3 + k[1] * r**5 + k[2] * r**7
+    return float(1000.0 * (r - c * tangent))
+
+
+def test_a_certificate_gives_back_the_lens_that_it_was_made_of(tmp_path: Path) -> None:
+    k, c, equivalent = (2.0e-8, -1.5e-12, 2.0e-17), 153.00, 153.02
+    table = [distortion_um(c, equivalent, k, angle) for angle in ANGLES]
+    fitted = fit(read_certificate(printed(tmp_path / "c.toml", c, table)))
+    assert fitted.equivalent_mm == pytest.approx(equivalent, abs=1e-8)
+    np.testing.assert_allclose(fitted.coefficients, k, rtol=1e-6)
+    np.testing.assert_allclose(fitted.residuals_um, 0.0, atol=1e-6)
+
+
+def test_the_calibrated_distance_balances_the_distortion(tmp_path: Path) -> None:
+    k, equivalent = np.array([3.0e-8, -2.0e-12, 0.0]), 152.0
+    calibrated = balanced_mm(equivalent, k, 120.0)
+    angles = np.degrees(np.arctan(np.linspace(0.0, 120.0, 500) / equivalent))
+    curve = [distortion_um(calibrated, equivalent, (3.0e-8, -2.0e-12, 0.0), angle) for angle in angles]
+    assert max(curve) == pytest.approx(-min(curve), abs=0.1)
+    assert calibrated != pytest.approx(equivalent, abs=1e-3)
+
+
+def test_a_published_table_is_fitted_to_its_rounding(tmp_path: Path) -> None:
+    """U.S. Geological Survey, Report of Calibration OSL/1785 (1992): radial distortion of a Lamegon PI/C, mean of four
+    half diagonals, in whole um and accurate within 5."""
+    table = read_certificate(printed(tmp_path / "osl.toml", 152.299, [3.0, 4.0, 1.0, -3.0, -4.0, 3.0]))
+    fitted = fit(table)
+    assert np.abs(fitted.residuals_um).max() < 1.5
+    assert fitted.calibrated_mm == pytest.approx(152.299, abs=0.005)
+    assert fitted.equivalent_mm - 152.299 > 0.01  # its distortion begins by rising
+    folder = imported("certificate", [tmp_path / "osl.toml"], tmp_path)
+    camera = read_camera(folder / "camera.toml")
+    assert camera.principal_distance_mm == pytest.approx(fitted.equivalent_mm)
+    assert camera.distortion.family == "torlegard"
+    rows = list(csv.reader((folder / "osl-residuals.csv").read_text(encoding="utf-8").splitlines()[1:]))
+    assert [float(row[2]) for row in rows[1:]] == [3.0, 4.0, 1.0, -3.0, -4.0, 3.0]
+    assert "calibrated 152.29" in (folder / "README.txt").read_text(encoding="utf-8")
+
+
+def test_radii_say_what_angles_say(tmp_path: Path) -> None:
+    k, c, equivalent = (2.0e-8, -1.5e-12, 0.0), 153.00, 153.02
+    table = [distortion_um(c, equivalent, k, angle) for angle in ANGLES]
+    by_angle = fit(read_certificate(printed(tmp_path / "a.toml", c, table)))
+    radii = [c * np.tan(np.radians(angle)) + um / 1000.0 for angle, um in zip(ANGLES, table, strict=True)]
+    text = f"calibrated_principal_distance_mm = {c}\nradius_mm = {[float(r) for r in radii]}\nradial_um = {table}\n"
+    (tmp_path / "r.toml").write_text(text, encoding="utf-8")
+    by_radius = fit(read_certificate(tmp_path / "r.toml"))
+    assert by_radius.equivalent_mm == pytest.approx(by_angle.equivalent_mm, abs=1e-7)
+    np.testing.assert_allclose(by_radius.coefficients, by_angle.coefficients, rtol=1e-6, atol=1e-20)
+
+
+def test_noise_in_the_table_moves_the_lens_by_its_sigma(tmp_path: Path) -> None:
+    k, c, equivalent = (2.0e-8, -1.5e-12, 2.0e-17), 153.00, 153.02
+    table = np.array([distortion_um(c, equivalent, k, angle) for angle in ANGLES])
+    rng = np.random.default_rng(4)
+    exact = read_certificate(printed(tmp_path / "c.toml", c, table.tolist(), sigma_um="2.0"))
+    off = []
+    for _ in range(300):
+        noisy = exact.radial_um + rng.normal(0.0, 2.0, table.size)
+        off.append(fit(replace(exact, radial_um=noisy)).equivalent_mm - equivalent)
+    assert np.std(off) == pytest.approx(fit(exact).sigmas[0], rel=0.15)
