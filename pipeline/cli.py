@@ -1,39 +1,31 @@
-"""The command line: arguments in, exit codes and one clear message out."""
+"""The command line: arguments in, exit codes and one clear message out.
+
+Each command imports what it needs when it runs: numpy and what stands on it take longer than the help.
+"""
 
 import json
 import sys
-import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import BrokenExecutor
 from dataclasses import asdict, replace
-from importlib import resources
-from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
-from pipeline import stages
-from pipeline.adjusting.choose_stage import choice_json, print_choice, run_choose
-from pipeline.adjusting.compare_stage import DRIFT, comparison_json, print_comparison, run_compare, verdict
-from pipeline.demo import run_demo
-from pipeline.design.run import run_design
 from pipeline.errors import InputError, what_to_do
 from pipeline.exchange.convention import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
-from pipeline.files.library import PREFIX, library_json, library_path, print_library, read_library
-from pipeline.files.project_file import FINEST_PITCH_UM, Project, read_project
-from pipeline.measuring.camera_answer import print_identification
-from pipeline.measuring.camera_trials import identify
-from pipeline.measuring.scan_kinds import identify_kinds, print_kinds, scan_files
-from pipeline.progress import Reporter
-from pipeline.rendered.scene_file import render_project
-from pipeline.resampling.resample_stage import resample, resampled_json
-from pipeline.results.adjustment_file import without_nan
-from pipeline.summary import Summary, print_summary
+from pipeline.files.pitch import FINEST_PITCH_UM
 from pipeline.terminal import PlainConsole, plain, spell_out_missing_letters
+from pipeline.text.finite import without_nan
 from pipeline.text.wording import counted
+
+if TYPE_CHECKING:
+    from pipeline.files.project_file import Project
+    from pipeline.progress import Reporter
+    from pipeline.summary import Summary
 
 DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 TEMPLATES = ("project", "camera", "scene")
@@ -69,7 +61,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _message(error.format_message(), WRONG_INPUT)
     except (InputError, MeasurementError, AdjustmentError) as error:
         return _message(str(error), WRONG_INPUT)
-    except BrokenProcessPool:
+    except BrokenExecutor:
         return _message(
             "a process that measures was ended from outside, most likely because the memory was full; nothing was "
             "written. Close other programs, or name one scan at a time.",
@@ -79,6 +71,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         place = f"{error.filename}: " if error.filename else ""
         return _message(f"{place}{error.strerror or error}. {what_to_do(error)}", WRONG_INPUT)
     except Exception:
+        import traceback
+
         traceback.print_exc()
         return _message("this is a fault of reseau itself; please report it with the lines above", INTERNAL_ERROR)
 
@@ -90,6 +84,8 @@ def root(
 ) -> None:
     """Options that go before any command; without one, the help."""
     if show_version:
+        from importlib.metadata import version
+
         typer.echo(f"reseau {version('reseau')}")
         raise typer.Exit
     if context.invoked_subcommand is None:
@@ -105,37 +101,51 @@ def demo(
     as_json: AsJson = False,
 ) -> int:
     """Render a small scan folder with its truth, run everything on it, print the summary and the report's path."""
+    from pipeline.demo import run_demo
+    from pipeline.progress import Reporter
+
     return _finish(run_demo(folder, Reporter()), as_json)
 
 
 @app.command("run")
 def run_project(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """The whole chain: measure, adjust, check, report."""
-    return _with_project(project, stages.run_all, as_json, max_pixels)
+    from pipeline.stages import run_all
+
+    return _with_project(project, run_all, as_json, max_pixels)
 
 
 @app.command()
 def measure(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """Scans to comparator coordinates."""
-    return _with_project(project, stages.run_measure, as_json, max_pixels)
+    from pipeline.stages import run_measure
+
+    return _with_project(project, run_measure, as_json, max_pixels)
 
 
 @app.command()
 def adjust(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """Comparator coordinates to the adjusted camera, in adjustment.json."""
-    return _with_project(project, stages.run_adjust, as_json, max_pixels)
+    from pipeline.stages import run_adjust
+
+    return _with_project(project, run_adjust, as_json, max_pixels)
 
 
 @app.command()
 def check(project: ProjectFile, as_json: AsJson = False) -> int:
     """The adjustment against OpenCV's calibration, in check.json."""
-    return _with_project(project, stages.run_check, as_json)
+    from pipeline.stages import run_check
+
+    return _with_project(project, run_check, as_json)
 
 
 @app.command()
 def choose(project: ProjectFile, as_json: AsJson = False) -> int:
     """Which transformation and distortion the observations ask for, in choose.json."""
-    settings = read_project(project)
+    from pipeline.adjusting.choose_stage import choice_json, print_choice, run_choose
+    from pipeline.progress import Reporter
+
+    settings = _read(project)
     choice = run_choose(settings, Reporter())
     if as_json:
         _echo_json(choice_json(choice))
@@ -158,6 +168,9 @@ def resample_scans(
     as_json: AsJson = False,
 ) -> int:
     """The scans in their camera's frame: film transformation and pose taken out."""
+    from pipeline.progress import Reporter
+    from pipeline.resampling.resample_stage import resample, resampled_json
+
     results = resample(_read(project, max_pixels), out_dir, pitch_um, lens, fast, Reporter())
     if as_json:
         _echo_json(resampled_json(results))
@@ -240,6 +253,8 @@ def compare(
     as_json: AsJson = False,
 ) -> int:
     """Calibrations of a camera: where and by how much they differ over the frame; `drift` or `no drift`."""
+    from pipeline.adjusting.compare_stage import DRIFT, comparison_json, print_comparison, run_compare, verdict
+
     when = None if times is None else _numbers(times)
     comparison, remarks = run_compare(adjustments, camera, when, "flat" if flat else "space", level, out)
     if as_json:
@@ -259,7 +274,9 @@ def _numbers(text: str) -> list[float]:
 @app.command()
 def report(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """What the earlier stages found, in report.html."""
-    return _with_project(project, stages.run_report, as_json, max_pixels)
+    from pipeline.stages import run_report
+
+    return _with_project(project, run_report, as_json, max_pixels)
 
 
 @app.command()
@@ -268,6 +285,9 @@ def render(
     out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the project goes.", show_default=False)],
 ) -> int:
     """Synthetic scans with their truth, as a project that can be run."""
+    from pipeline.progress import Reporter
+    from pipeline.rendered.scene_file import render_project
+
     with Reporter().stage("rendering") as count:
         render_project(scene, out_dir, count)
     typer.echo(plain(f"{out_dir / 'project.toml'}"))
@@ -283,6 +303,9 @@ def design(
     as_json: AsJson = False,
 ) -> int:
     """The precision to be expected of a scene's photographs, without any picture, and what would improve it."""
+    from pipeline.design.run import run_design
+    from pipeline.progress import Reporter
+
     planned = run_design(scene, out_dir, Reporter())
     if as_json:
         _echo_json(planned.content)
@@ -298,6 +321,8 @@ def template(
     """Print a commented file to start from."""
     if kind not in TEMPLATES:
         raise InputError(f"there is no template {kind!r}; possible are {', '.join(TEMPLATES)}.")
+    from importlib import resources
+
     typer.echo(resources.files("pipeline").joinpath("templates", f"{kind}.toml").read_text(encoding="utf-8"), nl=False)
     return DONE
 
@@ -327,11 +352,13 @@ def cameras(
 ) -> int:
     """The camera library: its list, one of its files, or which of its cameras scans are of."""
     if own is not None or scan is not None:
-        project = None if own is None else read_project(own)
+        project = None if own is None else _read(own)
         given = [*(scan or ()), *(Path(name) for name in names or ())] or (project.scans.values() if project else ())
         return _name_cameras(list(given), project, pitch_um, max_pixels, as_json)
     if (names and (as_json or len(names) > 1)) or pitch_um is not None:
         raise InputError("give NAME alone, or --scan with or without --pitch, or neither for the list.")
+    from pipeline.files.library import PREFIX, library_json, library_path, print_library
+
     if names:
         typer.echo(library_path(names[0].removeprefix(PREFIX)).read_text(encoding="utf-8"), nl=False)
     elif as_json:
@@ -342,9 +369,15 @@ def cameras(
 
 
 def _name_cameras(
-    given: Sequence[Path], project: Project | None, pitch_um: float | None, max_pixels: int | None, as_json: bool
+    given: Sequence[Path], project: "Project | None", pitch_um: float | None, max_pixels: int | None, as_json: bool
 ) -> int:
     """One scan with all that was tried on it; of many some of each kind."""
+    from pipeline.files.library import PREFIX, read_library
+    from pipeline.measuring.camera_answer import print_identification
+    from pipeline.measuring.camera_trials import identify
+    from pipeline.measuring.scan_kinds import identify_kinds, print_kinds, scan_files
+    from pipeline.progress import Reporter
+
     own = {name: camera for name, camera in project.cameras.items() if PREFIX not in name} if project else {}
     tried, reporter = {**own, **read_library()}, Reporter()
     if len(given) == 1 and not given[0].is_dir():
@@ -363,16 +396,22 @@ def _name_cameras(
 
 
 def _with_project(
-    path: Path, stage: Callable[[Project, Reporter], Summary], as_json: bool, max_pixels: int | None = None
+    path: Path, stage: "Callable[[Project, Reporter], Summary]", as_json: bool, max_pixels: int | None = None
 ) -> int:
+    from pipeline.progress import Reporter
+
     return _finish(stage(_read(path, max_pixels), Reporter()), as_json)
 
 
-def _read(path: Path, max_pixels: int | None) -> Project:
+def _read(path: Path, max_pixels: int | None = None) -> "Project":
+    from pipeline.files.project_file import read_project
+
     return replace(read_project(path), max_pixels=max_pixels)
 
 
-def _finish(summary: Summary, as_json: bool) -> int:
+def _finish(summary: "Summary", as_json: bool) -> int:
+    from pipeline.summary import print_summary
+
     if as_json:
         _echo_json(summary.as_json())
     else:

@@ -1,4 +1,7 @@
-"""The stages of the chain, each from files to files, so that any of them can be run alone and looked at."""
+"""The stages of the chain, each from files to files, so that any of them can be run alone and looked at.
+
+What only one stage needs is imported by it: adjusting takes no pictures, and measuring no other program's adjustment.
+"""
 
 import json
 from collections.abc import Sequence
@@ -8,12 +11,9 @@ from importlib.metadata import version
 from adjust.problem.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
-from pipeline.adjusting.second_visit import measure_again
 from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
-from pipeline.measuring.measure_stage import measure_project
-from pipeline.opencv_check.check import check_against_opencv
 from pipeline.progress import Reporter
 from pipeline.publishing.made_from import MadeFrom, adjusted_from, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
@@ -29,7 +29,6 @@ from pipeline.results.measured_scan import MeasuredScan
 from pipeline.results.measurement_file import read_measurement, write_measurement
 from pipeline.summary import Summary, summarise
 from pipeline.text.atomic import write_atomically
-from pipeline.thumbnails import Thumbnails
 from pipeline.workers import worker_pool
 
 
@@ -112,6 +111,8 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
 def _measured_marks(
     project: Project, made_from: MadeFrom, new: Unpublished, reporter: Reporter
 ) -> tuple[MeasuredScan, ...]:
+    from pipeline.measuring.measure_stage import measure_project
+
     with worker_pool(len(project.scans)) as workers:
         scans = measure_project(project, reporter, new.place(project.output / "learned"), workers)
     _write_marks(project, scans, made_from, new)
@@ -126,6 +127,8 @@ def _adjusted_marks(
     if scans and not anything_to_adjust(project, marks):
         return None
     adjustment = adjust_marks(project, marks)
+    from pipeline.adjusting.second_visit import measure_again
+
     again = measure_again(project, scans, adjustment, reporter)
     if again is None:
         return adjustment
@@ -165,6 +168,8 @@ def _write_adjustment(project: Project, adjustment: Adjustment, new: Unpublished
 
 
 def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> None:
+    from pipeline.opencv_check.check import check_against_opencv
+
     made_from = {project.adjustment_path.name: of_file(new.at(project.adjustment_path))}
     check = {"reseau": version("reseau"), "made_from": made_from, **check_against_opencv(adjustment).to_json()}
     text = json.dumps(check, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
@@ -172,6 +177,8 @@ def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> 
 
 
 def _reported(project: Project, data: ReportData, new: Unpublished) -> Summary:
+    from pipeline.thumbnails import Thumbnails
+
     scans = read_measurement(new.at(project.measurement_path), project.output) if data.measurement else ()
     with Thumbnails(scans, project.max_pixels) as pictures:
         write_report(replace(data, thumbnail=pictures.of), new.place(project.report_path))

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from adjust.functional_model.rotation import rotation_from_vector
@@ -102,6 +101,7 @@ def _scale(turned: Array, target: Array) -> float:
 
 def _refined(start: Array, model: Array, target: Array, given: NDArray[np.bool_]) -> tuple[float, Array]:
     """The sum of squares and the attitude at the minimum near a start."""
+    from scipy.optimize import least_squares  # takes longer to import than most adjustments
 
     def misfit(turn: Array) -> Array:
         return np.asarray(_misfit(rotation_from_vector(turn) @ start, model, target, given)[given])

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from adjust.initial_values.closed_form import KnownField, principal_distance_together
 from adjust.initial_values.resection import Resection, refine, resect
@@ -55,6 +54,8 @@ def _trimmed_cost(fields: Sequence[KnownField], c: float) -> float:
 
 
 def _minimum(fields: Sequence[KnownField], resections: dict[int, Resection], c: float, width: float) -> float:
+    from scipy.optimize import minimize_scalar  # takes longer to import than most adjustments
+
     logarithm = minimize_scalar(
         lambda s: _cost(fields, resections, float(np.exp(s))),
         bounds=(np.log(c / width), np.log(c * width)),

@@ -19,9 +19,9 @@ from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.publishing.made_from import adjusted_from
 from pipeline.publishing.publishing import unpublished
-from pipeline.results.adjustment_file import without_nan
 from pipeline.results.comparator_file import read_comparator
 from pipeline.text.atomic import write_atomically
+from pipeline.text.finite import without_nan
 
 Json = dict[str, Any]
 

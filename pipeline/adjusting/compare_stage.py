@@ -15,9 +15,9 @@ from adjust.choices.comparison import CameraCalibration, Comparison, Test, Use, 
 from adjust.functional_model.families import parameter_names
 from pipeline.adjusting.compare_picture import draw_comparison
 from pipeline.errors import InputError
-from pipeline.results.adjustment_file import without_nan
 from pipeline.results.adjustment_reader import calibrated_lens, read_adjustment, read_covariance
 from pipeline.text.atomic import check_writable, write_atomically
+from pipeline.text.finite import without_nan
 from pipeline.text.spelling import did_you_mean
 from pipeline.text.wording import listed
 

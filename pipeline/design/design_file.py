@@ -15,7 +15,8 @@ from pipeline.design.expected import Expected, rms
 from pipeline.design.reliability import error_unit
 from pipeline.design.sweeps import Layouts, Swept
 from pipeline.design.variations import Variations
-from pipeline.results.adjustment_file import ANGLES, DEG_PER_RAD, without_nan
+from pipeline.results.adjustment_file import ANGLES, DEG_PER_RAD
+from pipeline.text.finite import without_nan
 
 Json = dict[str, Any]
 

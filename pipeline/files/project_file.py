@@ -18,6 +18,7 @@ from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.distances_file import GivenDistance, read_distances
 from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import camera_path
+from pipeline.files.pitch import FINEST_PITCH_UM
 from pipeline.files.points_file import GivenPoints, read_points
 from pipeline.files.scan_files import find_scans
 from pipeline.files.target_table import TargetSettings, read_targets
@@ -25,7 +26,6 @@ from pipeline.files.tie_table import TieSettings, read_ties
 from pipeline.results.adjustment_reader import covariance_path
 from pipeline.text.tables import Table, read_toml
 
-FINEST_PITCH_UM = 0.1  # below it mm or m were meant: no scanner and no sensor has such pixels
 _COARSEST_PITCH_UM = 1e4  # above it nm were meant: film of a few pixels shows no mark
 DEFAULT_SCANNER = "1"  # the name of that of all images that name none
 TONES = ("linear", "srgb")  # beside auto and a power

@@ -23,6 +23,7 @@ from pipeline.results.covariance_arrays import covariance_arrays, covariance_not
 from pipeline.results.fingerprints import of_content
 from pipeline.results.reliability_json import point_tests, reliability_json, suspect_json
 from pipeline.text.atomic import atomic_path
+from pipeline.text.finite import without_nan
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -280,14 +281,3 @@ def _larger(w: Array) -> float:
     """The standardised residual of the axis that fits worse; NaN where neither axis is checked."""
     known = w[np.isfinite(w)]
     return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
-
-
-def without_nan(value: Any) -> Any:
-    """The same with null for every number that is not finite: JSON knows no others."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(item) for item in value]
-    return value

@@ -6,6 +6,8 @@ import os
 import re
 import resource
 import signal
+import subprocess
+import sys
 import time
 import tomllib
 from collections.abc import Callable
@@ -343,3 +345,12 @@ def test_unknown_command_and_option_have_code_2(capsys: SAID) -> None:
     assert run(["run", "--jason", "p.toml"]) == 2
     assert run(["template", "cameras"]) == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_the_help_does_not_wait_for_what_commands_need() -> None:
+    heavy = ("numpy", "scipy", "cv2", "pipeline.stages", "pipeline.files.project_file")
+    program = f"import sys, pipeline.cli; print(*set(sys.modules) & set({heavy}))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "\n"
+    program = "import sys, pipeline.stages; sys.exit('pipeline.measuring.measure_stage' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -210,7 +210,7 @@ def test_of_many_scans_some_of_each_kind_are_tried_with_the_projects_own_cameras
     (tmp_path / "ours.toml").write_text(own, encoding="utf-8")
     (tmp_path / "project.toml").write_text('camera = "ours.toml"\nscans = ["scans/a1.tif"]\n', encoding="utf-8")
     monkeypatch.setattr(
-        "pipeline.cli.read_library", lambda: {name: LIBRARY[name] for name in ("wild-rc5-153", RENDERED)}
+        "pipeline.files.library.read_library", lambda: {name: LIBRARY[name] for name in ("wild-rc5-153", RENDERED)}
     )
     assert run(["cameras", "--scan", str(folder), "--project", str(tmp_path / "project.toml"), "--json"]) == 1
     said = json.loads(capsys.readouterr().out)
@@ -249,7 +249,7 @@ def test_a_camera_too_large_for_the_scan_is_told_so_in_words_and_json(
     """Nowhere do its marks answer together: that is no number, which neither a sentence nor JSON could hold."""
     (scan,) = (frame.parent / "scans").glob("*.tif")
     few = {name: LIBRARY[name] for name in (RENDERED, "hasselblad-reseau-60")}
-    monkeypatch.setattr("pipeline.cli.read_library", lambda: few)
+    monkeypatch.setattr("pipeline.files.library.read_library", lambda: few)
     answered = answer
 
     def small_only(scan: Scan, layout: FiducialLayout, *given: Any) -> Answer:

@@ -69,7 +69,7 @@ def one_scan_more(folder: Path) -> MeasuredScan:
 def measured_before(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What measuring gives is known, and given at once."""
     scans = read_measurement(project / "out" / "measurement.json")
-    monkeypatch.setattr(stages, "measure_project", lambda *_: scans)
+    monkeypatch.setattr("pipeline.measuring.measure_stage.measure_project", lambda *_: scans)
 
 
 def test_a_finished_project_is_current(finished: tuple[Path, int]) -> None:
@@ -234,7 +234,7 @@ def test_marks_that_cannot_be_adjusted_are_kept_and_the_earlier_adjustment_is_no
     project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     more = (*read_measurement(project / "out" / "measurement.json"), one_scan_more(project))
-    monkeypatch.setattr(stages, "measure_project", lambda *_: more)
+    monkeypatch.setattr("pipeline.measuring.measure_stage.measure_project", lambda *_: more)
     monkeypatch.setattr(stages, "adjust_marks", fails_with(AdjustmentError("a wrong point number")))
     assert run(["run", str(project / "project.toml")]) == 2
     assert "frame4" in {point.image for point in read_comparator(project / "comparator.csv")}
