@@ -13,6 +13,7 @@ from pipeline.report.data import Problem, ReportData
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance
 from pipeline.results.comparator_file import measurement_of, read_comparator
 from pipeline.results.fingerprints import of_file
+from pipeline.results.measurement_file import read_made_from, read_measurement
 from pipeline.text.text_file import read_json
 from pipeline.text.wording import listed
 
@@ -32,8 +33,7 @@ def measured(project: Project, at: At) -> ReportData:
         made_from={project.comparator.name: of_file(comparator)},
     )
     fingerprint, path = measurement_of(comparator), at(project.measurement_path)
-    measurement = _json(path)
-    if measurement is None:
+    if not path.exists():
         return data
     if of_file(path) != fingerprint:
         if not fingerprint:
@@ -43,8 +43,9 @@ def measured(project: Project, at: At) -> ReportData:
             f"{path.name} is of other marks than {project.comparator.name}: it is not shown.",
             "Run `reseau measure`.",
         )
-    made, now = measurement.get("made_from", {}), measured_from(project) if project.scans else {}
-    data = replace(data, measurement=measurement, made_from={**data.made_from, path.name: fingerprint})
+    scans = {scan.frame.image: scan for scan in read_measurement(path, project.output)}
+    made, now = read_made_from(path), measured_from(project) if project.scans else {}
+    data = replace(data, measurement=scans, made_from={**data.made_from, path.name: fingerprint})
     if project.scans and made.get(PLACES) != now[PLACES]:
         note = f"The marks were looked for with other {PLACES} than there are now; `reseau measure` looks again."
         data = replace(data, notes=(*data.notes, note))

@@ -26,7 +26,7 @@ from pipeline.results.comparator_file import ComparatorPoint, read_comparator, w
 from pipeline.results.fingerprints import of_file
 from pipeline.results.frames_file import for_images, write_frames
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.measurement_file import read_measurement, write_measurement
+from pipeline.results.measurement_file import write_measurement
 from pipeline.summary import Summary, summarise
 from pipeline.text.atomic import write_atomically
 from pipeline.workers import worker_pool
@@ -179,7 +179,7 @@ def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> 
 def _reported(project: Project, data: ReportData, new: Unpublished) -> Summary:
     from pipeline.thumbnails import Thumbnails
 
-    scans = read_measurement(new.at(project.measurement_path), project.output) if data.measurement else ()
+    scans = data.measurement.values() if data.measurement else ()
     with Thumbnails(scans, project.max_pixels) as pictures:
         write_report(replace(data, thumbnail=pictures.of), new.place(project.report_path))
     files = {"comparator coordinates": project.comparator, "adjustment": project.adjustment_path}

@@ -16,6 +16,7 @@ from pipeline.report.data import ReportData
 from pipeline.report.marks import current_scans
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.verdict import Verdict, camera_is_calibrated, judge
+from pipeline.results.measured_record import pose_record
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
 Json = dict[str, Any]
@@ -54,7 +55,7 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     for mark in data.comparator:
         counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
         counts[mark.status] += 1
-    poses = {name: scan["pose"] for name, scan in current_scans(data).items() if scan.get("pose")}
+    poses = {name: pose_record(scan.frame.pose) for name, scan in current_scans(data).items() if scan.frame.pose}
     return Summary(judge(data), frames, poses, data.adjustment, data.check, files)
 
 

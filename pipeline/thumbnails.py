@@ -1,6 +1,6 @@
 """The pictures of the marks, cut from their scans as the report asks for them."""
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Self
 
@@ -22,7 +22,7 @@ _REACH_SIZES = 2.0  # a window's width in the mark's own
 class Thumbnails:
     """Windows about marks, by image, point and kind; one scan is open at a time, none behind the `with` block."""
 
-    def __init__(self, scans: Sequence[MeasuredScan], max_pixels: int | None = None) -> None:
+    def __init__(self, scans: Collection[MeasuredScan], max_pixels: int | None = None) -> None:
         self._max_pixels = max_pixels
         self._scans = {scan.frame.image: scan for scan in scans}
         self._marks = {

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.results.adjustment_reader import Covariance
 from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.measured_scan import MeasuredScan
 
 Json = dict[str, Any]
 
@@ -44,16 +45,16 @@ class Problem:
 class ReportData:
     """Everything a report can show.
 
-    comparator: the rows of comparator.csv. measurement, adjustment, check: the contents of measurement.json,
-    adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed frame by
-    camera name. thumbnail: from image, point and kind (a fiducial and a target may share a name) to the mark's picture.
-    problems, notes: what the caller has to say beyond the files. made_from: their fingerprints by name. unit:
+    comparator: the rows of comparator.csv. measurement: the scans of measurement.json by image. adjustment, check: the
+    contents of adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed
+    frame by camera name. thumbnail: from image, point and kind (a fiducial and a target may share a name) to the mark's
+    picture. problems, notes: what the caller has to say beyond the files. made_from: their fingerprints by name. unit:
     of the object coordinates.
     """
 
     project: str
     comparator: Sequence[ComparatorPoint] = ()
-    measurement: Json | None = None
+    measurement: Mapping[str, MeasuredScan] | None = None
     adjustment: Json | None = None
     covariance: Covariance | None = None
     check: Json | None = None

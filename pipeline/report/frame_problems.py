@@ -42,22 +42,23 @@ def said_by(shots: list[Frame], said: Callable[[Frame], Iterable[Sentence]]) -> 
 
 
 def _assumed(frame: Frame) -> Iterator[Problem]:
-    pose = frame.scan.get("pose")
-    if not pose or pose["decided"]:
+    pose = frame.scan.frame.pose if frame.scan else None
+    if not pose or pose.decided:
         return
-    if pose.get("roll"):
-        yield Problem(f"pose assumed: {pose['roll']}.", _ONE_ANSWER)
+    if pose.roll:
+        yield Problem(f"pose assumed: {pose.roll}.", _ONE_ANSWER)
     else:
         yield Problem(
-            f"pose assumed ({pose['name']}). {' '.join(pose.get('evidence', ()))}",
+            f"pose assumed ({pose.name}). {' '.join(pose.evidence)}",
             'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
         )
 
 
 def _problems_of(frame: Frame) -> Iterator[Problem]:
-    pose = frame.scan.get("pose")
-    said = set(pose.get("evidence", ())) if pose and not pose["decided"] else set()
-    yield from (Problem(problem) for problem in frame.scan.get("problems", ()) if problem not in said)
+    measured = frame.scan.frame if frame.scan else None
+    pose = measured.pose if measured else None
+    said = pose.evidence if pose and not pose.decided else ()
+    yield from (Problem(problem) for problem in (measured.problems if measured else ()) if problem not in said)
     lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
     found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
     if lost and (found or pose):  # a frame that was not found at all has said so
@@ -67,7 +68,8 @@ def _problems_of(frame: Frame) -> Iterator[Problem]:
             + (" The frame is used; its film transformation is less certain." if found else ""),
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
-    if targets and not frame.scan.get("failure") and not any(mark.status.is_observation for mark in targets):
+    is_lost = frame.scan is not None and frame.scan.failure is not None
+    if targets and not is_lost and not any(mark.status.is_observation for mark in targets):
         yield Problem(
             f"none of its {len(targets)} targets was measured.",
             "Look at their reasons in comparator.csv: a wrong pose, diameter or orientation misses them all.",

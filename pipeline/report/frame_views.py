@@ -1,7 +1,7 @@
 """What the report shows of each frame: a line of the summary, pictures of its marks, its residuals, its orientation."""
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,7 +140,7 @@ def _card(
     )
 
 
-def _by_edges(quality: Json) -> str:
+def _by_edges(quality: Mapping[str, float]) -> str:
     if "second_method_sigmas" not in quality:
         return ""
     off = (fixed(quality[f"second_method_{axis}_px"], 3, sign=True) for axis in ("col", "row"))

@@ -2,16 +2,18 @@
 
 import re
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
+from measure.results import MarkMeasurement
 from measure.status import Status
 from pipeline.report.data import Json, ReportData
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.measured_record import read_covariance
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 
@@ -34,7 +36,7 @@ class Mark:
     covariance: Covariance | None
     sigma_um: Array | None
     residual: Json | None
-    quality: Json = field(default_factory=dict)
+    quality: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def is_fiducial(self) -> bool:
@@ -48,11 +50,11 @@ class Mark:
 
 @dataclass(frozen=True)
 class Frame:
-    """One image: its marks, fiducials first; scan: its entry of measurement.json, empty where it was not measured."""
+    """One image: its marks, fiducials first; scan: what measuring it gave, None where it was not measured."""
 
     image: str
     marks: tuple[Mark, ...]
-    scan: Json = field(default_factory=dict)
+    scan: MeasuredScan | None = None
 
     def count(self, *statuses: Status) -> int:
         return sum(mark.status in statuses for mark in self.marks)
@@ -66,16 +68,15 @@ def frames(data: ReportData) -> list[Frame]:
         marks[mark.image][mark.is_fiducial, mark.point] = mark
     names = {*scans, *marks, *(data.adjustment["images"] if data.adjustment else {})}
     return [
-        Frame(name, tuple(sorted(marks[name].values(), key=_order)), scans.get(name, {}))
+        Frame(name, tuple(sorted(marks[name].values(), key=_order)), scans.get(name))
         for name in sorted(names, key=natural)
     ]
 
 
-def current_scans(data: ReportData) -> dict[str, Json]:
-    """The scans of measurement.json by image name; those left out whose marks comparator.csv no longer has."""
-    images = {row.image for row in data.comparator}
-    scans: dict[str, Json] = data.measurement["images"] if data.measurement else {}
-    return {name: scan for name, scan in scans.items() if name in images or not images or not scan.get("marks")}
+def current_scans(data: ReportData) -> dict[str, MeasuredScan]:
+    """The scans that were measured by image name; those left out whose marks comparator.csv no longer has."""
+    images, scans = {row.image for row in data.comparator}, data.measurement or {}
+    return {name: scan for name, scan in scans.items() if name in images or not images or not scan.frame.marks}
 
 
 def natural(name: str) -> list[tuple[int, str]]:
@@ -83,11 +84,9 @@ def natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def _marks(data: ReportData, scans: dict[str, Json]) -> list[Mark]:
+def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> list[Mark]:
     measured = {
-        (image, mark["kind"] == "fiducial", mark["point"]): mark
-        for image, scan in scans.items()
-        for mark in scan.get("marks", ())
+        (image, mark.kind == "fiducial", mark.point): mark for image, scan in scans.items() for mark in scan.frame.marks
     }
     residuals = {
         (row["image"], row["kind"] == "fiducial", row["point"]): row
@@ -97,20 +96,24 @@ def _marks(data: ReportData, scans: dict[str, Json]) -> list[Mark]:
     return [_mark(key, measured.get(key), given.get(key), residuals.get(key)) for key in {**measured, **given}]
 
 
-def _mark(key: tuple[str, bool, str], pixel: Json | None, row: ComparatorPoint | None, residual: Json | None) -> Mark:
+def _mark(
+    key: tuple[str, bool, str], pixel: MarkMeasurement | None, row: ComparatorPoint | None, residual: Json | None
+) -> Mark:
+    """Where the comparator file and the measurement differ, the file holds: the user may have changed it."""
     image, _, point = key
-    known: Json = pixel or {}
+    known = row or pixel
+    assert known is not None  # by one of both the key is known
     return Mark(
         image=image,
         point=point,
-        kind=row.kind if row else known["kind"],
-        status=row.status if row else Status(known["status"]),
-        reason=row.reason if row else known["reason"],
-        center_px=None if known.get("col_px") is None else np.array([known["col_px"], known["row_px"]]),
-        covariance=read_covariance(known),
+        kind=known.kind,
+        status=known.status,
+        reason=known.reason,
+        center_px=pixel.center_px if pixel else None,
+        covariance=pixel.covariance if pixel else None,
         sigma_um=_sigma_um(residual, row),
         residual=residual,
-        quality=known.get("quality", {}),
+        quality=pixel.quality if pixel else {},
     )
 
 

@@ -254,7 +254,7 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield (
             "Fiducial marks are the same in every frame: if two scans bear each other's names, nothing here shows it."
         )
-    for note, images in said_by(shots, lambda frame: frame.scan.get("notes", ())).items():
+    for note, images in said_by(shots, lambda frame: frame.scan.notes if frame.scan else ()).items():
         yield f"{listed(images)}: {note}"
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
         for kind, *words in (("target", "target"), ("tie", "sight of a tie point", "sights of tie points")):

@@ -3,40 +3,40 @@
 from markupsafe import Markup
 
 from measure.marks.poses import up_from_camera
+from measure.writing.line import Line
 from pipeline.report import svg
-from pipeline.report.data import Json
+from pipeline.results.measured_scan import MeasuredScan
 
 _WIDTH_PX = 640.0
 _LEAST_PX = 7.0  # of letters
 
 
-def written(scan: Json) -> Markup | None:
+def written(scan: MeasuredScan | None) -> Markup | None:
     """The scan's outline with its lines of writing in place; None where none was read. Those that the pose's evidence
     quotes stand out."""
-    lines = scan.get("writing")
-    if not lines:
+    if scan is None or not scan.frame.writing:
         return None
-    zoom = _WIDTH_PX / max(scan["width_px"], scan["height_px"])
-    width, height = scan["width_px"] * zoom, scan["height_px"] * zoom
-    evidence = " ".join((scan.get("pose") or {}).get("evidence", ()))
+    zoom = _WIDTH_PX / max(scan.width_px, scan.height_px)
+    width, height = scan.width_px * zoom, scan.height_px * zoom
+    evidence = " ".join(scan.frame.pose.evidence if scan.frame.pose else ())
     drawn = [svg.line([0, width, width, 0], [0, 0, height, height], "scan", closed=True)]
-    drawn += [_line(line, zoom, f'"{line["text"]}"' in evidence) for line in lines]
+    drawn += [_line(line, zoom, f'"{line.text}"' in evidence) for line in scan.frame.writing]
     return svg.picture(width, height, "What is written about the frame, as it lies in the scan", *drawn, class_="film")
 
 
-def _line(line: Json, zoom: float, told: bool) -> Markup:
+def _line(line: Line, zoom: float, told: bool) -> Markup:
     """The text over the rectangle in which it was read, turned and mirrored as it lies."""
-    outline = [(col * zoom, row * zoom) for col, row in line["outline_px"]]
+    outline = [(col * zoom, row * zoom) for col, row in line.outline_px]
     cols, rows = zip(*outline, strict=True)
     center = (sum(cols) / len(cols), sum(rows) / len(rows))
-    up = up_from_camera(line["pose"])
+    up = up_from_camera(line.pose)
     sides = max(cols) - min(cols), max(rows) - min(rows)
     size = max(0.8 * min(sides), _LEAST_PX)
     # SVG counts rows downwards, and so do letters.
     matrix = (up[0, 0], -up[1, 0], -up[0, 1], up[1, 1], *center)
     text = svg.tag(
         "text",
-        line["text"],
+        line.text,
         transform=f"matrix({' '.join(f'{value:g}' for value in matrix)})",
         class_="told" if told else "read",
         font_size=f"{size:.1f}",

@@ -34,7 +34,7 @@ def record_of(measured: MeasuredScan, folder: Path) -> Json:
         "height_px": measured.height_px,
         "pitch_um": _numbers(measured.pitch_um),
         "failure": measured.failure and {"code": str(measured.failure.code), "sentence": measured.failure.sentence},
-        "pose": frame.pose and _pose(frame.pose),
+        "pose": frame.pose and pose_record(frame.pose),
         "writing": None if frame.writing is None else [_line(line) for line in frame.writing],
         "pixel_from_camera": _numbers(frame.pixel_from_camera),
         "weights": _numbers(frame.weights),
@@ -107,26 +107,22 @@ def _mark(mark: MarkMeasurement) -> Json:
     }
 
 
-def read_covariance(mark: Mapping[str, Any]) -> Covariance | None:
-    """The covariance of an entry of `marks`, by its causes; None where nothing was fitted."""
-    causes = mark.get("causes_px2")
-    return None if causes is None else Covariance({Cause(name): _some(px2) for name, px2 in causes.items()})
-
-
 def _read_mark(mark: Mapping[str, Any]) -> MarkMeasurement:
     """The sum of the causes is written for others than this reader."""
+    causes = mark["causes_px2"]
     return MarkMeasurement(
         point=mark["point"],
         kind=mark["kind"],
         center_px=None if mark["col_px"] is None else _some([mark["col_px"], mark["row_px"]]),
-        covariance=read_covariance(mark),
+        covariance=None if causes is None else Covariance({Cause(name): _some(px2) for name, px2 in causes.items()}),
         status=Status(mark["status"]),
         reason=mark["reason"],
         quality={name: float(value) for name, value in mark["quality"].items()},
     )
 
 
-def _pose(pose: Pose) -> Json:
+def pose_record(pose: Pose) -> Json:
+    """A pose with its evidence as JSON."""
     return {
         "name": pose.name,
         "decided": pose.decided,

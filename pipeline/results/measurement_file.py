@@ -1,7 +1,8 @@
 """measurement.json: what comparator.csv has no room for: poses and their evidence, covariances, qualities, problems."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
@@ -26,8 +27,20 @@ def write_measurement(
 
 def read_measurement(path: Path, folder: Path | None = None) -> tuple[MeasuredScan, ...]:
     """Read it back. Raises InputError for a file that is broken. folder: as above."""
-    try:
+    with _told(path):
         images = read_json(path)["images"]
         return tuple(scan_of(name, image, folder or path.parent) for name, image in images.items())
+
+
+def read_made_from(path: Path) -> Mapping[str, str]:
+    """The fingerprints of what was measured and how. Raises InputError for a file that is broken."""
+    with _told(path):
+        return dict(read_json(path).get("made_from", {}))
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: cannot be read as a measurement ({error}). Run `reseau measure` again.") from error

@@ -1,6 +1,6 @@
 """A made-up calibration of five aerial frames, and its files: result file and report are tested on its numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -32,11 +32,14 @@ from adjust.problem.result import (
     Residuals,
     Suspect,
 )
+from measure.covariance import Cause, Covariance
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
 from pipeline.report import ReportData, Thumbnail
 from pipeline.results.adjustment_file import write_adjustment
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance
 from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -214,55 +217,39 @@ def measured() -> ReportData:
     """Scans measured, nothing adjusted: every mark found, every pose decided."""
     observations = adjustment().network.observations
     pixels = observations.xy_mm * (1e3 / PITCH_UM, -1e3 / PITCH_UM) + 6000.0
-    images: Json = {}
+    marks: dict[str, list[MarkMeasurement]] = {}
     rows = []
+    known = Covariance({Cause.NOISE: np.diag([0.0012, 0.0021]), Cause.TONE: np.diag([0.0004, 0.0004])})
     for i in range(len(observations)):
         image, point, kind = observations.image[i], observations.point[i], observations.kind[i]
         xy, sigma = observations.xy_mm[i], np.sqrt(np.diag(observations.covariance_mm2[i]))
         rows.append(ComparatorPoint(image, point, kind, xy, sigma, 0.0, Status.MEASURED, ""))
-        images.setdefault(image, _scan(image))["marks"].append(
-            {
-                "point": point,
-                "kind": kind,
-                "col_px": float(pixels[i, 0]),
-                "row_px": float(pixels[i, 1]),
-                "covariance_px2": [[0.0016, 0.0], [0.0, 0.0025]],
-                "causes_px2": {"noise": [[0.0012, 0.0], [0.0, 0.0021]], "tone": [[0.0004, 0.0], [0.0, 0.0004]]},
-                "status": "measured",
-                "reason": "",
-                "quality": {"snr": 31.0},
-            }
-        )
-    return ReportData(
-        "Five frames", rows, {"images": images}, thumbnail=_Crosses(images), frame_mm={"RC 20": (228.0, 228.0)}
-    )
+        mark = MarkMeasurement(point, kind, pixels[i], known, Status.MEASURED, quality={"snr": 31.0})
+        marks.setdefault(image, []).append(mark)
+    scans = {image: _scan(image, own) for image, own in marks.items()}
+    return ReportData("Five frames", rows, scans, thumbnail=_Crosses(marks), frame_mm={"RC 20": (228.0, 228.0)})
 
 
-def _scan(image: str) -> Json:
-    return {
-        "scan": f"../scans/{image}.tif",
-        "width_px": 12000,
-        "height_px": 12000,
-        "pitch_um": [PITCH_UM, PITCH_UM],
-        "pose": {"name": "0", "decided": True, "evidence": ["The dots beside the corner marks say so (41 to 3)."]},
-        "pixel_from_camera": [[50.0, 0.0, 6000.0], [0.0, -50.0, 6000.0]],
-        "problems": [],
-        "marks": [],
-    }
+def _scan(image: str, marks: Sequence[MarkMeasurement]) -> MeasuredScan:
+    pose = Pose("0", True, ("The dots beside the corner marks say so (41 to 3).",))
+    place = np.array([[50.0, 0.0, 6000.0], [0.0, -50.0, 6000.0]])
+    frame = FrameMeasurement(image, tuple(marks), pose, place)
+    return MeasuredScan(f"scans/{image}.tif", 12000, 12000, (PITCH_UM, PITCH_UM), frame)
 
 
 class _Crosses:
     """Pictures of a light cross about the measured centre, in noise."""
 
-    def __init__(self, images: Json) -> None:
+    def __init__(self, marks: Mapping[str, Sequence[MarkMeasurement]]) -> None:
         self._centers = {
-            (name, mark["point"], mark["kind"]): (mark["col_px"], mark["row_px"])
-            for name, scan in images.items()
-            for mark in scan["marks"]
+            (name, mark.point, str(mark.kind)): mark.center_px
+            for name, own in marks.items()
+            for mark in own
+            if mark.center_px is not None
         }
 
     def __call__(self, image: str, point: str, kind: str) -> Thumbnail | None:
-        col, row = self._centers[image, point, kind]
+        col, row = self._centers[image, point, kind].tolist()
         corner = round(col) - 20, round(row) - 20
         x, y = np.arange(41) + corner[0] - col, np.arange(41) + corner[1] - row
         arms = np.maximum(np.exp(-(x**2) / 6.0)[None, :], np.exp(-(y**2) / 6.0)[:, None])

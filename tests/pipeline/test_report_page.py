@@ -9,6 +9,7 @@ from pathlib import Path
 import made_up_calibration
 import pytest
 
+from measure.results import FrameMeasurement
 from measure.status import MEANING, Status
 from pipeline.report import Problem, ReportData, render_report, write_report
 from pipeline.results.comparator_file import ComparatorPoint
@@ -148,9 +149,11 @@ def test_a_frame_that_was_not_found_says_so_once(measured: ReportData) -> None:
     reason = "no fiducial was measured: the constellation does not fit"
     absent = [replace(point, status=Status.ABSENT, reason=reason) for point in measured.comparator]
     assert measured.measurement is not None
-    lost = {"pose": None, "problems": [f"{reason}."], "marks": []}
-    images = {image: {**scan, **lost} for image, scan in measured.measurement["images"].items()}
-    text = rendered(replace(measured, comparator=tuple(absent), measurement={"images": images})).text
+    scans = {
+        image: replace(scan, frame=FrameMeasurement(image, (), problems=(f"{reason}.",)))
+        for image, scan in measured.measurement.items()
+    }
+    text = rendered(replace(measured, comparator=tuple(absent), measurement=scans)).text
     assert text.count(f"{reason}.") == 1
     assert "fiducial marks not measured" not in text
     assert "run `reseau adjust`" not in text

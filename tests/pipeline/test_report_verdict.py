@@ -8,12 +8,14 @@ import made_up_calibration
 import numpy as np
 import pytest
 
+from measure.results import MarkMeasurement, Pose
 from measure.status import Status
 from pipeline.report import Problem, ReportData, judge
 from pipeline.report.fractions import fraction_test, places_px
 from pipeline.report.marks import frames
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
+from pipeline.results.measured_scan import MeasuredScan
 
 Json = dict[str, Any]
 
@@ -103,11 +105,19 @@ def test_no_convergence_is_no_result(adjusted: ReportData) -> None:
     assert verdict.problems[1].what == "Not final."
 
 
+def posed(data: ReportData) -> dict[str, MeasuredScan]:
+    """Its scans, of whose poses nothing is decided."""
+    pose = Pose("0", False, ("The marks are symmetric to 3 µm.",))
+    return {name: with_frame(scan, pose=pose) for name, scan in (data.measurement or {}).items()}
+
+
+def with_frame(scan: MeasuredScan, **changes: Any) -> MeasuredScan:
+    return replace(scan, frame=replace(scan.frame, **changes))
+
+
 def test_an_assumed_pose_needs_a_look_once_for_all_frames(measured: ReportData) -> None:
     assert measured.measurement is not None
-    pose = {"name": "0", "decided": False, "evidence": ["The marks are symmetric to 3 µm."]}
-    images = {name: {**scan, "pose": pose} for name, scan in measured.measurement["images"].items()}
-    data = replace(measured, measurement={"images": images})
+    data = replace(measured, measurement=posed(measured))
     assert len(judge(data).problems) == 1
     assert "f1, f2, f3, f4, f5: pose assumed (0). The marks are symmetric to 3 µm." in told(data)
     assert 'pose = "90"' in told(data)
@@ -116,21 +126,20 @@ def test_an_assumed_pose_needs_a_look_once_for_all_frames(measured: ReportData) 
 def test_a_pose_assumed_is_a_note_where_fiducials_are_all_there_is(adjusted: ReportData) -> None:
     assert adjusted.adjustment is not None
     assert adjusted.measurement is not None
-    pose = {"name": "0", "decided": False, "evidence": ["The marks are symmetric to 3 µm."]}
-    images = {name: {**scan, "pose": pose} for name, scan in adjusted.measurement["images"].items()}
+    scans = posed(adjusted)
     bare = {
         name: {**camera, "principal_distance_mm": {"value": 153.0, "sigma": None}}
         for name, camera in adjusted.adjustment["cameras"].items()
     }
     check = {"verdict": "not possible", "reason": "No camera is calibrated."}
-    data = replace(changed(adjusted, cameras=bare), measurement={"images": images}, check=check)
+    data = replace(changed(adjusted, cameras=bare), measurement=scans, check=check)
     verdict = judge(data)
     assert verdict.exit_code == 0
     told = " ".join(verdict.notes)
     assert "pose assumed (0). The marks are symmetric to 3 µm." in told
     assert "if two scans bear each other's names, nothing here shows it" in told
     assert "OpenCV cannot check" not in told
-    assert judge(replace(adjusted, measurement={"images": images})).exit_code == 1
+    assert judge(replace(adjusted, measurement=scans)).exit_code == 1
 
 
 def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
@@ -141,9 +150,8 @@ def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
 
 def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured: ReportData) -> None:
     assert measured.measurement is not None
-    images = measured.measurement["images"]
-    images = {**images, "f4": {**images["f4"], "problems": ["nearly black."]}}
-    data = replace(measured, measurement={"images": images}, problems=(Problem("points.csv: 99 was not measured."),))
+    scans = {**measured.measurement, "f4": with_frame(measured.measurement["f4"], problems=("nearly black.",))}
+    data = replace(measured, measurement=scans, problems=(Problem("points.csv: 99 was not measured."),))
     assert "f4: nearly black." in told(data)
     assert "99 was not measured" in told(data)
 
@@ -151,8 +159,8 @@ def test_problems_of_a_frame_and_of_the_caller_are_passed_on(measured: ReportDat
 def test_what_a_scans_file_does_unusually_is_noted_once(measured: ReportData) -> None:
     assert measured.measurement is not None
     note = "The file's orientation tag (6) is not applied."
-    images = {name: {**scan, "notes": [note]} for name, scan in measured.measurement["images"].items()}
-    verdict = judge(replace(measured, measurement={"images": images}))
+    scans = {name: replace(scan, notes=(note,)) for name, scan in measured.measurement.items()}
+    verdict = judge(replace(measured, measurement=scans))
     assert verdict.level == "good"
     assert f"f1, f2, f3, f4, f5: {note}" in verdict.notes
 
@@ -238,12 +246,19 @@ def test_a_bias_that_harms_nobody_is_left_alone_however_many_marks_show_it() -> 
     assert not test.is_locked
 
 
+def near_a_column(mark: MarkMeasurement, off_px: float) -> MarkMeasurement:
+    """The mark so far off a whole column."""
+    assert mark.center_px is not None
+    return replace(mark, center_px=np.array([round(mark.center_px[0]) + off_px, mark.center_px[1]]))
+
+
 def test_locked_positions_need_a_look(measured: ReportData) -> None:
     assert measured.measurement is not None
-    images: Json = {}
-    for name, scan in measured.measurement["images"].items():
-        images[name] = {**scan, "marks": [{**mark, "col_px": round(mark["col_px"]) + 0.02} for mark in scan["marks"]]}
-    text = told(replace(measured, measurement={"images": images}))
+    scans = {
+        name: with_frame(scan, marks=tuple(near_a_column(mark, 0.02) for mark in scan.frame.marks))
+        for name, scan in measured.measurement.items()
+    }
+    text = told(replace(measured, measurement=scans))
     assert "The column positions of the marks prefer parts of a pixel" in text
     assert "The row positions" not in text
 
@@ -251,18 +266,16 @@ def test_locked_positions_need_a_look(measured: ReportData) -> None:
 def test_marks_that_recur_in_one_place_are_no_pixel_locking(measured: ReportData) -> None:
     """A frame that lies in the same place of every scan: 4 marks, 38 times within 0.01 px of the same places."""
     assert measured.measurement is not None
-    (name, scan), *_ = measured.measurement["images"].items()
-    marks, rng = [mark for mark in scan["marks"] if mark.get("col_px") is not None][:4], np.random.default_rng(6)
+    (name, scan), *_ = measured.measurement.items()
+    rng = np.random.default_rng(6)
 
-    def again() -> Json:
-        off = rng.normal(0.0, 0.01, 4)
-        return {
-            **scan,
-            "marks": [{**m, "col_px": round(m["col_px"]) + d} for m, d in zip(marks, off.tolist(), strict=True)],
-        }
+    def again() -> MeasuredScan:
+        return with_frame(
+            scan, marks=tuple(near_a_column(mark, rng.normal(0.0, 0.01)) for mark in scan.frame.marks[:4])
+        )
 
-    images = {f"{name}-{k}": again() for k in range(38)}
-    recurring = replace(measured, comparator=(), measurement={"images": images})
+    scans = {f"{name}-{k}": again() for k in range(38)}
+    recurring = replace(measured, comparator=(), measurement=scans)
     shots = frames(recurring)
     assert sum(mark.status.is_observation for frame in shots for mark in frame.marks) == 4 * 38
     assert all(len(positions) <= 4 for positions in places_px(shots).values())
@@ -272,15 +285,13 @@ def test_marks_that_recur_in_one_place_are_no_pixel_locking(measured: ReportData
 def test_a_lattice_that_lies_along_the_pixels_is_no_pixel_locking(measured: ReportData) -> None:
     """A reseau of 20 x 20 crosses, 120.04 px apart: 20 columns and 20 rows, each measured 20 times."""
     assert measured.measurement is not None
-    (name, scan), *_ = measured.measurement["images"].items()
-    mark = next(mark for mark in scan["marks"] if mark.get("col_px") is not None)
+    (name, scan), *_ = measured.measurement.items()
+    mark = scan.frame.marks[0]
     rng = np.random.default_rng(8)
     places = np.stack(np.meshgrid(*[100.7 + 120.04 * np.arange(20)] * 2), axis=-1).reshape(-1, 2)
     places += rng.normal(0.0, 0.01, places.shape)
-    marks = [
-        {**mark, "point": str(index), "col_px": col, "row_px": row} for index, (col, row) in enumerate(places.tolist())
-    ]
-    lattice = replace(measured, comparator=(), measurement={"images": {name: {**scan, "marks": marks}}})
+    marks = tuple(replace(mark, point=str(index), center_px=place) for index, place in enumerate(places))
+    lattice = replace(measured, comparator=(), measurement={name: with_frame(scan, marks=marks)})
     assert len(frames(lattice)[0].marks) == 400
     assert judge(lattice).level == "good"
 

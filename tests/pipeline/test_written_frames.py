@@ -253,15 +253,10 @@ def test_the_library_names_a_camera_by_its_plate_or_says_that_it_is_none() -> No
 
 
 def test_the_report_draws_lines_in_place_and_those_that_told_stand_out() -> None:
-    told = {"text": "RUN 7", "pose": "90m", "outline_px": [[10, 10], [20, 10], [20, 90], [10, 90]]}
-    drawn = written(
-        {
-            "width_px": 100,
-            "height_px": 200,
-            "writing": [told, {**told, "text": "8617"}],
-            "pose": {"evidence": ['of 2 lines of writing "RUN 7" speak most']},
-        }
-    )
+    outline = ((10.0, 10.0), (20.0, 10.0), (20.0, 90.0), (10.0, 90.0))
+    lines = [replace(line(text, "90m"), outline_px=outline) for text in ("RUN 7", "8617")]
+    pose = Pose("0", True, ('of 2 lines of writing "RUN 7" speak most',))
+    drawn = written(replace(scan("a", lines, pose), height_px=200))
     assert drawn is not None
     assert 'transform="matrix(' in drawn
     # 3.2 page pixels a pixel. Right in its own frame is up in the scan after mirror and turn: down the page.
@@ -269,7 +264,8 @@ def test_the_report_draws_lines_in_place_and_those_that_told_stand_out() -> None
     assert matrix == pytest.approx([0.0, 1.0, 1.0, 0.0, 48.0, 160.0])
     assert 'class="told"' in drawn.split(">RUN 7<")[0].rsplit("<text", 1)[1]
     assert 'class="read"' in drawn.split(">8617<")[0].rsplit("<text", 1)[1]
-    assert written({"width_px": 100, "height_px": 200, "writing": None}) is None
+    assert written(scan("a", None)) is None
+    assert written(None) is None
 
 
 SCENE = """
