@@ -26,6 +26,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.frames.fiducial_rows import present_frame
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross, dot, polygon, ring_cross, ring_dot
+from measure.reason import NO_REASON
 from measure.results import FrameMeasurement, Pose
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
@@ -134,7 +135,7 @@ def drawn_and_measured(
     begin = np.column_stack([rotation @ np.diag([1.0, -1.0]) / mm, middle + rng.uniform(-1, 1, 2)])
     placement = Placement("0", begin, 8.0, 8, 1, 1, (mm, mm))
     frame = measure_frame(scan, layout, placement, FiducialOptions())
-    return present_frame(scan, layout, frame, Pose("0", True), (1000 * mm, 1000 * mm), (), ""), truth
+    return present_frame(scan, layout, frame, Pose("0", True), (1000 * mm, 1000 * mm), (), NO_REASON), truth
 
 
 def drawn(shape: Any, linear: Array, center: Array, blur_px: float, apart_px: float) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from measure.marks.frame_border import at_border
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.pose.pose_decision import decide_pose
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, Pose
 from measure.scans.scan import Scan
 from measure.search.centred_frame import is_worth_a_look, outermost
@@ -30,7 +31,7 @@ from measure.writing.reading import read_writing
 Array = NDArray[np.float64]
 
 _SET = ("set in the project.",)
-_UNSURE = "none of the marks is measured without blemish: the frame may lie elsewhere."
+_UNSURE = Reason("none of the marks is measured without blemish: the frame may lie elsewhere.", Code.CHANCE)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
 _HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
@@ -70,7 +71,7 @@ def measure_fiducials(
         return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
     found = [placement for placement in found if placement.pitch_mm == frame.placement.pitch_mm]
     lines = _read(scan, layout, frame) if options.writing == "all" else None
-    pose, against = Pose(options.pose, True, _SET), ""
+    pose, against = Pose(options.pose, True, _SET), NO_REASON
     if options.pose == "auto":
         frame = _in_every_pose(search, found, frame)
         pose, placement = _named(search, found, frame, lines or ())
@@ -83,7 +84,7 @@ def measure_fiducials(
     else:
         against = _against_the_set_pose(search, found, frame, lines or ())
     chance = doubt(search, frame)
-    problems = [f"{sentence}." for sentence in (*_rivals(search, found, frame), chance, against) if sentence]
+    problems = [each.told(f"{each}.") for each in (*_rivals(search, found, frame), chance, against) if each]
     doubts = problems if frame.measured else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
@@ -298,18 +299,21 @@ def _named(
     return pose, posed[POSES.index(pose.name)]
 
 
-def _against_the_set_pose(search: FrameSearch, found: Sequence[Placement], frame: Frame, lines: Sequence[Line]) -> str:
+def _against_the_set_pose(
+    search: FrameSearch, found: Sequence[Placement], frame: Frame, lines: Sequence[Line]
+) -> Reason:
     """A sentence where what is seen decides for another pose than the one that the project sets."""
     likeliest, placement = _named(search, found, frame, lines)
     if likeliest.name == frame.placement.pose or not frame.measured:
-        return ""
+        return NO_REASON
     pose = decide_pose(search.scan, search.layout, [frame.placement, placement], frame, search.options, lines)
     if not pose.decided or pose.name == frame.placement.pose:
-        return ""
+        return NO_REASON
     evidence = " ".join(pose.evidence).rstrip(".")
-    return (
+    return Reason(
         f"pose {frame.placement.pose} is set in the project, but what is seen of this frame decides for {pose.name}, "
-        f'and then the marks have other names (pose = "auto" takes each scan as it lies): {evidence}'
+        f'and then the marks have other names (pose = "auto" takes each scan as it lies): {evidence}',
+        Code.POSE,
     )
 
 
@@ -320,7 +324,7 @@ def _posed(found: Sequence[Placement], best: Placement, pose: str) -> Placement:
     )
 
 
-def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> list[str]:
+def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> list[Reason]:
     """Sentences about other placements in the same pose that nearly as many marks speak for, or that show a frame."""
     problems, best = [], frame.placement
     for other in found:
@@ -332,13 +336,18 @@ def _rivals(search: FrameSearch, found: Sequence[Placement], frame: Frame) -> li
                 best.pixel_from_camera[:, :2], other.pixel_from_camera[:, 2] - best.pixel_from_camera[:, 2]
             )
             told = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
-            problems.append(
+            beside = Reason(
                 f"the scan shows another frame {told} beside this one, with {other.supported} marks where this one has "
-                f"{best.supported}: give a scan of one frame"
-                if (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any()
-                else f"the constellation fits nearly as well shifted by {told}, on {other.supported} marks against "
-                f"{best.supported}: the marks' names are not certain"
+                f"{best.supported}: give a scan of one frame",
+                Code.OTHER_FRAME,
             )
+            shifted = Reason(
+                f"the constellation fits nearly as well shifted by {told}, on {other.supported} marks against "
+                f"{best.supported}: the marks' names are not certain",
+                Code.AMBIGUOUS,
+            )
+            is_beside = (np.abs(shift) > _BESIDE * np.array(search.layout.frame_mm)).any()
+            problems.append(beside if is_beside else shifted)
     return problems[:3]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
+from measure.reason import NO_REASON, Code, Reason
 from measure.scans.told_tone import FrameTone
 from measure.status import Status
 from measure.writing.line import Line
@@ -25,7 +26,7 @@ class MarkMeasurement:
     center_px: (2,) column and row, the centre of the top-left pixel being (0, 0). With status `predicted` it is the
     predicted place, with `absent` it may be None: there is nothing to say.
     covariance: of the centre, by its causes; None where nothing was fitted.
-    reason: one sentence; empty only when the status is `measured`.
+    reason: one sentence, with its codes (`measure.reason`); empty only when the status is `measured`.
     quality: named figures of the fit: snr, contrast_dn, blur_px, noise_dn, damaged_fraction, second_method_sigmas, ...
     """
 
@@ -34,7 +35,7 @@ class MarkMeasurement:
     center_px: Array | None
     covariance: Covariance | None
     status: Status
-    reason: str = ""
+    reason: Reason = NO_REASON
     quality: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -56,7 +57,7 @@ class MarkMeasurement:
         place = "" if self.center_px is None else f"({self.center_px[0]:.3f}, {self.center_px[1]:.3f})"
         sigmas = None if self.covariance_px2 is None else np.sqrt(np.diag(self.covariance_px2))
         told = "" if sigmas is None else f"+- ({sigmas[0]:.3f}, {sigmas[1]:.3f})"
-        return self.point, str(self.status), place, told, self.reason
+        return self.point, str(self.status), place, told, str(self.reason)
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class FrameMeasurement:
     pixel_from_camera: (2, 3) affine matrix, camera mm (x', y', 1) to (column, row), from the fiducials found; None
     where there are too few.
     weights: what each channel of a colour scan counts in what its fiducials were measured in; None for its grey value.
-    problems: what the user should look at, one sentence each.
+    problems: what the user should look at, one sentence each, with its codes.
     tone: what is believed of the curve by which its light was stored; None where no frame was found.
     writing: the lines read about the frame; None where none was looked for.
     """
@@ -102,7 +103,7 @@ class FrameMeasurement:
     marks: tuple[MarkMeasurement, ...]
     pose: Pose | None = None
     pixel_from_camera: Array | None = None
-    problems: tuple[str, ...] = ()
+    problems: tuple[Reason, ...] = ()
     weights: tuple[float, ...] | None = None
     tone: FrameTone | None = None
     writing: tuple[Line, ...] | None = None
@@ -112,6 +113,10 @@ class FrameMeasurement:
         """The scale of pixel_from_camera, the mean of both directions; None without one."""
         matrix = self.pixel_from_camera
         return None if matrix is None else float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+
+    def marks_because(self, code: Code) -> tuple[MarkMeasurement, ...]:
+        """Those of whose reason this is a code."""
+        return tuple(mark for mark in self.marks if code in mark.reason.codes)
 
     def __repr__(self) -> str:
         counts = Counter(str(mark.status) for mark in self.marks)

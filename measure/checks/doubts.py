@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause
+from measure.reason import NO_REASON, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 
@@ -22,7 +23,7 @@ class Doubt:
     """How far off a check puts a mark, and the cause to which that is counted; reason: why it is no longer called
     measured, empty where it still is, only less well known."""
 
-    reason: str
+    reason: Reason
     off_px: float
     cause: Cause
 
@@ -32,7 +33,7 @@ class Doubt:
         return self.off_px**2 / 2 * np.eye(2)
 
     def without_reason(self) -> "Doubt":
-        return replace(self, reason="")
+        return replace(self, reason=NO_REASON)
 
 
 def observed(frame: FrameMeasurement) -> list[MarkMeasurement]:
@@ -54,5 +55,4 @@ def _doubted(mark: MarkMeasurement, doubt: Doubt) -> MarkMeasurement:
     known = replace(mark, covariance=mark.covariance.plus(doubt.cause, doubt.px2))
     if not doubt.reason:
         return known
-    reason = f"{mark.reason}; {doubt.reason}" if mark.reason else doubt.reason
-    return replace(known, status=Status.WEAK, reason=reason)
+    return replace(known, status=Status.WEAK, reason=Reason.joined((mark.reason, doubt.reason)))

@@ -24,6 +24,7 @@ from measure.checks.triangles import by_triangles
 from measure.covariance import Cause
 from measure.film import SCATTER_MM
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement
 
 Array = NDArray[np.float64]
@@ -84,17 +85,17 @@ def _shared(
     layout: FiducialLayout,
     given_mm: Array,
     film_mm: float,
-) -> tuple[Explanation, str]:
+) -> tuple[Explanation, Reason]:
     """What explains the misfits best: the given places being right, or wrong, or the scanner bending all scans; and a
     sentence where it is not the first."""
     if len(misfits) == 1:
-        return explained(misfits, given_mm, 0.0, film_mm), ""
+        return explained(misfits, given_mm, 0.0, film_mm), NO_REASON
     by_places = _with_pattern(misfits, given_mm, film_mm)
     poses = [pose.name if (pose := frame.pose) else "0" for frame in frames.values()]
     is_clear = by_places.chance_of_pattern >= CHANCE
     is_quiet = not (by_places.film.is_more or any(each.film_mm or each.off_mm for each in by_places.frames.values()))
     if is_clear and (is_quiet or len(set(poses)) == 1):
-        return explained(misfits, given_mm, 0.0, film_mm), ""
+        return explained(misfits, given_mm, 0.0, film_mm), NO_REASON
     if len(set(poses)) == 1:
         return by_places, _of_places(by_places, layout, " The scanner may do the same: all frames lie alike in it.")
     sites = scan_sites(list(misfits.values()), poses)
@@ -107,7 +108,7 @@ def _shared(
     if lead > TOLD and by_scanner.chance_of_pattern < CHANCE:
         return by_scanner, _of_scanner(by_scanner)
     if is_clear:
-        return explained(misfits, given_mm, 0.0, film_mm), ""
+        return explained(misfits, given_mm, 0.0, film_mm), NO_REASON
     return by_places, _of_places(by_places, layout, "" if lead < -TOLD else " The scanner may do the same.")
 
 
@@ -119,20 +120,22 @@ def _with_pattern(misfits: Mapping[int, Misfit], sigma_mm: Array, film_mm: float
     return explained(misfits, sigma_mm, max(size_mm, film_mm), film_mm)
 
 
-def _of_places(shared: Explanation, layout: FiducialLayout, rest: str) -> str:
+def _of_places(shared: Explanation, layout: FiducialLayout, rest: str) -> Reason:
     off = {mark.id: float(np.hypot(*xy)) for mark, xy in zip(layout.marks, shared.pattern.mm, strict=True)}
-    return (
+    return Reason(
         f"in all frames of the camera the marks lie beside the given coordinates in the same way, "
         f"{_told(off)}, under an affine transformation: their standard deviations allow that with a probability of "
-        f"{shared.chance_of_pattern:.1g}. Look whether these are the coordinates of this camera.{rest}"
+        f"{shared.chance_of_pattern:.1g}. Look whether these are the coordinates of this camera.{rest}",
+        Code.OFF_GIVEN,
     )
 
 
-def _of_scanner(shared: Explanation) -> str:
+def _of_scanner(shared: Explanation) -> Reason:
     most = float(np.hypot(*shared.pattern.mm.T).max())
-    return (
+    return Reason(
         f"all scans are bent in the same way in the scanner's axes, by up to {most:.3f} mm beside an affine "
-        f"transformation (probability of chance {shared.chance_of_pattern:.1g}): the scanner does it."
+        f"transformation (probability of chance {shared.chance_of_pattern:.1g}): the scanner does it.",
+        Code.BENT_SCANS,
     )
 
 
@@ -143,7 +146,7 @@ def _told(off_mm: Mapping[str, float]) -> str:
     return ", ".join(f"{name} by {off_mm[name]:.3f} mm" for name in worst) + rest
 
 
-def _film_of(shared: Explanation, place: int, layout: FiducialLayout, believed_mm: float) -> tuple[float, list[str]]:
+def _film_of(shared: Explanation, place: int, layout: FiducialLayout, believed_mm: float) -> tuple[float, list[Reason]]:
     """The film's standard deviation in a frame, and sentences where it stands out."""
     frame = shared.frames.get(place)
     if frame is None or frame.film_mm is None:
@@ -159,8 +162,11 @@ def _film_of(shared: Explanation, place: int, layout: FiducialLayout, believed_m
         else "Its film is bent, or was moved while it was scanned."
     )
     return frame.film_mm, [
-        f"no affine transformation takes {than} to its marks, which lie off, {told}; film makes as much with a "
-        f"probability of {frame.chance:.1g}. {cause} Its marks count as known to {1000 * frame.film_mm:.0f} um."
+        Reason(
+            f"no affine transformation takes {than} to its marks, which lie off, {told}; film makes as much with a "
+            f"probability of {frame.chance:.1g}. {cause} Its marks count as known to {1000 * frame.film_mm:.0f} um.",
+            Code.BENT_FRAME,
+        )
     ]
 
 
@@ -177,7 +183,7 @@ def _doubts(shared: Explanation, place: int, layout: FiducialLayout) -> dict[str
         if not alone:
             has_it = "the camera's other frames have it, more than they scatter"
         doubts[name] = Doubt(
-            f"it lies {off:.3f} mm from where {has_it}",
+            Reason(f"it lies {off:.3f} mm from where {has_it}", Code.OFF_GIVEN if alone else Code.OFF_FRAMES),
             off / frame.misfit.mm,
             Cause.GIVEN_PLACES if alone else Cause.OTHER_FRAMES,
         )

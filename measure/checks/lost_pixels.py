@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.status import Status
@@ -22,7 +23,8 @@ def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
     if not scan.damage:
         return frame
     marks = without_lost(scan, frame.marks)
-    problem = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file anew, or rescan."
+    told = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file anew, or rescan."
+    problem = Reason(told, Code.DAMAGED_FILE)
     return replace(frame, marks=marks, problems=(problem, *(each for each in frame.problems if each != problem)))
 
 
@@ -34,6 +36,5 @@ def _told(scan: Scan, mark: MarkMeasurement) -> MarkMeasurement:
     why = scan.lost_in(int(col) - half, int(row) - half, 2 * half + 1, 2 * half + 1)
     if not why:
         return mark
-    return replace(
-        mark, covariance=None, status=Status.PREDICTED, reason=f"the scan's file is damaged at its place: {why}"
-    )
+    reason = Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE)
+    return replace(mark, covariance=None, status=Status.PREDICTED, reason=reason)

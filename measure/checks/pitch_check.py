@@ -6,6 +6,7 @@ from scipy.special import ndtri
 
 from measure.film import AFFINITY_SIGMA
 from measure.marks.shapes import FiducialLayout
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement
 
 Array = NDArray[np.float64]
@@ -16,7 +17,7 @@ _LEAST_MARKS = 3  # with two, a false one makes a pitch of its own
 
 def pitch_problem(
     frame: FrameMeasurement, layout: FiducialLayout, pitch_um: tuple[float, float], source: str
-) -> str | None:
+) -> Reason | None:
     """A sentence that names the pitch which the marks suggest, None where the given one (um, by source) is as good.
 
     Film and scanner stretch by some thousandths, and the given separations have their own standard deviations: what
@@ -37,9 +38,10 @@ def pitch_problem(
     excess = seen_um / np.asarray(pitch_um) - 1
     if np.abs(excess).max() <= limit:
         return None
-    return (
+    return Reason(
         f"{source} gives a pitch of {pitch_um[0]:.2f} x {pitch_um[1]:.2f} um, but the marks' separations suggest "
         f"{seen_um[0]:.2f} x {seen_um[1]:.2f} um ({100 * excess[0]:+.1f} and {100 * excess[1]:+.1f} %, where they and "
         f"the film allow {100 * limit:.1f} %): set pitch_um = [{seen_um[0]:.2f}, {seen_um[1]:.2f}] in the project, or "
-        "look whether the camera is the right one."
+        "look whether the camera is the right one.",
+        Code.PITCH,
     )

@@ -15,6 +15,7 @@ from scipy.special import chdtrc, chdtri, fdtrc
 from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, Doubt, observed
 from measure.covariance import Cause
 from measure.frames.frame import may_be_wrong
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 
 Array = NDArray[np.float64]
@@ -48,8 +49,11 @@ def _doubt(mark: MarkMeasurement, is_alone: bool) -> Doubt:
     assert mark.covariance_px2 is not None  # an observation has one
     off_px = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
     doubt = Doubt(
-        f"its edges put it {off_px:#.2g} px elsewhere, {mark.quality['second_method_sigmas']:.1f} standard deviations "
-        "of the difference: it is damaged or unlike its drawing",
+        Reason(
+            f"its edges put it {off_px:#.2g} px elsewhere, {mark.quality['second_method_sigmas']:.1f} standard "
+            "deviations of the difference: it is damaged or unlike its drawing",
+            Code.EDGES,
+        ),
         off_px,
         Cause.SECOND_METHOD,
     )

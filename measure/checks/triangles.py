@@ -20,6 +20,7 @@ from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, TOLD, Doubt, observ
 from measure.covariance import Cause
 from measure.film import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_MM
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 
 Array = NDArray[np.float64]
@@ -38,7 +39,7 @@ class Contradiction:
     problem of the frame and the standard deviation of film that it adds to its marks."""
 
     doubts: Mapping[str, Doubt] = field(default_factory=dict)
-    problem: str = ""
+    problem: Reason = NO_REASON
     film_mm: float = 0.0
 
 
@@ -48,10 +49,11 @@ class _Against:
 
     where: str
     cause: Cause
+    code: Code
 
 
-_GIVEN = _Against("where the given places and the scan's pitch have {}", Cause.GIVEN_PLACES)
-_OTHERS = _Against("where the camera's other frames have {}", Cause.OTHER_FRAMES)
+_GIVEN = _Against("where the given places and the scan's pitch have {}", Cause.GIVEN_PLACES, Code.OFF_GIVEN)
+_OTHERS = _Against("where the camera's other frames have {}", Cause.OTHER_FRAMES, Code.OFF_FRAMES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,8 +198,8 @@ def _explained(
     if marks[best] - max(pitches, *np.delete(marks, best)) > TOLD:
         weighed = np.linalg.solve(covariance, form.by_mark[best])
         off_mm = float(np.hypot(*np.linalg.solve(form.by_mark[best].T @ weighed, weighed.T @ stretched)))
-        reason = f"it lies {off_mm:.2f} mm off {against.where.format('it')}: three marks have no other check"
-        return Contradiction({names[best]: Doubt(reason, off_mm / form.mm, against.cause)})
+        told = f"it lies {off_mm:.2f} mm off {against.where.format('it')}: three marks have no other check"
+        return Contradiction({names[best]: Doubt(Reason(told, against.code), off_mm / form.mm, against.cause)})
     off_mm = float(np.sqrt(_misfit(stretched, form.covariance(1.0) - form.covariance(0.0)) / _FORM))
     problem = (
         f"its three marks {', '.join(names)} lie off {against.where.format('them')}, by about {off_mm:.2f} mm; film "
@@ -205,9 +207,9 @@ def _explained(
     )
     if pitches - max(marks) > TOLD or max(marks) - _log_density(covariance, stretched) < TOLD:
         told = "Film that is stretched more, or a wrong pitch, explains it best: look whether the pitch is right."
-        return Contradiction(problem=f"{problem} {told}")
+        return Contradiction(problem=Reason(f"{problem} {told}", Code.BENT_FRAME, Code.PITCH))
     told = f"One of the marks is off, or the pitch is wrong. They count as known to {1000 * off_mm:.0f} um."
-    return Contradiction(problem=f"{problem} {told}", film_mm=off_mm)
+    return Contradiction(problem=Reason(f"{problem} {told}", against.code), film_mm=off_mm)
 
 
 def _misfit(stretched: Array, covariance: Array) -> float:

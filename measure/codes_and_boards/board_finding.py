@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from measure.codes_and_boards.board_specs import ArucoSpec, CharucoSpec, ChessboardSpec, aruco_dictionary
 from measure.codes_and_boards.marker_reading import ReadMarkers, read_markers
+from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
@@ -35,8 +36,8 @@ class FoundBoard:
     number, and why; others_px: the middles of further boards that look the same."""
 
     corners: dict[str, FoundCorner]
-    reason: str = ""
-    refused: Mapping[int, str] = field(default_factory=dict)
+    reason: Reason = NO_REASON
+    refused: Mapping[int, Reason] = field(default_factory=dict)
     others_px: tuple[Array, ...] = ()
 
 
@@ -65,14 +66,15 @@ def _search_factors(scan: Scan) -> list[int]:
     return [coarse] if coarse == fine else [coarse, fine]
 
 
-def _searchable(scan: Scan, factor: int) -> tuple[Bytes, str]:
+def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
     """The reduced scan stretched to 8 bits, and why there is nothing to search in it, if so."""
     grey = scan.reduced(factor)
     low, high = np.percentile(grey, (1, 99))
     if high - low < _LEAST_CONTRAST * scan.full_scale_dn:
         share = 100 * (high - low) / scan.full_scale_dn
-        return np.zeros((1, 1), np.uint8), f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
-    return np.clip((grey - low) * (255 / (high - low)), 0, 255).astype(np.uint8), ""
+        told = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
+        return np.zeros((1, 1), np.uint8), Reason(told, Code.CONTRAST)
+    return np.clip((grey - low) * (255 / (high - low)), 0, 255).astype(np.uint8), NO_REASON
 
 
 def _in_scan(corner: FoundCorner, factor: int) -> FoundCorner:
@@ -88,7 +90,8 @@ def _find_chessboard(picture: Bytes, spec: ChessboardSpec) -> FoundBoard:
     """All inner corners of a chessboard that is wholly seen, and whether it is the only one."""
     grid = _chessboard_grid(picture, spec)
     if grid is None:
-        return FoundBoard({}, f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen")
+        told = f"no chessboard of {spec.columns} x {spec.rows} inner corners is wholly seen"
+        return FoundBoard({}, Reason(told, Code.NO_BOARD))
     corners = {
         f"r{row}c{column}": FoundCorner(grid[row, column], steps)
         for (row, column), steps in np.ndenumerate(_grid_steps(grid))
@@ -167,7 +170,8 @@ def _find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
         picture, markerCorners=outlines, markerIds=numbers_read
     )
     if corners is None or len(corners) < 4:
-        reason = f"{len(outlines)} markers of {spec.dictionary} were read, too few to place the board's corners"
+        told = f"{len(outlines)} markers of {spec.dictionary} were read, too few to place the board's corners"
+        reason = Reason(told, Code.NO_BOARD)
         return FoundBoard({}, _with_refused(reason, read), read.refused)
     places, ids = np.asarray(corners, float).reshape(-1, 2), np.asarray(numbers, int).ravel()
     return FoundBoard(
@@ -204,10 +208,12 @@ def _find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
         for index, corner in enumerate(corners):
             sides = np.stack([corners[(index + 1) % 4] - corner, corners[(index - 1) % 4] - corner], axis=-1)
             found[f"{number}.{index}"] = FoundCorner(corner, sides)
-    reason = "" if found else f"no marker {wanted[0]} to {wanted[-1]} of {spec.dictionary} was read"
-    return FoundBoard(found, reason and _with_refused(reason, read), read.refused)
+    if found:
+        return FoundBoard(found, NO_REASON, read.refused)
+    reason = Reason(f"no marker {wanted[0]} to {wanted[-1]} of {spec.dictionary} was read", Code.NO_BOARD)
+    return FoundBoard(found, _with_refused(reason, read), read.refused)
 
 
-def _with_refused(reason: str, read: ReadMarkers) -> str:
+def _with_refused(reason: Reason, read: ReadMarkers) -> Reason:
     """Why a board was not found, where markers were read that are not used."""
     return next(iter(read.refused.values()), reason)

@@ -19,6 +19,7 @@ from measure.codes_and_boards.circle_grids import measure_circle_grid
 from measure.codes_and_boards.corners import Corner, Surface, crossing, fit_corner, quarter
 from measure.covariance import Covariance
 from measure.fitting.scan_window import ScanWindow
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.status import Status
@@ -41,10 +42,10 @@ class BoardMeasurement:
     in the scan may be the board as well, so that none of its points is an observation."""
 
     marks: tuple[MarkMeasurement, ...]
-    reason: str = ""
+    reason: Reason = NO_REASON
     notes: tuple[str, ...] = ()
-    refused: tuple[str, ...] = ()
-    ambiguous: str = ""
+    refused: tuple[Reason, ...] = ()
+    ambiguous: Reason = NO_REASON
 
 
 def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
@@ -59,7 +60,7 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     notes: tuple[str, ...] = ()
     if isinstance(spec, ChessboardSpec) and fitted:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
-    unseen = board.reason or "not seen: its markers were not read"
+    unseen = board.reason or Reason("not seen: its markers were not read", Code.UNNAMED)
     why = {name: _refused(name, board, spec) or unseen for name in spec.object_points()}
     marks = tuple(_as_mark(name, fitted.get(name), missing) for name, missing in why.items())
     measured = BoardMeasurement(marks, board.reason, notes, tuple(board.refused.values()))
@@ -72,7 +73,8 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
         return measured
     middle = np.mean([mark.center_px for mark in measured.marks if mark.center_px is not None], axis=0)
     places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in (middle, *others_px))
-    why = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
+    told = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
+    why = Reason(told, Code.AMBIGUOUS)
     marks = tuple(
         replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
         for mark in measured.marks
@@ -80,9 +82,9 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
     return replace(measured, marks=marks, ambiguous=why)
 
 
-def _refused(name: str, board: FoundBoard, spec: BoardSpec) -> str:
+def _refused(name: str, board: FoundBoard, spec: BoardSpec) -> Reason:
     """Why the marker of a corner is not used, though it was read."""
-    return board.refused.get(int(name.split(".")[0]), "") if isinstance(spec, ArucoSpec) else ""
+    return board.refused.get(int(name.split(".")[0]), NO_REASON) if isinstance(spec, ArucoSpec) else NO_REASON
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,13 +170,14 @@ def _steps_right(found: dict[str, FoundCorner], names: NDArray[np.str_]) -> floa
     return float(last[0] - first[0])
 
 
-def _as_mark(name: str, fitted: FittedCorner | None, missing: str) -> MarkMeasurement:
+def _as_mark(name: str, fitted: FittedCorner | None, missing: Reason) -> MarkMeasurement:
     """The row of a point."""
     if fitted is None:
         return MarkMeasurement(name, "target", None, None, Status.ABSENT, missing)
     corner = fitted.corner
     if corner.reason:
-        return MarkMeasurement(name, "target", corner.center_px, None, Status.PREDICTED, f"not fitted: {corner.reason}")
+        reason = corner.reason.told(f"not fitted: {corner.reason}")
+        return MarkMeasurement(name, "target", corner.center_px, None, Status.PREDICTED, reason)
     quality = {
         "snr": abs(corner.contrast_dn) / max(corner.noise_dn, 1e-9),
         "contrast_dn": corner.contrast_dn,
@@ -186,7 +189,8 @@ def _as_mark(name: str, fitted: FittedCorner | None, missing: str) -> MarkMeasur
     if corner.junction_px is not None:
         quality |= {"junction_col_px": corner.junction_px[0], "junction_row_px": corner.junction_px[1]}
     weak = corner.damaged_fraction > _WEAK_DAMAGE
-    reason = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit" if weak else ""
+    told = f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit"
+    reason = Reason(told, Code.COVERED) if weak else NO_REASON
     status = Status.WEAK if weak else Status.MEASURED
     return MarkMeasurement(
         name, "target", corner.center_px, Covariance.of_noise(corner.covariance_px2), status, reason, quality

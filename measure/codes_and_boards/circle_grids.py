@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from measure.codes_and_boards.board_specs import CircleGridSpec
 from measure.codes_and_boards.lattices import Place, grid_places, is_whole
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.single_targets.disk_patches import Candidate, DiskSearch
@@ -27,7 +28,7 @@ class CircleGridMeasurement:
     others_px: the middles of further grids that look the same."""
 
     marks: tuple[MarkMeasurement, ...]
-    reason: str = ""
+    reason: Reason = NO_REASON
     notes: tuple[str, ...] = ()
     others_px: tuple[Array, ...] = ()
 
@@ -40,9 +41,10 @@ def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> CircleGridMeasureme
     looks = _looks(patches)
     assignments = grid_places(centers, looks, spec.places())
     if not is_whole(assignments):
-        reason = f"no grid of {spec.columns} x {spec.rows} dots is wholly seen; {len(patches)} spots look like dots"
+        told = f"no grid of {spec.columns} x {spec.rows} dots is wholly seen; {len(patches)} spots look like dots"
         if assignments:
-            reason = f"a grid of more than {spec.columns} x {spec.rows} dots is seen, or one with a line of it hidden"
+            told = f"a grid of more than {spec.columns} x {spec.rows} dots is seen, or one with a line of it hidden"
+        reason = Reason(told, Code.NO_BOARD)
         absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, reason) for name in names.values())
         return CircleGridMeasurement(tuple(absent), reason)
     assignment = max(assignments, key=lambda found: _upright(found, centers))
@@ -57,7 +59,7 @@ def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> CircleGridMeasureme
         margin = gap / (1 - gap) * 2 * float(np.linalg.svd(shape, compute_uv=False)[1])
         marks.append(_as_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in seen))
     others = _other_grids(centers, looks, assignment, spec.places())
-    return CircleGridMeasurement(tuple(marks), "", notes, others)
+    return CircleGridMeasurement(tuple(marks), NO_REASON, notes, others)
 
 
 def _other_grids(centers: Array, looks: Array, assignment: dict[Place, int], places: list[Place]) -> tuple[Array, ...]:
@@ -109,7 +111,8 @@ def _as_mark(name: str, disk: FittedDisk, was_seen: bool) -> MarkMeasurement:
     """The row of a dot."""
     if disk.reason:
         status = Status.REJECTED if was_seen else Status.PREDICTED
-        return MarkMeasurement(name, "target", disk.center_px, None, status, f"not fitted: {disk.reason}")
+        reason = disk.reason.told(f"not fitted: {disk.reason}")
+        return MarkMeasurement(name, "target", disk.center_px, None, status, reason)
     weakness = disk.weakness or disk.lone_doubt
     status = Status.WEAK if weakness else Status.MEASURED
     return MarkMeasurement(name, "target", disk.center_px, disk.covariance, status, weakness, disk.quality)

@@ -21,6 +21,7 @@ from measure.fitting.scan_window import ScanWindow
 from measure.noise.noise import correlated, noise_model, robust_scale
 from measure.noise.pixel_sums import products
 from measure.noise.robust import tukey_weights
+from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,7 +55,7 @@ class Corner:
     noise_dn: float
     blur_px: float
     damaged_fraction: float
-    reason: str = ""
+    reason: Reason = NO_REASON
     junction_px: Array | None = None
 
 
@@ -122,7 +123,8 @@ class _CornerFit:
         self.unknowns = _SHAPE_UNKNOWNS + len(self.linear)
         self.scale_dn = 0.0
         self.weights = self._area()
-        self.reason = "" if self.weights.sum() > 2 * self.unknowns else "too little of it is inside of the scan"
+        outside = Reason("too little of it is inside of the scan", Code.OUTSIDE)
+        self.reason = NO_REASON if self.weights.sum() > 2 * self.unknowns else outside
 
     def run(self) -> None:
         """Plain, then robust, until the corner stands still; or a reason why it does not."""
@@ -144,7 +146,7 @@ class _CornerFit:
             inverse = np.linalg.pinv(products(weighted, design), hermitian=True)
             covariance = (inverse @ products(weighted, correlated(weighted, model)) @ inverse)[:2, :2]
             if not 2 * abs(self.linear[0]) > 4 * noise:
-                self.reason = "no edges stand out from the noise"
+                self.reason = Reason("no edges stand out from the noise", Code.CONTRAST)
             elif self.bends:
                 meeting = self._junction(residuals)
         return Corner(
@@ -174,7 +176,7 @@ class _CornerFit:
             self.weights = self._area() * tukey_weights(residuals, self.scale_dn)
             if self._step(design, residuals) < tolerance_px:
                 return
-        self.reason = self.reason or "the fit does not settle"
+        self.reason = self.reason or Reason("the fit does not settle", Code.NO_FIT)
 
     def _area(self) -> Array:
         """Weights 0 to 1 of a parallelogram about the corner; its border is smooth, and it moves with the corner: a
@@ -222,7 +224,7 @@ class _CornerFit:
         normal = products(weighted, design)
         size = np.sqrt(np.diag(normal))
         if not np.all(size > 0):
-            self.reason = "nothing here shows where the edges meet"
+            self.reason = Reason("nothing here shows where the edges meet", Code.NO_FIT)
             return 0.0
         scaled = normal / np.outer(size, size) + 1e-9 * np.eye(self.unknowns)
         step = np.linalg.solve(scaled, np.tensordot(weighted, residuals, axes=2) / size) / size
@@ -232,7 +234,7 @@ class _CornerFit:
         variance = np.clip(self.variance + step[4], self.variance / 2, self.variance * 2)
         self.variance = float(np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance))
         if np.hypot(*(self.center - self.start)) > self.max_shift_px:
-            self.reason = "the fit ran away to something else"
+            self.reason = Reason("the fit ran away to something else", Code.NO_FIT)
         elif np.abs(self.edges - self.start_edges).max() > _MOST_TURN_RAD:
-            self.reason = "the edges here run otherwise than they should"
+            self.reason = Reason("the edges here run otherwise than they should", Code.SIZE)
         return float(np.hypot(*step[:2]))

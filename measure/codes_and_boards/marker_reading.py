@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.sheet_view import SheetView, robust_view
+from measure.reason import Code, Reason
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -19,7 +20,7 @@ class ReadMarkers:
     at places that nothing tells apart, and why."""
 
     corners_px: Mapping[int, Array]
-    refused: Mapping[int, str]
+    refused: Mapping[int, Reason]
 
 
 def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, board: Mapping[int, Array]) -> ReadMarkers:
@@ -32,24 +33,27 @@ def read_markers(picture: Bytes, dictionary: cv2.aruco.Dictionary, board: Mappin
     half_module = 0.5 / (dictionary.markerSize + 2)
     view = _view(readings, board, (picture.shape[1], picture.shape[0]), half_module)
     corners: dict[int, Array] = {}
-    refused: dict[int, str] = {}
+    refused: dict[int, Reason] = {}
     for number, places in readings.items():
         off = [_off(view, board[number], place) for place in places]
         best = int(np.argmin(np.nan_to_num(off, nan=np.inf)))
         if off[best] < 1.0 or (len(readings) == len(places) == 1):
             corners[number] = places[best]
         elif len(places) > 1:
-            refused[number] = (
+            refused[number] = Reason(
                 f"marker {number} was read at {len(places)} places, and nothing tells which is the board's: "
-                "there may be another such board"
+                "there may be another such board",
+                Code.AMBIGUOUS,
             )
         elif view is None:
-            refused[number] = (
+            refused[number] = Reason(
                 f"marker {number} was read, but the board's markers do not agree on where the board lies: "
-                "there may be another such board"
+                "there may be another such board",
+                Code.AMBIGUOUS,
             )
         else:
-            refused[number] = f"marker {number} was read where the board's other markers do not have it"
+            told = f"marker {number} was read where the board's other markers do not have it"
+            refused[number] = Reason(told, Code.OFF_PLACE)
     return ReadMarkers(corners, refused)
 
 

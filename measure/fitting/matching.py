@@ -36,6 +36,7 @@ from measure.noise.blank_film import blank_patches, is_coloured
 from measure.noise.grain import grain_model
 from measure.noise.noise import NoiseModel, is_textured, noise_model
 from measure.noise.pixel_sums import combined, factors, products
+from measure.reason import Reason
 from measure.scans.told_tone import ToldTone
 
 __all__ = ["Match", "MatchOptions", "match", "window_about"]
@@ -66,7 +67,7 @@ class Match:
     """
 
     converged: bool
-    reason: str
+    reason: Reason
     center_px: Array
     place_covariance: Covariance
     pixel_from_mark: Array

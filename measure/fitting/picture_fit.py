@@ -24,6 +24,7 @@ from measure.noise.pixel_sums import combined, products
 from measure.noise.robust import damage, damage_where_lossy, grown, solution, tukey_loss, tukey_weights
 from measure.noise.steadiness import steadiness
 from measure.noise.weighting import weighted
+from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,7 +38,7 @@ _LEAST_VARIANCE_DN2 = 1e-12
 _UNROUNDED_PX, _MOST_UNROUNDED = 0.0001, 30  # a move by other grey values that needs no further ones; how often
 _WEIGHTED_STEPS = 4  # by the grain's weights: the place is nearly right before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # a last step that needs no further one; the longest that may be the last
-_UNSETTLED = "the adjustment did not converge"
+_UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # what counts as the mark itself
 _GROUND = 0.1  # of the mark: what shows less is its ground
 EDGE_BLURS = 3.0  # from the frame's border, in which a mark ends: a thousandth of its step is seen farther off
@@ -55,18 +56,18 @@ class PictureFit:
         self.area = self.used = usable
         self.far = np.zeros_like(usable)
         self.variance_dn2, self.least_variance_dn2, self.rounding_variance_dn2 = 1.0, 0.0, 0.0
-        self.reason = ""
+        self.reason = NO_REASON
 
     def approach(self) -> None:
         """Plain, then roughly robust; stops with a reason where something gives way."""
         self.choose_area()
         if not self.reason and np.ptp(self.model.grey[self.area]) == 0.0:
-            self.reason = "the picture is even there: nothing stands out"
+            self.reason = Reason("the picture is even there: nothing stands out", Code.CONTRAST)
         if not self.reason:
             self.model.bent = ROUGHLY_BENT
             self._adjust(robust=False, tolerance_px=0.1)
         if self.reason == _UNSETTLED:  # dust may keep squares from settling, and not what holds against it
-            self.reason = ""
+            self.reason = NO_REASON
         if not self.reason:
             self.choose_area()
         if not self.reason:
@@ -79,7 +80,7 @@ class PictureFit:
         if not self.reason:
             self._adjust(robust=False, tolerance_px=0.05)
         if self.reason == _UNSETTLED:
-            self.reason = ""
+            self.reason = NO_REASON
 
     def refine(self) -> None:
         """Robust from there, then on what is undamaged."""
@@ -97,10 +98,10 @@ class PictureFit:
                 return
             self.used = undamaged
             if self.telling.sum() < 3 * len(self.model.design):
-                self.reason = "too little of the mark is undamaged"
+                self.reason = Reason("too little of the mark is undamaged", Code.COVERED)
                 return
             if round_ == 0 and not self._is_plain():
-                self.reason = "the ground about the mark is not plain"
+                self.reason = Reason("the ground about the mark is not plain", Code.NO_FIT)
                 return
             self._adjust(robust=False, tolerance_px=0.002)
 
@@ -246,11 +247,11 @@ class PictureFit:
             distance = cv2.distanceTransform(outside, cv2.DIST_L2, 5)
             near, self.far = distance <= self.options.margin_px, distance > self.options.plain_px
             if outside.all():
-                self.reason = "the mark lies outside of its window"
+                self.reason = Reason("the mark lies outside of its window", Code.NO_FIT)
         near &= known(mark, place, width, height, EDGE_BLURS * self.model.seen_blur_px)
         self.area = self.used = self.usable & near
         if self.area.sum() < 0.5 * near.sum() or self.area.sum() < 40:
-            self.reason = self.reason or "most of the mark lies outside of the scan"
+            self.reason = self.reason or Reason("most of the mark lies outside of the scan", Code.OUTSIDE)
 
     def _adjust(self, robust: bool, tolerance_px: float) -> None:
         """Gauss-Newton until the mark moves less than tolerance_px; a step that does not improve the fit is halved."""
@@ -269,7 +270,7 @@ class PictureFit:
         for _ in range(_ITERATIONS):
             step = self._solve(self.used * tukey_weights(model.residuals, scale_dn))
             if step is None:
-                self.reason = "the picture does not determine the mark's place"
+                self.reason = Reason("the picture does not determine the mark's place", Code.NO_FIT)
                 return
             before, cost_before = model.state, cost
             moved = model.step(step)

@@ -12,6 +12,7 @@ from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.marks.shapes import Mark, MarkTemplate, thinnest_mm
 from measure.match_options import MatchOptions
 from measure.noise.pixel_sums import combined, factors
+from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -338,14 +339,14 @@ class PictureModel:
             departures[self.blur] = self.state.variance_px2 - self.options.blur_px**2
         return departures
 
-    def ran_away(self) -> str:
+    def ran_away(self) -> Reason:
         """Why the present state is no mark where one was expected; empty where it may be."""
         moved = float(np.hypot(*(self.state.pixel_from_mark[:, 2] - self.start[:, 2])))
         if moved > self.options.max_shift_px:
-            return f"the fit ran {moved:.1f} px away from where the mark was expected"
+            return Reason(f"the fit ran {moved:.1f} px away from where the mark was expected", Code.NO_FIT)
         if np.abs(self._distortion()).max() > _MOST_DISTORTION:
-            return "the fit wants a mark of another size or direction than the one drawn"
-        return ""
+            return Reason("the fit wants a mark of another size or direction than the one drawn", Code.SIZE)
+        return NO_REASON
 
     def detail(self, image: NDArray[np.floating]) -> Array:
         """(height, width) grey values, or their model, without what is coarser than the mark's lines."""

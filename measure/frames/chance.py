@@ -14,6 +14,7 @@ from scipy.special import bdtrc
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
 from measure.frames.frame_sighter import first_search_px
+from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.search.constellation import sign_of
 from measure.search.frame_search import FrameSearch
@@ -31,7 +32,7 @@ _REDUCED_PX = 1.5  # of the reduced scan: so near to where it answers there a ma
 _APART = 2.0  # search radii off: beyond what a mark itself answers
 
 
-def doubt(search: FrameSearch, frame: Frame) -> str:
+def doubt(search: FrameSearch, frame: Frame) -> Reason:
     """A sentence where chance may have made the frame; empty where it is unlikely to."""
     inside = [index for index, sighting in enumerate(frame.sightings) if sighting.inside]
     clear = {
@@ -42,7 +43,7 @@ def doubt(search: FrameSearch, frame: Frame) -> str:
         and not frame.sightings[index].closer  # those were seen for the others
     }
     if frame.belongs.sum() >= _SURE:
-        return ""
+        return NO_REASON
     if len(clear) == len(inside):
         return _by_the_scan(search, frame, clear)
     return _by_places_beside(search, frame, inside, clear)
@@ -59,19 +60,20 @@ def expected_where_seen(search: FrameSearch, frame: Frame, seen_px: dict[int, Ar
     return search.expected_where_seen(frame.placement, frame.inside, seen_px)
 
 
-def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> str:
+def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> Reason:
     """Where every mark was found: whether the scan has many places that answer as strongly. A frame that was looked for
     in the middle of its scan is not doubted: the windows about its marks tell of no other places."""
     if len(clear) <= _FREE or not search.was_everywhere(frame.placement):
-        return ""
+        return NO_REASON
     expected = expected_where_seen(search, frame, clear)
     if expected > _LIKELY:
         expected *= _as_good_in_full(search, frame, clear) ** len(clear)
     if expected <= _LIKELY:
-        return ""
-    return (
+        return NO_REASON
+    return Reason(
         f"so much of the scan looks like the {len(clear)} marks found that chance would make {expected:.2g} such "
-        "frames in it, and the frame may lie elsewhere"
+        "frames in it, and the frame may lie elsewhere",
+        Code.CHANCE,
     )
 
 
@@ -93,7 +95,7 @@ def _as_good_in_full(search: FrameSearch, frame: Frame, clear: dict[int, Array])
     return _share(hits, len(others))
 
 
-def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]) -> str:
+def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], clear: dict[int, Array]) -> Reason:
     """Where some marks were not found: whether places beside them look as much like marks as those that were."""
     found, radius = len(clear), first_search_px(frame.placement, search.layout, search.options)
     places = _beside(search.scan, frame, inside, radius)
@@ -101,10 +103,11 @@ def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], 
     hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in places)
     chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, len(places))))
     if chance <= _LIKELY:
-        return ""
-    return (
+        return NO_REASON
+    return Reason(
         f"only {found} of {len(inside)} marks were clearly found, and {hits} of {len(places)} places beside them look "
-        f"as much like marks: chance finds as many with a probability of {chance:.2f}, and the frame may lie elsewhere"
+        f"as much like marks: chance finds as many with a probability of {chance:.2f}, and the frame may lie elsewhere",
+        Code.CHANCE,
     )
 
 

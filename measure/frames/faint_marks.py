@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from measure.covariance import Covariance
 from measure.fitting.matching import Match
 from measure.marks.rendering import extent_px, picture
+from measure.reason import NO_REASON
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT, detail_px
 from measure.search.prediction import MarkPrediction
@@ -147,7 +148,7 @@ class _Field:
         contrast_dn = self.polarity * amplitude * float(np.average(self.room_dn[patch], weights=lit))
         fit = Match(
             converged=True,
-            reason="",
+            reason=NO_REASON,
             center_px=place,
             place_covariance=Covariance.of_noise(inverse @ slopes @ inverse),
             pixel_from_mark=np.column_stack([self.linear, place]),

@@ -12,6 +12,7 @@ from measure.frames.refinement import Sighting
 from measure.frames.unseen import Ground, reason_unseen
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FrameCorner, Mark
+from measure.reason import Code, Reason
 from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
@@ -104,7 +105,7 @@ def _about(sighter: FrameSighter, mark: Mark, pixel_from_mark: Array, times: flo
     return np.asarray(window, dtype=float)
 
 
-def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark | None, unseen: str) -> None:
+def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark | None, unseen: Reason) -> None:
     """Keep a clear fit where what was seen is the same mark; else what was seen counts, or that nothing was."""
     clear, away = sighter.clear(index), np.inf
     if seen is not None and sighting.fit is not None:
@@ -115,8 +116,8 @@ def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark
     if seen is None and not clear:
         sighter.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
     elif seen is not None and (not clear or away > _SAME_PX):
-        reason = f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
-        sighter.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, reason)
+        told = f"it stands out of the texture about it by {seen.fit.significance:.1f} standard deviations only"
+        sighter.sightings[index] = Sighting(sighting.predicted_px, True, seen.fit, Reason(told, Code.CONTRAST))
 
 
 def _is_certain(sighter: FrameSighter, seen: FaintMark) -> bool:

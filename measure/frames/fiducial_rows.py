@@ -10,22 +10,26 @@ from measure.film import AFFINITY_SIGMA
 from measure.fitting.second_place import SecondPlace
 from measure.frames.frame import Frame
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
 from measure.search.correlation import CLOSE
 from measure.special_marks.learned import honest_covariance
 from measure.status import Status
 
-_FAINT = "the frame was found at a closer look only, its marks being faint beside what surrounds them"
-_ASSUMED = "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere"
+_FAINT = Reason(
+    "the frame was found at a closer look only, its marks being faint beside what surrounds them", Code.FAINT_FRAME
+)
+_ASSUMED = Reason(
+    "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
+)
+_OWN = Reason("its template is its own picture: nothing checks its place", Code.OWN_PICTURE)
 
 
 def lost_frame(scan: Scan, layout: FiducialLayout) -> FrameMeasurement:
     """Of a scan whose file gives none of its pixels."""
-    marks = tuple(
-        MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {scan.damage}")
-        for mark in layout.marks
-    )
+    reason = Reason(f"not found: {scan.damage}", Code.DAMAGED_FILE)
+    marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, reason) for mark in layout.marks)
     return FrameMeasurement(scan.name, marks)
 
 
@@ -33,13 +37,13 @@ def absent_frame(scan: Scan, layout: FiducialLayout, reason: str, rotation_deg: 
     """Of a scan in which no frame was found; reason: why, a part of a sentence; rotation_deg: by how much turned it was
     sought."""
     also = "; parts of the scan's file are damaged" if scan.damage else ""
-    marks = tuple(
-        MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, f"not found: {reason}{also}")
-        for mark in layout.marks
-    )
-    problem = (
+    codes = (Code.NO_FRAME, Code.DAMAGED_FILE) if scan.damage else (Code.NO_FRAME,)
+    why = Reason(f"not found: {reason}{also}", *codes)
+    marks = tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, why) for mark in layout.marks)
+    problem = Reason(
         f"no fiducial was measured: {reason}; look whether the camera is that of the scan, the pitch right, and the "
-        f"film laid within {rotation_deg:g} degrees of upright or of a quarter turn."
+        f"film laid within {rotation_deg:g} degrees of upright or of a quarter turn.",
+        Code.NO_FRAME,
     )
     return FrameMeasurement(scan.name, marks, None, None, (problem,))
 
@@ -50,15 +54,15 @@ def present_frame(
     frame: Frame,
     pose: Pose,
     pitch_um: tuple[float, float] | None,
-    problems: Sequence[str],
-    chance: str,
+    problems: Sequence[Reason],
+    chance: Reason,
 ) -> FrameMeasurement:
     """Of a frame that was found. pitch_um: as given; None: pixels are taken as square. problems: why it may lie
     elsewhere, sentences, beside those that its marks show; chance: why it may be none at all: then none of its marks is
     certain, nor if it was found at a closer look."""
     marks = tuple(_row(mark, index, frame, scan.name) for index, mark in enumerate(layout.marks))
     marks = tuple(_of_assumed_name(row, mark, pose) for row, mark in zip(marks, layout.marks, strict=True))
-    weak = chance or (_FAINT if frame.placement.surroundings == CLOSE else "")
+    weak = chance or (_FAINT if frame.placement.surroundings == CLOSE else NO_REASON)
     if weak:
         marks = tuple(
             replace(mark, status=Status.WEAK, reason=weak) if mark.status is Status.MEASURED else mark for mark in marks
@@ -67,19 +71,21 @@ def present_frame(
     return FrameMeasurement(scan.name, marks, pose, frame.pixel_from_camera, problems, frame.weights, frame.tone)
 
 
-def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[str]:
+def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
     """What the user should look at in the frame itself."""
     problems = []
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     given = pitch_um or (1.0, 1.0)
     if abs(per_mm[0] * given[0] / (per_mm[1] * given[1]) - 1) > 2 * AFFINITY_SIGMA:
-        problems.append(
+        told = (
             f"by the marks a pixel is {1000 / per_mm[0]:.1f} um wide and {1000 / per_mm[1]:.1f} um tall: film is never "
             "stretched so much. Look whether the scanner, or the camera file, is to blame."
         )
+        problems.append(Reason(told, Code.PITCH))
     used = int(frame.belongs.sum())
     if used <= 3:
-        problems.append(f"an affine transformation on {used} fiducials has no redundancy: no check.")
+        told = f"an affine transformation on {used} fiducials has no redundancy: no check."
+        problems.append(Reason(told, Code.NO_CHECK))
     return problems
 
 
@@ -107,7 +113,7 @@ def _row(mark: LayoutMark, index: int, frame: Frame, scan: str) -> MarkMeasureme
     if isinstance(mark.mark, MarkTemplate):
         covariance = honest_covariance(mark.mark, scan, fit)
         if status is Status.MEASURED and scan in mark.mark.shares and len(mark.mark.shares) == 1:
-            status, reason = Status.WEAK, "its template is its own picture: nothing checks its place"
+            status, reason = Status.WEAK, _OWN
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, quality)
 
 

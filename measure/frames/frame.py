@@ -9,6 +9,7 @@ from scipy.special import chdtrc
 from measure.film import SCATTER_MM
 from measure.fitting.matching import Match
 from measure.frames.refinement import Sighting
+from measure.reason import NO_REASON, Code, Reason
 from measure.scans.told_tone import FrameTone
 from measure.scans.tone import LINEAR
 from measure.search.constellation import Placement
@@ -132,24 +133,25 @@ class Frame:
             "where the others put them"
         )
 
-    def verdict(self, index: int) -> tuple[Status, str]:
+    def verdict(self, index: int) -> tuple[Status, Reason]:
         """What became of a mark that was fitted, by its picture: where it lies beside the others tells of the frame."""
         fit = self.sightings[index].fit
         if fit is None or not self.belongs[index]:
             off = f"{self.misfit_mm[index]:.2f} mm from where the other {int(self.belongs.sum())} marks put it"
-            return Status.REJECTED, f"what was measured lies {off}"
-        reasons = [self.sightings[index].reason] if self.sightings[index].reason else []
+            return Status.REJECTED, Reason(f"what was measured lies {off}", Code.OFF_PLACE)
+        reasons = [self.sightings[index].reason]
         if fit.likeness < CLEAR_LIKENESS:
-            reasons.append(f"it correlates with its drawing by only {fit.likeness:.2f}")
+            reasons.append(Reason(f"it correlates with its drawing by only {fit.likeness:.2f}", Code.LIKENESS))
         if fit.snr < _CLEAR_SNR:
-            reasons.append(f"its contrast is only {fit.snr:.1f} times the noise")
+            reasons.append(Reason(f"its contrast is only {fit.snr:.1f} times the noise", Code.CONTRAST))
         if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, _MOST_UNLIKE):
-            reasons.append(f"{fit.damaged_fraction:.0%} of it is damaged")
+            reasons.append(Reason(f"{fit.damaged_fraction:.0%} of it is damaged", Code.COVERED))
         sigma_px = largest_sigma_px(fit.covariance_px2)
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX
         if may_be_wrong(fit.covariance_px2) and not is_plain:
-            reasons.append(f"its standard deviation is {sigma_px:.2f} px")
-        return (Status.WEAK, "; ".join(reasons)) if reasons else (Status.MEASURED, "")
+            reasons.append(Reason(f"its standard deviation is {sigma_px:.2f} px", Code.IMPRECISE))
+        reason = Reason.joined(reasons)
+        return (Status.WEAK, reason) if reason else (Status.MEASURED, NO_REASON)
 
 
 def may_be_wrong(covariance_px2: Array) -> bool:

@@ -25,6 +25,7 @@ from measure.marks.rendering import reach_px
 from measure.marks.shapes import Disk, Mark, MarkShape, Ring
 from measure.match_options import MatchOptions
 from measure.noise.noise import may_be_noise
+from measure.reason import Code, Reason
 from measure.scans.told_tone import FrameTone, ToldTone
 from measure.scans.tone import Tone
 
@@ -110,7 +111,8 @@ def count_tone(sighter: FrameSighter) -> None:
         sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(fit.tone))
         sighter.widen(index, Cause.TONE, sighter.tone.covariance_of_own_px2(fit.tone, sighter.prior_tone))
         if sighter.tone.contradiction > _CONTRADICTED and fit.tone.leans_px > fit.sigma_px:
-            sighter.doubt(index, "the marks' edges agree on no tone curve: they are not as drawn, or lit unevenly")
+            told = "the marks' edges agree on no tone curve: they are not as drawn, or lit unevenly"
+            sighter.doubt(index, Reason(told, Code.TONE))
 
 
 def share_blur(sighter: FrameSighter) -> None:
@@ -130,7 +132,8 @@ def share_blur(sighter: FrameSighter) -> None:
         _match_again(sighter, index, match, frame_sigma)
         if blur.differs:
             own_px = fits[index].blur_px
-            sighter.doubt(index, f"its blur is {own_px:.2f} px, where the other marks have {blur.blur_px:.2f}")
+            reason = f"its blur is {own_px:.2f} px, where the other marks have {blur.blur_px:.2f}"
+            sighter.doubt(index, Reason(reason, Code.BLUR))
     sighter.judge()
 
 
@@ -148,18 +151,19 @@ def compare_sizes(sighter: FrameSighter) -> None:
         sizes = shared_sizes([fits[index] for index in indices], sighter.pixel_from_camera[:, :2])
         for index, size in zip(indices, sizes, strict=True):
             if size is not None and size.differs:
-                reason = f"it is {size.ratio:.2f} times as large as the other marks: something may cover or touch it"
-                sighter.doubt(index, reason)
+                told = f"it is {size.ratio:.2f} times as large as the other marks: something may cover or touch it"
+                sighter.doubt(index, Reason(told, Code.SIZE, Code.COVERED))
             if size is not None and is_round(mark):
                 linear, is_damaged = fits[index].pixel_from_mark[:, :2], fits[index].damaged_fraction > 0
                 px_per_mm = float(np.sqrt(abs(np.linalg.det(linear))))
                 touch = touch_of_round(size, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
                 sighter.widen(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))
                 if is_damaged and not size.differs and touch.beyond(WRONG_PX) > WRONG_CHANCE:
-                    reason = (
-                        f"it is {size.ratio:.2f} times as large as the other marks and damaged beside it: something"
+                    told = (
+                        f"it is {size.ratio:.2f} times as large as the other marks and damaged beside it: something "
+                        f"may touch it and have moved it by more than {WRONG_PX} px"
                     )
-                    sighter.doubt(index, f"{reason} may touch it and have moved it by more than {WRONG_PX} px")
+                    sighter.doubt(index, Reason(told, Code.SIZE, Code.COVERED))
 
 
 def compare_shapes(sighter: FrameSighter) -> None:
@@ -176,10 +180,11 @@ def compare_shapes(sighter: FrameSighter) -> None:
             continue
         if other.differs:
             turn_deg = np.degrees(other.off[1])
-            reason = (
-                f"its edges make it {other.ratio:.2f} times as large as the other marks, and turned by {turn_deg:.1f}"
+            told = (
+                f"its edges make it {other.ratio:.2f} times as large as the other marks, and turned by {turn_deg:.1f} "
+                "degrees: something may cover or touch it"
             )
-            sighter.doubt(index, f"{reason} degrees: something may cover or touch it")
+            sighter.doubt(index, Reason(told, Code.SIZE, Code.COVERED))
         middle_px = reach_px(sighter.layout.marks[index].mark, fits[index].pixel_from_mark[:, :2]) / 2
         touch = touch_of_edges(other, shape.on_place, middle_px, fits[index].damaged_fraction > 0)
         sighter.widen(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))

@@ -13,9 +13,10 @@ from measure.frames.channels import best_weights
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
 from measure.frames.frame_fit import fit_frame, strangers
-from measure.frames.refinement import Sighting, sight
+from measure.frames.refinement import Sighting, nothing_within, sight
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.reason import Reason
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 from measure.scans.told_tone import FrameTone
 from measure.search.constellation import NARROW, Placement, sign_of
@@ -158,12 +159,11 @@ class FrameSighter:
         clear = sum(self.clear(index) for index in np.flatnonzero(self.belongs).tolist())
         return bool(self.belongs.sum() >= MANY and clear >= MANY / 2)
 
-    def doubt(self, index: int, reason: str) -> None:
+    def doubt(self, index: int, reason: Reason) -> None:
         """Say of a mark that was seen why it may be wrong."""
         sighting = self.sightings[index]
         if sighting is not None:
-            reasons = [each for each in (sighting.reason, reason) if each]
-            self.sightings[index] = replace(sighting, reason="; ".join(reasons))
+            self.sightings[index] = replace(sighting, reason=Reason.joined((sighting.reason, reason)))
 
     def widen(self, index: int, cause: Cause, px2: Array) -> None:
         """Count a covariance (2, 2) to a cause for the place of a mark that was seen."""
@@ -220,8 +220,7 @@ class FrameSighter:
         sure = closer and sighting.chance <= CHANCE
         least = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
         if fit is not None and (fit.likeness < least[0] or fit.significance < least[1]):
-            reason = f"nothing within {search_px:.0f} px of its place looks like it"
-            return Sighting(sighting.predicted_px, True, None, reason)
+            return Sighting(sighting.predicted_px, True, None, nothing_within(search_px))
         return sighting
 
     def expected(self, index: int, search_px: float) -> MarkPrediction:

@@ -13,6 +13,7 @@ from measure.frames.first_look import seen
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
 from measure.noise.blank_film import BESIDE_PX
+from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.scans.tone import LINEAR
@@ -42,7 +43,7 @@ class Sighting:
     predicted_px: Array
     inside: bool
     fit: Match | None
-    reason: str = ""
+    reason: Reason = NO_REASON
     chance: float = 1.0
     closer: bool = False
 
@@ -56,12 +57,12 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     predicted = expected.center_px.copy()
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
     if not inside:
-        return Sighting(predicted, False, None, "its place is outside of the scan")
+        return Sighting(predicted, False, None, Reason("its place is outside of the scan", Code.OUTSIDE))
     fit, chance = _fitted(scan, expected, options, frame_sigma)
     if lost := _lost(scan, expected if fit is None or not fit.converged else expected.moved(fit.center_px)):
         return Sighting(predicted, False, None, lost)
     if fit is None:
-        return Sighting(predicted, True, None, f"nothing within {expected.search_px:.0f} px of its place looks like it")
+        return Sighting(predicted, True, None, nothing_within(expected.search_px))
     if not fit.converged:
         return Sighting(predicted, True, None, fit.reason)
     reason = _unlike(fit, expected, scan.full_scale_dn)
@@ -72,28 +73,34 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     return Sighting(predicted, True, fit, chance=chance)
 
 
-def _lost(scan: Scan, expected: MarkPrediction) -> str:
+def nothing_within(search_px: float) -> Reason:
+    """Why a mark was not found."""
+    return Reason(f"nothing within {search_px:.0f} px of its place looks like it", Code.NOT_FOUND)
+
+
+def _lost(scan: Scan, expected: MarkPrediction) -> Reason:
     """That the file does not give all pixels of the mark, where it is expected or was fitted; empty where it does."""
     why = scan.lost_in(*window_about(expected.mark, expected.pixel_from_mark, 0.0))
-    return f"the scan's file is damaged at its place: {why}" if why else ""
+    return Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE) if why else NO_REASON
 
 
-def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> str:
+def _unlike(fit: Match, expected: MarkPrediction, full_scale_dn: float) -> Reason:
     """Why what was fitted is no such mark; empty where it may be."""
     off_px = float(np.hypot(*(fit.center_px - expected.center_px)))
     if off_px > expected.search_px + _DRIFT_PX:
-        return f"what lies there is {off_px:.0f} px from its place"
+        return Reason(f"what lies there is {off_px:.0f} px from its place", Code.OFF_PLACE)
     contrast = abs(fit.stored_contrast_dn) / full_scale_dn
     if contrast < FAINT:
-        return "there is no contrast at its place"
+        return Reason("there is no contrast at its place", Code.CONTRAST)
     if contrast * (1 - _SURE / max(fit.significance, _SURE)) > _MOST_CONTRAST:
-        return (
+        return Reason(
             "what lies there is far wider than the mark's lines: as fine as these, it would have "
-            f"{contrast:.1f} times the contrast that a scan can show"
+            f"{contrast:.1f} times the contrast that a scan can show",
+            Code.SIZE,
         )
     if fit.contrast_dn * expected.polarity <= 0:
-        return "what lies there has the other polarity"
-    return ""
+        return Reason("what lies there has the other polarity", Code.POLARITY)
+    return NO_REASON
 
 
 def _fitted(

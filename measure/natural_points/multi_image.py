@@ -22,6 +22,7 @@ from scipy.special import chdtrc
 
 from measure.natural_points.bending import Bending
 from measure.noise.noise import NoiseModel, correlated, noise_model
+from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -67,7 +68,7 @@ class Matched:
     variance: float
     unevenness: float
     bending: Bending | None = None
-    reason: str = ""
+    reason: Reason = NO_REASON
 
 
 def match_pieces(pieces: Sequence[Piece], reference: int, radius_px: int = RADIUS_PX) -> tuple[Matched, ...]:
@@ -95,7 +96,7 @@ class _Fit:
     def __init__(self, pieces: Sequence[Piece], reference: int, radius_px: int) -> None:
         self.pieces, self.reference = pieces, reference
         self.maps = [np.array(piece.scan_from_patch, dtype=float) for piece in pieces]
-        self.reasons = [""] * len(pieces)
+        self.reasons = [NO_REASON] * len(pieces)
         edge = np.arange(-radius_px - 1, radius_px + 2)
         self.grid = np.stack(np.meshgrid(edge, edge), axis=-1).astype(float)
         self.used: Mask = np.hypot(self.grid[..., 0], self.grid[..., 1]) <= radius_px
@@ -116,19 +117,19 @@ class _Fit:
                 self._move(index, step)
             if any(self.reasons) or np.abs(steps[:, :2]).max() < _STILL_PX:
                 return
-        self.reasons = [r or "the matching does not come to rest" for r in self.reasons]
+        self.reasons = [r or Reason("the matching does not come to rest", Code.NO_FIT) for r in self.reasons]
 
     def _resample(self, splines: Sequence[Array]) -> None:
         """All pieces on the grid of the patch, less their means, in units of their own contrast."""
         for index, (piece, spline) in enumerate(zip(self.pieces, splines, strict=True)):
             places = self.grid @ self.maps[index][:, :2].T + self.maps[index][:, 2] - piece.origin_px
             if places.min() < 0.0 or (places.max(axis=(0, 1)) > np.array(spline.shape)[::-1] - 1).any():
-                self.reasons[index] = "the matching leaves the window about the approximate place"
+                self.reasons[index] = Reason("the matching leaves the window about the approximate place", Code.NO_FIT)
                 continue
             grey = ndimage.map_coordinates(spline, places[..., ::-1].transpose(2, 0, 1), order=3, prefilter=False)
             self.gains[index] = float(np.std(grey[self.used]))
             if not self.gains[index] > _EVEN * np.abs(grey).max():
-                self.reasons[index] = "the picture is even there"
+                self.reasons[index] = Reason("the picture is even there", Code.CONTRAST)
                 continue
             self.values[index] = (grey - grey[self.used].mean()) / self.gains[index]
 
@@ -143,7 +144,9 @@ class _Fit:
         self.design[:, self.used] = single.mean(axis=0).T
         size = np.sqrt(np.abs(np.diag(self.normal)))
         if not (size > 0.0).all() or np.linalg.eigvalsh(self.normal / np.outer(size, size))[0] < _LEAST_EIGENVALUE:
-            self.reasons = ["the texture does not fix the place in both directions"] * len(self.pieces)
+            self.reasons = [Reason("the texture does not fix the place in both directions", Code.IMPRECISE)] * len(
+                self.pieces
+            )
             return False
         return True
 
@@ -174,7 +177,7 @@ class _Fit:
     def _move(self, index: int, step: Array) -> None:
         """Where a piece looks as the patch does at u + d(u), the patch at u is found at u - d(u)."""
         if not np.isfinite(step).all() or np.hypot(*step[:2]) > _FARTHEST_STEP_PX or np.abs(step[2:]).max() > 0.5:
-            self.reasons[index] = "the matching runs away from the approximate place"
+            self.reasons[index] = Reason("the matching runs away from the approximate place", Code.NO_FIT)
             return
         linear, shift = np.eye(2) - step[2:].reshape(2, 2), -step[:2]
         before = self.maps[index]

@@ -22,6 +22,7 @@ from measure.natural_points.neighbours import astray
 from measure.natural_points.tie_candidates import TieCandidate, widened
 from measure.natural_points.tie_frame import TieFrame
 from measure.noise.noise import robust_scale
+from measure.reason import Code, Reason
 from measure.scans.parallel import mapped
 
 Array = NDArray[np.float64]
@@ -33,8 +34,17 @@ _WIDEST_PX = 2.0 * _RADII_PX[-1]
 _LEAST_BATCH = 4  # part of the points wanted: every batch goes through all scans
 _FINE_PX = 1.0  # how far measured points may lie off their epipolar lines for the lens
 _CHUNK = 16  # points that a worker gets at a time
-_OFF_LINES = "the point lies off the epipolar lines of the other scans, unlike its neighbours"
-_ASTRAY = "the points about it map elsewhere from scan to scan: ground that repeats itself may have been mistaken"
+_OFF_LINES = Reason("the point lies off the epipolar lines of the other scans, unlike its neighbours", Code.OTHER_SCANS)
+_UNLIKE_NEIGHBOURS = Reason(
+    "the points about it map elsewhere from scan to scan: ground that repeats itself may have been mistaken",
+    Code.OTHER_SCANS,
+)
+_UNEVEN = Reason(
+    "parts of the picture about the point move unlike each other: it is no plane piece of ground", Code.OTHER_SCANS
+)
+_OTHER_PICTURE = Reason(
+    "the picture about the point is unlike that in the other scans: something else", Code.OTHER_SCANS
+)
 _CHANCE = 1e-4  # that a test refuses a right point
 _PRECISE_PX = 0.125  # rms length of the error of the weakest measured point: half a pixel is four times as much
 
@@ -45,8 +55,8 @@ class TiePoint:
 
     candidate: TieCandidate
     matched: dict[int, Matched]
-    unmatched: dict[int, str]
-    refused: dict[int, str] = field(default_factory=dict)
+    unmatched: dict[int, Reason]
+    refused: dict[int, Reason] = field(default_factory=dict)
 
     def separation(self, frame: int) -> Array:
         """(2, 2) covariance of the point in a frame if it is the reference's point exactly, px."""
@@ -161,7 +171,7 @@ def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate]) -> 
 def _point(fewest: int, sought: tuple[TieCandidate, Windows]) -> TiePoint:
     """The candidate measured; a frame that cannot be matched is left out where enough others remain."""
     candidate, windows = sought
-    members, unmatched = sorted(candidate.maps), dict[int, str]()
+    members, unmatched = sorted(candidate.maps), dict[int, Reason]()
     while True:
         pieces = [Piece(*windows[i], candidate.maps[i]) for i in members]
         matched = dict(
@@ -173,7 +183,8 @@ def _point(fewest: int, sought: tuple[TieCandidate, Windows]) -> TiePoint:
         unmatched |= failed
         left = [i for i in members if i not in failed]
         if candidate.reference in failed or len(left) < fewest:
-            alike = f"cannot be matched: {next(iter(failed.values()))} in another scan"
+            first = next(iter(failed.values()))
+            alike = first.told(f"cannot be matched: {first} in another scan")
             return TiePoint(candidate, {}, {i: unmatched.get(i, alike) for i in candidate.maps})
         members = left
 
@@ -215,14 +226,10 @@ def _straight(piece: Matched, variance: Array) -> Matched:
 def _judge(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
     """What speaks against the points, each compared with all others."""
     for point in points:
-        point.refused = {
-            frame: "parts of the picture about the point move unlike each other: it is no plane piece of ground"
-            for frame in point.standing
-            if point.matched[frame].unevenness < _CHANCE
-        }
+        point.refused = {frame: _UNEVEN for frame in point.standing if point.matched[frame].unevenness < _CHANCE}
     _refuse_strange_pictures(points)
     _refuse_contradictions(frames, points, partial(contradicting, tolerance=_FINE_PX), _OFF_LINES)
-    _refuse_contradictions(frames, points, astray, _ASTRAY)
+    _refuse_contradictions(frames, points, astray, _UNLIKE_NEIGHBOURS)
 
 
 def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
@@ -238,11 +245,11 @@ def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
         limit = np.median(values) - float(ndtri(_CHANCE)) * robust_scale(values)
         for point, value in rows:
             if value > limit:
-                point.refused[frame] = "the picture about the point is unlike that in the other scans: something else"
+                point.refused[frame] = _OTHER_PICTURE
 
 
 def _refuse_contradictions(
-    frames: Sequence[TieFrame], points: Sequence[TiePoint], differ: Callable[[Array, Array], Mask], reason: str
+    frames: Sequence[TieFrame], points: Sequence[TiePoint], differ: Callable[[Array, Array], Mask], reason: Reason
 ) -> None:
     """Where two frames contradict each other in a point, unlike the points about it: differ tells which do of the
     places (n, 2) of points in both. It is then wrong in the frame that all its contradictions have in common, or, where

@@ -12,6 +12,7 @@ from measure.natural_points.epipolar import FEWEST_PAIRS
 from measure.natural_points.tie_candidates import Shared, candidates, frame_features, verified
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.tie_points import TiePoint, measured_points
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.parallel import mapped
 from measure.status import Status
@@ -40,7 +41,7 @@ class Ties:
     """The natural points by image, and what the user should know, a sentence each."""
 
     marks: Mapping[str, tuple[MarkMeasurement, ...]]
-    problems: tuple[str, ...] = ()
+    problems: tuple[Reason, ...] = ()
 
 
 def measure_ties(
@@ -101,16 +102,17 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
         "images": float(len(point.standing)),
         "size_px": 2.0 * point.candidate.radius_px + 1.0,
     }
-    status, reason = Status.MEASURED, ""
+    status, reason = Status.MEASURED, NO_REASON
     if frame in point.refused:
         status, reason = Status.REJECTED, point.refused[frame]
     elif len(point.standing) < options.images:
         status, reason = (
             Status.REJECTED,
-            f"only {len(point.standing)} scans agree on the point, {options.images} are to",
+            Reason(f"only {len(point.standing)} scans agree on the point, {options.images} are to", Code.FEW_SCANS),
         )
     elif not point.is_sharp(frame):
-        status, reason = Status.WEAK, f"the texture fixes it to {point.error_px(frame):.2f} px only"
+        told = f"the texture fixes it to {point.error_px(frame):.2f} px only"
+        status, reason = Status.WEAK, Reason(told, Code.IMPRECISE)
     covariance = Covariance.of_noise(piece.covariance_px2)
     return MarkMeasurement(name, "tie", piece.center_px, covariance, status, reason, quality)
 
@@ -121,7 +123,7 @@ def _problems(
     candidate_count: int,
     shared: Shared,
     options: TieOptions,
-) -> tuple[str, ...]:
+) -> tuple[Reason, ...]:
     """A sentence where fewer points than wanted were found, with the reason."""
     if found >= options.wanted:
         return ()
@@ -129,11 +131,13 @@ def _problems(
         counts = ", ".join(
             f"{frames[i].image} and {frames[j].image} {len(pairs)}" for (i, j), pairs in sorted(shared.items())
         )
-        return (
+        told = (
             f"No natural point was found: none is in {options.images} scans. Features that pairs of scans share, of "
-            f"{FEWEST_PAIRS} at least: {counts or 'none'}. Overlapping photographs of one season would have some.",
+            f"{FEWEST_PAIRS} at least: {counts or 'none'}. Overlapping photographs of one season would have some."
         )
-    return (
-        f"Of {options.wanted} natural points wanted, {found} were found: {candidate_count} features are in "
-        f"{options.images} scans or more.",
-    )
+    else:
+        told = (
+            f"Of {options.wanted} natural points wanted, {found} were found: {candidate_count} features are in "
+            f"{options.images} scans or more."
+        )
+    return (Reason(told, Code.FEW_TIES),)

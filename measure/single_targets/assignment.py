@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from measure.noise.noise import robust_scale
+from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ class Assignment:
 
     chosen: list[int | None]
     nearest: list[int | None]
-    why_not: list[str]
+    why_not: list[Reason]
 
 
 def assign(links: Links, gate_sigmas: float, least_gate_px: float) -> Assignment:
@@ -46,7 +47,7 @@ def assign(links: Links, gate_sigmas: float, least_gate_px: float) -> Assignment
     count = len(links.places)
     chosen: list[int | None] = [None] * count
     nearest: list[int | None] = [None] * count
-    why_not = [""] * count
+    why_not = [NO_REASON] * count
     place, disk = links.pairs()
     if not len(place):
         return Assignment(chosen, nearest, why_not)
@@ -62,15 +63,15 @@ def assign(links: Links, gate_sigmas: float, least_gate_px: float) -> Assignment
         rivals = [index for index in np.flatnonzero(gated[row] < _FORBIDDEN) if index not in taken]
         if own is not None and rivals:
             chosen[row], nearest[row] = None, own
-            why_not[row] = f"{len(rivals) + 1} disks lie within {gate:.1f} px of its place"
+            why_not[row] = Reason(f"{len(rivals) + 1} disks lie within {gate:.1f} px of its place", Code.AMBIGUOUS)
         elif own is None and links.near[row]:
             best = links.near[row][int(np.argmin(cost[row, links.near[row]]))]
             off = float(cost[row, best])
             nearest[row] = best
             why_not[row] = (
-                "the disk at its place is another target"
+                Reason("the disk at its place is another target", Code.AMBIGUOUS)
                 if best in taken and off <= gate
-                else f"what was found lies {off:.1f} px from where the other targets put it"
+                else Reason(f"what was found lies {off:.1f} px from where the other targets put it", Code.OFF_PLACE)
             )
     return Assignment(chosen, nearest, why_not)
 

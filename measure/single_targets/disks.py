@@ -14,6 +14,7 @@ from measure.fitting.second_place import SecondPlace
 from measure.marks.shapes import Disk, MarkShape
 from measure.noise.blank_film import BESIDE_PX
 from measure.noise.noise import may_be_noise
+from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.single_targets.disk_batch import LEAST_MARGIN_PX, MARGIN, SMOOTH, WORST_MISFIT, WORST_SMOOTH_MISFIT
@@ -53,8 +54,8 @@ class FittedDisk:
     damaged_fraction: float
     appearance_covariance: Array
     sloping: SecondPlace | None = None
-    weakness: str = ""
-    reason: str = ""
+    weakness: Reason = NO_REASON
+    reason: Reason = NO_REASON
 
     @property
     def covariance_px2(self) -> Array:
@@ -87,12 +88,16 @@ class FittedDisk:
         return float(np.sqrt(self.appearance_covariance[3, 3]))
 
     @property
-    def lone_doubt(self) -> str:
+    def lone_doubt(self) -> Reason:
         """Why a disk that cannot be compared with others is doubtful: dust and spots look like it; empty otherwise."""
         shorter = self.half_axes_px[1]
         if shorter < _SMALL_RADIUS_PX:
-            return f"small: half axis {shorter:.1f} px, dust of its size would look the same"
-        return f"its edge is as soft as a spot's: blur {self.blur_px:.1f} px, half axis {shorter:.1f} px" * self.is_soft
+            told = f"small: half axis {shorter:.1f} px, dust of its size would look the same"
+            return Reason(told, Code.SMALL, Code.DUST)
+        if not self.is_soft:
+            return NO_REASON
+        told = f"its edge is as soft as a spot's: blur {self.blur_px:.1f} px, half axis {shorter:.1f} px"
+        return Reason(told, Code.BLUR, Code.DUST)
 
     @property
     def quality(self) -> dict[str, float]:
@@ -144,7 +149,7 @@ def fit_disk(
     if narrow.reason or not disk.is_spoilt:
         return narrow
     agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
-    return narrow if agree else replace(narrow, weakness=f"with more ground: {disk.reason}")
+    return narrow if agree else replace(narrow, weakness=disk.reason.told(f"with more ground: {disk.reason}"))
 
 
 def _fit_by_margin(
@@ -175,7 +180,7 @@ def _fit_by_margin(
             damaged_fraction=fit.damaged_fraction,
             appearance_covariance=_appearance_covariance(fit),
             sloping=fit.sloping,
-            reason="" if fit.converged else fit.reason,
+            reason=NO_REASON if fit.converged else fit.reason,
         )
         return _judged(disk, fit)
 
@@ -201,19 +206,23 @@ def _judged(disk: FittedDisk, fit: Match) -> FittedDisk:
     are alike in neighbouring pixels."""
     if disk.reason:
         return disk
-    reason = weakness = ""
+    reason = weakness = NO_REASON
     contrast, (_, shorter) = abs(disk.contrast_dn), disk.half_axes_px
     # White residuals are noise, which also moves a contrast: as strong as it may be, the disk counts.
     most = contrast * (1 + min(_SURE * disk.contrast_sigma, _MOST_FAINTER)) if fit.covariance_is_white else contrast
     worst = WORST_SMOOTH_MISFIT if fit.neighbour_correlation > SMOOTH else WORST_MISFIT
     if not disk.is_fitted or most < LEAST_SNR * disk.noise_dn:
-        reason = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
+        told = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
+        reason = Reason(told, Code.CONTRAST)
     elif disk.noise_dn > worst * contrast and not fit.covariance_is_white:
-        reason = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
+        told = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
+        reason = Reason(told, Code.LIKENESS)
     elif disk.is_spoilt:
-        reason = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
+        told = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
+        reason = Reason(told, Code.COVERED)
     elif shorter < SMALLEST_RADIUS_PX:
-        reason = f"too small: half axis {shorter:.1f} px"
+        reason = Reason(f"too small: half axis {shorter:.1f} px", Code.SMALL)
     elif disk.damaged_fraction > _WEAK_DAMAGE:
-        weakness = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
+        told = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it are damaged"
+        weakness = Reason(told, Code.COVERED)
     return replace(disk, reason=reason, weakness=weakness)

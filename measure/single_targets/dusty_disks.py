@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from measure.noise.noise import SIGMA_OF_DEVIATION
+from measure.reason import NO_REASON, Code, Reason
 from measure.single_targets.disks import FittedDisk
 
 Array = NDArray[np.float64]
@@ -40,7 +41,7 @@ _ROUNDS, _SETTLED = 60, 1e-4
 _LEAST_SPREAD = 1e-4  # no frame's targets are alike to better than 1 %, nor is the linearisation of their noise
 
 
-def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[str]:
+def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[Reason]:
     """Why each disk may be as far off as only dust is, or more or less than its target, empty where it is too large for
     dust and not soft, or well determined and like the others; predicted: pixel_from_disk (2, 2) of each, right but for
     a factor common to all. Fewer than _FEWEST tell nothing: then every one that dust may look like is doubted."""
@@ -49,24 +50,28 @@ def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[str]
     appearances = np.array([_appearance(disk, shape) for disk, shape in zip(disks, predicted, strict=True)])
     common = _common(appearances, disks)
     return [
-        _doubt(disk, appearance - common.appearance, kinds) if disk.is_soft or disk.half_axes_px[1] < _DUST_PX else ""
+        _doubt(disk, appearance - common.appearance, kinds)
+        if disk.is_soft or disk.half_axes_px[1] < _DUST_PX
+        else NO_REASON
         for disk, appearance, kinds in zip(disks, appearances, common.kinds, strict=True)
     ]
 
 
-def _doubt(disk: FittedDisk, off: Array, kinds: Array) -> str:
+def _doubt(disk: FittedDisk, off: Array, kinds: Array) -> Reason:
     """Of one that dust may look like; off (5,): how far its appearance is from that of the others; kinds (kinds,): the
     probability of each kind of dust."""
     if kinds[_MUCH].sum() < _SHOWN:
         sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
         chances = chdtrc(2, _LARGE_PX**2 / (sigma**2 + _DUST_MOVES_PX**2))
         if chances[0] > _LARGE_CHANCE:
-            return f"faint: good to {sigma:.2f} px only"
-        return f"dust that puts it {_LARGE_PX} px off may hide in it" if chances @ kinds > _LARGE_CHANCE else ""
+            return Reason(f"faint: good to {sigma:.2f} px only", Code.IMPRECISE)
+        hidden = Reason(f"dust that puts it {_LARGE_PX} px off may hide in it", Code.DUST)
+        return hidden if chances @ kinds > _LARGE_CHANCE else NO_REASON
     size, *form, contrast, variance = off
-    return (
+    return Reason(
         f"unlike the other targets: {np.exp(size):.2f} times their size, {np.exp(contrast):.2f} times their "
-        f"contrast, its form {100 * np.hypot(*form):.0f} % off, its blur by {variance:.1f} px²; dust may hide in it"
+        f"contrast, its form {100 * np.hypot(*form):.0f} % off, its blur by {variance:.1f} px²; dust may hide in it",
+        Code.DUST,
     )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from measure.marks.rendering import extent_px, picture
 from measure.marks.shapes import MarkShape, thinnest_mm
+from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.single_targets.disks import UNIT_DISK, FittedDisk, fit_disk
 
@@ -44,7 +45,7 @@ class SearchResult:
 
     disks: list[FittedDisk] = field(default_factory=list)
     near: list[list[int]] = field(default_factory=list)
-    why_none: list[str] = field(default_factory=list)
+    why_none: list[Reason] = field(default_factory=list)
 
 
 def search_targets(
@@ -54,7 +55,7 @@ def search_targets(
     is kept."""
     result = SearchResult()
     for prediction in predictions:
-        near, why = [], ""
+        near, why = [], NO_REASON
         for spot in _spots(scan, prediction, polarity, shape):
             index, reason = _fitted_at(scan, spot, prediction, size_tolerance, shape, result)
             if index is None:
@@ -62,8 +63,8 @@ def search_targets(
             elif index not in near:
                 near.append(index)
         result.near.append(near)
-        why = f"nothing like it within {prediction.search_px:.0f} px of its place" + (f"; {why}" if why else "")
-        result.why_none.append("" if near else why)
+        none = Reason(f"nothing like it within {prediction.search_px:.0f} px of its place", Code.NOT_FOUND)
+        result.why_none.append(NO_REASON if near else Reason.joined((none, why)))
     if polarity == "auto":
         _keep_common_polarity(result)
     return result
@@ -117,7 +118,7 @@ def _compared_part(pixel_from_disk: Array, half: NDArray[np.intp], shape: MarkSh
 
 def _fitted_at(
     scan: Scan, spot: Array, prediction: Prediction, size_tolerance: float, shape: MarkShape, result: SearchResult
-) -> tuple[int | None, str]:
+) -> tuple[int | None, Reason]:
     """The index of the disk at a spot, fitted now or before; None, and why, if there is none of the right size."""
     index = _known_disk(result.disks, spot)
     if index is not None:
@@ -127,13 +128,13 @@ def _fitted_at(
         if disk.reason:
             return None, disk.reason
         if np.hypot(*(disk.center_px - prediction.center_px)) > prediction.search_px + 1:
-            return None, "what was found lies farther off"
+            return None, Reason("what was found lies farther off", Code.OFF_PLACE)
         index = len(result.disks)
         result.disks.append(disk)
     ratio = float(np.sqrt(abs(np.linalg.det(disk.pixel_from_disk) / np.linalg.det(prediction.pixel_from_disk))))
     if not 1 / size_tolerance < ratio < size_tolerance:
-        return None, f"what was found there has {ratio:.2f} times its radius"
-    return index, ""
+        return None, Reason(f"what was found there has {ratio:.2f} times its radius", Code.SIZE)
+    return index, NO_REASON
 
 
 def _in_perspective(shape: MarkShape, prediction: Prediction) -> MarkShape:
@@ -160,5 +161,6 @@ def _keep_common_polarity(result: SearchResult) -> None:
     for number, near in enumerate(result.near):
         kept = [index for index in near if result.disks[index].contrast_dn * sign > 0]
         if near and not kept:
-            result.why_none[number] = f"what was found there is not {name} as the other targets are"
+            told = f"what was found there is not {name} as the other targets are"
+            result.why_none[number] = Reason(told, Code.POLARITY)
         result.near[number] = kept

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.marks.shapes import MarkShape, cross
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.single_targets.assignment import Links, assign
@@ -77,7 +78,7 @@ class _Row:
     prediction: TargetPrediction
     disk: FittedDisk | None = None
     status: Status = Status.PREDICTED
-    reason: str = field(default="")
+    reason: Reason = NO_REASON
 
 
 def measure_disks(
@@ -117,10 +118,11 @@ def _refusal(prediction: TargetPrediction, scan: Scan) -> _Row | None:
     """Why a target is not even looked for."""
     col, row = prediction.center_px
     if not (-0.5 <= col < scan.width_px - 0.5 and -0.5 <= row < scan.height_px - 0.5):
-        return _Row(prediction, None, Status.ABSENT, "outside of the scan")
+        return _Row(prediction, None, Status.ABSENT, Reason("outside of the scan", Code.OUTSIDE))
     shorter = prediction.half_axes_px[1]
     if shorter < SMALLEST_RADIUS_PX:
-        return _Row(prediction, None, Status.PREDICTED, f"too small to be measured: half axis {shorter:.1f} px")
+        reason = Reason(f"too small to be measured: half axis {shorter:.1f} px", Code.SMALL)
+        return _Row(prediction, None, Status.PREDICTED, reason)
     return None
 
 
@@ -156,7 +158,7 @@ def _compared(rows: list[_Row]) -> list[_Row]:
     reasons = doubts([disk for _, disk in seen], [row.prediction.pixel_from_disk for row, _ in seen])
     doubt = {id(row): reason for (row, _), reason in zip(seen, reasons, strict=True) if reason}
     return [
-        replace(row, status=Status.WEAK, reason="; ".join(filter(None, (row.reason, doubt[id(row)]))))
+        replace(row, status=Status.WEAK, reason=Reason.joined((row.reason, doubt[id(row)])))
         if id(row) in doubt
         else row
         for row in rows

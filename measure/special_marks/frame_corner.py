@@ -20,6 +20,7 @@ from measure.fitting.matching import Match
 from measure.marks.shapes import FrameCorner
 from measure.noise.noise import robust_scale
 from measure.noise.robust import tukey_weights
+from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT
 from measure.search.prediction import MarkPrediction
@@ -41,6 +42,7 @@ _RIM_PX = 2.0  # of a profile: a step so near its end may be another's
 _MOST_ALIKE = 0.9  # correlation of neighbouring profiles: nineteen count as one
 _BLUR_RANGE_PX = (0.3, 4.0)
 _SCATTER_FLOOR_PX = 0.01  # under the scatter about a line: clean pictures have none
+_UNSEEN = Reason("an edge of the frame is not to be seen there as one line", Code.NOT_FOUND)
 _ROUNDED = 0.1  # of the reach: left out at every corner, for few are sharp
 
 
@@ -106,7 +108,7 @@ def corner_of_edges(scan: Scan, mark: FrameCorner, expected: MarkPrediction) -> 
         course = _Course(scan, expected.center_px, along, across, expected.weights)
         edge = _edge(course, (first, reach), expected.search_px, expected.polarity)
         if edge is None:
-            return _missed(expected.pixel_from_mark, "an edge of the frame is not to be seen there as one line")
+            return _missed(expected.pixel_from_mark, _UNSEEN)
         edges.append(edge)
     return _met(edges, unit, expected.pixel_from_mark)
 
@@ -248,7 +250,7 @@ def _met(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array) -> Match:
     contrast = min((edge.contrast_dn for edge in edges), key=abs)
     return Match(
         converged=True,
-        reason="",
+        reason=NO_REASON,
         center_px=center,
         place_covariance=Covariance.of_noise(unit @ covariance @ unit.T),
         pixel_from_mark=np.column_stack([pixel_from_mark[:, :2], center]),
@@ -265,7 +267,7 @@ def _met(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array) -> Match:
     )
 
 
-def _missed(pixel_from_mark: Array, reason: str) -> Match:
+def _missed(pixel_from_mark: Array, reason: Reason) -> Match:
     return Match(
         converged=False,
         reason=reason,

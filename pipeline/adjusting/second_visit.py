@@ -10,6 +10,7 @@ from adjust.problem.images import adjusted_image
 from adjust.problem.result import Adjustment
 from measure.checks.lost_pixels import without_lost
 from measure.errors import MeasurementError
+from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import open_scan
 from measure.status import Status
@@ -48,7 +49,7 @@ def _visited(scan: MeasuredScan, visit: Callable[[MeasuredScan], MeasuredScan]) 
     try:
         return visit(scan)
     except MeasurementError as error:
-        problem = f"It could not be looked at again: {error}"
+        problem = Reason(f"It could not be looked at again: {error}", Code.DAMAGED_FILE)
         return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
 
 

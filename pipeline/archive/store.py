@@ -221,15 +221,13 @@ def row_of(mark: Mapping[str, Any]) -> tuple[Any, ...]:
     covariance = mark["covariance_px2"]
     variances = _NO_NUMBER if covariance is None else (covariance[0][0], covariance[1][1], covariance[0][1])
     causes = None if mark["causes_px2"] is None else json.dumps({"sum": covariance, "of": mark["causes_px2"]})
-    code = mark.get("reason_code", "")
-    told = (mark["status"], code, mark["reason"], json.dumps(mark["quality"]))
+    told = (mark["status"], mark["reason_code"], mark["reason"], json.dumps(mark["quality"]))
     return (mark["point"], mark["kind"], mark["col_px"], mark["row_px"], *map(_number, variances), causes, *told)
 
 
 def mark_of(row: Sequence[Any]) -> Json:
     told = dict(zip(_MARK, row, strict=True))
     causes = told["causes"] and json.loads(told["causes"])
-    code = {"reason_code": told["reason_code"]} if told["reason_code"] else {}
     return {
         "point": told["point"],
         "kind": told["kind"],
@@ -238,7 +236,7 @@ def mark_of(row: Sequence[Any]) -> Json:
         "covariance_px2": causes and causes["sum"],
         "causes_px2": causes and causes["of"],
         "status": told["status"],
-        **code,
         "reason": told["reason"],
+        "reason_code": told["reason_code"],
         "quality": json.loads(told["quality"]),
     }

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from measure.reason import Code, Reason
 from measure.writing.fields import CAMERA, fields_of
 from measure.writing.line import Line
 from pipeline.files.camera_file import CameraFile
@@ -69,5 +70,5 @@ def _told(
             f"The camera's plate{number} says a principal distance of {plate['principal_distance_mm']} mm, its file "
             f"{camera.principal_distance_mm:g} mm: worth taking as an approximation, and nothing is changed by it."
         )
-    frame = replace(scan.frame, problems=(*scan.frame.problems, *problems))
+    frame = replace(scan.frame, problems=(*scan.frame.problems, *(Reason(each, Code.PLATE) for each in problems)))
     return replace(scan, frame=frame, notes=(*scan.notes, *notes))

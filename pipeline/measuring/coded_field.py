@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.single_targets.disk_patches import Candidate
@@ -44,7 +45,8 @@ def measure_coded_field(
     else:
         named = name_field(field, model, camera, measured, found, coded)
     if isinstance(named, str):
-        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, named) for id in points.ids)
+        unnamed = Reason(named, Code.UNNAMED)
+        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in points.ids)
         return marks, (*notes, f"No target has a name: {named}.")
     ids = {dot: points.ids[point] for dot, point in read.items()}
     strangers = [(id, found[dot]) for dot, id in ids.items() if named.candidates.get(id) is not found[dot]]
@@ -59,19 +61,19 @@ def measure_coded_field(
     }
     sought = [one for one in predictions if one.point not in contradicted]
     seen = {mark.point: mark for mark in measure_disks(scan, sought, TargetOptions(points.settings.polarity))}
-    unseen = "it lies behind the camera"
+    unseen = Reason("it lies behind the camera", Code.OUTSIDE)
     absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in points.ids}
     marks = tuple((absent | seen | contradicted).values())
     return checked_places(marks, field, named.model, measured), notes
 
 
-def _contradiction(prediction: TargetPrediction, strangers: Sequence[tuple[str, Candidate]]) -> str:
+def _contradiction(prediction: TargetPrediction, strangers: Sequence[tuple[str, Candidate]]) -> Reason:
     """Why a point is not what lies at its place, if a ring there says so."""
     reach = float(prediction.half_axes_px[0]) + prediction.search_px
     for id, dot in strangers:
         if id != prediction.point and np.hypot(*(dot.center_px - prediction.center_px)) < reach:
-            return f"the ring at its place reads as {id}"
-    return ""
+            return Reason(f"the ring at its place reads as {id}", Code.UNNAMED)
+    return NO_REASON
 
 
 def _is_mirrored(measured: MeasuredScan) -> bool:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from measure.codes_and_boards.sheet_naming import Dots, Naming, name_dots
+from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.single_targets.disk_patches import Candidate
@@ -35,7 +36,8 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
         found, coded = [found[i] for i in alike], {new: coded[i] for new, i in enumerate(alike) if i in coded}
         naming = name_dots(sheet.places, _dots(found, coded), (scan.width_px, scan.height_px))
     if isinstance(naming, str):
-        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, naming) for id in sheet.ids)
+        unnamed = Reason(naming, Code.UNNAMED)
+        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in sheet.ids)
         return marks, (*notes, f"No target has a name: {naming}.")
     strangers = [sheet.ids[coded[dot]] for dot in naming.strangers]
     if strangers:
@@ -43,7 +45,7 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
     options = TargetOptions("light" if _sign(found, coded) > 0.0 else "dark")
     predictions = _predictions(sheet, found, naming)
     measured = {mark.point: mark for mark in measure_disks(scan, predictions, options)}
-    unseen = "the sheet's place in the picture does not show it"
+    unseen = Reason("the sheet's place in the picture does not show it", Code.OUTSIDE)
     absent = {id: MarkMeasurement(id, "target", None, None, Status.ABSENT, unseen) for id in sheet.ids}
     return tuple((absent | measured).values()), notes
 

@@ -18,6 +18,7 @@ from measure.errors import MeasurementError, MissingError, TooLargeError
 from measure.fiducials import measure_fiducials
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.status import Status
@@ -100,13 +101,13 @@ def measured_scan(task: ScanTask) -> MeasuredScan:
 
 def failed_scan(task: ScanTask, code: FailureCode, sentence: str) -> MeasuredScan:
     """Of a scan that could not be measured: a row for each mark that would have been sought, all of them absent."""
-    reason = f"the scan could not be measured: {sentence}"
+    reason = Reason(f"the scan could not be measured: {sentence}", Code.FAILED_SCAN)
     fiducials, targets = [mark.id for mark in task.options.camera.drawn], task.options.targets
     marks = (
         *(MarkMeasurement(id, "fiducial", None, None, Status.ABSENT, reason) for id in fiducials),
         *(MarkMeasurement(id, "target", None, None, Status.ABSENT, reason) for id in (targets.ids if targets else ())),
     )
-    frame = FrameMeasurement(task.name, marks, problems=(sentence,))
+    frame = FrameMeasurement(task.name, marks, problems=(Reason(sentence, Code.FAILED_SCAN),))
     return MeasuredScan.failed(task.scan, frame, Failure(code, sentence))
 
 
@@ -146,7 +147,9 @@ def _opened_and_measured(task: ScanTask) -> MeasuredScan:
         notes = (*file_notes, *notes, *curve, *_missed_reading(options, frame))
         measured = MeasuredScan(task.scan, scan.width_px, scan.height_px, pitch, frame, notes)
         if misplaced := misplaced_principal_point(options.camera, measured):
-            measured = replace(measured, frame=replace(frame, problems=(*frame.problems, misplaced)))
+            measured = replace(
+                measured, frame=replace(frame, problems=(*frame.problems, Reason(misplaced, Code.OFF_GIVEN)))
+            )
         measured = measure_targets(options, scan, measured)
         return replace(measured, frame=with_damage(scan, measured.frame))
 
@@ -192,7 +195,7 @@ def _with_sizes(
 
 def _pitch(
     options: ScanOptions, scan: Scan, frame: FrameMeasurement
-) -> tuple[tuple[float, float], tuple[str, ...], tuple[str, ...]]:
+) -> tuple[tuple[float, float], tuple[Reason, ...], tuple[str, ...]]:
     """The pitch of a scan in um, as the project, the file or the marks say it; what needs a look in it, and what is
     only worth knowing."""
     if options.pitch_um is not None:
@@ -206,7 +209,7 @@ def _pitch(
     if options.camera.frame_mm is not None:
         pitch = 1000.0 * max(options.camera.frame_mm) / max(scan.width_px, scan.height_px)
         note = f"The pitch is not known ({scan.pitch_note}); {pitch:.1f} um is taken, as if the frame filled the scan."
-        return (pitch, pitch), (note,), ()
+        return (pitch, pitch), (Reason(note, Code.PITCH),), ()
     raise InputError(
         f"pitch_um is missing in the project, and {scan.path.name} does not say it ({scan.pitch_note}). Give the size "
         "of a pixel in um; for a digital camera that of the sensor's, or any, with the principal distance to match."

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.ties import measure_ties
+from measure.reason import Code, Reason
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.tie_table import TieSettings
@@ -21,6 +22,10 @@ Array = NDArray[np.float64]
 
 _TIE_NAME = re.compile(r"tie\d+")
 _LEAST_MARK_PX = 20.0  # about a mark whose size nobody has noted
+
+_NO_FRAME = Reason(
+    "No natural points are sought here: without fiducials nobody knows where the frame lies.", Code.NO_FRAME
+)
 
 
 def check_tie_names(project: Project) -> None:
@@ -40,11 +45,7 @@ def with_ties(
     frames = {scan.frame.image: _tie_frame(project, scan) for scan in scans}
     placed = [frame for frame in frames.values() if frame is not None]
     ties = measure_ties(placed, settings.options, count, workers)
-    problems: dict[str, tuple[str, ...]] = {
-        image: ("No natural points are sought here: without fiducials nobody knows where the frame lies.",)
-        for image, frame in frames.items()
-        if frame is None
-    }
+    problems: dict[str, tuple[Reason, ...]] = {image: (_NO_FRAME,) for image, frame in frames.items() if frame is None}
     if placed:
         problems[placed[0].image] = ties.problems
     return tuple(

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement
 from pipeline.results.frames_file import said
 from pipeline.results.measured_scan import MeasuredScan
@@ -33,8 +34,9 @@ def _told(
     if not name or not others:
         return scan
     told = ", ".join(f"{field} {value}" for field, value in name)
-    problem = (
+    problem = Reason(
         f"its writing says {told}, and so does that of {' and '.join(others)}: these are scans of one frame, or a line "
-        "is misread. Leave one of them out, or look at frames.csv."
+        "is misread. Leave one of them out, or look at frames.csv.",
+        Code.AMBIGUOUS,
     )
     return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.sheet_places import FLAT, SeenSheet, along_plane, sheet_points
+from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.single_targets.common_points import ImagePoints, compared_together
 from measure.status import Status
@@ -122,7 +123,9 @@ def _judged_mark(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
     witnesses = "the sheet's other points" + (" and other pictures" if verdict.others else "")
     how = f"it lies {verdict.off_px:.2f} px from where {witnesses} put it"
     if (verdict.others >= _WITNESSES or verdict.is_beyond) and verdict.chance < _REFUSED:
-        return replace(mark, status=Status.REJECTED, reason=f"another mark, or one disturbed: {how}")
+        return replace(
+            mark, status=Status.REJECTED, reason=Reason(f"another mark, or one disturbed: {how}", Code.OFF_PLACE)
+        )
     alone = "" if verdict.others else ", and no other picture tells whether it does so on the sheet"
-    reason = f"{how}{alone}; the chance that any right one does is {verdict.chance:.1g}"
-    return replace(mark, status=Status.WEAK, reason="; ".join(filter(None, (mark.reason, reason))))
+    reason = Reason(f"{how}{alone}; the chance that any right one does is {verdict.chance:.1g}", Code.OFF_PLACE)
+    return replace(mark, status=Status.WEAK, reason=Reason.joined((mark.reason, reason)))

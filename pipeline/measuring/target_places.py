@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_vector
+from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.single_targets.shared_offsets import TargetPlaces, compared
 from measure.status import Status
@@ -47,11 +48,10 @@ def _judged(mark: MarkMeasurement, verdicts: Mapping[str, tuple[float, float]]) 
         return mark
     how = f"it lies {off_px:.2f} px from where the other targets put it"
     if chance < _IMPOSSIBLE:
-        return replace(
-            mark, status=Status.REJECTED, reason=f"another mark, or the point's coordinates are wrong: {how}"
-        )
-    reason = f"{how}, as one of {1.0 / chance:.0f} right ones does"
-    return replace(mark, status=Status.WEAK, reason="; ".join(filter(None, (mark.reason, reason))))
+        wrong = Reason(f"another mark, or the point's coordinates are wrong: {how}", Code.OFF_PLACE)
+        return replace(mark, status=Status.REJECTED, reason=wrong)
+    reason = Reason(f"{how}, as one of {1.0 / chance:.0f} right ones does", Code.OFF_PLACE)
+    return replace(mark, status=Status.WEAK, reason=Reason.joined((mark.reason, reason)))
 
 
 def target_places(field: Field, model: ImageModel, scan: MeasuredScan) -> TargetPlaces:

@@ -10,6 +10,7 @@ from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.resection import resect
 from measure.codes_and_boards.boards import measure_board
+from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
 from measure.single_targets.targets import TargetPrediction
@@ -64,10 +65,11 @@ def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) ->
             problems = (f"No point of the board is used: {board.ambiguous}. Cover all but one, or cut the scan.",)
         # A board that is the same after a half turn may be named either way, unless its points were surveyed singly.
         notes = tuple(f"{note}." for note in board.notes) if sought.surveyed else ()
-        return with_targets(measured, board.marks, (*problems, *notes))
+        return with_targets(measured, board.marks, (*problems, *notes), Code.NO_BOARD)
     found, notes = _oriented_by_targets(options, sought, scan, measured)
     if isinstance(found, str):
-        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, found) for id in field.ids)
+        unnamed = Reason(found, Code.UNNAMED)
+        marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in field.ids)
         return with_targets(measured, marks, (*notes, f"No target has a name: {found}."))
     model, predictions = found
     seen = measure_single_targets(scan, predictions, settings)
@@ -75,14 +77,16 @@ def measure_targets(options: ScanOptions, scan: Scan, measured: MeasuredScan) ->
 
 
 def with_targets(
-    measured: MeasuredScan, targets: Sequence[MarkMeasurement], problems: Sequence[str] = ()
+    measured: MeasuredScan,
+    targets: Sequence[MarkMeasurement],
+    problems: Sequence[str] = (),
+    code: Code = Code.UNNAMED,
 ) -> MeasuredScan:
-    """The scan with these targets instead of the ones it has."""
+    """The scan with these targets instead of the ones it has; code: of the problems."""
     frame = measured.frame
     fiducials = tuple(mark for mark in frame.marks if mark.kind == "fiducial")
-    return replace(
-        measured, frame=replace(frame, marks=(*fiducials, *targets), problems=(*frame.problems, *problems))
-    )  # fmt: skip
+    told = (Reason(problem, code) for problem in problems)
+    return replace(measured, frame=replace(frame, marks=(*fiducials, *targets), problems=(*frame.problems, *told)))
 
 
 def _oriented_by_targets(

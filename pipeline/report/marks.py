@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
+from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.status import Status
 from pipeline.report.data import Json, ReportData
@@ -31,7 +32,7 @@ class Mark:
     point: str
     kind: str
     status: Status
-    reason: str
+    reason: Reason
     center_px: Array | None
     covariance: Covariance | None
     sigma_um: Array | None
@@ -41,6 +42,11 @@ class Mark:
     @property
     def is_fiducial(self) -> bool:
         return self.kind == "fiducial"
+
+    @property
+    def codes(self) -> tuple[Code, ...]:
+        """Of its reason, as it was measured."""
+        return self.reason.codes
 
     @property
     def w(self) -> float | None:
@@ -108,7 +114,7 @@ def _mark(
         point=point,
         kind=known.kind,
         status=known.status,
-        reason=known.reason,
+        reason=pixel.reason if pixel and pixel.reason == known.reason else Reason.read(known.reason, ""),
         center_px=pixel.center_px if pixel else None,
         covariance=pixel.covariance if pixel else None,
         sigma_um=_sigma_um(residual, row),

@@ -1,5 +1,6 @@
 """report.html: one file, no network, readable without scripts and on paper."""
 
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import version
@@ -9,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from measure.status import MEANING
+from measure import reason, status
 from pipeline.report.camera_views import camera_views
 from pipeline.report.charts import fraction_plot
 from pipeline.report.data import Json, ReportData
@@ -71,7 +72,9 @@ def _context(data: ReportData) -> dict[str, Any]:
         "scanners": scanner_views(data),
         "fractions": list(_fractions(shots)),
         "least_marks": LEAST_MARKS,
-        "meaning": MEANING,
+        "meaning": status.MEANING,
+        "codes": reason.MEANING,
+        "reasons": Counter(code for frame in shots for mark in frame.marks for code in mark.codes).most_common(),
         "arrow_bar": _arrow_bar(shots),
         "sigma0_bounds": sigma0_bounds(adjustment["redundancy"]) if adjustment and adjustment["redundancy"] else None,
         "critical_w": critical_w(2 * len(adjustment["residuals"])) if adjustment else 0.0,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause, Covariance
+from measure.reason import Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.told_tone import FrameTone
 from measure.scans.tone import SaidOfTone, Tone, power, srgb
@@ -40,6 +41,7 @@ def record_of(measured: MeasuredScan, folder: Path) -> Json:
         "weights": _numbers(frame.weights),
         "tone": frame.tone and _frame_tone(frame.tone),
         "problems": list(frame.problems),
+        "problem_codes": [problem.code for problem in frame.problems],
         "notes": list(measured.notes),
         "marks": [_mark(mark) for mark in frame.marks],
     }
@@ -53,7 +55,7 @@ def scan_of(image: str, record: Mapping[str, Any], folder: Path) -> MeasuredScan
         marks=tuple(_read_mark(mark) for mark in record["marks"]),
         pose=record["pose"] and _read_pose(record["pose"]),
         pixel_from_camera=_array(record["pixel_from_camera"]),
-        problems=tuple(record["problems"]),
+        problems=tuple(map(Reason.read, record["problems"], record["problem_codes"])),
         weights=None if record["weights"] is None else tuple(map(float, record["weights"])),
         tone=record["tone"] and _read_frame_tone(record["tone"]),
         writing=None if record["writing"] is None else tuple(_read_line(line) for line in record["writing"]),
@@ -103,6 +105,7 @@ def _mark(mark: MarkMeasurement) -> Json:
         "causes_px2": causes,
         "status": str(mark.status),
         "reason": mark.reason,
+        "reason_code": mark.reason.code,
         "quality": {name: _numbers(value) for name, value in mark.quality.items()},
     }
 
@@ -116,7 +119,7 @@ def _read_mark(mark: Mapping[str, Any]) -> MarkMeasurement:
         center_px=None if mark["col_px"] is None else _some([mark["col_px"], mark["row_px"]]),
         covariance=None if causes is None else Covariance({Cause(name): _some(px2) for name, px2 in causes.items()}),
         status=Status(mark["status"]),
-        reason=mark["reason"],
+        reason=Reason.read(mark["reason"], mark["reason_code"]),
         quality={name: float(value) for name, value in mark["quality"].items()},
     )
 

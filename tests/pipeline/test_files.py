@@ -13,6 +13,7 @@ import tifffile
 from measure.covariance import Cause, Covariance
 from measure.film import SCATTER_MM
 from measure.marks.shapes import MarkShape, MarkTemplate, Polygon
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
@@ -238,7 +239,7 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
     covariance = np.array([[0.0004, 0.0001], [0.0001, 0.0009]])
     marks = (
         MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), Covariance.of_noise(covariance), Status.MEASURED),
-        MarkMeasurement("7", "target", None, None, Status.ABSENT, 'outside, "far" off'),
+        MarkMeasurement("7", "target", None, None, Status.ABSENT, Reason('outside, "far" off', Code.OUTSIDE)),
     )
     path = tmp_path / "comparator.csv"
     write_comparator(path, [FrameMeasurement("#1", marks)], {"#1": (20.0, 10.0)})
@@ -254,12 +255,18 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
     assert second.reason == 'outside, "far" off'
 
 
-def test_a_measurement_is_read_back_with_the_causes_of_its_covariances(tmp_path: Path) -> None:
+def test_a_measurement_is_read_back_with_its_reasons_and_the_causes_of_its_covariances(tmp_path: Path) -> None:
     known = Covariance.of_noise(np.array([[4e-4, 1e-4], [1e-4, 9e-4]])).plus(Cause.TONE, np.diag([1e-4, 0.0]))
-    mark = MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), known, Status.MEASURED)
-    scan = MeasuredScan(str(tmp_path / "a.tif"), 300, 400, (20.0, 20.0), FrameMeasurement("a", (mark,)))
+    weak = Reason("half of it is gone", Code.COVERED, Code.SIZE)
+    mark = MarkMeasurement("1", "fiducial", np.array([100.25, 200.5]), known, Status.WEAK, weak)
+    bent = Reason("the film is bent.", Code.BENT_FRAME)
+    frame = FrameMeasurement("a", (mark,), problems=(bent,))
+    scan = MeasuredScan(str(tmp_path / "a.tif"), 300, 400, (20.0, 20.0), frame)
     write_measurement(tmp_path / "measurement.json", [scan])
-    ((back,),) = (one.frame.marks for one in read_measurement(tmp_path / "measurement.json"))
+    (frame,) = (one.frame for one in read_measurement(tmp_path / "measurement.json"))
+    (back,) = frame.marks
+    assert (back.reason, back.reason.codes) == (weak, weak.codes)
+    assert [(each, each.codes) for each in frame.problems] == [(bent, bent.codes)]
     assert back.covariance is not None
     assert back.covariance.parts.keys() == known.parts.keys()
     for cause, part in known.parts.items():

@@ -12,6 +12,7 @@ from drawn_project import PROJECT, write_project
 from single_scans import measure_scan
 
 from measure.covariance import Cause, Covariance
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.told_tone import FrameTone
 from measure.scans.tone import SaidOfTone, Tone, power, sampled, srgb
@@ -37,7 +38,7 @@ MARK = MarkMeasurement(
     np.array([1234.5678901234567, 1 / 3]),
     Covariance({Cause.NOISE: RNG.normal(size=(2, 2)), Cause.TONE: np.array([[np.inf, 0.0], [0.0, 1e-300]])}),
     Status.WEAK,
-    "dusty",
+    Reason("dusty; large", Code.DUST, Code.SIZE),
     {"snr": np.inf, "drift": -np.inf, "second_method_sigmas": np.nan, "blur_px": 0.1 + 0.2},
 )
 RICH = MeasuredScan(
@@ -47,10 +48,10 @@ RICH = MeasuredScan(
     (20.1, 1 / 7),
     FrameMeasurement(
         "roll 7/a",
-        (MARK, MarkMeasurement("8", "fiducial", None, None, Status.ABSENT, "not found")),
+        (MARK, MarkMeasurement("8", "fiducial", None, None, Status.ABSENT, Reason("not found", Code.NOT_FOUND))),
         Pose("90m", True, ("this", "and that"), {"0": -3.25, "90m": 1 / 3}, "180", "one question", ("0", "90")),
         RNG.normal(size=(2, 3)),
-        ("look here",),
+        (Reason("look here", Code.PITCH),),
         (0.25, 1 / 3, -0.1),
         TONE,
         (LINE,),
@@ -71,6 +72,9 @@ def same(one: Any, other: Any, where: str = "scan") -> None:
         assert isinstance(other, np.ndarray), where
         assert one.dtype == other.dtype, where
         np.testing.assert_array_equal(one, other, where)
+    elif isinstance(one, Reason):
+        assert isinstance(other, Reason), where
+        assert (one, one.codes) == (other, other.codes), where
     elif is_dataclass(one):
         assert type(one) is type(other), where
         for each in fields(one):

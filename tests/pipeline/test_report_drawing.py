@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from measure.reason import NO_REASON
 from measure.status import Status
 from pipeline.report import Thumbnail
 from pipeline.report.data import Json
@@ -57,7 +58,7 @@ def test_names_sort_by_their_numbers() -> None:
 
 
 def mark(center: tuple[float, float], residual: Json | None = None) -> Mark:
-    return Mark("f1", "7", "target", Status.MEASURED, "", np.array(center), None, None, residual)
+    return Mark("f1", "7", "target", Status.MEASURED, NO_REASON, np.array(center), None, None, residual)
 
 
 def spot(center: tuple[float, float], origin: tuple[int, int], size: int) -> NDArray[np.float64]:

@@ -9,6 +9,8 @@ from pathlib import Path
 import made_up_calibration
 import pytest
 
+from measure.reason import MEANING as REASONS
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement
 from measure.status import MEANING, Status
 from pipeline.report import Problem, ReportData, render_report, write_report
@@ -150,7 +152,7 @@ def test_a_frame_that_was_not_found_says_so_once(measured: ReportData) -> None:
     absent = [replace(point, status=Status.ABSENT, reason=reason) for point in measured.comparator]
     assert measured.measurement is not None
     scans = {
-        image: replace(scan, frame=FrameMeasurement(image, (), problems=(f"{reason}.",)))
+        image: replace(scan, frame=FrameMeasurement(image, (), problems=(Reason(f"{reason}.", Code.NO_FRAME),)))
         for image, scan in measured.measurement.items()
     }
     text = rendered(replace(measured, comparator=tuple(absent), measurement=scans)).text
@@ -294,3 +296,28 @@ def test_a_marks_sigma_is_told_by_its_causes(measured: ReportData) -> None:
     page = render_report(measured)
     assert "<dt>of which</dt>" in page
     assert re.search(r">noise 0\.041</span>, <span [^>]*>tone 0\.020</span> px", page)
+
+
+def test_marks_can_be_chosen_by_the_code_of_their_reason(measured: ReportData) -> None:
+    assert measured.measurement is not None
+    image, scan = next(iter(measured.measurement.items()))
+    gone = Reason("half of it is gone", Code.COVERED, Code.SIZE)
+    changed = [mark.point for mark in scan.frame.marks if mark.kind == "fiducial"][:2]
+    marks = tuple(
+        replace(mark, status=Status.WEAK, reason=gone) if mark.kind == "fiducial" and mark.point in changed else mark
+        for mark in scan.frame.marks
+    )
+    rows = tuple(
+        replace(row, status=Status.WEAK, reason="a hair" if row.point == changed[1] else str(gone))
+        if row.image == image and row.kind == "fiducial" and row.point in changed
+        else row
+        for row in measured.comparator
+    )
+    scans = {**measured.measurement, image: replace(scan, frame=replace(scan.frame, marks=marks))}
+    html = render_report(replace(measured, comparator=rows, measurement=scans))
+    assert html.count('data-codes="covered size"') == 1  # what a person wrote has no code
+    assert '<option value="covered">covered (1)</option>' in html
+    text = Document(html).text
+    assert "half of it is gone covered size" in text
+    assert REASONS[Code.COVERED] in text
+    assert "<select" not in good_page()

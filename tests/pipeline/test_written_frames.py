@@ -12,6 +12,7 @@ from measure.covariance import Cause, Covariance
 from measure.marks.poses import POSES, pose_in_camera
 from measure.marks.shapes import Side, WrittenPlace
 from measure.pose.written_pose import side_in_camera, writing_likelihoods
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
 from measure.writing import networks as networks_module
@@ -154,7 +155,7 @@ def test_what_single_frames_do_not_tell_they_tell_together() -> None:
         "a": ("0", True),
         "b": ("270m", True),
     }
-    doubted = replace(scans[1], frame=replace(scans[1].frame, problems=("not told.",)))
+    doubted = replace(scans[1], frame=replace(scans[1].frame, problems=(Reason("not told.", Code.CHANCE),)))
     assert not poses_of_roll([scans[0], doubted], WILD)["b"].decided
 
 

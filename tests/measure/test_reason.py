@@ -1,0 +1,80 @@
+"""Reasons and their codes: one table, checked against the documentation and against every place that gives a reason."""
+
+import ast
+import pickle
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from measure.reason import MEANING, NO_REASON, Code, Reason
+from measure.results import FrameMeasurement, MarkMeasurement
+from measure.status import Status
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_every_code_has_a_meaning_and_is_short() -> None:
+    assert set(MEANING) == set(Code)
+    assert all(re.fullmatch(r"[a-z]+(-[a-z]+)?", code) for code in Code)
+    assert all(meaning.endswith(".") for meaning in MEANING.values())
+
+
+def test_the_page_has_the_table() -> None:
+    page = (ROOT / "docs" / "reading-the-report.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `([a-z-]+)` \| (.+) \|$", page, flags=re.MULTILINE))
+    assert rows == {str(code): meaning for code, meaning in MEANING.items()}
+
+
+def test_every_reason_of_the_code_has_a_code() -> None:
+    """Each call of Reason in measure and pipeline: a sentence, then at least one code."""
+    calls = [
+        (f"{file.relative_to(ROOT)}:{node.lineno}", len(node.args))
+        for package in ("measure", "pipeline")
+        for file in (ROOT / package).rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Reason"
+    ]
+    assert len(calls) > 80
+    assert [place for place, arguments in calls if arguments == 1] == []
+
+
+def test_every_code_is_used() -> None:
+    used = {
+        node.attr
+        for package in ("measure", "pipeline")
+        for file in (ROOT / package).rglob("*.py")
+        if file.name != "reason.py"
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "Code"
+    }
+    assert used == set(Code.__members__)
+
+
+def test_joined_reasons_keep_their_codes_once_each() -> None:
+    faint, covered = Reason("it is faint", Code.CONTRAST), Reason("half of it is gone", Code.COVERED, Code.CONTRAST)
+    both = Reason.joined((faint, NO_REASON, covered))
+    assert both == "it is faint; half of it is gone"
+    assert both.codes == (Code.CONTRAST, Code.COVERED)
+    assert both.code == "contrast covered"
+    assert not Reason.joined((NO_REASON, NO_REASON))
+
+
+def test_a_reason_survives_processes_and_files() -> None:
+    reason = Reason("its place is outside", Code.OUTSIDE, Code.NOT_FOUND)
+    for again in (pickle.loads(pickle.dumps(reason)), Reason.read(str(reason), reason.code)):
+        assert (again, again.codes) == (reason, reason.codes)
+    assert Reason.read("of an earlier version", "").codes == ()
+    with pytest.raises(ValueError, match="nonsense"):
+        Reason.read("of a later version", "nonsense")
+
+
+def test_marks_are_filtered_by_their_codes() -> None:
+    reasons = {"1": Reason("a", Code.COVERED, Code.SIZE), "2": Reason("b", Code.CONTRAST), "3": Reason("c", Code.SIZE)}
+    marks = [
+        MarkMeasurement(name, "fiducial", np.zeros(2), None, Status.PREDICTED, why) for name, why in reasons.items()
+    ]
+    frame = FrameMeasurement("f", tuple(marks))
+    assert [mark.point for mark in frame.marks_because(Code.SIZE)] == ["1", "3"]
+    assert frame.marks_because(Code.BLUR) == ()
