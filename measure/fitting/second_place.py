@@ -48,7 +48,7 @@ def edge_place(fit: LinearFit, blur_px: float) -> SecondPlace | None:
     across an edge, under a Gaussian, passes through nothing. Summed round the mark that gives a place of its own: gain,
     offset and whatever is smooth have no part in it, and a mark whose opposite edges are alike needs no drawing for it.
     """
-    weights = _across_edges(fit.design[:2] * fit.used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * fit.used
+    weights = across_edges(fit.design[:2] * fit.used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * fit.used
     response = products(weights, fit.design)
     by_place = response[:, :2]
     if not np.linalg.cond(by_place) < _WORST_CONDITION:
@@ -82,7 +82,7 @@ def _second_place(offset_px: Array, covariance_px2: Array) -> SecondPlace | None
     return SecondPlace(offset_px, covariance_px2)
 
 
-def _across_edges(slopes: Array, smoothing_px: float) -> Array:
+def across_edges(slopes: Array, smoothing_px: float) -> Array:
     """(2, height, width): what each grey value counts in the sums, along columns and rows, of the second derivatives
     across the edges; slopes (2, height, width): of the mark's picture."""
     square = np.maximum((slopes**2).sum(axis=0), 1e-300)

@@ -13,8 +13,10 @@ from adjust.functional_model.rotation import angles_from_rotation
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.initial_values.approximations import approximate
 from adjust.problem.network import EXTERIOR_NAMES, Exterior, Fiducial, Image, Network, ObjectPoint, Prior
+from adjust.problem.problem import number
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Datum, Options, adjust
+from adjust.undetermined.datum import object_datum
 
 Array = NDArray[np.float64]
 
@@ -211,6 +213,18 @@ def test_seven_values_are_fixed() -> None:
     fixed = [name for name in minimal.names if name.startswith("PT.") and minimal.sigma(name) == 0.0]
     assert sorted(name[-1] for name in fixed) == ["X", "X", "Y", "Y", "Z", "Z", "Z"]
     assert all(free.sigma(name) > 0.0 for name in free.names if name.startswith("PT."))
+
+
+def test_a_generator_moves_a_point_at_the_fields_root_mean_square_distance_by_one_unit() -> None:
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
+    problem = number(network, start)
+    datum = object_datum(problem, problem.start())
+    points = np.array(list(start.points.values()))
+    spread = np.sqrt(((points - points.mean(axis=0)) ** 2).sum() / len(points))
+    assert datum.extent == pytest.approx(spread, rel=1e-9)
+    positions = np.array([problem.unknowns.point[name] for name in start.points])
+    motions = datum.generators[positions, 6]
+    np.testing.assert_allclose(motions, (points - points.mean(axis=0)) / spread, atol=1e-9)
 
 
 def test_inner_constraints_have_the_least_trace_and_leave_the_centre() -> None:

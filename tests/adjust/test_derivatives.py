@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from bent_scans import MIDDLE_MM, in_a_bent_scanner
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from simulated import KINDS, Truth, simulated
 
 from adjust.functional_model.distortion import image_equations
@@ -72,6 +73,12 @@ def test_rotation_vector_by_angles() -> None:
     step = 1e-7 * np.array([0.4, -1.0, 0.7])
     moved = rotation_from_vector(jacobian @ step) @ rotation_from_angles(angles)
     np.testing.assert_allclose(moved, rotation_from_angles(angles + step), atol=1e-13)
+
+
+@pytest.mark.parametrize("length", [1e-9, 0.3, 1.4, 3.1])
+def test_a_rotation_vector_is_the_rotation_of_other_programs(length: float) -> None:
+    vector = length * np.array([2.0, -3.0, 6.0]) / 7.0
+    np.testing.assert_allclose(rotation_from_vector(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
 
 
 def test_rays_accept_complex_steps() -> None:

@@ -10,6 +10,7 @@ from simulated import Truth, field_points, simulated
 
 from adjust.problem.network import Camera, Exterior, Fiducial, Network, ObservationKind, Observations, Prior
 from adjust.problem.result import Adjustment
+from adjust.quality.reweighting import robust_weights
 from adjust.solution.adjustment import Options, adjust
 
 Array = NDArray[np.float64]
@@ -299,3 +300,15 @@ def test_names_do_not_matter() -> None:
     assert other.sigma("EO.roll 7.frame.8.tif.Z0") == pytest.approx(plain.sigma("EO.f1.Z0"), rel=1e-9)
     assert other.value("PT.P.17.X") == plain.value("PT.3.X")
     assert other.vpv == pytest.approx(plain.vpv, rel=1e-12)
+
+
+def test_the_redescending_weights_are_the_published_ones() -> None:
+    """Yang, Song and Xu 2002, k = 2 and K = 4.5: 1, then k / t ((K - t) / (K - k))², then none. t of an observation is
+    over the scale that the median gives: of a pair of normally distributed errors that is sqrt(ln 2)."""
+    t = np.array([0.5, 1.9, 2.5, 3.25, 4.4, 6.0])
+    ordinary = np.full(101, np.log(2.0))
+    weights = robust_weights(2.0 * np.array([*ordinary, *t**2]), np.full(107, 2), 107, "igg3")[101:]
+    expected = [1.0, 1.0, 0.8 * 0.64, 2.0 / 3.25 * 0.25, 2.0 / 4.4 * 0.0016, 0.0]
+    np.testing.assert_allclose(weights, expected, rtol=1e-9, atol=1e-11)
+    huber = robust_weights(2.0 * np.array([*ordinary, *t**2]), np.full(107, 2), 107, "huber")[101:]
+    np.testing.assert_allclose(huber, [1.0, 1.0, 0.8, 2.0 / 3.25, 2.0 / 4.4, 1.0 / 3.0], rtol=1e-9)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from brute_marks import Array
 
+from measure.film import AFFINITY_SIGMA
 from measure.frames.frame_fit import fit_frame, strangers
 from measure.marks.poses import POSES, up_from_camera
 
@@ -85,3 +86,17 @@ def test_two_strangers_do_not_hide_each_other() -> None:
     up[3] += (0.28, 0.0)
     up[16] += (-0.25, 0.05)
     assert np.flatnonzero(strangers(grid, up, np.full(20, 0.005), turn, 0.3)).tolist() == [3, 16]
+
+
+@pytest.mark.parametrize("stretch", [0.0008, 0.003])
+def test_the_affinity_is_estimated_with_the_standard_deviation_that_film_has(stretch: float) -> None:
+    """Bayes for one number: marks that tell the stretch to s give it the share S² / (S² + s²), S being the film's. On
+    the square x² sums to y², so that stretch and scale are not correlated, and its s is sigma / sqrt(sum r²)."""
+    camera, sigma = 0.01 * SQUARE, 0.006  # as small as leaves the affinity open
+    up = camera * (1 + stretch, 1 - stretch)
+    fit = fit_frame(camera, up, np.full(4, sigma), np.eye(2))
+    told = sigma / np.sqrt((camera**2).sum())
+    expected = stretch * AFFINITY_SIGMA**2 / (AFFINITY_SIGMA**2 + told**2)
+    found = (fit.up_from_camera[0, 0] - fit.up_from_camera[1, 1]) / 2
+    assert 0.2 * stretch < expected < 0.95 * stretch  # or nothing would be tested
+    assert found == pytest.approx(expected, rel=1e-6)

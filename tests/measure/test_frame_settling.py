@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from true_marks import KIND, TrueMark, some_mark
 
-from measure.covariance import Covariance
+from measure.covariance import Cause, Covariance
 from measure.fiducial_options import FiducialOptions
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
+from measure.frames.frame_sighter import FrameSighter
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
@@ -84,3 +85,19 @@ def test_what_all_marks_lack_alike_is_the_drawings_and_no_damage() -> None:
     assert status(0.27, 0.0) is Status.WEAK
     assert status(0.27, 0.2) is Status.MEASURED
     assert status(0.4, 0.4) is Status.WEAK
+
+
+def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None:
+    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    layout = tuple(LayoutMark(str(n), place, (0.005, 0.005), KIND["gap cross"].shape) for n, place in enumerate(PLACES))
+    scan = Scan(Path("even.tif"), WholePicture(np.zeros((SIDE_PX, SIDE_PX, 1), np.uint16)), NO_TAGS)
+    sighter = FrameSighter(scan, FiducialLayout(layout, (50.0, 50.0)), frame.placement, FiducialOptions())
+    sighter.sightings = list(frame.sightings)
+    before, added = frame.sightings[2].fit, np.array([[4e-3, 1e-3], [1e-3, 2e-3]])
+    assert before is not None
+    sighter.widen(2, Cause.TOUCHED, added)
+    sighter.widen(2, Cause.TOUCHED, added)
+    after = sighter.frame().sightings[2].fit
+    assert after is not None
+    np.testing.assert_allclose(after.covariance_px2 - before.covariance_px2, 2 * added, atol=1e-12)
+    np.testing.assert_allclose(after.place_covariance.parts[Cause.TOUCHED], 2 * added, atol=1e-12)

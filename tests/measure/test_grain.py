@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from measure.noise.blank_film import PATCH_PX, PLANE
 from measure.noise.grain import grain_model
 from measure.noise.noise import noise_model
 
@@ -35,3 +36,21 @@ def test_variance_and_power_of_grain_are_found_behind_a_fit_that_took_most_of_it
     assert power == pytest.approx(correlation.sum() + white**2, rel=0.25)
     # Without the model nearly all of the power at low frequencies is lost: that is what it is for.
     assert np.median([model.autocovariance_dn2.sum() for model in naive]) < 0.5 * power
+
+
+@pytest.mark.parametrize(("grain_px", "is_grain"), [(1.5, True), (2.8, False)])
+def test_coarse_grain_is_told_from_a_landscape(grain_px: float, is_grain: bool) -> None:
+    """By how alike neighbours are: in noise smeared by a Gaussian of s px by exp(-1 / (4 s²)); 1.8 px is film's end.
+    Nine directions of a fit take little of what is so coarse in a window so wide."""
+    rng = np.random.default_rng(4)
+    size, reach = 8 * PATCH_PX, 12
+    grain = gaussian_filter(rng.standard_normal((size + 2 * reach,) * 2), grain_px)[reach:-reach, reach:-reach]
+    grain /= grain.std()
+    neighbours = float(np.mean(grain[:, 1:] * grain[:, :-1]))
+    assert neighbours == pytest.approx(np.exp(-1 / (4 * grain_px**2)), abs=0.02)
+    flat = grain.reshape(8, PATCH_PX, 8, PATCH_PX).swapaxes(1, 2).reshape(-1, PATCH_PX * PATCH_PX)
+    patches = (flat - flat @ PLANE @ PLANE.T).reshape(-1, PATCH_PX, PATCH_PX)
+    window = grain[:19, :19] - grain[:19, :19].mean()
+    used, design = np.ones((19, 19), dtype=bool), np.ones((1, 19, 19))
+    model = grain_model(window, used, design, neighbours, patches)
+    assert model.is_grain is is_grain

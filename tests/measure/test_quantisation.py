@@ -6,10 +6,17 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from brute_marks import brute_picture, placed
 from numpy.typing import NDArray
 
+from measure.fitting.matching import match
+from measure.fitting.scan_window import ScanWindow
+from measure.marks.shapes import MarkShape, ring_cross
+from measure.scans.compression import covariance_of_compression
+from measure.scans.picture_scan import WholePicture
 from measure.scans.quantisation import UNKNOWN_DN, rounding_step_dn
-from measure.scans.scan import open_scan
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan, open_scan
 
 # Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.
 COARSE = (16, 11, 12, 14, 12, 10, 16, 14, 13, 14, 18, 17, 16, 19, 24)
@@ -80,3 +87,23 @@ def test_what_never_was_jpeg_is_not_taken_for_it(levels: int, tmp_path: Path) ->
         with open_scan(path) as scan:
             assert not scan.is_lossy
             assert not scan.notes
+
+
+def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_said() -> None:
+    """Of a contrast of three, four and six rounding steps: the rms error over the claim, both measured at once. What
+    residuals do not show falls with the square of the contrast: one that fell with it would be twice too large."""
+    rng, mark, ratios = np.random.default_rng(2), MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15, angle_deg=45.0)), []
+    even = np.zeros((48, 48), np.uint8)
+    step_dn = rounding_step_dn(cv2.imencode(".jpg", even, (cv2.IMWRITE_JPEG_QUALITY, 30))[1].tobytes())
+    for number in range(24):
+        middle = 23.5 + rng.uniform(-4, 4, 2)
+        place = placed(10.0, (middle[0], middle[1]), rng.uniform(0.02, 0.05))
+        picture, noise = brute_picture(mark, place, 48, 48, 1.2), rng.normal(0, 3, (48, 48))
+        contrast_dn = (3, 4, 6)[number % 3] * step_dn
+        grey = np.clip(np.rint(60 + contrast_dn * picture + noise), 0, 255).astype(np.uint8)
+        start = placed(10.0, tuple(place[:, 2] + rng.uniform(-0.5, 0.5, 2)))
+        fit = match(ScanWindow(stored_after_jpeg(grey, 30).astype(float), is_lossy=True), mark, start)
+        scan = Scan(Path("lossy.tif"), WholePicture(even[..., None], rounding_step_dn=step_dn), NO_TAGS)
+        variance = np.trace(fit.covariance_px2 + covariance_of_compression(scan, fit.contrast_dn)) / 2
+        ratios.append((fit.center_px - place[:, 2]) / np.sqrt(variance))
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.25

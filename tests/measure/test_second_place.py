@@ -10,7 +10,7 @@ from drawn import drawn, ellipse
 
 from measure.fitting.matching import Match, match
 from measure.fitting.scan_window import ScanWindow
-from measure.fitting.second_place import SecondPlace
+from measure.fitting.second_place import SecondPlace, across_edges
 from measure.marks.shapes import Mark, MarkShape, polygon, ring_cross
 from measure.match_options import MatchOptions
 from measure.single_targets.disks import UNIT_DISK
@@ -79,3 +79,17 @@ def test_where_paint_slopes_its_place_is_nearer_than_the_matched_one() -> None:
     assert off > 0.05
     assert np.hypot(*(fit.center_px + fit.sloping.offset_px - DISK_PLACE)) < 0.7 * off
     assert fit.sloping.chance < 1e-6
+
+
+def test_the_sums_are_of_second_derivatives_across_the_edges() -> None:
+    """Of a picture with the same second derivatives everywhere, n'Hn summed over the edges' pixels is known."""
+    rng = np.random.default_rng(8)
+    slopes = np.zeros((2, SIZE, SIZE))
+    slopes[:, 15:-15, 15:-15] = rng.normal(size=(2, SIZE - 30, SIZE - 30))
+    weights = across_edges(slopes, 1.6)
+    row, col = np.mgrid[:SIZE, :SIZE] - SIZE / 2
+    for hessian in (np.diag([1.0, 0.0]), np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[0.4, -0.7], [-0.7, 1.1]])):
+        picture = (hessian[0, 0] * col**2 + 2 * hessian[0, 1] * col * row + hessian[1, 1] * row**2) / 2
+        across = np.einsum("irc,ij,jrc->rc", slopes, hessian, slopes) / np.maximum((slopes**2).sum(axis=0), 1e-300)
+        expected = (slopes * across).sum(axis=(1, 2))
+        np.testing.assert_allclose((weights * picture).sum(axis=(1, 2)), expected, rtol=0.01, atol=0.02)

@@ -390,3 +390,8 @@ def test_a_tone_curve_that_is_none(tmp_path: Path, said: str, words: list[str]) 
     message = refused(read_project, path)
     for word in words:
         assert word in message
+
+
+def test_rows_go_down_and_y_goes_up() -> None:
+    np.testing.assert_allclose(comparator_from_pixel(np.array([[3.0, 5.0]]), (20.0, 10.0)), [[0.06, -0.05]])
+    np.testing.assert_allclose(pixel_from_comparator(np.array([0.06, -0.05]), (20.0, 10.0)), [3.0, 5.0])

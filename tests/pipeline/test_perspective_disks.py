@@ -137,3 +137,24 @@ def test_vectors_across_are_at_right_angles() -> None:
         np.testing.assert_allclose(np.sum(one * other, axis=1), 0.0, atol=1e-15)
     np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1.0)
     np.testing.assert_allclose(np.linalg.norm(second, axis=1), 1.0)
+
+
+def test_the_ellipse_of_a_near_disk_is_that_of_its_outline() -> None:
+    """Through a pinhole, of a disk a third as far off as it is wide: the centre of gravity of 4000 points' polygon."""
+    radius, c = 0.9, 100.0
+    centers, normals = np.array([[0.8, -0.5, -3.0], [-1.0, 0.6, -2.7]]), np.array([[0.6, 0.0, 0.8], [0.36, -0.48, 0.8]])
+    film = Film("none", np.empty(0), np.zeros(2), False)
+    model = ImageModel(Distortion("none", {}), np.array([c, 0.0, 0.0]), np.empty(0), np.eye(3), np.zeros(3), film)
+    found = eccentricity_mm(model, centers, normals, radius)
+    angles = np.linspace(0.0, 2.0 * np.pi, 4000, endpoint=False)
+    for center, normal, off in zip(centers, normals, found, strict=True):
+        first = np.cross(normal, [0.0, 1.0, 0.0])
+        first /= np.linalg.norm(first)
+        outline = center + radius * (
+            np.outer(np.cos(angles), first) + np.outer(np.sin(angles), np.cross(normal, first))
+        )
+        x, y = -c * outline[:, 0] / outline[:, 2], -c * outline[:, 1] / outline[:, 2]
+        cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+        middle = np.array([((x + np.roll(x, -1)) * cross).sum(), ((y + np.roll(y, -1)) * cross).sum()])
+        middle /= 3.0 * cross.sum()
+        np.testing.assert_allclose(off, middle + c * center[:2] / center[2], atol=1e-3)
