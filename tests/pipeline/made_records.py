@@ -46,6 +46,7 @@ def mark(rng: random.Random, point: str, status: str = "measured") -> Json:
         "causes_px2": {"noise": noise, "film": film},
         "status": status,
         "reason": "" if status == "measured" else "it is faint",
+        "reason_code": "" if status == "measured" else "contrast",
         "quality": {"snr": rng.uniform(5, 50), "contrast_dn": "nan", "blur_px": rng.uniform(1, 2)},
     }
 
