@@ -23,7 +23,7 @@ from measure.search.centred_frame import is_worth_a_look, outermost
 from measure.search.constellation import Placement
 from measure.search.correlation import CLOSE
 from measure.search.frame_search import FrameSearch
-from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.search.pitches import PitchHypothesis, pitch_hypotheses, slightly_longer
 from measure.writing.line import KnownLine, Line
 from measure.writing.networks import networks
 from measure.writing.reading import read_writing
@@ -34,7 +34,7 @@ _SET = ("set in the project.",)
 _UNSURE = Reason("none of the marks is measured without blemish: the frame may lie elsewhere.", Code.CHANCE)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
 _CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
-_HOPELESS = 1.0  # the same before its marks are matched: a placement that chance makes will not become a frame
+_HOPELESS = 30.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 _LOOKS = 2  # in the whole scan, and where the frame's edges put the marks
 _BESIDE = 0.95  # of the frame's size: a rival farther off is another photograph
@@ -59,13 +59,13 @@ def measure_fiducials(
         return lost_frame(scan, layout)
     search = FrameSearch(scan, layout, options)
     hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
-    found, frame = _at_first_look(search, hypotheses, pitch_um is not None)
+    found, frame, unsure = _at_first_look(search, hypotheses, pitch_um is not None)
     if frame is None or not frame.accepted:
         reason = frame.misfit() if frame else "nothing in the scan looks like two or more of the camera's marks"
         search = FrameSearch(scan, layout, options, CLOSE)
-        limit = np.inf if pitch_um is None else _STRETCH
-        closer = [replace(each, tolerance=min(each.tolerance, limit)) for each in hypotheses[0]]
-        found, frame = _at_a_closer_look(search, closer)
+        closer = hypotheses[0] if pitch_um is None else slightly_longer(hypotheses[0][0], _STRETCH)
+        found, frame, faint = _at_a_closer_look(search, closer)
+        reason += _pitch_to_try([*unsure, *faint])
     if frame is None:
         absent = absent_frame(scan, layout, reason, options.rotation_deg)
         return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
@@ -141,21 +141,26 @@ def _read(
 
 def _at_first_look(
     search: FrameSearch, hypotheses: Sequence[Sequence[PitchHypothesis]], is_given: bool
-) -> tuple[list[Placement], Frame | None]:
-    """The placements, best first, and the frame in one of them, None where there is none.
+) -> tuple[list[Placement], Frame | None, list[Frame]]:
+    """The placements, best first, and the frame in one of them, None where there is none; and those under other pitches
+    that chance may have made.
 
     It is looked for in the middle of the scan where the pitch is given, then anywhere. Where what is found may be
     chance, other pitches are tried."""
     found, frame = _in_the_middle(search, hypotheses[0][0]) if is_given else ([], None)
     if frame is None or not frame.is_complete:
         found, frame = _anywhere(search, hypotheses[0])
-    tried = len(hypotheses[0])
+    tried, unsure = len(hypotheses[0]), list[Frame]()
     for others in hypotheses[1:]:
         if frame is not None and frame.accepted and not doubt(search, frame):
             break
         tried += len(others)
-        found, frame = _in_spite_of_pitch(search, others, tried) or (found, frame)
-    return found, frame
+        placements, frames = _in_spite_of_pitch(search, others)
+        if frames and tried * expected_as_good(search, frames[0]) <= _CHANCE:
+            found, frame = placements, frames[0]
+        else:
+            unsure += frames
+    return found, frame, unsure
 
 
 def _in_the_middle(search: FrameSearch, given: PitchHypothesis) -> tuple[list[Placement], Frame | None]:
@@ -209,50 +214,63 @@ def _as_its_pictures_say(search: FrameSearch, found: Sequence[Placement], placem
 
 
 def _in_spite_of_pitch(
-    search: FrameSearch, hypotheses: Sequence[PitchHypothesis], tried: int
-) -> tuple[list[Placement], Frame] | None:
-    """The placements and the frame under other pitches than the given one, None where there is none. So much freedom
-    finds false frames too: only one counts that chance would hardly make in all the hypotheses tried."""
+    search: FrameSearch, hypotheses: Sequence[PitchHypothesis]
+) -> tuple[list[Placement], list[Frame]]:
+    """The placements and the accepted frames under other pitches than the given one, those first that chance makes
+    least. So much freedom finds false frames too: only one counts that it would hardly make in all hypotheses tried."""
     found = search.anywhere(hypotheses)
-    frames = [_as_its_pictures_say(search, found, place) for place in _hopeful(search, found, tried)]
-    sure = [frame for frame in frames if frame.accepted and tried * expected_as_good(search, frame) <= _CHANCE]
-    return (found, min(sure, key=lambda frame: expected_as_good(search, frame))) if sure else None
+    frames = [_as_its_pictures_say(search, found, place) for place in _hopeful(search, found, len(hypotheses))]
+    accepted = [frame for frame in frames if frame.accepted]
+    return found, sorted(accepted, key=lambda frame: expected_as_good(search, frame))
+
+
+def _pitch_to_try(unsure: Sequence[Frame]) -> str:
+    """A clause about the frame of most marks among those that chance may have made."""
+    if not unsure:
+        return ""
+    best = max(unsure, key=lambda frame: (frame.measured, int(frame.belongs.sum())))
+    pair = ", ".join(f"{um:.2f}" for um in 1000 / np.hypot(*best.pixel_from_camera[:, :2].T))
+    seen = f"under another pitch {int(best.belongs.sum())} of them lie as they should, which may be chance"
+    return f"; {seen}: try pitch_um = [{pair}]"
 
 
 def _at_a_closer_look(
     search: FrameSearch, hypotheses: Sequence[PitchHypothesis]
-) -> tuple[list[Placement], Frame | None]:
-    """The placements, best first, and the frame in one of them, None where there is none. Less of what lies beside a
-    mark counts here: the frame's edge may drown it else.
+) -> tuple[list[Placement], Frame | None, list[Frame]]:
+    """The placements, best first, and the frame in one of them, None where there is none; and those that chance may
+    have made. Less of what lies beside a mark counts here: the frame's edge may drown it else.
 
     The whole scan is searched, then only about where the edges of the exposed frame put the marks. The second search
     counts the hypotheses of the first as tried too."""
     found, tried = search.anywhere(hypotheses), len(hypotheses)
-    frame = _hardly_chance(search, found, tried, search.expected_alike)
+    frame, unsure = _hardly_chance(search, found, tried, search.expected_alike)
     if frame is None:
         found = search.within_its_edges(hypotheses)
-        frame = _hardly_chance(search, found, _LOOKS * tried)
-    return found, frame
+        frame, others = _hardly_chance(search, found, _LOOKS * tried)
+        unsure += others
+    return found, frame, unsure
 
 
 def _hardly_chance(
     search: FrameSearch, found: Sequence[Placement], tried: int, *others: Callable[[Placement], float]
-) -> Frame | None:
-    """The frame that chance is least expected to make, None where it may be chance. others: further estimates of how
-    many such placements chance makes; the least of all estimates counts, times their number.
+) -> tuple[Frame | None, list[Frame]]:
+    """The frame that chance is least expected to make, None where it may be chance; and those that it may have made.
+    others: further estimates of how many such placements chance makes; the least of all estimates counts, times their
+    number.
 
     The marks' pictures need not be clear: whether a frame is there is one question, which pose it has another."""
-    best, least = None, _CHANCE
+    best, least, unsure = None, _CHANCE, list[Frame]()
     for place in _hopeful(search, found, tried):
         frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
         if not frames:
             continue
+        unsure += frames
         as_measured = min(expected_where_seen(search, frame, _seen_px(frame)) for frame in frames)
         counts = [as_measured, *(count(place) for count in others)]
         expected = len(counts) * tried * min(counts)
         if expected <= least:
             best, least = max(frames, key=lambda frame: frame.belongs.sum()), expected
-    return best
+    return best, unsure
 
 
 def _in_its_likeliest_poses(search: FrameSearch, found: Sequence[Placement], placement: Placement) -> list[Frame]:

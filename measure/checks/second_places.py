@@ -57,4 +57,6 @@ def _doubt(mark: MarkMeasurement, is_alone: bool) -> Doubt:
         off_px,
         Cause.SECOND_METHOD,
     )
-    return doubt if is_alone or may_be_wrong(mark.covariance_px2 + doubt.px2) else doubt.without_reason()
+    before, after = mark.covariance_px2, mark.covariance_px2 + doubt.px2
+    is_told = is_alone or (may_be_wrong(after) and not may_be_wrong(before))
+    return doubt if is_told else doubt.without_reason()

@@ -23,6 +23,8 @@ from measure.search.prediction import MarkPrediction
 Array = NDArray[np.float64]
 
 _LIKELY = 0.05  # probability of chance above which a frame is doubted
+_SELDOM, _HOPELESS = 1e-3, 1e6  # expected frames: fewer are no question, and of more nothing becomes a frame
+_COUNTED = 3  # marks that at least are no chance
 _PLACES = 64  # that are looked at beside the marks: enough to tell three marks of four from chance
 _BESIDE = (2.5, 4.5)  # search radii off: beyond what the mark itself answers
 _FREE = 2  # marks that a similarity goes through wherever they lie
@@ -56,8 +58,12 @@ def expected_as_good(search: FrameSearch, frame: Frame) -> float:
 
 
 def expected_where_seen(search: FrameSearch, frame: Frame, seen_px: dict[int, Array]) -> float:
-    """The same with the marks that count as seen, by index, and where."""
-    return search.expected_where_seen(frame.placement, frame.inside, seen_px)
+    """The same with the marks that count as seen, by index, and where. Chance finds places that answer as strongly at
+    reduced size; few of them look so in the scan itself."""
+    expected = search.expected_where_seen(frame.placement, frame.inside, seen_px)
+    if frame.placement.reduction == 1 or not _SELDOM < expected < _HOPELESS:
+        return expected
+    return expected * _as_good_in_full(search, frame, seen_px) ** min(_COUNTED, len(seen_px))
 
 
 def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> Reason:
@@ -66,8 +72,6 @@ def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> 
     if len(clear) <= _FREE or not search.was_everywhere(frame.placement):
         return NO_REASON
     expected = expected_where_seen(search, frame, clear)
-    if expected > _LIKELY:
-        expected *= _as_good_in_full(search, frame, clear) ** len(clear)
     if expected <= _LIKELY:
         return NO_REASON
     return Reason(
@@ -77,19 +81,19 @@ def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> 
     )
 
 
-def _as_good_in_full(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> float:
+def _as_good_in_full(search: FrameSearch, frame: Frame, seen_px: dict[int, Array]) -> float:
     """Of the places that answer as strongly as the marks at reduced size, the share that does so in the scan itself."""
     marks_px, apart_px = (
-        np.array([*clear.values()]),
+        np.array([*seen_px.values()]),
         _APART * first_search_px(frame.placement, search.layout, search.options),
     )
     others = [
         (index, place)
-        for index, seen in clear.items()
-        for place in search.places_as_good(frame.placement, index, seen)[: _PLACES // len(clear)]
+        for index, seen in seen_px.items()
+        for place in search.places_as_good(frame.placement, index, seen)[: _PLACES // len(seen_px)]
         if np.hypot(*(marks_px - place).T).min() > apart_px
     ]
-    weakest = min(_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items())
+    weakest = min(_response(search, frame, index, place, _FITTED_PX) for index, place in seen_px.items())
     radius = _REDUCED_PX * frame.placement.reduction
     hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in others)
     return _share(hits, len(others))

@@ -28,6 +28,8 @@ Pair = tuple[float, float]
 _TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
 # Of the marks' middle from that of the exposed frame: one body carries both, but a gate is no datum.
 _OFF_MIDDLE_MM = 0.5
+_WAYS = 3  # of being as good: by heights, by the misfit, or by that under a stretch
+_STRETCHES = np.linspace(-0.03, 0.03, 13)  # of pixels longer one way, in steps that move no mark by more than is narrow
 _TURNED_RAD = 0.01  # of the marks against the exposed frame's edges, and what these leave open
 
 
@@ -100,7 +102,7 @@ class FrameSearch:
     def anywhere(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
         """The placements in the whole scan, of all poses asked for, best first."""
         found: list[Placement] = []
-        for drawn_mm, alike in groupby(hypotheses, key=lambda hypothesis: hypothesis.drawn_mm):
+        for drawn_mm, alike in groupby(hypotheses, _drawn_mm):
             if self._drawn is None or self._drawn[0] != drawn_mm:
                 looks = self._looks(drawn_mm, self.poses)
                 answers = respond(self.scan, looks, self._signs, self.surroundings, self._maps, self._most_px)
@@ -122,8 +124,10 @@ class FrameSearch:
         """The placements of a frame whose edges are seen, best first: its marks lie about the middle of what is
         exposed. `anywhere` must have searched the whole scan under these hypotheses before."""
         found: list[Placement] = []
+        # Pixels slightly longer one way change the frame's sides by less than these may be wrong.
+        edges_of = {drawn_mm: self._edges(next(alike)) for drawn_mm, alike in groupby(hypotheses, _drawn_mm)}
         for hypothesis in hypotheses:
-            whole, edges = self._searched[hypothesis.mm], self._edges(hypothesis)
+            whole, edges = self._searched[hypothesis.mm], edges_of[hypothesis.drawn_mm]
             if edges is None:
                 continue
             frame, poses = edges
@@ -189,12 +193,14 @@ class FrameSearch:
 
     def expected_where_seen(self, placement: Placement, inside: int, seen_px: dict[int, Array]) -> float:
         """The same of a frame that was measured: of its marks inside the scan, those that count as seen, by index, and
-        where. Chance puts marks anywhere within the tolerance: those that a similarity fits better are the less likely,
-        the more of them there are."""
-        widest_px = self._searched[placement.pitch_mm].search.tolerance_px
-        tolerances = (widest_px, NARROW * widest_px)
-        kept = [each for each in tolerances if each == widest_px or self._misfit_px(placement, seen_px) <= each]
-        return len(tolerances) * min(self._expected(placement, seen_px, inside, each) for each in kept)
+        where. Chance puts marks anywhere within the tolerance: those that a similarity fits better, or one under one of
+        the stretches, are the less likely, the more of them there are."""
+        widest_px, expected = self._searched[placement.pitch_mm].search.tolerance_px, list[float]()
+        for stretches in (np.zeros(1), _STRETCHES):
+            misfit_px = self._misfit_px(placement, seen_px, stretches)
+            tolerance_px = min(max(misfit_px, NARROW * widest_px), widest_px)
+            expected.append(len(stretches) * self._expected(placement, seen_px, inside, tolerance_px))
+        return _WAYS * min(expected)
 
     def places_as_good(self, placement: Placement, index: int, seen_px: Array) -> Array:
         """(n, 2) the strongest places of the scan that at reduced size answer to a mark, by index, as strongly as the
@@ -209,15 +215,19 @@ class FrameSearch:
         heights = layer.highest(layer.candidates, 0.0)[1]
         return responses.scan_px(layer.candidates[heights >= height])
 
-    def _misfit_px(self, placement: Placement, seen_px: dict[int, Array]) -> float:
-        """How far from its place (px of the reduced scan) the best similarity leaves a mark that was seen."""
+    def _misfit_px(self, placement: Placement, seen_px: dict[int, Array], stretches: Array) -> float:
+        """How far from its place (px of the reduced scan) the best similarity leaves a mark that was seen, pixels being
+        longer one way by the best of the stretches."""
         if not seen_px:
             return 0.0
         pitch = np.asarray(placement.pitch_mm)
         given = self._camera_mm[list(seen_px)] @ placement.pixel_from_camera[:, :2].T
-        given, seen = ((each - each.mean(axis=0)) * pitch @ (1, 1j) for each in (given, np.array([*seen_px.values()])))
-        turn = np.vdot(given, seen) / max(float(np.vdot(given, given).real), 1e-12)
-        return float(np.abs(seen - turn * given).max() / pitch.mean() / placement.reduction)
+        given, seen = ((each - each.mean(axis=0)) * pitch for each in (given, np.array([*seen_px.values()])))
+        longer = np.stack([1 + stretches / 2, 1 - stretches / 2], axis=-1)
+        given, seen = (given * longer[:, None]) @ (1, 1j), seen @ (1, 1j)
+        turns = (given.conj() @ seen) / np.maximum((np.abs(given) ** 2).sum(axis=1), 1e-12)
+        off = np.abs(seen - turns[:, None] * given).max(axis=1)
+        return float(off.min() / pitch.mean() / placement.reduction)
 
     def _expected(self, placement: Placement, seen_px: dict[int, Array], inside: int, tolerance_px: float) -> float:
         """seen_px: by index, where marks were seen, within tolerance_px (of the reduced scan) of the frame's places."""
@@ -296,6 +306,10 @@ def _beside_edges(responses: Responses, looks: dict[int, Look], frame: ExposedFr
             free = frame.free_of_edges(places, least - margin_px, greatest + margin_px)
             maps[key] = np.where(free, responses.maps[key], np.float32(0.0))
     return replace(responses, maps=maps)
+
+
+def _drawn_mm(hypothesis: PitchHypothesis) -> Pair:
+    return hypothesis.drawn_mm
 
 
 def _flip(pitch_mm: Pair) -> Array:

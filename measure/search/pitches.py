@@ -1,13 +1,14 @@
 """What a scan's pixels may measure: as given; longer one way than the other; or such that the frame fills the scan."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from measure.fiducial_options import FiducialOptions
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 
 _STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # an office scanner's carriage may run by per cents too fast
+_SLIGHT = (-0.005, 0.005, -0.01, 0.01)  # where marks are so faint that they are looked for near by only
 _SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
 _STEP_TOLERANCE = 0.06  # so that each step reaches the next
 
@@ -35,10 +36,21 @@ def pitch_hypotheses(
     filling = [
         PitchHypothesis(pair, _STEP_TOLERANCE, pair) for s in _SCALE_STEPS for pair in [(1 / (s * largest),) * 2]
     ]
+    filling_longer = [_longer(each, stretch) for each in filling for stretch in _STRETCHES]
     if pitch_um is None:
-        return [filling]
-    x, y = given = (pitch_um[0] / 1000, pitch_um[1] / 1000)
-    tolerance = options.scale_tolerance
-    longer = [PitchHypothesis((x * (1 + s / 2), y * (1 - s / 2)), tolerance, given) for s in _STRETCHES]
-    as_given: list[Sequence[PitchHypothesis]] = [[PitchHypothesis(given, tolerance, given)], longer]
+        return [filling, filling_longer]
+    pair = (pitch_um[0] / 1000, pitch_um[1] / 1000)
+    given = PitchHypothesis(pair, options.scale_tolerance, pair)
+    as_given: list[Sequence[PitchHypothesis]] = [[given], [_longer(given, stretch) for stretch in _STRETCHES]]
     return as_given if options.pitch_is_right else [*as_given, filling]
+
+
+def slightly_longer(given: PitchHypothesis, tolerance: float) -> list[PitchHypothesis]:
+    """A given pitch as it is, and with pixels slightly longer one way, each right by a tolerance."""
+    near = replace(given, tolerance=tolerance)
+    return [near, *(_longer(near, stretch) for stretch in _SLIGHT)]
+
+
+def _longer(given: PitchHypothesis, stretch: float) -> PitchHypothesis:
+    x, y = given.mm
+    return replace(given, mm=(x * (1 + stretch / 2), y * (1 - stretch / 2)))

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from brute_marks import written_scan
 from drawn_frames import (
     ALIKE,
@@ -18,9 +19,13 @@ from drawn_frames import (
 from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import measure_fiducials
+from measure.fiducials import _pitch_to_try, measure_fiducials
+from measure.frames.frame_measurement import measure_frame
 from measure.marks.shapes import MarkShape
+from measure.search.constellation import NARROW, Placement
+from measure.search.pitches import PitchHypothesis, slightly_longer
 
+AERIAL = ((106.0, -106.0), (-106.0, -106.0), (-106.0, 106.0), (106.0, 106.0))
 # A frame of 14 mm with a hundredth of the usual tolerances bends as little as one of 140 mm.
 STIFF = FiducialOptions(pose="0", misfit_mm=0.03, affinity=1e-4, gate_mm=0.03)
 
@@ -59,3 +64,29 @@ def test_three_of_many_marks_that_lie_as_the_cameras_are_no_frame(tmp_path: Path
         alone[row - 30 : row + 31, col - 30 : col + 31] += another
     result = measured(alone, layout, tmp_path, STIFF)
     assert not any(mark.status.is_observation for mark in result.marks)
+    (problem,) = result.problems
+    assert "under another pitch 3 of them lie as they should, which may be chance: try pitch_um = [" in problem
+
+
+def test_the_pitch_to_try_is_what_the_marks_say(tmp_path: Path) -> None:
+    matrix = pixel_from_camera("0", turn_rad=0.0)
+    matrix[:, :2] = np.diag([1.012, 0.988]) @ matrix[:, :2]
+    pair_mm = (PITCH_UM / 1012, PITCH_UM / 988)
+    with written_scan(frame_picture(ALIKE, matrix), tmp_path) as scan:
+        frame = measure_frame(scan, ALIKE, Placement("0", matrix, 1.0, 4, 1, 1, pair_mm), STIFF)
+    told = _pitch_to_try([frame])
+    assert told.startswith("; under another pitch 4 of them lie as they should, which may be chance: try pitch_um = [")
+    pair = [float(number) for number in told.split("[")[1].rstrip("]").split(", ")]
+    assert pair == pytest.approx([1000 * mm for mm in pair_mm], rel=1e-3)
+    assert _pitch_to_try([]) == ""
+
+
+def test_a_closer_look_tries_pixels_slightly_longer_one_way_so_that_no_mark_lies_beyond_its_reach() -> None:
+    """Of an aerial camera, pixels longer by up to 1 % either way."""
+    layout, options = layout_of([MarkShape(RING_CROSS)] * 4, AERIAL, (228.0, 228.0)), FiducialOptions()
+    pitches = slightly_longer(PitchHypothesis((0.127, 0.127), 0.04, (0.127, 0.127)), 0.015)
+    tried = np.array([each.mm for each in pitches]) / 0.127
+    for stretch in np.linspace(-0.01, 0.01, 9):
+        true = np.array([1 + stretch / 2, 1 - stretch / 2])
+        off_mm = np.hypot(*((true / tried - 1) * AERIAL[0]).T).min()
+        assert off_mm < NARROW * options.search_mm(layout)

@@ -1,0 +1,144 @@
+"""Frames of an aerial camera with faint marks, in scans whose pixels are longer one way than the other.
+
+python benchmarks/unequal_pixels.py [--frames 24] [--first 0] [--seed 1]
+
+Four plain diagonal crosses at the corners of a square of 212 mm, as Wild cameras have them, a pixel wide, on pads,
+among dust, scratches and hairs on grainy film. The lines are 3 to 8 times the scanner's noise before they are blurred.
+Pixels differ by 0.4 to 1 % either way, and the pitch given for both is off by up to 0.4 %. One line a frame: how many
+marks were found where they are, how many elsewhere, and what was said; then a table by contrast.
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.fiducials import measure_fiducials
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
+from measure.scans.scan import Scan
+from pipeline.rendered.scene_file import scene_mark
+from synthetic_images.background import scene_background
+from synthetic_images.frame import frame_truth, make_frame
+from synthetic_images.render import grey_strips
+from synthetic_images.scene import (
+    DiskField,
+    Film,
+    FilmTransformation,
+    Scanner,
+    Scene,
+    SceneCamera,
+    SceneFiducial,
+    SceneImage,
+    Tones,
+)
+
+Array = NDArray[np.float64]
+
+FRAME_MM, AT_MM = 228.0, 106.0
+PITCH_UM = 127.5
+UNEQUAL, MOST_WRONG = (0.004, 0.01), 0.004
+SNRS = (3.0, 5.0, 8.0)
+PAD = 0.06  # of full scale
+NOISE = 0.012  # likewise
+SAME_PX = 1.0
+CROSS = MarkShape(cross(1.75, 0.12, 0.25, 45.0), "light")
+LAYOUT = FiducialLayout(
+    tuple(
+        LayoutMark(str(number), (x * AT_MM, y * AT_MM), (0.01, 0.01), CROSS)
+        for number, (x, y) in enumerate(((-1, -1), (1, 1), (-1, 1), (1, -1)), 1)
+    ),
+    (FRAME_MM, FRAME_MM),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A scan, the pitch that is given for it, and its marks' true places by their names."""
+
+    snr: float
+    unequal: float
+    given_um: float
+    scan: Scan
+    centers_px: dict[str, Array]
+
+
+def draw_case(seed: int, index: int) -> Case:
+    """The index-th frame of a study."""
+    rng = np.random.default_rng([seed, index])
+    snr = SNRS[index % len(SNRS)]
+    unequal = float(rng.choice([-1.0, 1.0]) * rng.uniform(*UNEQUAL))
+    pitch_um = (PITCH_UM * (1 + unequal / 2), PITCH_UM * (1 - unequal / 2))
+    image = SceneImage(
+        name="frame",
+        exterior=(0.0, 0.0, 1000.0, 0.0, 0.0, 0.0),
+        pose="0",
+        turn_rad=float(np.radians(rng.normal(0.0, 0.5))),
+        offset_mm=(float(rng.normal(0.0, 1.0)), float(rng.normal(0.0, 1.0))),
+        film=FilmTransformation((1 + float(rng.normal(0, 3e-4)), 1 + float(rng.normal(0, 3e-4))), 0.0),
+    )
+    scene = Scene(
+        name="unequal pixels",
+        seed=int(rng.integers(2**31)),
+        camera=SceneCamera(
+            "faint",
+            (FRAME_MM, FRAME_MM),
+            153.0,
+            fiducials=tuple(SceneFiducial(mark.id, mark.xy_mm, scene_mark(mark.mark)) for mark in LAYOUT.marks),
+        ),
+        field=DiskField((), 1.0),
+        images=(image,),
+        scanner=Scanner(pitch_um, margin_mm=6.0, blur_px=float(rng.uniform(0.4, 0.8)), noise=NOISE),
+        film=Film(grain=0.02, grain_px=1.0, dust=600, scratches=20, hairs=30),
+        tones=Tones(border=0.03, background=0.4, contrast=0.15, mark=PAD + snr * 1.2 * NOISE),
+        background="terrain",
+        pad_mm=float(rng.choice([2.2, 4.0])),
+    )
+    truth = frame_truth(scene, 0)
+    grey = np.concatenate(list(grey_strips(make_frame(scene, 0), 0, scene_background(scene))))
+    return Case(
+        snr,
+        unequal,
+        PITCH_UM * (1 + float(rng.uniform(-MOST_WRONG, MOST_WRONG))),
+        Scan(Path(f"{index}.tif"), WholePicture(grey[..., None]), NO_TAGS),
+        {name: each.center_px for name, each in truth.fiducials.items()},
+    )
+
+
+def main() -> None:
+    """Measure the frames one by one, and print."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    rows = [told(draw_case(given.seed, index), index) for index in range(given.first, given.first + given.frames)]
+    print(f"\n{'SNR':>4}{'frames':>8}{'marks':>7}{'found':>7}{'measured':>10}{'elsewhere':>11}")
+    for snr in SNRS:
+        own = [counts for each, counts in rows if each == snr]
+        found, measured, elsewhere = np.sum(own, axis=0).tolist() if own else (0, 0, 0)
+        print(f"{snr:4.0f}{len(own):8}{4 * len(own):7}{found:7}{measured:10}{elsewhere:11}")
+
+
+def told(case: Case, index: int) -> tuple[float, tuple[int, int, int]]:
+    result = measure_fiducials(case.scan, LAYOUT, (case.given_um, case.given_um))
+    places = np.array(list(case.centers_px.values()))
+    seen = [mark for mark in result.marks if mark.status.is_observation and mark.center_px is not None]
+    right = [mark for mark in seen if np.hypot(*(places - mark.center_px).T).min() < SAME_PX]
+    counts = len(right), sum(mark.status == "measured" for mark in right), len(seen) - len(right)
+    snrs = " ".join(f"{mark.quality['snr']:.1f}" for mark in right)
+    said = "" if len(right) == len(LAYOUT.marks) else " ".join(result.problems)
+    off = f"{100 * case.unequal:+.2f} %, given {100 * (case.given_um / PITCH_UM - 1):+.2f} %"
+    print(
+        f"{index}: SNR {case.snr:.0f}, {off}: "
+        f"found {counts[0]}, measured {counts[1]}, elsewhere {counts[2]} (SNR {snrs}) {said}",
+        flush=True,
+    )
+    return case.snr, counts
+
+
+if __name__ == "__main__":
+    main()
