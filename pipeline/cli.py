@@ -237,6 +237,31 @@ def import_files(
 
 
 @app.command()
+def block(
+    project: ProjectFile,
+    out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the block goes.", show_default=False)],
+    pitch_um: Annotated[
+        float | None,
+        typer.Option("--pitch-um", metavar="UM", min=FINEST_PITCH_UM, help="Of the pictures; by default the scans'."),
+    ] = None,
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """Overlapping frames without any orientation: oriented by COLMAP, then adjusted with films, lens and control."""
+    from pipeline.blocks.block_stage import block_lines, run_block
+    from pipeline.progress import Reporter
+    from pipeline.stages import run_adjust
+
+    reporter = Reporter()
+    oriented = run_block(_read(project, max_pixels), out_dir, pitch_um, reporter)
+    summary = run_adjust(oriented.project, reporter)
+    for line in () if as_json else block_lines(oriented):
+        typer.echo(plain(line))
+    code = _finish(summary, as_json)
+    return max(code, LOOK) if oriented.left_out else code
+
+
+@app.command()
 def compare(
     adjustments: Annotated[
         list[Path], typer.Argument(metavar="A/adjustment.json B/adjustment.json...", show_default=False)

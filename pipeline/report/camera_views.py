@@ -7,6 +7,7 @@ from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
 from pipeline.report import fiducials, lens, vectors
+from pipeline.report.certificate import CertificateView, certificate_view
 from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image
 from pipeline.report.lens_map import LensMap, lens_map
@@ -68,6 +69,7 @@ class CameraView:
     effect_where: str
     lens_map: LensMap | None
     curve_rows: list[CurveRow]
+    certificate: CertificateView | None
     fiducials: list[FiducialRow]
     figure: Markup | None
     vectors: Markup | None
@@ -103,6 +105,9 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         effect_where="in the frame" if lens.lens(name, camera).is_of_frame else f"at {fixed(radius_mm, 0)} mm",
         lens_map=_lens_map(name, camera, covariance, rows, frame_mm) if covariance else None,
         curve_rows=_curve_rows(curve) if curve else [],
+        certificate=certificate_view(lens.lens(name, camera), covariance, _reach_mm(curve, radius_mm))
+        if curve and covariance
+        else None,
         fiducials=[_fiducial_row(id, fiducial, form) for id, fiducial in camera["fiducials"].items()],
         figure=fiducials.figure_plot(form) if form else None,
         vectors=_vectors(rows, frame_mm),
@@ -149,6 +154,11 @@ def _curves(
         return None
     of = lens.lens(name, camera)
     return lens.curves(of, covariance, min(largest, *of.distortion.half_mm) if of.is_of_frame else largest)
+
+
+def _reach_mm(curve: lens.Curves, observed_mm: float) -> float:
+    """How far a certificate goes: to the outermost target, or as far as the curve."""
+    return min(observed_mm or np.inf, float(curve.radius_mm[-1]))
 
 
 def _lens_map(

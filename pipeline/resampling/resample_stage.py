@@ -85,7 +85,7 @@ def resample(
     if not project.measurement_path.exists():
         raise InputError(f"{project.measurement_path}: there is no such file. Run `reseau measure` first.")
     check_writable(folder)
-    tasks, results = _tasks(project, folder, pitch_um, with_lens, BEST if not fast else FAST)
+    tasks, results = resample_tasks(project, folder, pitch_um, with_lens, BEST if not fast else FAST)
     with reporter.stage("resampled") as count, worker_pool(max(len(tasks), 1)) as workers:
         futures = {workers.submit(resampled, task): task for task in tasks}
         for done, future in enumerate(as_completed(futures), 1):
@@ -94,7 +94,7 @@ def resample(
     return tuple(sorted(results, key=lambda result: result.image))
 
 
-def _tasks(
+def resample_tasks(
     project: Project, folder: Path, pitch_um: float | None, with_lens: bool, degree: Degree
 ) -> tuple[list[ResampleTask], list[Resampled]]:
     """What is to be done, and what cannot be."""

@@ -53,8 +53,30 @@ def write_comparator(
     pitch_um: by image, NaN of a scan that could not be measured. measurement: the fingerprint of the
     measurement.json that holds the same marks.
     """
+    lines = _head(pitch_um, measurement)
+    for frame in sorted(frames, key=lambda frame: frame.image):
+        lines += [_line(frame.image, mark, pitch_um[frame.image]) for mark in frame.marks]
+    write_atomically(path, "\n".join(lines) + "\n")
+
+
+def points_text(points: Sequence[ComparatorPoint], pitch_um: Mapping[str, tuple[float, float]]) -> str:
+    """The same file of marks that were read, or came otherwise; pixels stay empty where no pitch is known."""
+    lines = _head(pitch_um)
+    return "\n".join([*lines, *(_point_line(point, pitch_um.get(point.image)) for point in points)]) + "\n"
+
+
+def _point_line(point: ComparatorPoint, pitch_um: tuple[float, float] | None) -> str:
+    place = [None, None] if point.xy_mm is None else point.xy_mm.tolist()
+    sigma = [None, None] if point.sigma_mm is None else point.sigma_mm.tolist()
+    pixel = [None, None] if point.xy_mm is None or pitch_um is None else pixel_from_comparator(point.xy_mm, pitch_um)
+    numbers = [*place, *sigma, point.rho, *pixel]
+    cells = ["" if number is None else f"{number:.7f}" for number in numbers]
+    return csv_line([point.image, point.point, point.kind, *cells, str(point.status), point.reason])
+
+
+def _head(pitch_um: Mapping[str, tuple[float, float]], measurement: str = "") -> list[str]:
     known_pitches = [(image, pitch) for image, pitch in sorted(pitch_um.items()) if math.isfinite(pitch[0])]
-    lines = [
+    return [
         f"# comparator coordinates, reseau {version('reseau')}",
         *([f"# measurement {measurement}"] if measurement else []),
         "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
@@ -63,9 +85,6 @@ def write_comparator(
         "# status: only measured and weak are observations",
         ",".join(COLUMNS),
     ]
-    for frame in sorted(frames, key=lambda frame: frame.image):
-        lines += [_line(frame.image, mark, pitch_um[frame.image]) for mark in frame.marks]
-    write_atomically(path, "\n".join(lines) + "\n")
 
 
 def comparator_from_pixel(center_px: Array, pitch_um: tuple[float, float]) -> Array:

@@ -1,0 +1,148 @@
+"""`reseau block`: a folder of overlapping frames without any orientation to an oriented, calibrated block.
+
+Scans are resampled into their camera's frame; COLMAP finds features, matches and poses with the given camera; its poses
+come back as approximations and its tracks as observations in the scans; one adjustment takes them with the films, the
+fiducials, the lens and the control.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.rotation import angles_from_rotation
+from adjust.problem.network import Exterior
+from pipeline.blocks.mapping import Mapped, given_interior, mapped
+from pipeline.blocks.pictures import BlockPicture, write_pictures
+from pipeline.blocks.ties import oriented_by_control, tie_marks
+from pipeline.errors import InputError
+from pipeline.files.images_file import ELEMENTS, GivenImages
+from pipeline.files.project_file import Project
+from pipeline.progress import Reporter
+from pipeline.resampling.resample_stage import FAST, Resampled, resample, resample_tasks
+from pipeline.results.comparator_file import ComparatorPoint, pitches_of, points_text, read_comparator
+from pipeline.text.atomic import write_atomically
+from pipeline.text.csv_table import csv_line
+from pipeline.text.wording import counted
+
+Array = NDArray[np.float64]
+
+MOST_PX = 3000  # along a frame's side, unless the user says a pitch
+
+
+@dataclass(frozen=True)
+class OrientedBlock:
+    """project: with the block's own comparator.csv, images.csv and output; seconds: of every step; left_out: images
+    that COLMAP did not orient; ties, tracks: how many tie marks of how many points."""
+
+    project: Project
+    mapped: Mapped
+    pictures: tuple[BlockPicture, ...]
+    seconds: dict[str, float]
+    left_out: tuple[str, ...]
+    ties: int
+    tracks: int
+
+
+def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: Reporter) -> OrientedBlock:
+    """All up to the adjustment, which is then run as of any project.
+
+    Raises InputError where fiducials were not measured yet, where COLMAP orients nothing, or control is missing.
+    """
+    if not project.comparator.exists():
+        raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first: films come by it.")
+    marks = read_comparator(project.comparator)
+    pitch_um = pitch_um or coarse_pitch_um(project)
+    clock = _Clock()
+    with clock.step("resampling"):
+        frames = folder / "frames"
+        results = resample(project, frames, pitch_um, False, True, reporter)
+        made = {result.image for result in results if not result.problem}
+        tasks = [task for task in resample_tasks(project, frames, pitch_um, False, FAST)[0] if task.image in made]
+    if len(tasks) < 2:
+        raise InputError(f"a block needs two frames, and {len(tasks)} could be resampled. {_problems(results)}")
+    cameras = {camera.name: camera for camera in project.cameras.values()}
+    with clock.step("pictures"):
+        pictures = write_pictures(tasks, cameras, folder)
+    with clock.step("features, matches and mapping"):
+        found = mapped(pictures, cameras, folder)
+    with clock.step("tracks and poses back"):
+        ties = tie_marks(found, pictures)
+        interior = {picture.image: given_interior(cameras[picture.camera]) for picture in pictures}
+        poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
+        own = _written(project, folder, (*marks, *ties), poses)
+    left_out = tuple(sorted({mark.image for mark in marks} - set(poses)))
+    return OrientedBlock(own, found, pictures, clock.seconds, left_out, len(ties), len({tie.point for tie in ties}))
+
+
+def coarse_pitch_um(project: Project) -> float | None:
+    """A pitch by which the frames have so many pixels that features come in minutes; None where that of the scans is
+    as coarse."""
+    pitches = pitches_of(project.comparator)
+    sides = [max(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm is not None]
+    enough = 1000.0 * max(sides, default=0.0) / MOST_PX
+    finest = min((min(pitch) for pitch in pitches.values()), default=0.0)
+    return enough if enough > finest else None
+
+
+def block_lines(block: OrientedBlock) -> list[str]:
+    """What a user is told of it."""
+    lines = [
+        f"COLMAP oriented {counted(len(block.mapped.poses), 'image')}; {counted(block.ties, 'tie mark')} of "
+        f"{counted(block.tracks, 'point')} are observations now."
+    ]
+    lines += [f"not oriented: {', '.join(block.left_out)}"] if block.left_out else []
+    return [*lines, *(f"{step}: {seconds:.0f} s" for step, seconds in block.seconds.items())]
+
+
+def _written(
+    project: Project,
+    folder: Path,
+    marks: Sequence[ComparatorPoint],
+    poses: dict[str, tuple[Array, Array]],
+) -> Project:
+    """comparator.csv and images.csv of the block, and the project that is made of them."""
+    pitches = pitches_of(project.comparator)
+    kept = [mark for mark in marks if mark.kind != "target" or mark.image in poses]
+    write_atomically(folder / "comparator.csv", points_text(kept, pitches))
+    exterior: dict[str, Exterior | None] = {}
+    lines = ["# orientations by COLMAP, as approximations", ",".join(("image", *ELEMENTS, "camera", "scanner"))]
+    given = project.given_images
+    cameras = dict(given.camera) if given else {}
+    scanners = dict(given.scanner) if given else {}
+    for image, (rotation, station) in sorted(poses.items()):
+        values = np.concatenate([station, angles_from_rotation(rotation)])
+        exterior[image] = Exterior(values)
+        degrees = [*values[:3], *np.degrees(values[3:])]
+        own = [cameras.get(image, ""), scanners.get(image, "")]
+        lines.append(csv_line([image, *(repr(float(value)) for value in degrees), *own]))
+    write_atomically(folder / "images.csv", "\n".join(lines) + "\n")
+    return replace(
+        project,
+        scans={},
+        comparator=folder / "comparator.csv",
+        output=folder / "out",
+        given_images=GivenImages(exterior, cameras, scanners),
+        images_path=folder / "images.csv",
+    )
+
+
+def _problems(results: Sequence[Resampled]) -> str:
+    return " ".join(f"{result.image}: {result.problem}." for result in results if result.problem)
+
+
+class _Clock:
+    """The seconds of every step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        start = time.monotonic()
+        yield
+        self.seconds[name] = time.monotonic() - start

@@ -1,0 +1,135 @@
+"""COLMAP's own part: features, matches and incremental mapping of a block's pictures, with the given cameras."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.blocks.pictures import BlockPicture, Lattice
+from pipeline.errors import InputError
+from pipeline.exchange.colmap_format import CONVENTION, imported
+from pipeline.files.camera_file import CameraFile
+
+Array = NDArray[np.float64]
+
+FEATURES = 2000  # an image: a block needs hundreds of them in common
+SEED = 0
+_EXHAUSTIVE = 60  # images up to which every pair is matched
+_NEIGHBOURS = 12
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """What COLMAP found, in coordinates of its own: by image the rotation (3, 3) and translation (3,) to axes x right,
+    y down, z forward; by point its coordinates (3,) and its tracks (image, column, row), the first pixel's centre being
+    (0, 0), with their reprojection errors in px; focal_px: of its cameras, the mean."""
+
+    poses: dict[str, tuple[Array, Array]]
+    points: dict[int, Array]
+    tracks: dict[int, list[tuple[str, float, float]]]
+    errors_px: dict[int, float]
+    focal_px: float
+
+
+def mapped(
+    pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], folder: Path, refine_camera: bool = False
+) -> Mapped:
+    """The largest part of the block that COLMAP orients. refine_camera: let it estimate the camera, too, as it does by
+    default. Raises InputError where it orients nothing."""
+    pycolmap = imported()
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    database = folder / "colmap.db"
+    for left in folder.glob("colmap.db*"):
+        left.unlink()
+    for camera in dict.fromkeys(picture.camera for picture in pictures):
+        own = [picture for picture in pictures if picture.camera == camera]
+        _extract(pycolmap, database, folder, own, cameras[camera])
+    _match(pycolmap, database, len(pictures))
+    return run_mapping(pycolmap, pictures, folder, refine_camera)
+
+
+def run_mapping(pycolmap: Any, pictures: Sequence[BlockPicture], folder: Path, refine_camera: bool) -> Mapped:
+    """From the matches in the database to poses and points."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = SEED
+    options.min_model_size = 3
+    options.extract_colors = False
+    options.ba_refine_focal_length = options.ba_refine_extra_params = refine_camera
+    options.ba_refine_principal_point = refine_camera
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_camera
+    sparse = folder / "sparse"
+    sparse.mkdir(exist_ok=True)
+    models = pycolmap.incremental_mapping(str(folder / "colmap.db"), str(folder / "pictures"), str(sparse), options)
+    if not models:
+        raise InputError("COLMAP orients no two of these frames: they may not overlap, or show too little in common.")
+    return read_model(max(models.values(), key=lambda model: model.num_reg_images()), pictures)
+
+
+def read_model(model: Any, pictures: Sequence[BlockPicture]) -> Mapped:
+    """What a reconstruction says, by the images' names here."""
+    names = {picture.name: picture.image for picture in pictures}
+    images = {number: model.images[number] for number in model.reg_image_ids()}
+    poses = {}
+    for image in images.values():
+        pose = image.cam_from_world()
+        poses[names[image.name]] = (np.array(pose.rotation.matrix()), np.array(pose.translation))
+    tracks, points, errors = {}, {}, {}
+    for number, point in model.points3D.items():
+        places = []
+        for element in point.track.elements:
+            image = images[element.image_id]
+            col, row = image.points2D[element.point2D_idx].xy - CONVENTION.first_pixel_px
+            places.append((names[image.name], float(col), float(row)))
+        tracks[int(number)], points[int(number)], errors[int(number)] = places, np.array(point.xyz), float(point.error)
+    focal_px = float(np.mean([camera.mean_focal_length() for camera in model.cameras.values()]))
+    return Mapped(poses, points, tracks, errors, focal_px)
+
+
+def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[BlockPicture], camera: CameraFile) -> None:
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model, reader.camera_params = (
+        "OPENCV",
+        ",".join(map(repr, camera_params(camera, pictures[0].lattice))),
+    )
+    reader.mask_path = str(folder / "masks")
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = FEATURES
+    extraction.sift.first_octave = 0  # a scan is blurred: a picture of twice its size costs four times and adds nothing
+    pycolmap.extract_features(
+        str(database),
+        str(folder / "pictures"),
+        [picture.name for picture in pictures],
+        pycolmap.CameraMode.SINGLE,
+        reader,
+        extraction,
+        pycolmap.Device.cpu,
+    )
+
+
+def camera_params(camera: CameraFile, lattice: Lattice) -> list[float]:
+    """fx, fy, cx, cy, k1, k2, p1, p2 of COLMAP's OPENCV: the given principal distance and point, no distortion."""
+    c, x0, y0 = given_interior(camera).tolist()
+    focal = c / lattice.pitch_mm
+    col, row = CONVENTION.first_pixel_px
+    center = ((x0 - lattice.x_mm) / lattice.pitch_mm + col, (lattice.y_mm - y0) / lattice.pitch_mm + row)
+    return [focal, focal, float(center[0]), float(center[1]), 0.0, 0.0, 0.0, 0.0]
+
+
+def given_interior(camera: CameraFile) -> Array:
+    """c, x0', y0' (3,) in mm. Raises InputError where the file does not give c."""
+    if camera.principal_distance_mm is None:
+        raise InputError(f"{camera.path}: principal_distance_mm is missing: COLMAP needs about the right one. Give it.")
+    return np.array([camera.principal_distance_mm, *(camera.principal_point_mm or (0.0, 0.0))])
+
+
+def _match(pycolmap: Any, database: Path, images: int) -> None:
+    device = pycolmap.Device.cpu
+    if images <= _EXHAUSTIVE:
+        pycolmap.match_exhaustive(str(database), device=device)
+        return
+    pairing = pycolmap.SequentialPairingOptions()
+    pairing.overlap = _NEIGHBOURS
+    pycolmap.match_sequential(str(database), pairing_options=pairing, device=device)

@@ -1,0 +1,124 @@
+"""The pictures that COLMAP matches: resampled frames of one lattice a camera, and masks of what moves with it."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
+from pipeline.resampling.frame_chain import FrameChain
+from pipeline.resampling.resample_stage import ResampleTask
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+_BORDER = 0.02  # of the frame's side: vignetting, the frame's edge
+_MARK = 0.03  # about a fiducial: it stands still in the camera, and would be matched with itself in every frame
+_DARKEST, _LIGHTEST = 0.5, 99.5  # percentiles that become black and white
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The pixels of a camera's pictures: camera coordinates of the first one's centre, and how many there are."""
+
+    x_mm: float
+    y_mm: float
+    pitch_mm: float
+    width_px: int
+    height_px: int
+
+    def camera_mm(self, pixels: Array) -> Array:
+        """(n, 2) of columns and rows (n, 2), the first pixel's centre being (0, 0)."""
+        return np.asarray((self.x_mm, self.y_mm) + pixels * (self.pitch_mm, -self.pitch_mm))
+
+
+@dataclass(frozen=True)
+class BlockPicture:
+    """One image: its file's name, in its camera's folder; the lattice, and the way from its frame to its scan."""
+
+    image: str
+    camera: str
+    name: str
+    lattice: Lattice
+    chain: FrameChain
+
+
+def lattice_of(camera: CameraFile, pitch_mm: float) -> Lattice:
+    """The exposed frame at whole multiples of the pitch. Raises InputError where its size is not known."""
+    if camera.frame_mm is None or not camera.fiducials:
+        raise InputError(
+            f"{camera.path}: frame_mm and fiducials are needed to make pictures of one lattice. Give them."
+        )
+    columns, rows = (int(np.floor(side / 2.0 / pitch_mm)) for side in camera.frame_mm)
+    return Lattice(-columns * pitch_mm, rows * pitch_mm, pitch_mm, 2 * columns + 1, 2 * rows + 1)
+
+
+def write_pictures(
+    tasks: Sequence[ResampleTask], cameras: Mapping[str, CameraFile], folder: Path
+) -> tuple[BlockPicture, ...]:
+    """The frames of the tasks as pictures of 8 bits below folder/pictures, their masks below folder/masks."""
+    made = []
+    for task in tasks:
+        camera = cameras[task.camera]
+        lattice = lattice_of(camera, task.pitch_mm)
+        picture, mask = _cut(task.target, lattice)
+        mask = mask & _usable(camera, lattice)
+        name = f"{_word(task.camera)}/{task.image.replace('/', '_')}.png"
+        for kind, content in (("pictures", _eight_bits(picture, mask)), ("masks", mask.astype(np.uint8) * 255)):
+            path = folder / kind / (name if kind == "pictures" else f"{name}.png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not cv2.imwrite(str(path), content):
+                raise InputError(f"{path}: cannot be written. Make room there, or set another output folder.")
+        made.append(BlockPicture(task.image, task.camera, name, lattice, task.chain))
+    return tuple(made)
+
+
+def _cut(path: Path, lattice: Lattice) -> tuple[Array, NDArray[np.bool_]]:
+    """A resampled frame's part within the lattice in grey, and which of it the scan has."""
+    with tifffile.TiffFile(path) as file:
+        description = json.loads(file.pages.first.description)
+        pixels, inside = file.pages[0].asarray(), file.pages[1].asarray().astype(bool)
+    grey = pixels.mean(axis=2) if pixels.ndim == 3 else pixels.astype(np.float64)
+    col = round((lattice.x_mm - description["x_mm"]) / lattice.pitch_mm)
+    row = round((description["y_mm"] - lattice.y_mm) / lattice.pitch_mm)
+    picture, mask = (
+        np.zeros((lattice.height_px, lattice.width_px)),
+        np.zeros((lattice.height_px, lattice.width_px), bool),
+    )
+    rows = slice(max(row, 0), min(row + lattice.height_px, grey.shape[0]))
+    cols = slice(max(col, 0), min(col + lattice.width_px, grey.shape[1]))
+    there = (slice(rows.start - row, rows.stop - row), slice(cols.start - col, cols.stop - col))
+    picture[there], mask[there] = grey[rows, cols], inside[rows, cols]
+    return picture, mask
+
+
+def _usable(camera: CameraFile, lattice: Lattice) -> NDArray[np.bool_]:
+    """The frame within its border, its fiducials left out."""
+    assert camera.frame_mm is not None
+    x = lattice.x_mm + lattice.pitch_mm * np.arange(lattice.width_px)
+    y = lattice.y_mm - lattice.pitch_mm * np.arange(lattice.height_px)
+    width, height = camera.frame_mm
+    inside = (np.abs(x) < (0.5 - _BORDER) * width)[None, :] & (np.abs(y) < (0.5 - _BORDER) * height)[:, None]
+    reach = _MARK * max(camera.frame_mm)
+    for mark in camera.fiducials:
+        left, up = mark.xy_mm
+        inside &= ~((np.abs(x - left) < reach)[None, :] & (np.abs(y - up) < reach)[:, None])
+    return np.asarray(inside)
+
+
+def _eight_bits(picture: Array, mask: NDArray[np.bool_]) -> Picture:
+    if not mask.any():
+        return np.zeros(picture.shape, np.uint8)
+    dark, light = np.percentile(picture[mask], (_DARKEST, _LIGHTEST))
+    scaled = (picture - dark) * (255.0 / max(light - dark, 1e-9))
+    return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
+
+
+def _word(name: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)

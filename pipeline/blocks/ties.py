@@ -1,0 +1,144 @@
+"""COLMAP's tracks as tie marks of the scans, and its poses in the frame of the control."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.problem.network import ObjectPoint
+from measure.status import Status
+from pipeline.blocks.mapping import Mapped
+from pipeline.blocks.pictures import BlockPicture
+from pipeline.errors import InputError
+from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
+from pipeline.results.comparator_file import ComparatorPoint, comparator_from_pixel
+
+Array = NDArray[np.float64]
+
+CELLS = 8  # a side of an image: ties are spread over these
+A_CELL = 3  # ties that are taken of one, the longest tracks first
+FEWEST_CONTROL = 3
+_MAD = 1.4826  # of a normal distribution's standard deviation in median absolute deviations
+_CONSISTENT = 3.0  # standard deviations of a reprojection error that a track may have
+
+
+def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[ComparatorPoint, ...]:
+    """The tracks that are taken, back in the scans that they were seen in, with one standard deviation for all."""
+    by_image = {picture.image: picture for picture in pictures}
+    sigma_px = feature_sigma_px(mapped)
+    marks = []
+    for number in chosen_tracks(mapped, by_image, sigma_px):
+        for image, col, row in mapped.tracks[number]:
+            picture = by_image[image]
+            place_px, found = picture.chain.scan_from_frame(picture.lattice.camera_mm(np.array([[col, row]])))
+            if not found[0]:
+                continue
+            place = comparator_from_pixel(place_px[0], picture.chain.pitch_um)
+            sigma = np.full(2, sigma_px * picture.lattice.pitch_mm)
+            marks.append(ComparatorPoint(image, f"tie-{number}", "tie", place, sigma, 0.0, Status.MEASURED, ""))
+    return tuple(marks)
+
+
+def feature_sigma_px(mapped: Mapped) -> float:
+    """The standard deviation of a feature's coordinate, from the reprojection errors of tracks that are seen thrice or
+    more: of 2 n coordinates three degrees of freedom went into the point."""
+    squares = [
+        mapped.errors_px[number] ** 2 / 2.0 * len(track) * 2 / (len(track) * 2 - 3)
+        for number, track in mapped.tracks.items()
+        if len(track) >= 3
+    ]
+    if not squares:
+        raise InputError("COLMAP found no point in three frames: a block needs more overlap.")
+    return float(np.sqrt(np.median(squares)))
+
+
+def chosen_tracks(mapped: Mapped, pictures: Mapping[str, BlockPicture], sigma_px: float) -> list[int]:
+    """Of every part of every image the longest tracks, as far as they agree with themselves."""
+    usable = [
+        number
+        for number, track in mapped.tracks.items()
+        if len({image for image, _, _ in track}) == len(track) and mapped.errors_px[number] < _CONSISTENT * sigma_px
+    ]
+    usable.sort(key=lambda number: (-len(mapped.tracks[number]), mapped.errors_px[number]))
+    taken: dict[tuple[str, int, int], int] = defaultdict(int)
+    chosen = []
+    for number in usable:
+        cells = [_cell(pictures[image], col, row) for image, col, row in mapped.tracks[number]]
+        if any(taken[cell] < A_CELL for cell in cells):
+            chosen.append(number)
+            for cell in cells:
+                taken[cell] += 1
+    return sorted(chosen)
+
+
+def _cell(picture: BlockPicture, col: float, row: float) -> tuple[str, int, int]:
+    lattice = picture.lattice
+    return picture.image, int(CELLS * col / lattice.width_px), int(CELLS * row / lattice.height_px)
+
+
+def oriented_by_control(
+    mapped: Mapped,
+    pictures: Sequence[BlockPicture],
+    marks: Sequence[ComparatorPoint],
+    points: Mapping[str, ObjectPoint],
+    camera_rays: Mapping[str, Array],
+) -> dict[str, tuple[Array, Array]]:
+    """By image: rotation (3, 3) to axes x right, y up, looking along -z, and station (3,), in the frame of the control.
+
+    camera_rays: by image the principal distance and point (3,) by which COLMAP saw it, mm. Raises InputError where
+    fewer than three control points are seen by two oriented images each.
+    """
+    seen = defaultdict(list)
+    by_image = {picture.image: picture for picture in pictures}
+    for mark in marks:
+        if mark.kind == "target" and mark.status.is_observation and mark.image in mapped.poses and mark.point in points:
+            seen[mark.point].append(mark)
+    theirs, ours = [], []
+    for point, own in sorted(seen.items()):
+        given = points[point]
+        if len(own) < 2 or given.X is None or given.Y is None or given.Z is None:
+            continue
+        theirs.append(_intersection(mapped, [(mark, by_image[mark.image], camera_rays[mark.image]) for mark in own]))
+        ours.append([given.X.value, given.Y.value, given.Z.value])
+    if len(ours) < FEWEST_CONTROL:
+        raise InputError(
+            f"{len(ours)} points with coordinates are marked in two of the frames that COLMAP oriented; "
+            f"{FEWEST_CONTROL} are needed to place the block. Mark more control points, as targets in comparator.csv."
+        )
+    scale, turn, shift = similarity(np.array(theirs), np.array(ours))
+    placed = {}
+    for image, (rotation, translation) in mapped.poses.items():
+        station = shift + scale * turn @ (-rotation.T @ translation)
+        placed[image] = (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ turn.T), np.asarray(station))
+    return placed
+
+
+def _intersection(mapped: Mapped, views: Sequence[tuple[ComparatorPoint, BlockPicture, Array]]) -> Array:
+    """The point (3,) nearest to the rays of its marks, in COLMAP's coordinates."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for mark, picture, (c, x0, y0) in views:
+        assert mark.xy_mm is not None
+        place = picture.chain.film.camera_from_comparator(
+            picture.chain.bend.apply(picture.chain.bend_parameters, mark.xy_mm[None])
+        )[0]
+        rotation, translation = mapped.poses[mark.image]
+        ray = rotation.T @ np.array([(place[0] - x0) / c, -(place[1] - y0) / c, 1.0])
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        normal += across
+        right += across @ (-rotation.T @ translation)
+    return np.asarray(np.linalg.solve(normal, right))
+
+
+def similarity(start: Array, end: Array) -> tuple[float, Array, Array]:
+    """Scale, rotation (3, 3) and shift (3,) from points (n, 3) to points (n, 3), by least squares.
+
+    S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 13 (1991).
+    """
+    a, b = start - start.mean(axis=0), end - end.mean(axis=0)
+    u, d, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    turn = u @ np.diag(signs) @ vt
+    scale = float((d * signs).sum() / (a**2).sum())
+    return scale, turn, end.mean(axis=0) - scale * turn @ start.mean(axis=0)

@@ -1,0 +1,168 @@
+"""Blocks through COLMAP: pictures of one lattice, tracks back in the scans, poses in the control's frame."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from exported_project import IMAGES, PITCH_MM, POINTS, TRUTH, camera_mm, ideal_mm, scan_px
+from numpy.typing import NDArray
+from simulated import FIDUCIALS, affine, rotation
+
+from adjust.functional_model.transformation import Film
+from adjust.problem.network import Distortion, ObjectPoint, Prior
+from measure.status import Status
+from pipeline.blocks.mapping import Mapped, camera_params
+from pipeline.blocks.pictures import BlockPicture, lattice_of, write_pictures
+from pipeline.blocks.ties import A_CELL, CELLS, feature_sigma_px, oriented_by_control, similarity, tie_marks
+from pipeline.errors import InputError
+from pipeline.exchange.foreign_camera import fiducial_camera
+from pipeline.files.camera_file import CameraFile
+from pipeline.resampling.frame_chain import FrameChain
+from pipeline.resampling.resample_stage import BEST, ResampleTask, resampled
+from pipeline.results.comparator_file import ComparatorPoint, points_text, read_comparator
+
+Array = NDArray[np.float64]
+
+CAMERA: CameraFile = replace(
+    fiducial_camera("K", {id: np.array(xy) for id, xy in FIDUCIALS.items()}),
+    frame_mm=(228.0, 228.0),
+    principal_distance_mm=TRUTH.c,
+    principal_point_mm=(TRUTH.x0, TRUTH.y0),
+    distortion=Distortion(),
+)
+LATTICE = lattice_of(CAMERA, PITCH_MM)
+PITCH_UM = (1000.0 * PITCH_MM, 1000.0 * PITCH_MM)
+
+
+def chain(image: int) -> FrameChain:
+    return FrameChain(PITCH_UM, Film("affine", affine(TRUTH, image, "affine"), np.array(TRUTH.middle_mm)))
+
+
+PICTURES = tuple(BlockPicture(f"f{i}", "K", f"K/f{i}.png", LATTICE, chain(i)) for i in IMAGES)
+SCALE, SHIFT = 0.01, np.array([3.0, -2.0, 5.0])
+TURN = rotation(0.4, -0.9, 2.0)
+
+
+def lattice_px(places_mm: Array) -> Array:
+    """Column and row of camera places in the pictures, counted from the frame's upper left pixel."""
+    return (places_mm - (-114.0, 114.0)) * (1.0, -1.0) / PITCH_MM
+
+
+def mapped(noise_px: float = 0.0) -> Mapped:
+    """What COLMAP would say of a perfect block, in a frame that is turned, shifted and of another scale."""
+    rng = np.random.default_rng(5)
+    theirs = SCALE * POINTS @ TURN.T + SHIFT
+    poses = {}
+    for i in IMAGES:
+        turn = np.diag([1.0, -1.0, -1.0]) @ rotation(*TRUTH.attitudes[i]) @ TURN.T
+        station = SCALE * TURN @ np.array(TRUTH.stations[i]) + SHIFT
+        poses[f"f{i}"] = (turn, -turn @ station)
+    seen = [lattice_px(camera_mm(i)) + rng.normal(0.0, noise_px, (100, 2)) for i in IMAGES]
+    tracks = {j: [(f"f{i}", *seen[i][j].tolist()) for i in IMAGES] for j in range(100)}
+    free = np.sqrt((8 - 3) / 8)  # of eight coordinates three went into the point
+    off = noise_px * np.sqrt(2.0) * free
+    return Mapped(poses, dict(enumerate(theirs)), tracks, dict.fromkeys(range(100), off), 1530.0)
+
+
+def test_a_similarity_is_found() -> None:
+    scale, turn, shift = similarity(POINTS, SCALE * POINTS @ TURN.T + SHIFT)
+    assert scale == pytest.approx(SCALE)
+    np.testing.assert_allclose(turn, TURN, atol=1e-12)
+    np.testing.assert_allclose(shift, SHIFT, atol=1e-12)
+    mirrored = similarity(POINTS, POINTS * (1, 1, -1))[1]
+    assert np.linalg.det(mirrored) == pytest.approx(1.0)
+
+
+def test_tracks_come_back_into_turned_and_mirrored_scans() -> None:
+    marks = tie_marks(replace(mapped(), errors_px=dict.fromkeys(range(100), 0.4)), PICTURES)
+    assert {mark.image for mark in marks} == {"f0", "f1", "f2", "f3"}
+    for mark in marks:
+        col, row = scan_px(int(mark.image[1:]), camera_mm(int(mark.image[1:])))[int(mark.point.removeprefix("tie-"))]
+        np.testing.assert_allclose(mark.xy_mm, [col * PITCH_MM, -row * PITCH_MM], atol=1e-9)  # type: ignore[arg-type]
+        assert mark.kind == "tie"
+
+
+def test_their_standard_deviation_is_that_of_the_features() -> None:
+    """Of eight coordinates of a point three degrees of freedom are gone."""
+    assert feature_sigma_px(mapped(0.5)) == pytest.approx(0.5, rel=1e-6)
+    with pytest.raises(InputError, match="more overlap"):
+        feature_sigma_px(replace(mapped(), tracks={1: [("f0", 1.0, 1.0), ("f1", 1.0, 1.0)]}))
+
+
+def test_ties_are_spread_and_wrong_ones_left_out() -> None:
+    block = mapped(0.5)
+    crowded = {j: [(f"f{i}", 1000.0 + j, 1000.0) for i in IMAGES] for j in range(100)}
+    assert len(tie_marks(replace(block, tracks=crowded), PICTURES)) == 4 * A_CELL
+    assert LATTICE.width_px / CELLS > 100
+    wrong = {**block.errors_px, 7: 4.0}
+    assert "tie-7" not in {mark.point for mark in tie_marks(replace(block, errors_px=wrong), PICTURES)}
+    twice = {**block.tracks, 8: [*block.tracks[8], ("f0", 5.0, 5.0)]}
+    assert "tie-8" not in {mark.point for mark in tie_marks(replace(block, tracks=twice), PICTURES)}
+
+
+def control(count: int) -> tuple[list[ComparatorPoint], dict[str, ObjectPoint]]:
+    """Control points marked in two images each, free of distortion: COLMAP's camera knows none here."""
+    marks, points = [], {}
+    for j in range(count):
+        points[str(j)] = ObjectPoint(str(j), *(Prior(float(value)) for value in POINTS[j]))
+        for i in (0, 2):
+            px = scan_px(i, ideal_mm(i))[j] * (PITCH_MM, -PITCH_MM)
+            marks.append(ComparatorPoint(f"f{i}", str(j), "target", px, np.ones(2), 0.0, Status.MEASURED, ""))
+    return marks, points
+
+
+def test_poses_come_into_the_frame_of_the_control() -> None:
+    rays = {f"f{i}": np.array([TRUTH.c, TRUTH.x0, TRUTH.y0]) for i in IMAGES}
+    placed = oriented_by_control(mapped(), PICTURES, *control(4), rays)
+    for i in IMAGES:
+        turn, station = placed[f"f{i}"]
+        np.testing.assert_allclose(turn, rotation(*TRUTH.attitudes[i]), atol=1e-9)
+        np.testing.assert_allclose(station, TRUTH.stations[i], atol=1e-6)
+    with pytest.raises(InputError, match="2 points with coordinates"):
+        oriented_by_control(mapped(), PICTURES, *control(2), rays)
+
+
+def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
+    """A spot of light at a known place of the camera, in a mirrored scan, through resampling into the picture."""
+    place = np.array([[31.37, -22.81]])
+    col, row = scan_px(2, place)[0]
+    cols, rows = np.meshgrid(np.arange(2500.0), np.arange(2500.0))
+    spot = 9000.0 * np.exp(-((cols - col) ** 2 + (rows - row) ** 2) / (2 * 2.5**2))
+    tifffile.imwrite(tmp_path / "f2.tif", np.rint(4000.0 + 14.0 * cols + spot).astype(np.uint16), compression="deflate")
+    task = ResampleTask("f2", "K", tmp_path / "f2.tif", chain(2), "0m", PITCH_MM, BEST, None, tmp_path / "frame.tif")
+    assert resampled(task).problem == ""
+    (picture,) = write_pictures([task], {"K": CAMERA}, tmp_path)
+    image = np.asarray(cv2.imread(str(tmp_path / "pictures" / picture.name), cv2.IMREAD_UNCHANGED), dtype=float)
+    mask = np.asarray(cv2.imread(str(tmp_path / "masks" / f"{picture.name}.png"), cv2.IMREAD_UNCHANGED))
+    assert image.shape == mask.shape == (LATTICE.height_px, LATTICE.width_px)
+    there = lattice_px(place)[0]
+    left, top = (round(value) - 12 for value in there.tolist())
+    window = image[top : top + 25, left : left + 25]
+    y, x = np.mgrid[:25, :25]
+    plane = np.stack([x, y, np.ones_like(x)], axis=-1)
+    edge = (np.abs(x - 12) > 10) | (np.abs(y - 12) > 10)
+    window = window - plane @ np.linalg.lstsq(plane[edge], window[edge])[0]
+    found = [left + (window * x).sum() / window.sum(), top + (window * y).sum() / window.sum()]
+    np.testing.assert_allclose(found, there, atol=0.1)
+    for xy in FIDUCIALS.values():
+        x, y = (round(value) for value in lattice_px(np.array(xy)).tolist())
+        assert mask[y, x] == 0
+    assert mask[1140, 1140] == 255
+
+
+def test_the_camera_that_colmap_is_given_counts_from_the_corner() -> None:
+    fx, fy, cx, cy, *rest = camera_params(CAMERA, LATTICE)
+    assert fx == fy == pytest.approx(TRUTH.c / PITCH_MM)
+    assert (cx, cy) == pytest.approx(lattice_px(np.array([TRUTH.x0, TRUTH.y0])) + 0.5)
+    assert rest == [0.0] * 4
+
+
+def test_marks_are_written_as_they_were_read(tmp_path: Path) -> None:
+    marks, _ = control(2)
+    (tmp_path / "c.csv").write_text(points_text(marks, {"f0": PITCH_UM}), encoding="utf-8")
+    for mark, again in zip(marks, read_comparator(tmp_path / "c.csv"), strict=True):
+        assert (mark.image, mark.point, mark.kind) == (again.image, again.point, again.kind)
+        np.testing.assert_allclose(again.xy_mm, mark.xy_mm, atol=1e-7)  # type: ignore[arg-type]

@@ -1,0 +1,110 @@
+"""The report's certificate: the same lens as a certificate would print it, with standard deviations that hold."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adjust.functional_model.families import parameter_names
+from adjust.problem.network import Distortion
+from pipeline.exchange.certificate import fit, read_certificate
+from pipeline.report.certificate import ANGLES_DEG, certificate_view
+from pipeline.report.lens import Lens
+from pipeline.results.adjustment_reader import Covariance
+
+C, K3, K5 = 153.02, 2.0e-8, -1.5e-12
+NAMES = parameter_names("torlegard")
+LENS = Lens(
+    "K",
+    Distortion("torlegard"),
+    np.array([C, 0.1, -0.2]),
+    np.array([{"k3": K3, "k5": K5, "p1": 3e-7}.get(name, 0.0) for name in NAMES]),
+)
+SIGMAS = {"IO.K.c": 0.01, "IO.K.k3": 4e-9, "IO.K.k5": 3e-13}
+COVARIANCE = Covariance(tuple(SIGMAS), np.zeros(3), np.diag(np.square(list(SIGMAS.values()))))
+REACH_MM = 140.0
+
+
+def number(text: str) -> float:
+    return float(text.replace("−", "-").replace(" × 10⁻", "e-").translate(str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹", "0123456789")))
+
+
+def distortion_um(c: float, angle_deg: Any, lens: tuple[float, float, float] = (C, K3, K5)) -> Any:
+    """By fixed-point iteration, of the lens at angles against c."""
+    equivalent, k3, k5 = lens
+    tangent = np.tan(np.radians(angle_deg))
+    r = equivalent * tangent
+    for _ in range(20):
+        r = equivalent * tangent + k3 * r**3 + k5 * r**5
+    return 1000.0 * (r - c * tangent)
+
+
+def balanced(lens: tuple[float, float, float]) -> float:
+    """By bisection over a dense table."""
+    largest = REACH_MM - lens[1] * REACH_MM**3 - lens[2] * REACH_MM**5
+    angles = np.degrees(np.arctan(np.linspace(0.0, largest / lens[0], 800)))
+    own = distortion_um(0.0, angles, lens)
+    low, high = lens[0] - 1.0, lens[0] + 1.0
+    for _ in range(60):
+        middle = (low + high) / 2.0
+        off = own - 1000.0 * middle * np.tan(np.radians(angles))
+        low, high = (middle, high) if off.max() + off.min() > 0.0 else (low, middle)
+    return (low + high) / 2.0
+
+
+def test_the_table_is_that_of_the_lens() -> None:
+    view = certificate_view(LENS, COVARIANCE, REACH_MM)
+    calibrated = balanced((C, K3, K5))
+    assert number(view.calibrated[0]) == pytest.approx(calibrated, abs=6e-4)
+    assert number(view.equivalent[0]) == pytest.approx(C, abs=6e-4)
+    assert number(view.equivalent[1]) == pytest.approx(SIGMAS["IO.K.c"], rel=0.05)
+    assert [number(row.angle_deg) for row in view.rows] == list(ANGLES_DEG)
+    for row in view.rows:
+        there = distortion_um(calibrated, number(row.angle_deg))
+        assert number(row.radial[0]) == pytest.approx(there, abs=0.05 + 0.06 * number(row.radial[1]))
+
+
+def test_its_standard_deviations_are_those_of_lenses_drawn_at_random() -> None:
+    rng = np.random.default_rng(2)
+    drawn = [rng.normal((C, K3, K5), list(SIGMAS.values())) for _ in range(300)]
+    view = certificate_view(LENS, COVARIANCE, REACH_MM)
+    distances = [balanced((float(c), float(k3), float(k5))) for c, k3, k5 in drawn]
+    assert number(view.calibrated[1]) == pytest.approx(np.std(distances), rel=0.15)
+    for row in view.rows[1:]:
+        angle = number(row.angle_deg)
+        values = [
+            distortion_um(own, angle, (float(c), float(k3), float(k5)))
+            for own, (c, k3, k5) in zip(distances, drawn, strict=True)
+        ]
+        assert number(row.radial[1]) == pytest.approx(np.std(values), rel=0.2)
+
+
+def test_the_printed_table_gives_the_lens_back(tmp_path: Path) -> None:
+    """Read as a certificate: its principal distances come out again."""
+    view = certificate_view(LENS, replace(COVARIANCE, matrix=COVARIANCE.matrix * 1e-8), REACH_MM)
+    radial = [number(row.radial[0]) for row in view.rows]
+    (tmp_path / "c.toml").write_text(
+        f"calibrated_principal_distance_mm = {number(view.calibrated[0])}\nangle_deg = {list(ANGLES_DEG)}\n"
+        f"radial_um = {radial}\n",
+        encoding="utf-8",
+    )
+    fitted = fit(read_certificate(tmp_path / "c.toml"))
+    assert fitted.equivalent_mm == pytest.approx(C, abs=0.002)
+    assert fitted.coefficients[0] == pytest.approx(K3, rel=0.05)
+
+
+def test_a_narrow_camera_has_angles_of_its_own() -> None:
+    view = certificate_view(replace(LENS, interior=np.array([600.0, 0.0, 0.0])), COVARIANCE, 140.0)
+    angles = [number(row.angle_deg) for row in view.rows]
+    assert len(angles) == 6
+    assert angles[-1] == pytest.approx(np.degrees(np.arctan(140.0 / 600.0)), abs=0.1)
+
+
+def test_the_report_shows_it(finished: tuple[Path, int]) -> None:
+    text = (finished[0] / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Certificate style: calibrated principal distance" in text
+
+
+test_the_report_shows_it = pytest.mark.xdist_group("demonstration")(test_the_report_shows_it)
