@@ -107,6 +107,27 @@ def demo(
     return _finish(run_demo(folder, Reporter()), as_json)
 
 
+@app.command()
+def init(
+    scans: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER_OR_URL...", help="Folders with scans, or scans.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where project.toml and images.csv go.")] = Path(),
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """Look at the scans; write a project of them, with each one's camera, and say what could not be told."""
+    from pipeline.archive.new_project import init_project, print_new_project
+    from pipeline.progress import Reporter
+
+    new = init_project(scans, out, Reporter(), max_pixels)
+    if as_json:
+        _echo_json(new.as_json())
+    else:
+        print_new_project(new, PlainConsole())
+    return LOOK if any(cases for _, cases in new.remarks()) else DONE
+
+
 @app.command("run")
 def run_project(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
     """The whole chain: measure, adjust, check, report."""

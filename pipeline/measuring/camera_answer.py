@@ -89,7 +89,8 @@ class Identification:
             told += " Their marks are alike; the data strip or the focal length must decide."
         named = [name for trial in self.best for name in trial.cameras if name in self.unreported]
         told += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
-        return told + self._of_plate() + self._against_pitch(first)
+        against = self.against_pitch()
+        return told + self._of_plate() + (f" {against}" if against else "")
 
     def _of_plate(self) -> str:
         """What the plate says of the cameras that stand out."""
@@ -104,15 +105,16 @@ class Identification:
         agree = f"; of these that is {' or '.join(left)}" if len(left) < len(standing) else ""
         return f" Its plate says {read}{agree}."
 
-    def _against_pitch(self, trial: Trial) -> str:
-        """A sentence where the pitch cannot be right if the scan is of that camera."""
-        if self.pitch_um is None or trial.pixel_um is None:
+    def against_pitch(self) -> str:
+        """A sentence where the pitch cannot be right if the scan is of the best camera; else nothing."""
+        trial = self.best[0] if self.best else None
+        if self.pitch_um is None or trial is None or trial.pixel_um is None:
             return ""
         pitch_um = math.sqrt(math.prod(self.pitch_um))
         if abs(trial.pixel_um / pitch_um - 1) < _SHRUNK:
             return ""
         return (
-            f" Its marks lie as far apart as they should only if a pixel measures {trial.pixel_um:.1f} um, not "
+            f"Its marks lie as far apart as they should only if a pixel measures {trial.pixel_um:.1f} um, not "
             f"{pitch_um:.1f}: if the scan is of this camera, the pitch that --pitch or its file gives is wrong."
         )
 

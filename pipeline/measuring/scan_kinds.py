@@ -18,7 +18,7 @@ Json = dict[str, Any]
 
 _ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".png")
 _ALIKE = 0.03  # of their sides: scans of one roll are cut by hand
-_SAMPLES = 3  # scans of each kind
+SAMPLES = 3  # scans of each kind
 
 
 @dataclass(frozen=True)
@@ -32,20 +32,38 @@ class ScanKind:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Those that most samples name, and no sample with a camera contradicts."""
-        named = [frozenset(name for trial in sample.best for name in trial.cameras) for sample in self.samples]
-        common = [names for names in named if names]
-        return tuple(sorted(frozenset.intersection(*common))) if 2 * len(common) > len(named) else ()
+        """Those that most samples name, no sample with a camera contradicts, and no plate."""
+        named = [names for names in self._named if names]
+        if 2 * len(named) <= len(self.samples):
+            return ()
+        against = frozenset(name for sample in self.samples for name in sample.contradicted)
+        return tuple(sorted(frozenset.intersection(*named) - against))
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Of cameras, as their plates in the samples have them."""
+        return tuple(sorted({sample.plate.get("camera_number", "") for sample in self.samples} - {""}))
 
     def sentence(self) -> str:
         scans = f"{len(self.paths)} scan{'s' * (len(self.paths) > 1)} of about {self.width_px} x {self.height_px} px"
         if self.cameras:
             return f"{scans}: {' or '.join(self.cameras)}, by {len(self.samples)} of them."
-        counts = Counter(name for sample in self.samples for trial in sample.best for name in trial.cameras)
+        return f"{scans}: {self.why_not()}."
+
+    def why_not(self) -> str:
+        """Why no camera is named, a part of a sentence."""
+        counts = Counter(name for names in self._named for name in names)
         if not counts:
-            return f"{scans}: no camera stands out in {len(self.samples)} of them."
+            return f"no camera stands out in {len(self.samples)} of them"
         told = ", ".join(f"{name} in {count}" for name, count in counts.most_common())
-        return f"{scans}: of {len(self.samples)} samples not all show the same camera ({told})."
+        if 2 * sum(map(bool, self._named)) > len(self.samples) and frozenset.intersection(*filter(None, self._named)):
+            return f"what is seen are marks of {told}, and the camera's plate in the picture says another one"
+        return f"of {len(self.samples)} samples not all show the same camera ({told})"
+
+    @property
+    def _named(self) -> list[frozenset[str]]:
+        """The cameras that each sample names."""
+        return [frozenset(name for trial in sample.best for name in trial.cameras) for sample in self.samples]
 
     def as_json(self) -> Json:
         return {
@@ -95,7 +113,7 @@ def identify_kinds(paths: Sequence[Path], identify: Callable[[Path], Identificat
     kinds, unread = list[ScanKind](), dict[Path, str]()
     for (width, height), own in _alike(paths, unread):
         samples = list[Identification]()
-        for path in _spread(own):
+        for path in spread(own):
             try:
                 samples.append(identify(path))
             except MeasurementError as error:
@@ -134,7 +152,7 @@ def _alike(paths: Sequence[Path], unread: dict[Path, str]) -> list[tuple[tuple[i
     return [(size, tuple(own)) for _, size, own in kinds]
 
 
-def _spread(paths: Sequence[Path]) -> list[Path]:
-    """A few of them, from the first to the last."""
-    chosen = np.unique(np.linspace(0, len(paths) - 1, _SAMPLES).round().astype(int))
+def spread(paths: Sequence[Path]) -> list[Path]:
+    """The samples among scans, from the first to the last."""
+    chosen = np.unique(np.linspace(0, len(paths) - 1, SAMPLES).round().astype(int))
     return [paths[index] for index in chosen]
