@@ -164,7 +164,7 @@ def project_text(new: NewProject) -> str:
     usual = max(names, key=lambda name: names[name])
     camera = f"{PREFIX}{usual}" if usual else "camera.toml"
     lines = [
-        "# What `reseau init` found. Paths are relative to this file; `reseau template project` shows what may stand in it",
+        "# What `reseau init` found. Paths are relative to it; `reseau template project` shows what may stand in it.",
         "",
         f"camera = {quoted(camera)}    # of {names[usual]} scans; images.csv has each one's own",
         f"scans = [{', '.join(quoted(pattern) for pattern in _patterns(new))}]",

@@ -24,11 +24,12 @@ WRITTEN = ("run", "frame", "date", "time", "height", "scale", "camera_number")  
 @dataclass(frozen=True)
 class GivenImages:
     """By image name: exterior orientation (None where the line gives none), the camera file's name and the scanner's
-    ("" where none)."""
+    ("" where none). asks_writing: whether there is a column for what may be read on the film."""
 
     exterior: Mapping[str, Exterior | None]
     camera: Mapping[str, str]
     scanner: Mapping[str, str] = field(default_factory=dict)
+    asks_writing: bool = False
 
 
 def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
@@ -37,14 +38,15 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
     antenna: the offset of the point whose X0, Y0, Z0 are given from the projection centre, as in `Exterior`.
     """
     exterior: dict[str, Exterior | None] = {}
-    camera, scanner = {}, {}
+    camera, scanner, asks_writing = {}, {}, False
     for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner", *WRITTEN)):
         name = image_name(row.name("image"))
         if name in exterior:
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
         exterior[name] = _exterior(row, antenna)
         camera[name], scanner[name] = row.text("camera"), row.text("scanner")
-    return GivenImages(exterior, camera, scanner)
+        asks_writing = any(column in row.cells for column in WRITTEN)
+    return GivenImages(exterior, camera, scanner, asks_writing)
 
 
 def fill_images(path: Path, values: Mapping[str, Mapping[str, str]]) -> None:

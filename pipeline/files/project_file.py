@@ -20,7 +20,7 @@ from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import camera_path
 from pipeline.files.pitch import FINEST_PITCH_UM
 from pipeline.files.points_file import GivenPoints, read_points
-from pipeline.files.scan_files import find_scans
+from pipeline.files.scan_files import FoundScans, find_scans
 from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 from pipeline.results.adjustment_reader import covariance_path
@@ -36,7 +36,8 @@ UNITS_MM = {"m": 1000.0, "dm": 100.0, "cm": 10.0, "mm": 1.0}
 class Project:
     """A project file as read; paths are resolved against the file's folder.
 
-    cameras: by file name; the first one serves where images.csv names none. scans: by image name, in their order.
+    cameras: by file name; the first one serves where images.csv names none. scans: by image name, in their order;
+    left_out: the images that `exclude` leaves out.
     tone: the curve of the scans: auto, one of TONES, or the power of the grey value that light grows as.
     unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
     crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
@@ -61,11 +62,18 @@ class Project:
     max_pixels: int | None = None
     writing: Reads = "pose"
     images_path: Path | None = None
+    left_out: frozenset[str] = frozenset()
     crs: str = ""
 
     def open_scan(self, name: str) -> Scan:
         """The scan of an image. Raises MeasurementError where it cannot be read."""
         return open_scan(self.scans[name], self.max_pixels)
+
+    @property
+    def reads(self) -> Reads:
+        """In which scans writing is read: in all where images.csv asks for what it says, unless the user forbids it."""
+        asked = self.given_images is not None and self.given_images.asks_writing
+        return "all" if asked and self.writing == "pose" else self.writing
 
     @property
     def film_sigma_mm(self) -> float:
@@ -179,10 +187,12 @@ def read_project(path: Path) -> Project:
         each.done()
     _check_named(table, objects, camera, named)
     images = read_images(named["images"], antenna) if "images" in named else None
+    found = FoundScans({}, frozenset()) if patterns is None else find_scans(table, patterns, exclude)
     project = replace(
         project,
         cameras=_cameras(table, camera, images),
-        scans={} if patterns is None else find_scans(table, patterns, exclude),
+        scans=found.files,
+        left_out=found.left_out,
         given_points=read_points(named["points"]) if "points" in named else None,
         given_images=images,
         given_distances=read_distances(named["distances"]) if "distances" in named else (),

@@ -2,15 +2,24 @@
 
 import glob
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.text.image_names import names_below
 from pipeline.text.tables import Table
 
 
-def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) -> Mapping[str, Path]:
-    """The scan files that the patterns find, by image name, without those that `exclude` names or finds. Raises
-    InputError for a pattern that finds nothing, and for files whose images would have the same name."""
+@dataclass(frozen=True, eq=False)
+class FoundScans:
+    """files: by image name, in their order; left_out: the names of the images that `exclude` leaves out."""
+
+    files: Mapping[str, Path]
+    left_out: frozenset[str]
+
+
+def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) -> FoundScans:
+    """The scan files that the patterns find, without those that `exclude` names or finds. Raises InputError for a
+    pattern that finds nothing, and for files whose images would have the same name."""
     folder = table.file.parent
     found = dict[Path, None]()
     for pattern in patterns:
@@ -33,7 +42,7 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
         if name in scans:
             raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
         scans[name] = file
-    return scans
+    return FoundScans(scans, frozenset(names_below(files, left_out).values()))
 
 
 def _found(pattern: str, folder: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from pipeline.measuring.checked import CheckedScan, checked
 from pipeline.measuring.learn_stage import learn_marks
 from pipeline.measuring.measured import measure_scans
 from pipeline.measuring.natural_points import check_tie_names
-from pipeline.measuring.roll import roll_of
+from pipeline.measuring.roll import roll_of, with_known_lines
 from pipeline.measuring.scan_task import Measure, ScanTask, scan_tasks
 from pipeline.measuring.tied import TiedScan, tied
 from pipeline.measuring.tone_stage import said_of_tones
@@ -40,7 +40,8 @@ def measure_project(
     names = check_measurable(project)
     learned = learn_marks(project, reporter, measure, executor, learned_folder)
     tasks = scan_tasks(learned, names, said_of_tones(learned, reporter, measure))
-    measured = _measured(tasks, measure, reporter)
+    tasks, read = with_known_lines(tasks, measure, reporter)
+    measured = _measured(tasks, read, measure, reporter)
     if all(scan.failure for scan in measured.values()):
         raise MeasurementError("\n".join(dict.fromkeys(s.failure.sentence for s in measured.values() if s.failure)))
     return tied(learned, _checked(learned, tasks, measured, measure), reporter, executor)
@@ -54,20 +55,22 @@ def check_measurable(project: Project) -> tuple[str, ...]:
     check_tie_names(project)
     _check_marks(project)
     listed = project.given_images.exterior if project.given_images else {}
-    names = (*project.scans, *(name for name in listed if name not in project.scans))
+    names = (*project.scans, *(name for name in listed if name not in project.scans and name not in project.left_out))
     scan_tasks(project, names)  # raises for targets that nothing names and for marks that nobody has drawn
     return names
 
 
-def _measured(tasks: Sequence[ScanTask], measure: Measure, reporter: Reporter) -> Mapping[str, MeasuredScan]:
-    """The first step, by image in the order of the tasks."""
-    measured = dict[str, MeasuredScan]()
+def _measured(
+    tasks: Sequence[ScanTask], read: Mapping[str, MeasuredScan], measure: Measure, reporter: Reporter
+) -> Mapping[str, MeasuredScan]:
+    """The first step, by image in the order of the tasks. read: what was measured before."""
+    measured, left = dict(read), [task for task in tasks if task.name not in read]
     with reporter.stage("measured") as count:
-        for done, scan in enumerate(measure(tasks), 1):
+        for done, scan in enumerate(measure(left), 1):
             measured[scan.frame.image] = scan
-            count(scan.frame.image, done, len(tasks))
-            if done == 1 < len(tasks):
-                reporter.say(expected_time(scan.seconds, len(tasks)))
+            count(scan.frame.image, done, len(left))
+            if done == 1 < len(left):
+                reporter.say(expected_time(scan.seconds, len(left)))
     return {task.name: measured[task.name] for task in tasks}
 
 

@@ -5,7 +5,7 @@ is written on each adds to what tells how the camera has it. What is not told ev
 """
 
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -19,14 +19,15 @@ from measure.pose.written_pose import bounded, line_score
 from measure.results import FrameMeasurement, Pose
 from measure.status import Status
 from measure.writing.line import KnownLine, Line, without_numbers
-from pipeline.measuring.scan_task import ScanTask
+from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask
+from pipeline.progress import Reporter
 from pipeline.results.measured_scan import MeasuredScan
 
 _ONE_QUESTION = (
     "the frames are named so that what is written lies alike in all of the camera whose writing was read; nothing says "
     "how the camera has it"
 )
-_READ_FIRST = 4  # frames of a camera
+_READ_FIRST = 4  # frames of a camera on which all writing is read
 _WAYS = 2  # in which frames of a roll lie, as far as they are looked for: more take as long as reading all
 _LEAST = 6  # letters and digits of a line by which frames are known
 _TURNS = ("0", "90", "180", "270")  # in which writing may lie in the camera's frame
@@ -62,10 +63,37 @@ def roll_of(tasks: Sequence[ScanTask], scans: Sequence[MeasuredScan], places: Se
     return Roll(poses, tuple(task for task in again if task.options.fiducials.pose != names.get(task.name)))
 
 
-def read_first(images: Iterable[str]) -> frozenset[str]:
-    """Those of a camera's images on which all writing is read, before it is known what stands on all; one image more
-    or less changes few of them."""
-    return frozenset(sorted(images, key=lambda image: sha256(image.encode()).digest())[:_READ_FIRST])
+def with_known_lines(
+    tasks: Sequence[ScanTask], measure: Measure, reporter: Reporter
+) -> tuple[tuple[ScanTask, ...], Mapping[str, MeasuredScan]]:
+    """The tasks, in their order, with the lines by which to know that a frame lies as others of its camera; and, by
+    image, the few scans that were measured for it. They are no others where one scan comes or goes, but rarely."""
+    of_camera = defaultdict[int, list[ScanTask]](list)
+    for task in tasks:
+        if task.options.fiducials.pose == "auto" and task.options.fiducials.writing == "pose":
+            of_camera[id(task.options.camera)].append(task)
+    rolls = {camera: _first(own) for camera, own in of_camera.items() if len(own) > _READ_FIRST}
+    first = [task for own in rolls.values() for task in own]
+    measured = dict[str, MeasuredScan]()
+    with reporter.stage("read") as count:
+        for done, scan in enumerate(measure(first) if first else (), 1):
+            measured[scan.frame.image] = scan
+            count(scan.frame.image, done, len(first))
+    known = {camera: known_lines([measured[task.name].frame for task in own]) for camera, own in rolls.items()}
+    options = dict[int, ScanOptions]()  # of those that tasks share
+    knowing = []
+    for task in tasks:
+        lines = known.get(id(task.options.camera), ())
+        if lines and task.name not in measured and task.options.fiducials.writing == "pose":
+            options.setdefault(id(task.options), task.options.knowing(lines))
+            task = replace(task, options=options[id(task.options)])
+        knowing.append(task)
+    return tuple(knowing), measured
+
+
+def _first(tasks: Iterable[ScanTask]) -> list[ScanTask]:
+    """Those of a camera on which all writing is read: in an order that another scan more does not change."""
+    return sorted(tasks, key=lambda task: sha256(task.name.encode("utf-8", "surrogateescape")).digest())[:_READ_FIRST]
 
 
 def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:

@@ -11,6 +11,7 @@ from measure.fiducial_options import FiducialOptions
 from measure.results import Pose
 from measure.scans.scan import Scan, open_scan
 from measure.scans.tone import SaidOfTone
+from measure.writing.line import KnownLine
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.measuring.sought_targets import SoughtTargets
@@ -38,6 +39,10 @@ class ScanOptions:
     said: tuple[SaidOfTone, ...] = ()
     targets: SoughtTargets | None = None
     exterior: Exterior | None = None
+
+    def knowing(self, lines: tuple[KnownLine, ...]) -> "ScanOptions":
+        """The same, with lines by which a frame is known to lie as others of its camera."""
+        return replace(self, fiducials=replace(self.fiducials, known_lines=lines))
 
     @cached_property
     def json(self) -> str:
@@ -71,12 +76,12 @@ class ScanTask:
 
     def posed(self, pose: str) -> "ScanTask":
         """The same scan in a pose that is known, nothing read in it."""
-        fiducials = replace(self.options.fiducials, pose=pose, writing="none")
+        fiducials = replace(self.options.fiducials, pose=pose, writing="none", known_lines=())
         return replace(self, options=replace(self.options, fiducials=fiducials))
 
     def fiducials_alone(self, tone: float | str) -> "ScanTask":
         """The same scan, of which the fiducials alone are sought, seen through that curve."""
-        fiducials = replace(self.options.fiducials, writing="none")
+        fiducials = replace(self.options.fiducials, writing="none", known_lines=())
         options = replace(self.options, fiducials=fiducials, tone=tone, said=(), targets=None, exterior=None)
         return replace(self, options=options)
 
@@ -101,7 +106,7 @@ def scan_tasks(
         exterior = project.given_images.exterior.get(name) if project.given_images and targets else None
         key = (key_of[id(given)], pose, known is None, *map(id, told), id(exterior))
         if key not in shared:
-            options = FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm, writing=project.writing)
+            options = FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm, writing=project.reads)
             camera = cameras[key_of[id(given)]]
             shared[key] = ScanOptions(camera, project.pitch_um, options, known, project.tone, told, targets, exterior)
         scan = project.scans.get(name)

@@ -15,8 +15,10 @@ def image_name(text: str) -> str:
     return folder + slash + (name if ending.lower() in SCAN_ENDINGS else file).strip()
 
 
-def names_below(files: Iterable[Path]) -> dict[Path, str]:
-    """The names of images by their files: the path below the folder that all of them share."""
+def names_below(files: Iterable[Path], others: Iterable[Path] | None = None) -> dict[Path, str]:
+    """The names of images by their files: the path below the folder that all the files share. others: whose names are
+    asked for, if not those of the files."""
     absolute = {file: os.path.abspath(file) for file in files}
     shared = os.path.commonpath([os.path.dirname(path) for path in absolute.values()]) if absolute else ""
-    return {file: image_name(Path(os.path.relpath(path, shared)).as_posix()) for file, path in absolute.items()}
+    asked = absolute if others is None else {file: os.path.abspath(file) for file in others}
+    return {file: image_name(Path(os.path.relpath(path, shared)).as_posix()) for file, path in asked.items()}

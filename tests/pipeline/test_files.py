@@ -368,6 +368,14 @@ def test_images_are_called_by_their_path_below_the_folder_that_all_share(
     assert set(project_of(tmp_path, said, *files).scans) == set(names)
 
 
+def test_an_image_that_is_left_out_may_stand_in_images_csv(tmp_path: Path) -> None:
+    written(tmp_path, "images.csv", "image\nscans/a\nb\nc\n")
+    said = 'scans = ["scans/*.tif"]\nexclude = ["scans/b.tif"]\n[object]\nimages = "images.csv"'
+    project = project_of(tmp_path, said, "scans/a.tif", "scans/b.tif")
+    assert project.left_out == {"b"}
+    assert set(project.scans) == {"a"}
+
+
 def test_two_files_of_one_name_in_a_folder_are_refused_and_so_is_leaving_all_out(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="have the same name 'a/1'"):
         project_of(tmp_path, 'scans = ["**/*.*g"]', "a/1.jpg", "a/1.png", "b/1.png")

@@ -1,14 +1,16 @@
 """What is written on the frames, through the files: frames.csv, images.csv, the camera's file, a roll's poses."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from measure.covariance import Cause, Covariance
+from measure.fiducial_options import FiducialOptions, Reads
 from measure.marks.poses import POSES, pose_in_camera
 from measure.marks.shapes import Side, WrittenPlace
 from measure.pose.written_pose import side_in_camera, writing_likelihoods
@@ -24,8 +26,10 @@ from pipeline.files.camera_text import camera_text
 from pipeline.files.images_file import WRITTEN, fill_images, read_images
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, plate_of, with_plates
-from pipeline.measuring.roll import known_lines, poses_of_roll, read_first
+from pipeline.measuring.roll import known_lines, poses_of_roll, with_known_lines
 from pipeline.measuring.same_frames import with_same_frames
+from pipeline.measuring.scan_task import ScanOptions, ScanTask
+from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 from pipeline.report.writing import written
 from pipeline.results.frames_file import for_images, write_frames
@@ -197,12 +201,41 @@ def test_frames_are_known_by_the_line_that_all_have_and_that_tells_itself_best()
     assert known_lines([frame_of_roll(image, "0", "8601 8639") for image in "ab"]) == ()
 
 
-def test_the_frames_that_are_read_first_hardly_change_with_one_scan_more() -> None:
-    images = [f"{number:04d}" for number in range(200)]
-    first = read_first(images)
-    assert len(first) == 4
-    assert read_first(reversed(images)) == first
-    assert max(len(first - read_first([*images, f"more{number}"])) for number in range(50)) <= 1
+def roll_tasks(images: Sequence[str], writing: Reads = "pose") -> list[ScanTask]:
+    camera = parse_camera(Table({**CAMERA}, Path("camera.toml"), ""))
+    options = ScanOptions(camera, None, FiducialOptions(writing=writing))
+    return [ScanTask(image, f"{image}.tif", options) for image in images]
+
+
+def test_a_few_frames_of_a_roll_are_read_and_the_others_know_by_what() -> None:
+    asked = list[str]()
+
+    def measure(tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
+        for task in tasks:
+            asked.append(task.name)
+            yield replace(scan(task.name, None), frame=frame_of_roll(task.name, "0", f"DEVELOPMENT {task.name}"))
+
+    tasks = roll_tasks([f"{number:04d}" for number in range(200)])
+    knowing, read = with_known_lines(tasks, measure, Reporter(Console(quiet=True)))
+    assert [task.name for task in knowing] == [task.name for task in tasks]
+    assert sorted(asked) == sorted(read)
+    assert len(read) == 4
+    for task in knowing:
+        known = task.options.fiducials.known_lines
+        assert [each.text[:11] for each in known] == ([] if task.name in read else ["DEVELOPMENT"])
+    assert len({id(task.options) for task in knowing}) == 2
+    assert knowing[0].posed("90").options.fiducials.known_lines == ()
+    for none in (roll_tasks(["a", "b", "c", "d"]), roll_tasks([f"{n}" for n in range(9)], "all")):
+        assert with_known_lines(none, measure, Reporter(Console(quiet=True))) == (tuple(none), {})
+
+
+def test_the_frames_that_are_read_hardly_change_with_one_scan_more() -> None:
+    def first(*more: str) -> set[str]:
+        silent = Reporter(Console(quiet=True))
+        tasks = roll_tasks([*(f"{number:04d}" for number in range(200)), *more])
+        return set(with_known_lines(tasks, lambda own: (scan(task.name, ()) for task in own), silent)[1])
+
+    assert max(len(first() - first(f"more{number}")) for number in range(20)) <= 1
 
 
 RC10 = parse_camera(
