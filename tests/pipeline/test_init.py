@@ -1,0 +1,211 @@
+"""`reseau init`: what scans there are, and the project that is made of them."""
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from pipeline.archive import new_project, sampling
+from pipeline.archive.catalogue import Group, catalogue
+from pipeline.archive.new_project import chosen
+from pipeline.archive.sampling import name_cameras
+from pipeline.cli import run
+from pipeline.files.project_file import read_project
+from pipeline.measuring.camera_answer import Identification, Trial
+from pipeline.measuring.scan_kinds import ScanKind
+from pipeline.progress import Reporter
+
+SAID = pytest.CaptureFixture[str]
+RNG = np.random.default_rng(9)
+
+
+def scan(path: Path, height: int = 60, width: int = 90, **tags: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = RNG.integers(0, 255, (height, width)).astype(np.uint8)
+    tifffile.imwrite(path, picture, **{"resolution": (500, 500), "resolutionunit": "CENTIMETER", **tags})  # type: ignore[arg-type]
+    return path
+
+
+def no_count(_what: str, _done: int, _total: int) -> None:
+    """Nobody looks."""
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Path:
+    """Two folders: in one two kinds, a copy, a broken file and what is no scan, in the other one kind, and a picture
+    beside its smaller namesake."""
+    folder = tmp_path / "box [1]"
+    for name in ("0001.tif", "0002.tif", "sub/0001.tif"):
+        scan(folder / "1952" / name)
+    scan(folder / "1952" / "0003.tif", 61, 89)  # cut by hand
+    scan(folder / "1952" / "0004.tif", 120, 90)
+    shutil.copy(folder / "1952" / "0002.tif", folder / "1952" / "0009.tif")
+    (folder / "1952" / "broken.tif").write_bytes(b"II*\0")
+    (folder / "1952" / "notes.txt").write_text("by hand")
+    (folder / "1952" / ".hidden.tif").write_bytes(b"")
+    scan(folder / "1958" / "0001.TIF")
+    tifffile.imwrite(folder / "1958" / "0001.tiff", np.zeros((30, 40), np.uint8))
+    return folder
+
+
+def test_files_are_sorted_into_kinds_copies_and_broken_ones(box: Path) -> None:
+    found = catalogue([box], no_count)
+    kinds = {(group.folder.name, group.head.height_px): [path.name for path in group.paths] for group in found.groups}
+    assert kinds == {
+        ("1952", 60): ["0001.tif", "0002.tif", "0003.tif"],
+        ("1952", 120): ["0004.tif"],
+        ("sub", 60): ["0001.tif"],
+        ("1958", 60): ["0001.TIF"],
+        ("1958", 30): ["0001.tiff"],
+    }
+    assert found.copies == {box / "1952/0009.tif": box / "1952/0002.tif"}
+    assert [path.name for path in found.broken] == ["broken.tif"]
+    assert found.endings == {".txt": 1}
+    assert found.files == 9
+
+
+def test_scans_of_one_size_and_head_are_no_copies_unless_all_their_bytes_are_the_same(tmp_path: Path) -> None:
+    """What tells most files apart is the head and the middle; here nothing but a corner does."""
+    first = scan(tmp_path / "a.tif", 600, 600)
+    data = bytearray(first.read_bytes())
+    data[-1] ^= 1
+    (tmp_path / "b.tif").write_bytes(data)
+    assert catalogue([tmp_path], no_count).copies == {}
+
+
+def of_camera(
+    path: Path, *names: str, plate: Mapping[str, str] | None = None, against: Sequence[str] = ()
+) -> Identification:
+    trial = Trial(names, 4, 4, 0.9, 9.0, 0.9, None, None, None, "", 1.0, 1e-9, 20.0)
+    contradicted = {name: ["another"] for name in against}
+    return Identification(path, (trial,) if names else (), {}, (20.0, 20.0), plate or {}, contradicted)
+
+
+def kind(group: Group, *samples: Identification) -> ScanKind:
+    return ScanKind(group.paths, group.head.width_px, group.head.height_px, samples)
+
+
+def test_a_camera_is_told_by_most_samples_and_by_what_its_plate_does_not_contradict(box: Path) -> None:
+    group = catalogue([box / "1958"], no_count).groups[0]
+    path = group.paths[0]
+    alike = of_camera(path, "wild-rc10-153", "wild-rc10-305", against=["wild-rc10-305"])
+    assert kind(group, alike, of_camera(path), of_camera(path, "wild-rc10-153", "wild-rc10-305")).cameras == (
+        "wild-rc10-153",
+    )
+    for samples, why in [
+        ((of_camera(path), of_camera(path)), "no camera stands out in 2 of them"),
+        ((alike, of_camera(path, "zeiss-rmk-a-153")), "not all show the same camera"),
+        ((alike, of_camera(path), of_camera(path)), "not all show the same camera"),
+        (
+            (of_camera(path, "wild-rc5-153", against=["wild-rc5-153"]),),
+            "the camera's plate in the picture says",
+        ),
+    ]:
+        told = kind(group, *samples)
+        assert told.cameras == ()
+        assert why in told.why_not()
+    both = kind(group, of_camera(path, "wild-rc30-153", "wild-rc10-153"))
+    assert chosen(both) == "wild-rc10-153"  # by far the more reports
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What samples say, by where they stand: those of 1952 are of one camera, all others of none that is known."""
+
+    def samples(groups: Sequence[Group], _: Reporter, __: int | None) -> tuple[list[ScanKind], dict[Path, str]]:
+        names = [("wild-rc10-153",) if group.folder.name in ("1952", "sub") else () for group in groups]
+        plates = [{"camera_number": str(group.head.height_px)} for group in groups]
+        return [
+            kind(group, of_camera(group.paths[0], *own, plate=plate))
+            for group, own, plate in zip(groups, names, plates, strict=True)
+        ], {}
+
+    monkeypatch.setattr(new_project, "name_cameras", samples)
+
+
+@pytest.mark.usefixtures("told")
+def test_the_project_that_is_written_is_read_and_has_each_scans_camera(box: Path, tmp_path: Path, capsys: SAID) -> None:
+    out = tmp_path / "work" / "first"
+    assert run(["init", str(box), "--out", str(out), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    project = read_project(out / "project.toml")
+    assert sorted(project.scans) == ["0001", "0002", "0003", "0004", "sub/0001"]
+    assert all(project.camera_of(name).name == "Wild RC10, 153 mm" for name in project.scans)
+    lines = (out / "images.csv").read_text(encoding="utf-8").splitlines()
+    assert lines[:2] == ["image,camera", "0001,library:wild-rc10-153"]
+    assert told["scans"] == len(lines) - 1 == 5
+    looks = told["needs_a_look"]
+    assert len(looks) == 3
+    assert any("broken.tif" in case for cases in looks.values() for case in cases)
+    assert any("1958" in case and "no camera stands out" in case for cases in looks.values() for case in cases)
+    assert any("Nr 120, 60" in case for cases in looks.values() for case in cases)
+    text = (out / "project.toml").read_text(encoding="utf-8")
+    assert "# the same bytes as another scan\n" in text
+    assert "0009.tif" in text
+    assert run(["init", str(box), "--out", str(out)]) == 2
+    assert "init writes over nothing" in capsys.readouterr().err
+    assert (out / "project.toml").read_text(encoding="utf-8") == text
+
+
+@pytest.mark.usefixtures("told")
+def test_where_no_camera_is_told_all_scans_are_of_the_one_that_the_user_draws(
+    box: Path, monkeypatch: pytest.MonkeyPatch, capsys: SAID
+) -> None:
+    """The project stands among the scans: what it will write is not taken for one."""
+    monkeypatch.chdir(box / "1958")
+    assert run(["init", "."]) == 1
+    assert "have its marks learned" in capsys.readouterr().out
+    (box / "1958/camera.toml").write_text("frame_mm = [230.0, 230.0]\n", encoding="utf-8")
+    scan(box / "1958" / "out" / "learned" / "mark.TIF")
+    project = read_project(Path("project.toml"))
+    assert [path.name for path in project.scans.values()] == ["0001.TIF"]  # the larger of two of one name
+    assert (box / "1958/images.csv").read_text(encoding="utf-8") == "image,camera\n0001,\n"
+
+
+def test_of_each_kind_in_each_folder_three_are_tried(box: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Here:
+        def submit(self, function: object, *given: object) -> object:
+            from concurrent.futures import Future
+
+            future: Future[object] = Future()
+            future.set_result(function(*given))  # type: ignore[operator]
+            return future
+
+    def identified(path: Path, _: int | None) -> Identification | str:
+        return "cannot be decoded" if path.name == "0004.tif" else of_camera(path, "wild-rc5-153")
+
+    for number in range(5, 9):
+        scan(box / "1952" / f"000{number}.tif")
+    monkeypatch.setattr(sampling, "worker_pool", lambda _: nullcontext(Here()))
+    monkeypatch.setattr(sampling, "_identified", identified)
+    groups = catalogue([box], no_count).groups
+    kinds, unread = name_cameras(groups, Reporter(), None)
+    tried = {
+        (group.folder.name, group.head.height_px): len(each.samples) for group, each in zip(groups, kinds, strict=True)
+    }
+    assert tried == {("1952", 60): 3, ("1952", 120): 0, ("sub", 60): 1, ("1958", 60): 1, ("1958", 30): 1}
+    assert [
+        sample.scan.name for sample in kinds[groups.index(next(g for g in groups if len(g.paths) > 3))].samples
+    ] == [
+        "0001.tif",
+        "0005.tif",
+        "0008.tif",
+    ]
+    assert unread == {box / "1952/0004.tif": "cannot be decoded"}
+
+
+@pytest.mark.parametrize(
+    ("given", "said"), [("nowhere", "there is no"), ("empty", "no scan there, nor below"), ("only", "none can be read")]
+)
+def test_what_holds_no_scan_is_told_and_nothing_is_written(given: str, said: str, tmp_path: Path, capsys: SAID) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "only").mkdir()
+    (tmp_path / "only" / "a.tif").write_bytes(b"no scan")
+    assert run(["init", str(tmp_path / given), "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
