@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout
+from measure.scans.parallel import side_by_side
 from measure.scans.scan import open_scan
 from measure.single_targets.disk_patches import DiskSearch
 from measure.single_targets.disk_search import disk_candidates
@@ -149,7 +150,7 @@ def windows(path: Path, marks_px: NDArray[np.float64]) -> None:
     with open_scan(path) as scan:
         side = round(WINDOW_MM / FRAME_MM * scan.width_px)
         corners = np.round(marks_px - side / 2).astype(int).tolist()
-        scan.each(lambda corner: scan.window(corner[0], corner[1], side, side), corners)
+        side_by_side(lambda corner: scan.window(corner[0], corner[1], side, side), corners)
 
 
 def reduced(path: Path) -> None:

@@ -17,6 +17,7 @@ from measure.frames.refinement import Sighting, nothing_within, sight
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.reason import Reason
+from measure.scans.parallel import side_by_side
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
 from measure.scans.told_tone import FrameTone
 from measure.search.constellation import NARROW, Placement, sign_of
@@ -106,7 +107,7 @@ class FrameSighter:
         # From below upwards: the search of windows ended there, and what it read last is still decoded.
         rows = self._predicted_px()[:, 1]
         upwards = sorted(indices, key=lambda index: -rows[index])
-        sighted = self.scan.each(lambda index: self._sight(index, search_px), upwards)
+        sighted = side_by_side(lambda index: self._sight(index, search_px), upwards)
         for index, sighting in zip(upwards, sighted, strict=True):
             self.sightings[index] = sighting
 

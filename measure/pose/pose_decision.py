@@ -23,6 +23,7 @@ from measure.marks.shapes import LEARNED_ORIGIN, Disk, FiducialLayout, LayoutMar
 from measure.pose.pose_pictures import Drawings, Shown, Site
 from measure.pose.written_pose import line_score, main_pose, writing_likelihoods
 from measure.results import Pose
+from measure.scans.parallel import side_by_side
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.writing.line import Line
@@ -91,7 +92,7 @@ def decide_pose(
     def of_site(index: int) -> Array:
         return sites[index].likelihoods([each.shown(index, layout) for each in named])
 
-    pictures = np.array(scan.each(of_site, range(len(sites)))).reshape(len(sites), len(named))
+    pictures = np.array(side_by_side(of_site, range(len(sites)))).reshape(len(sites), len(named))
     verdicts = [each.verdict(pictures[:, index]) for index, each in enumerate(named)]
     if not lines or not frame.accepted:
         return _decision(verdicts, layout, len(seen))

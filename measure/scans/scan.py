@@ -1,13 +1,12 @@
 """A scan file, opened by windows."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
 from itertools import product
 from math import lcm
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -37,9 +36,6 @@ _COMPRESSION_PX = 256  # the side of the part in the middle that tells of an ear
 _PLAINLY_COARSER = 1.5  # than what the file itself rounds to, which shows as well
 _NAMED = 3  # damaged parts of a file: more are counted
 _LEAST_UNIT_DN = 16  # of 8 bits in a file of 16: as 12 bits stored from the top have it
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 class Scan:
@@ -217,11 +213,6 @@ class Scan:
         fine = self.samples(col0 * factor, row0 * factor, width * factor, height * factor)
         return weighted(means(fine, factor), self._weights(weights))
 
-    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-        """What the function makes of each item, in their order, by as many threads as OpenCV may use: decoders and
-        filters run side by side."""
-        return side_by_side(function, items)
-
     def close(self) -> None:
         self._segments.close()
 
@@ -272,7 +263,7 @@ class Scan:
             own_rows, own_cols = own.shape[:2]
             own[:] = means(self.samples(col0 * factor, row0 * factor, own_cols * factor, own_rows * factor), factor)
 
-        self.each(fill, product(range(0, height, rows), range(0, width, cols)))
+        side_by_side(fill, product(range(0, height, rows), range(0, width, cols)))
         return result
 
     def _weights(self, weights: Sequence[float] | None) -> Sequence[float]:

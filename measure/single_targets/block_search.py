@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from measure.scans.parallel import side_by_side
 from measure.scans.radiometry import Samples
 from measure.scans.scan import Scan
 from measure.single_targets.block import Block
@@ -60,7 +61,7 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], confirmed: Confirmed | 
         return found
 
     corners = product(range(0, scan.height_px, height), range(0, scan.width_px, width))
-    return _separate(joined(*scan.each(in_block, corners))).candidates()
+    return _separate(joined(*side_by_side(in_block, corners))).candidates()
 
 
 def _block_px(scan: Scan, unit: int, margin: int) -> tuple[int, int]:

@@ -13,6 +13,7 @@ import tifffile
 from stored_picture import HEIGHT, WIDTH, picture
 
 from measure.errors import MeasurementError
+from measure.scans.parallel import side_by_side
 from measure.scans.scan import open_scan
 
 
@@ -85,7 +86,7 @@ def test_a_damaged_tile_is_unknown_and_costs_none_of_the_others(tmp_path: Path, 
     (tmp_path / "s.tif").write_bytes(bytes(data))
     with open_scan(tmp_path / "s.tif") as scan:
         for _ in range(2):
-            seen = scan.each(lambda row: scan.window(0, row, WIDTH, 1)[0], range(HEIGHT))
+            seen = side_by_side(lambda row: scan.window(0, row, WIDTH, 1)[0], range(HEIGHT))
             known = scan.inside(0, 0, WIDTH, HEIGHT)
         assert "tile 7" in scan.damage
         assert "tile 7" in scan.lost_in(120, 120, 10, 10)

@@ -1,5 +1,6 @@
 """Scans are measured one by one, each by its own task: what it depends on, and what becomes of those that fail."""
 
+import importlib.util
 import json
 import os
 import pickle
@@ -271,3 +272,15 @@ def test_a_scan_refused_for_its_size_says_how_to_allow_it(tmp_path: Path, capsys
     assert failed.failure.code is FailureCode.TOO_LARGE
     assert task.options_json() == scan_tasks(read_project(project), ["a"])[0].options_json()
     assert os.path.samefile(failed.scan, tmp_path / "a.tif")
+
+
+def test_no_module_is_entered_again_from_one_that_it_has_called() -> None:
+    file = Path(__file__).parents[2] / "benchmarks" / "trip.py"
+    spec = importlib.util.spec_from_file_location("trip", file)
+    assert spec is not None
+    assert spec.loader is not None
+    trip = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(trip)
+    calls = trip.followed()
+    assert {"measure.fiducials", "pipeline.measuring.checked", "pipeline.results.comparator_file"} <= set(calls.order)
+    assert not calls.again

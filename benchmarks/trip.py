@@ -1,0 +1,95 @@
+"""The trip of a scan file to a row of comparator.csv: the modules that its calls go through, each where it is first
+entered, and which are entered again from one that they have called.
+
+Run: python benchmarks/trip.py. It measures a small drawn frame of four ring-crosses and a scan of nothing but grain, in
+which every way of looking is tried, and follows every call.
+"""
+
+import sys
+from collections import Counter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import FrameType
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+
+ROOT = Path(__file__).parents[1]
+sys.path += [str(ROOT / "tests" / "pipeline"), str(ROOT / "tests" / "measure")]
+PACKAGES = ("measure", "adjust", "pipeline")
+MAPS = "measure/scans/parallel.py"  # calls what it is given for each of many, as `map` does
+
+
+class Followed:
+    """The modules of this project that calls go through."""
+
+    def __init__(self) -> None:
+        self.stack: list[str] = []
+        self.order: dict[str, int] = {}
+        self.again: Counter[tuple[str, str]] = Counter()
+        self._names: dict[str, str] = {}
+
+    def __call__(self, frame: FrameType, event: str, _: Any) -> None:
+        if event not in ("call", "return"):
+            return
+        name = self._name(frame)
+        if event == "return":
+            if self.stack:
+                self.stack.pop()
+            return
+        above = self.stack[-1] if self.stack else ""
+        if name and name != above:
+            if name not in self.order:
+                self.order[name] = len(set(self.stack))
+            elif name in self.stack:
+                self.again[name, above] += 1
+        self.stack.append(name or above)
+
+    def _name(self, frame: FrameType) -> str:
+        file = frame.f_code.co_filename
+        if file not in self._names:
+            path = Path(file)
+            inside = path.relative_to(ROOT) if path.is_relative_to(ROOT) else Path("elsewhere")
+            known = inside.parts[0] in PACKAGES and inside.as_posix() != MAPS
+            self._names[file] = ".".join(inside.with_suffix("").parts) if known else ""
+        return self._names[file]
+
+
+def followed() -> Followed:
+    cv2.setNumThreads(1)  # what other threads call is not followed
+    from drawn_project import write_project
+
+    from pipeline.files.project_file import read_project
+    from pipeline.measuring.measure_stage import measure_project
+    from pipeline.progress import Reporter
+    from pipeline.results.comparator_file import write_comparator
+
+    with TemporaryDirectory() as place:
+        path = write_project(Path(place), ["frame"])
+        grain = np.random.default_rng(2).normal(9000.0, 900.0, (400, 400))
+        tifffile.imwrite(path.with_name("grain.tif"), grain.astype(np.uint16))
+        project = read_project(path)
+        calls = Followed()
+        sys.setprofile(calls)
+        try:
+            scans = measure_project(project, Reporter(), Path(place) / "learned")
+            pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
+            write_comparator(project.comparator, [scan.frame for scan in scans], pitch_um)
+        finally:
+            sys.setprofile(None)
+    return calls
+
+
+def main() -> None:
+    calls = followed()
+    for name, depth in calls.order.items():
+        print(f"{'  ' * depth}{name}")
+    print(f"\nentered again from one that they have called: {len(calls.again)}")
+    for (name, above), count in calls.again.most_common():
+        print(f"  {name}, from {above}: {count} times")
+
+
+if __name__ == "__main__":
+    main()
