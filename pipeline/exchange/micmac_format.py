@@ -71,27 +71,30 @@ def _camera_files(block: Block, camera: str, frames: Sequence[OutFrame], options
     left_out = []
     if fiducials:
         files["Ori-InterneScan/MeasuresCamera.xml"] = xml_text(_marks("Glob", fiducials))
-    for frame in frames:
+    usable = []
+    for frame in frames if fiducials else ():
         marks = frame.observed(fiducials=True)
-        if len(marks) < _FEWEST or not fiducials:
+        if len(marks) < _FEWEST:
             left_out.append(f"{frame.image}: {len(marks)} fiducials are observed, and MicMac's affine fit needs three.")
             continue
+        usable.append(frame)
         places = frame.pixels(marks) + CONVENTION.first_pixel_px
         named = {mark.point: place for mark, place in zip(marks, places, strict=True)}
         lines = _marks(frame.file_name, named, _sigmas_px(marks, sum(frame.known_pitch_um) / 2000.0))
         files[f"Ori-InterneScan/MeasuresIm-{frame.file_name}.xml"] = xml_text(lines)
-    oriented = [frame for frame in frames if frame.is_oriented]
+    oriented = [frame for frame in (usable if fiducials else frames) if frame.is_oriented]
     if not oriented:
         return Written(files, notes=_no_orientation(camera), left_out=tuple(left_out))
     lens = nearest_lens(block, oriented[0], (BROWN,), ExportOptions(largest_misfit_px=options.largest_misfit_px))
-    box = box_of(block, oriented[0], options)
+    box = box_of(block, oriented[0], options) if fiducials else picture_box(block, oriented[0])
+    reech = _REECH if fiducials else ""
     misfit = {each.image: (lens.largest_mm + sight_misfit_mm(block, each)) / box.pitch_mm for each in oriented}
     check_misfit(misfit, options, "micmac")
     calibration = f"Ori-Reseau/AutoCal_{_file_word(camera)}.xml"
     files[calibration] = _calibration(lens, box)
     for frame in oriented:
-        files[f"Ori-Reseau/Orientation-{_REECH}{frame.file_name}.xml"] = _orientation(frame, calibration)
-    files["Measures-S2D.xml"] = _measures(block, oriented, box)
+        files[f"Ori-Reseau/Orientation-{reech}{frame.file_name}.xml"] = _orientation(frame, calibration)
+    files["Measures-S2D.xml"] = _measures(block, oriented, box, reech)
     files["Measures-S3D.xml"] = _ground(block)
     notes = _notes(camera, oriented, fiducials, box, max(misfit.values()))
     return Written(files, notes=notes, left_out=tuple(left_out))
@@ -104,6 +107,16 @@ def box_of(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
     left, top = floor(corners[0, 0]), ceil(corners[1, 1])
     width, height = ceil(corners[1, 0]) - left, top - floor(corners[0, 1])
     return Canvas(left * pitch / 1000.0, top * pitch / 1000.0, pitch / 1000.0, width, height)
+
+
+def picture_box(block: Block, frame: OutFrame) -> Canvas:
+    """A digital camera's picture, which is not resampled. Raises InputError where its pixels are no squares."""
+    x_um, y_um = frame.known_pitch_um
+    if x_um != y_um:
+        raise InputError(
+            f"micmac: a pixel of {frame.image!r} is {x_um:g} x {y_um:g} um. Resample it, and export colmap."
+        )
+    return Canvas(0.0, 0.0, x_um / 1000.0, *block.size_px(frame))
 
 
 def _fiducials(block: Block, camera: str) -> dict[str, Array]:
@@ -175,8 +188,8 @@ def _orientation(frame: OutFrame, calibration: str) -> str:
     return xml_text(xml_lines("ExportAPERO", xml_lines("OrientationConique", content)))
 
 
-def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas) -> str:
-    """The points' marks in the frames that ReSampFid makes."""
+def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas, reech: str) -> str:
+    """The points' marks in the frames that ReSampFid makes, or in a digital camera's pictures."""
     images = []
     for frame in frames:
         marks = frame.observed(fiducials=False)
@@ -184,7 +197,7 @@ def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas) -> str:
         places = frame.model.camera_from_comparator(np.array([mark.xy_mm for mark in marks]).reshape(-1, 2))
         pixels = (places - (box.x_mm, box.y_mm)) * _Y_DOWN / box.pitch_mm + CONVENTION.first_pixel_px
         named = {mark.point: pixel for mark, pixel in zip(marks, pixels, strict=True) if mark.point in block.points}
-        images += _marks(f"{_REECH}{frame.file_name}", named, _sigmas_px(marks, box.pitch_mm))
+        images += _marks(f"{reech}{frame.file_name}", named, _sigmas_px(marks, box.pitch_mm))
     return xml_text(xml_lines("SetOfMesureAppuisFlottants", images))
 
 
@@ -205,7 +218,10 @@ def _ground(block: Block) -> str:
 def _notes(
     camera: str, frames: Sequence[OutFrame], fiducials: Mapping[str, Array], box: Canvas, misfit_px: float
 ) -> tuple[str, ...]:
-    pitch, right, bottom = box.pitch_mm, box.x_mm + box.width_px * box.pitch_mm, box.y_mm - box.height_px * box.pitch_mm
+    fitted = f"{camera}: the lens was fitted over the frame: it is off by {misfit_px:.2g} px at most."
+    if not fiducials:
+        return (fitted,)
+    right, bottom = box.x_mm + box.width_px * box.pitch_mm, box.y_mm - box.height_px * box.pitch_mm
     corners = ",".join(f"{value:.{_DIGITS}g}" for value in (box.x_mm, -box.y_mm, right, -bottom))
     beside = {frame.image: affine_misfit_px(frame, fiducials, box) for frame in frames}
     worst = max(beside, key=lambda image: beside[image])
@@ -213,11 +229,8 @@ def _notes(
         f"MicMac fits its affine transformation without weights: in image {worst} it lies up to {beside[worst]:.2g} px "
         "beside the adjusted one."
     )
-    return (
-        f'{camera}: mm3d ReSampFid ".*tif" {pitch:.{_DIGITS}g} BoxCh=[{corners}] makes the frames of Ori-Reseau.',
-        f"{camera}: the lens was fitted over the frame: it is off by {misfit_px:.2g} px at most.",
-        own,
-    )
+    command = f'mm3d ReSampFid ".*tif" {box.pitch_mm:.{_DIGITS}g} BoxCh=[{corners}]'
+    return (f"{camera}: {command} makes the frames of Ori-Reseau.", fitted, own)
 
 
 def affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canvas) -> float:

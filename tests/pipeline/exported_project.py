@@ -22,9 +22,9 @@ TRUTH = Truth(distortion=LENS, mirrored=(False, False, True, False), middle_mm=(
 POINTS = np.random.default_rng(8).uniform((-700.0, -700.0, -150.0), (700.0, 700.0, 150.0), (100, 3))
 
 
-def adjusted_project(folder: Path, truth: Truth = TRUTH, crs: str = "") -> Path:
+def adjusted_project(folder: Path, truth: Truth = TRUTH, crs: str = "", kind: str = "affine") -> Path:
     """project.toml of an adjusted project, with scans that have a size and nothing in them."""
-    network, _ = simulated(np.random.default_rng(1), truth, points=POINTS, noise=False)
+    network, _ = simulated(np.random.default_rng(1), truth, kind, points=POINTS, noise=False)
     path = write_project(network, folder)
     text = path.read_text(encoding="utf-8")
     more = f'crs = "{crs}"\n' if crs else ""

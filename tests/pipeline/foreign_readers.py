@@ -53,9 +53,9 @@ def brown(x: Array, y: Array, k1: float, k2: float, k3: float, p1: float, p2: fl
     )
 
 
-def micmac_px(folder: Path, image: str, points: Array) -> Array:
+def micmac_px(folder: Path, image: str, points: Array, before: str = "OIS-Reech_") -> Array:
     """X = R P + C; ideal = PP + F (x, y) / z; ModPhgrStd of the ideal pixel about CDist. Of ReSampFid's picture."""
-    pose = ElementTree.parse(folder / "Ori-Reseau" / f"Orientation-OIS-Reech_{image}.tif.xml").getroot()[0]
+    pose = ElementTree.parse(folder / "Ori-Reseau" / f"Orientation-{before}{image}.tif.xml").getroot()[0]
     outer = one(pose, "Externe")
     matrix = np.array([values(one(outer, "ParamRotation/CodageMatr"), f"L{i}") for i in (1, 2, 3)])
     x, y, z = matrix.T @ (points - values(outer, "Centre")).T

@@ -31,10 +31,13 @@ from foreign_readers import asp_px, colmap_px, metashape_mm, micmac_affine, micm
 from numpy.typing import NDArray
 from simulated import affine, rotation
 
+from adjust.functional_model.line_of_sight import LineOfSight
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
 from pipeline.exchange import asp_format, colmap_format, micmac_format, mmvii_format, opencv_format, pinhole
+from pipeline.exchange.block import read_block
 from pipeline.exchange.convention import FORMATS
 from pipeline.exchange.map_projection import lon_lat
+from pipeline.files.project_file import read_project
 
 Array = NDArray[np.float64]
 
@@ -167,9 +170,6 @@ def test_mmvii_has_the_whole_covariance(project: Path, tmp_path: Path) -> None:
 
 
 def test_rho_changes_its_sign_where_rows_run_down(project: Path) -> None:
-    from pipeline.exchange.block import read_block
-    from pipeline.files.project_file import read_project
-
     mark = replace(read_block(read_project(project)).frames[0].marks[0], rho=0.3, sigma_mm=np.array([0.002, 0.004]))
     xx, xy, yy = mmvii_format._sigma2(mark, (20.0, 20.0))
     assert (xx, yy) == pytest.approx((0.01, 0.04))
@@ -369,6 +369,34 @@ def test_a_mirrored_scan_goes_out_resampled(project: Path, tmp_path: Path) -> No
     folder = exported(project, "opencv", tmp_path, "--lens")
     storage = cv2.FileStorage(str(folder / f"f{MIRRORED}.yml"), cv2.FILE_STORAGE_READ)
     assert np.linalg.det(storage.getNode("R").mat()) == pytest.approx(1.0)
+
+
+def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without fiducials and film the frame is the picture: comparator coordinates are the camera's."""
+    monkeypatch.setattr("simulated.FIDUCIALS", {})
+    here = replace(TRUTH, x0=125.4, y0=-125.3, mirrored=(False,) * 4)
+    project = adjusted_project(tmp_path, here, kind="none")
+    pixels = {i: camera_mm(i, here) * (1, -1) / PITCH_MM for i in IMAGES}
+    for format, (reader, _) in PINHOLES.items():
+        folder = exported(project, format, tmp_path)
+        off = np.linalg.norm(reader(folder, "f1", POINTS) - pixels[1], axis=1)
+        assert off.max() < 1.05 * told_misfit_px(folder) + SAME_PX
+    folder = exported(project, "micmac", tmp_path)
+    assert not (folder / "Ori-InterneScan").exists()
+    off = np.linalg.norm(micmac_px(folder, "f3", POINTS, "") - pixels[3], axis=1)
+    assert off.max() < 1.05 * told_misfit_px(folder) + SAME_PX
+
+
+def test_a_bent_sight_is_told(project: Path) -> None:
+    """The earth's curvature lowers a point at 700 m by 4 cm: some 3 um in the picture."""
+    block = read_block(read_project(project))
+    frame = block.frames[0]
+    assert frame.model is not None
+    assert pinhole.sight_misfit_mm(block, frame) == 0.0
+    bent = replace(frame, model=replace(frame.model, line_of_sight=LineOfSight(curvature=True)))
+    reach = np.hypot(*(POINTS - TRUTH.stations[0]).T[:2])
+    lowered_mm = TRUTH.c * reach**3 / (2 * 6.37e6) / (TRUTH.stations[0][2] - POINTS[:, 2]) ** 2
+    assert pinhole.sight_misfit_mm(block, bent) == pytest.approx(lowered_mm.max(), rel=0.2)
 
 
 def test_without_an_adjustment_the_marks_go_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,19 @@ def film(turn_deg: float, mirrored: bool) -> tuple[Film, Array, Array]:
     return Film("affine", np.array([*a, *b]), middle), matrix, shift
 
 
+@lru_cache
+def marked() -> tuple[Array, Array]:
+    """The middles (n, 2) of Gaussian marks, apart from one another, and their picture."""
+    grid = np.stack(np.meshgrid(np.arange(60.0, WIDTH - 60, 45), np.arange(60.0, HEIGHT - 60, 45)), -1).reshape(-1, 2)
+    middles = grid + np.random.default_rng(7).uniform(0.0, 1.0, grid.shape)
+    col, row = np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float)
+    x, y = (
+        np.exp(-((at - place[:, None]) ** 2) / (2 * BLUR_PX**2))
+        for at, place in zip((col, row), middles.T, strict=True)
+    )
+    return middles, 8000.0 + 20000.0 * y.T @ x
+
+
 def task(scan: Path, folder: Path, chain: FrameChain, degree: int = BEST) -> ResampleTask:
     return ResampleTask("a", "K", scan, chain, "0", 0.02, BEST if degree == BEST else FAST, None, folder / "a.tif")
 
@@ -74,6 +88,37 @@ def place_of(description: dict[str, float], shape: tuple[int, ...]) -> Array:
     col, row = np.meshgrid(np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float))
     x = description["x_mm"] + description["pitch_mm"] * col
     return np.stack([x, description["y_mm"] - description["pitch_mm"] * row], axis=-1)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("turn_deg", [0.4, 90.4, 180.3, 269.7])
+def test_marks_measured_in_the_frame_lie_where_the_transformation_puts_them(
+    turn_deg: float, mirrored: bool, tmp_path: Path
+) -> None:
+    """Gaussian marks, by least squares with their own form as the transformation turns it: within 0.002 px rms."""
+    middles, picture = marked()
+    tifffile.imwrite(tmp_path / "scan.tif", np.rint(picture).astype(np.uint16))
+    transformation, matrix, shift = film(turn_deg, mirrored)
+    assert resampled(task(tmp_path / "scan.tif", tmp_path, FrameChain(PITCH_UM, transformation))).problem == ""
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        frame = file.pages[0].asarray().astype(float)
+    said = described(tmp_path / "a.tif")
+    to_mm, to_px = np.diag([PITCH_UM[0], -PITCH_UM[1]]) / 1000.0, np.diag([1.0, -1.0]) / said["pitch_mm"]
+    there = ((middles @ to_mm) @ matrix.T + shift - (said["x_mm"], said["y_mm"])) @ to_px
+    form = to_px @ matrix @ to_mm
+    inverse = np.linalg.inv(BLUR_PX**2 * form @ form.T)
+    at = np.arange(-9, 10)
+    off = []
+    for x, y in there:
+        left, top = round(x), round(y)
+        d = np.stack(np.meshgrid(at + left - x, at + top - y), axis=-1)
+        seen = frame[top - 9 : top + 10, left - 9 : left + 10]
+        mark = np.exp(-np.einsum("ijk,kl,ijl->ij", d, inverse, d) / 2.0)
+        slopes = 20000.0 * mark[..., None] * (d @ inverse)
+        design = np.concatenate([np.stack([mark, np.ones_like(mark)], axis=-1), slopes], axis=-1).reshape(-1, 4)
+        off.append(np.linalg.lstsq(design, seen.ravel())[0][2:])
+    assert len(off) > 80
+    assert np.sqrt(np.mean(np.square(off))) < 0.002
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
