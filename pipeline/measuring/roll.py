@@ -6,9 +6,8 @@ is written on each adds to what tells how the camera has it. What is not told ev
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from hashlib import sha256
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from measure.pose.written_pose import bounded, line_score
 from measure.results import FrameMeasurement, Pose
 from measure.status import Status
 from measure.writing.line import KnownLine, Line, without_numbers
-from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask
+from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, few_of
 from pipeline.progress import Reporter
 from pipeline.results.measured_scan import MeasuredScan
 
@@ -91,9 +90,10 @@ def with_known_lines(
     return tuple(knowing), measured
 
 
-def _first(tasks: Iterable[ScanTask]) -> list[ScanTask]:
-    """Those of a camera on which all writing is read: in an order that another scan more does not change."""
-    return sorted(tasks, key=lambda task: sha256(task.name.encode("utf-8", "surrogateescape")).digest())[:_READ_FIRST]
+def _first(tasks: Sequence[ScanTask]) -> list[ScanTask]:
+    """Those of a camera on which all writing is read."""
+    few = few_of([task.name for task in tasks], _READ_FIRST)
+    return [task for task in tasks if task.name in few]
 
 
 def known_lines(frames: Sequence[FrameMeasurement]) -> tuple[KnownLine, ...]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 
 from adjust.problem.network import Distortion, Exterior, Prior
@@ -112,6 +113,12 @@ def scan_tasks(
         scan = project.scans.get(name)
         tasks.append(ScanTask(name, "" if scan is None else str(scan), shared[key], project.max_pixels))
     return tuple(tasks)
+
+
+def few_of(names: Sequence[str], count: int) -> list[str]:
+    """So many of them, in their order: the same ones where another name comes to them, but rarely."""
+    chosen = set(sorted(names, key=lambda name: sha256(name.encode("utf-8", "surrogateescape")).digest())[:count])
+    return [name for name in names if name in chosen]
 
 
 def _pose(project: Project, camera: CameraFile, name: str) -> tuple[str, Pose | None]:

@@ -13,7 +13,7 @@ from measure.scans.declared_tone import declared_tone
 from measure.scans.tone import SaidOfTone, Tone, power, srgb
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.scan_task import Measure, scan_tasks
+from pipeline.measuring.scan_task import Measure, few_of, scan_tasks
 from pipeline.progress import Reporter
 
 _SAMPLES = 4  # scans of a scanner that tell its curve to the others
@@ -36,7 +36,7 @@ def said_of_tones(project: Project, reporter: Reporter, measure: Measure) -> Map
     kinds: dict[str, list[str]] = {}
     for name in names:
         kinds.setdefault(_kind(project, name), []).append(name)
-    samples = {kind: _spread(of_kind) for kind, of_kind in kinds.items() if len(of_kind) > 1}
+    samples = {kind: few_of(of_kind, _SAMPLES) for kind, of_kind in kinds.items() if len(of_kind) > 1}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
     said = dict[str, SaidOfTone]()
     with reporter.stage("tone curve looked for in") as tell:
@@ -76,9 +76,3 @@ def _has_tip(mark: Mark | object) -> bool:
     if isinstance(mark, FrameCorner):
         return True
     return isinstance(mark, MarkShape) and any(isinstance(part, Polygon) for part in mark.parts)
-
-
-def _spread(names: Sequence[str]) -> list[str]:
-    """Some of them, from the first to the last."""
-    places = np.unique(np.linspace(0, len(names) - 1, min(_SAMPLES, len(names))).round().astype(int))
-    return [names[place] for place in places]

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.measuring import measured
 from pipeline.measuring.measured import measure_scans, measured_scan
-from pipeline.measuring.scan_task import ScanTask, scan_tasks
+from pipeline.measuring.scan_task import ScanTask, few_of, scan_tasks
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_scan import FailureCode, MeasuredScan
 from pipeline.results.measurement_file import read_measurement
@@ -121,6 +122,15 @@ def test_the_marks_of_another_camera_do_not_count(tmp_path: Path) -> None:
     before, after = both("0.1"), both("0.12")
     assert before[0].options_json() == after[0].options_json()
     assert before[1].options_json() != after[1].options_json()
+
+
+def test_few_of_many_scans_are_the_same_when_another_one_comes() -> None:
+    names = [f"roll/{number}" for number in range(60)]
+    few = [few_of(names[:count], 4) for count in range(10, 60)]
+    assert all(len(each) == 4 and each == sorted(each, key=names.index) for each in few)
+    assert sum(before != after for before, after in pairwise(few)) < 15  # 4 in so many, of each: 7 are to be expected
+    assert few_of(names[::-1], 4) == few_of(names, 4)[::-1]
+    assert few_of(names[:3], 4) == names[:3]
 
 
 class Watched:
