@@ -16,6 +16,7 @@ from measure.marks.frame_border import at_border
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.pose.pose_decision import decide_pose
+from measure.probabilities import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, Pose
 from measure.scans.scan import Scan
@@ -33,8 +34,6 @@ Array = NDArray[np.float64]
 _SET = ("set in the project.",)
 _UNSURE = Reason("none of the marks is measured without blemish: the frame may lie elsewhere.", Code.CHANCE)
 _TRIALS = 4  # placements tried at full resolution after the best one has failed
-_CHANCE = 0.01  # frames that chance may be expected to find in a scan without any, where the pitch is not as given
-_HOPELESS = 30.0  # the same before its marks are matched: a placement that chance makes will not become a frame
 _STRETCH = 3 * AFFINITY_SIGMA  # by which a given pitch may be wrong where marks are too faint to correct it
 _LOOKS = 2  # in the whole scan, and where the frame's edges put the marks
 _BESIDE = 0.95  # of the frame's size: a rival farther off is another photograph
@@ -156,7 +155,7 @@ def _at_first_look(
             break
         tried += len(others)
         placements, frames = _in_spite_of_pitch(search, others)
-        if frames and tried * expected_as_good(search, frames[0]) <= _CHANCE:
+        if frames and tried * expected_as_good(search, frames[0]) <= FRAMES_BY_CHANCE:
             found, frame = placements, frames[0]
         else:
             unsure += frames
@@ -259,7 +258,7 @@ def _hardly_chance(
     number.
 
     The marks' pictures need not be clear: whether a frame is there is one question, which pose it has another."""
-    best, least, unsure = None, _CHANCE, list[Frame]()
+    best, least, unsure = None, FRAMES_BY_CHANCE, list[Frame]()
     for place in _hopeful(search, found, tried):
         frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
         if not frames:
@@ -293,7 +292,7 @@ def _seen_px(frame: Frame) -> dict[int, Array]:
 def _hopeful(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
     """The best placement and its rivals elsewhere, without those of which chance makes many that answer as well."""
     places = (*found[:1], *_others(found))
-    return [place for place in places if tried * search.expected_alike(place) <= _HOPELESS]
+    return [place for place in places if tried * search.expected_alike(place) <= PLACEMENTS_BY_CHANCE]
 
 
 def _others(found: Sequence[Placement]) -> list[Placement]:
@@ -373,7 +372,7 @@ def _is_another_frame(search: FrameSearch, other: Placement, frame: Frame) -> bo
     """Whether a placement shows another frame, of as many marks: of two photographs in a scan one may answer better."""
     if other.supported < frame.placement.supported or not search.was_everywhere(other):
         return False
-    if search.expected_alike(other) > _CHANCE:
+    if search.expected_alike(other) > FRAMES_BY_CHANCE:
         return False
     seen = measure_frame(search.scan, search.layout, other, search.options)
     return seen.is_sure and not frame.has_all_of(seen)

@@ -13,7 +13,6 @@ from measure.status import Status
 
 Array = NDArray[np.float64]
 
-CHANCE = 0.01  # of doubting any good mark, of each check
 TOLD = np.log(100.0)  # log-odds at which one cause rather than another is taken for what is off
 MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
 

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, fdtrc
 
-from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, TOLD
+from measure.checks.doubts import MEDIAN_EFFICIENCY, TOLD
 from measure.checks.misfits import Misfit, Pattern, log_densities_wider
 from measure.film import SCATTER_DEGREES
+from measure.probabilities import FALSE_DOUBT
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ class Explanation:
         """What is strange costs as much as it is rare."""
         strange = sum((each.film_mm is not None) + len(each.off_mm) for each in self.frames.values())
         misfits = [each.under(self.film) for each in self.frames.values()]
-        return self.pattern.log_density(misfits) + strange * float(np.log(CHANCE))
+        return self.pattern.log_density(misfits) + strange * float(np.log(FALSE_DOUBT))
 
     @property
     def chance_of_pattern(self) -> float:
@@ -90,9 +91,9 @@ def explained(misfits: Mapping[int, Misfit], sigma_mm: Array, free_mm: float, be
         open_ = [place for place, each in frames.items() if each.film_mm is None]
         chances = {place: _chance(frames[place], pattern, film, believed_mm) for place in open_}
         least = min(chances.values(), default=1.0)
-        if least * len(frames) >= CHANCE:
+        if least * len(frames) >= FALSE_DOUBT:
             return result
-        odd = [p for p in open_ if chances[p] * len(frames) < CHANCE and _log(chances[p]) < _AS_ODD * _log(least)]
+        odd = [p for p in open_ if chances[p] * len(frames) < FALSE_DOUBT and _log(chances[p]) < _AS_ODD * _log(least)]
         frames = {
             place: _explained(replace(each, chance=chances[place]), result, place) if place in odd else each
             for place, each in frames.items()
@@ -154,5 +155,5 @@ def _film(misfits: list[Misfit], pattern: Pattern, before: Film, believed_mm: fl
     )[(len(misfits) - 1) // 2]
     degrees = MEDIAN_EFFICIENCY * sum(each.degrees for each in misfits)
     variance = (SCATTER_DEGREES * believed_mm**2 + degrees * shown) / (SCATTER_DEGREES + degrees)
-    is_more = bool(chdtrc(degrees, degrees * shown / believed_mm**2) < CHANCE)
+    is_more = bool(chdtrc(degrees, degrees * shown / believed_mm**2) < FALSE_DOUBT)
     return Film(float(np.sqrt(variance)), SCATTER_DEGREES + degrees, is_more)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.checks.doubts import CHANCE, TOLD, Doubt, doubted
+from measure.checks.doubts import TOLD, Doubt, doubted
 from measure.checks.explanation import Explanation, explained
 from measure.checks.misfits import Misfit, scan_sites
 from measure.checks.second_places import by_second_places
@@ -24,6 +24,7 @@ from measure.checks.triangles import by_triangles
 from measure.covariance import Cause
 from measure.film import SCATTER_MM
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.probabilities import FALSE_DOUBT
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement
 
@@ -92,7 +93,7 @@ def _shared(
         return explained(misfits, given_mm, 0.0, film_mm), NO_REASON
     by_places = _with_pattern(misfits, given_mm, film_mm)
     poses = [pose.name if (pose := frame.pose) else "0" for frame in frames.values()]
-    is_clear = by_places.chance_of_pattern >= CHANCE
+    is_clear = by_places.chance_of_pattern >= FALSE_DOUBT
     is_quiet = not (by_places.film.is_more or any(each.film_mm or each.off_mm for each in by_places.frames.values()))
     if is_clear and (is_quiet or len(set(poses)) == 1):
         return explained(misfits, given_mm, 0.0, film_mm), NO_REASON
@@ -105,7 +106,7 @@ def _shared(
     }
     by_scanner = _with_pattern(turned, np.zeros(len(sites)), film_mm)
     lead = by_scanner.log_evidence - by_places.log_evidence
-    if lead > TOLD and by_scanner.chance_of_pattern < CHANCE:
+    if lead > TOLD and by_scanner.chance_of_pattern < FALSE_DOUBT:
         return by_scanner, _of_scanner(by_scanner)
     if is_clear:
         return explained(misfits, given_mm, 0.0, film_mm), NO_REASON

@@ -6,12 +6,12 @@ from scipy.special import ndtri
 
 from measure.film import AFFINITY_SIGMA
 from measure.marks.shapes import FiducialLayout
+from measure.probabilities import RIGHT_PITCH_REFUSED
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement
 
 Array = NDArray[np.float64]
 
-_CHANCE = 0.01  # of calling a right pitch wrong
 _LEAST_MARKS = 3  # with two, a false one makes a pitch of its own
 
 
@@ -34,7 +34,7 @@ def pitch_problem(
     if not lever_mm > given:
         return None
     sigma = float(np.hypot(AFFINITY_SIGMA, given / lever_mm))
-    limit = -float(ndtri(_CHANCE / 2 / 2)) * sigma
+    limit = -float(ndtri(RIGHT_PITCH_REFUSED / 2 / 2)) * sigma
     excess = seen_um / np.asarray(pitch_um) - 1
     if np.abs(excess).max() <= limit:
         return None

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, fdtrc
 
-from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, Doubt, observed
+from measure.checks.doubts import MEDIAN_EFFICIENCY, Doubt, observed
 from measure.covariance import Cause
 from measure.frames.frame import may_be_wrong
+from measure.probabilities import FALSE_DOUBT
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 
@@ -33,7 +34,7 @@ def by_second_places(frames: Sequence[FrameMeasurement]) -> Iterator[dict[str, D
     told = iter(zip(by_noise.tolist(), among_others.tolist(), strict=True))
     for own in tested:
         chances = [(mark, *next(told)) for mark in own]
-        yield {mark.point: _doubt(mark, among < CHANCE) for mark, noise, among in chances if noise < CHANCE}
+        yield {mark.point: _doubt(mark, among < FALSE_DOUBT) for mark, noise, among in chances if noise < FALSE_DOUBT}
 
 
 def _chances(squares: Array) -> Array:

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri, fdtrc, logsumexp
 
-from measure.checks.doubts import CHANCE, MEDIAN_EFFICIENCY, TOLD, Doubt, observed
+from measure.checks.doubts import MEDIAN_EFFICIENCY, TOLD, Doubt, observed
 from measure.covariance import Cause
 from measure.film import AFFINITY_SIGMA, MOST_BENT_MM, SCATTER_MM
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.probabilities import FALSE_DOUBT
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 
@@ -107,7 +108,7 @@ def _against_given(form: _Form, names: Sequence[str], given_mm: Array, tests: in
     """Of the marks called names, whose given places are known to given_mm (3,)."""
     covariance = form.covariance(given_mm) + _STRETCH
     chance = float(chdtrc(_FORM, _misfit(form.stretched, covariance)))
-    if chance * tests >= CHANCE:
+    if chance * tests >= FALSE_DOUBT:
         return None
     return _explained(form, form.stretched, covariance, names, _GIVEN, chance)
 
@@ -134,7 +135,7 @@ def _against_others(
         worst = max((n for n, place in enumerate(places) if place in three), key=lambda n: misfits[n])
         degrees = MEDIAN_EFFICIENCY * _FORM * (len(places) - 1)
         chance = float(fdtrc(_FORM, degrees, misfits[worst] / _FORM))
-        if chance * tests >= CHANCE:
+        if chance * tests >= FALSE_DOUBT:
             break
         form = left.pop(places[worst])
         found[places[worst]] = _explained(form, apart[worst], covariances[worst], names, _OTHERS, chance)

@@ -14,6 +14,7 @@ from scipy.special import fdtrc
 from measure.fitting.picture_model import GREY, PictureModel
 from measure.noise.noise import REACH_PX, NoiseModel, autocovariance, correlated
 from measure.noise.pixel_sums import products
+from measure.probabilities import BORDER_FEIGNED
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,7 +25,6 @@ _POWERS = 3  # of the picture that an edge is summed with: 0 to 2
 _LEAST_SIDE = 0.05  # of the area: a smaller one is no ground beyond a border
 _FEWEST = 3  # pixels to an unknown
 _LEAST_LEFT = 1e-4  # of a change of contrast, beside the step: less cannot be told from it
-_CHANCE = 1e-12  # that noise feigns a border: the luckiest of some hundred, in one of many million marks
 
 
 class LikelyBorder(NamedTuple):
@@ -55,7 +55,7 @@ def is_overwhelming(chi_square: float, greys: int, noise: NoiseModel, redundancy
     it than as many others would, by the sum of their squared correlations (Bartlett).
     """
     alike = float(np.sum(noise.autocovariance_dn2**2)) / max(noise.variance_dn2**2, 1e-300)
-    return bool(fdtrc(greys, max(redundancy / max(alike, 1.0), 1.0), chi_square / greys) < _CHANCE)
+    return bool(fdtrc(greys, max(redundancy / max(alike, 1.0), 1.0), chi_square / greys) < BORDER_FEIGNED)
 
 
 class _Search:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, log_ndtr
 
 from measure.noise.noise import robust_scale
+from measure.probabilities import NATURAL_END
 from measure.scans.scan import Scan
 
 Array = NDArray[np.float64]
@@ -26,7 +27,6 @@ _LOG_DENSITY = -0.5 * np.log(2 * np.pi)
 _TAIL = 2.0  # standard deviations below the greatest value
 _LEAST_STEPS = 1.5  # of the scan's grey values in a standard deviation: in less noise an even ground is a pile as well
 _FEWEST = 20  # pixels: fewer bend no fit
-_CHANCE = 1e-6  # of a natural end: there are many windows
 _GROSS = 3.5  # standard deviations: beyond it a residual is damage
 _SCALE_ROUNDS = 8  # each leaves at most two fifths of what was wrong
 _CLEAR = 3.0  # standard deviations of the noise
@@ -118,7 +118,7 @@ def _is_cut(grey: NDArray[np.floating]) -> bool:
     if beside.sum() < _FEWEST or not sigma > _LEAST_STEPS * step:
         return False
     tail = int((grey >= greatest - _TAIL * sigma).sum())
-    return bool(bdtrc(pile - 1, tail, step / (_TAIL * sigma)) < _CHANCE)
+    return bool(bdtrc(pile - 1, tail, step / (_TAIL * sigma)) < NATURAL_END)
 
 
 def _limits(full_scale_dn: float) -> set[float]:

@@ -11,6 +11,7 @@ from measure.fitting.matching import Match
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import look_at_frame
 from measure.marks.shapes import FiducialLayout
+from measure.probabilities import CAMERA_BY_CHANCE
 from measure.scans.scan import Scan
 from measure.search.candidates import Effort
 from measure.search.constellation import Placement
@@ -19,7 +20,6 @@ from measure.search.pitches import PitchHypothesis
 
 _COMPARED = 5  # best placements: the one that chance makes least is among them
 _QUICK = Effort(held_bytes=84 << 20, half_px=16)
-_SURE = 0.01  # constellations expected by chance: other pitches need not be tried
 _PLACES = 2  # that are looked at
 
 
@@ -43,7 +43,7 @@ def answer(
         found = search.anywhere(group)[:_COMPARED]
         ranked += [(tried * search.expected_alike(placement), placement) for placement in found]
         ranked.sort(key=lambda each: each[0])
-        if ranked and ranked[0][0] <= _SURE:
+        if ranked and ranked[0][0] <= CAMERA_BY_CHANCE:
             break
     return Answer(ranked[0][0] if ranked else np.inf, tuple(placement for _, placement in ranked))
 

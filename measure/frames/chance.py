@@ -14,6 +14,7 @@ from scipy.special import bdtrc
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
 from measure.frames.frame_sighter import first_search_px
+from measure.probabilities import FRAME_BY_CHANCE
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 from measure.search.constellation import sign_of
@@ -22,7 +23,6 @@ from measure.search.prediction import MarkPrediction
 
 Array = NDArray[np.float64]
 
-_LIKELY = 0.05  # probability of chance above which a frame is doubted
 _SELDOM, _HOPELESS = 1e-3, 1e6  # expected frames: fewer are no question, and of more nothing becomes a frame
 _COUNTED = 3  # marks that at least are no chance
 _PLACES = 64  # that are looked at beside the marks: enough to tell three marks of four from chance
@@ -72,7 +72,7 @@ def _by_the_scan(search: FrameSearch, frame: Frame, clear: dict[int, Array]) -> 
     if len(clear) <= _FREE or not search.was_everywhere(frame.placement):
         return NO_REASON
     expected = expected_where_seen(search, frame, clear)
-    if expected <= _LIKELY:
+    if expected <= FRAME_BY_CHANCE:
         return NO_REASON
     return Reason(
         f"so much of the scan looks like the {len(clear)} marks found that chance would make {expected:.2g} such "
@@ -106,7 +106,7 @@ def _by_places_beside(search: FrameSearch, frame: Frame, inside: Sequence[int], 
     weakest = min((_response(search, frame, index, place, _FITTED_PX) for index, place in clear.items()), default=0.0)
     hits = sum(_response(search, frame, index, place, radius) >= weakest for index, place in places)
     chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, len(places))))
-    if chance <= _LIKELY:
+    if chance <= FRAME_BY_CHANCE:
         return NO_REASON
     return Reason(
         f"only {found} of {len(inside)} marks were clearly found, and {hits} of {len(places)} places beside them look "

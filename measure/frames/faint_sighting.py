@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from measure.fitting.matching import Match
 from measure.frames.faint_marks import FaintMark, find_faint
-from measure.frames.frame_sighter import CHANCE, FrameSighter
+from measure.frames.frame_sighter import FrameSighter
 from measure.frames.refinement import Sighting
 from measure.frames.unseen import Ground, reason_unseen
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FrameCorner, Mark
+from measure.probabilities import TEXTURE_LIKE_A_FAINT_MARK
 from measure.reason import Code, Reason
 from measure.search.prediction import MarkPrediction
 
@@ -123,4 +124,4 @@ def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark
 def _is_certain(sighter: FrameSighter, seen: FaintMark) -> bool:
     """Whether neither texture nor rounding feigns it."""
     strong = abs(seen.fit.contrast_dn) >= _FAINT_CONTRAST * sighter.scan.full_scale_dn
-    return seen.chance <= CHANCE and strong
+    return seen.chance <= TEXTURE_LIKE_A_FAINT_MARK and strong

@@ -10,6 +10,7 @@ from scipy.special import ndtr
 
 from measure.fitting.matching import window_about
 from measure.marks.rendering import extent_px, known_picture
+from measure.probabilities import NOISE_LIKE_A_MARK
 from measure.scans.scan import Scan
 from measure.search.candidates import FAINT, detail_px
 from measure.search.prediction import MarkPrediction
@@ -18,7 +19,6 @@ from measure.search.response_layers import highest
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-_CHANCE = 0.05  # of noise as coarse as the window's: what is likelier is not worth a fit
 _SURE = 1e-6  # what is less likely is the mark, however soft: there are many marks
 _HALVED_PX = 6.0  # of the finest line: from there on half the resolution shows it as well
 _SHARP_PX, _SOFT_PX = 1.0, 2.5  # blur of the picture that is looked for: a fine line seen softly is another picture
@@ -32,7 +32,7 @@ def seen(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None:
     if looks[0].chance > _SURE:
         looks.append(_Look(scan, expected, _SOFT_PX))
     best = min(looks, key=lambda look: look.chance)
-    return (best.center_px, best.chance) if best.chance <= _CHANCE else None
+    return (best.center_px, best.chance) if best.chance <= NOISE_LIKE_A_MARK else None
 
 
 def strongest(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:

@@ -9,6 +9,7 @@ from scipy.special import chdtrc
 from measure.film import SCATTER_MM
 from measure.fitting.matching import Match
 from measure.frames.refinement import Sighting
+from measure.probabilities import LARGE_ERROR
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.told_tone import FrameTone
 from measure.scans.tone import LINEAR
@@ -23,7 +24,7 @@ CLEAR_DAMAGE = 0.25  # of a mark: with more of it gone, what is left may be anot
 _CLEAR_SNR = 3.0  # contrast over the noise of a pixel: with less a mark is weak
 _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit any similarity
 _CHECKED = 4  # marks that agree: an affine transformation through them has a check
-WRONG_PX, WRONG_CHANCE = 0.5, 0.0015  # an error that a mark called measured must not have, and its probability
+WRONG_PX = 0.5  # an error that a mark called measured must not have
 _PLAIN_SIGMA_PX = 0.25  # in plain noise a standard deviation says all; on a landscape it knows of in part only
 _MOST_UNLIKE = 0.03  # of a mark that its drawing may lack: with more gone, what is left may still be another's
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
@@ -156,7 +157,7 @@ class Frame:
 
 def may_be_wrong(covariance_px2: Array) -> bool:
     """Whether a mark so well known (2, 2) may have an error that one called measured must not have."""
-    return bool(chdtrc(2, (WRONG_PX / largest_sigma_px(covariance_px2)) ** 2) > WRONG_CHANCE)
+    return bool(chdtrc(2, (WRONG_PX / largest_sigma_px(covariance_px2)) ** 2) > LARGE_ERROR)
 
 
 def largest_sigma_px(covariance_px2: Array) -> float:

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.film import AFFINITY_SIGMA
+from measure.probabilities import TRUE_MARK_A_STRANGER
 
 Array = NDArray[np.float64]
 
-_STRANGE = 1e-3  # probability of taking any true mark for a stranger, were the film's deformation random
 _MANY = 8  # marks whose scatter says more than the gate
 _LEAST_GATE = 0.1  # of the gate: film bends marks so far off, however well most agree
 
@@ -67,7 +67,7 @@ def strangers(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, gate
             )
             off = np.hypot(*(up_mm[kept] - predicted).T)
             chance = np.array([_chance(*pair) for pair in zip(size * off, fits, strict=True)])
-            strange = (size > _LEAST_GATE * gate_mm) & (chance < _STRANGE / len(kept)) | (size > gate_mm)
+            strange = (size > _LEAST_GATE * gate_mm) & (chance < TRUE_MARK_A_STRANGER / len(kept)) | (size > gate_mm)
             worst = int(np.where(strange, chance, 2.0).argmin())
         else:
             strange = size > gate_mm

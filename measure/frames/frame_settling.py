@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from measure.covariance import Cause
 from measure.fitting.generators import is_round
 from measure.fitting.matching import Match
-from measure.frames.frame import WRONG_CHANCE, WRONG_PX
+from measure.frames.frame import WRONG_PX
 from measure.frames.frame_sighter import FrameSighter
 from measure.frames.mark_comparison import (
     SharedBlur,
@@ -25,6 +25,7 @@ from measure.marks.rendering import reach_px
 from measure.marks.shapes import Disk, Mark, MarkShape, Ring
 from measure.match_options import MatchOptions
 from measure.noise.noise import may_be_noise
+from measure.probabilities import LARGE_ERROR
 from measure.reason import Code, Reason
 from measure.scans.told_tone import FrameTone, ToldTone
 from measure.scans.tone import Tone
@@ -158,7 +159,7 @@ def compare_sizes(sighter: FrameSighter) -> None:
                 px_per_mm = float(np.sqrt(abs(np.linalg.det(linear))))
                 touch = touch_of_round(size, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
                 sighter.widen(index, Cause.TOUCHED, touch.variance_px2 * np.eye(2))
-                if is_damaged and not size.differs and touch.beyond(WRONG_PX) > WRONG_CHANCE:
+                if is_damaged and not size.differs and touch.beyond(WRONG_PX) > LARGE_ERROR:
                     told = (
                         f"it is {size.ratio:.2f} times as large as the other marks and damaged beside it: something "
                         f"may touch it and have moved it by more than {WRONG_PX} px"

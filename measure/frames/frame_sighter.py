@@ -16,6 +16,7 @@ from measure.frames.frame_fit import fit_frame, strangers
 from measure.frames.refinement import Sighting, nothing_within, sight
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
+from measure.probabilities import TEXTURE_LIKE_A_FAINT_MARK
 from measure.reason import Reason
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import LUMINANCE, SINGLE_CHANNELS, Scan
@@ -34,7 +35,6 @@ MANY = 6  # marks that agree and tell where a faint one must be
 _CLEAR_RESPONSE = 0.25  # correlation of marks before they are fitted, where likenesses are CLEAR_LIKENESS
 _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
 _REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
-CHANCE = 1e-4  # of texture feigning a faint mark so strongly so near to its place: one in some five hundred places
 
 
 def first_search_px(
@@ -119,7 +119,7 @@ class FrameSighter:
                 continue
             expected = replace(self.expected(index, self.gate_px), surroundings=CLOSE)
             seen = sight(self.scan, expected, self.options.match)
-            if seen.fit is not None and seen.chance <= CHANCE and _is_plain(seen.fit):
+            if seen.fit is not None and seen.chance <= TEXTURE_LIKE_A_FAINT_MARK and _is_plain(seen.fit):
                 self.sightings[index] = replace(seen, closer=True)
 
     def look_astray(self, indices: Sequence[int]) -> None:
@@ -218,7 +218,7 @@ class FrameSighter:
         """At a closer look a mark may be as faint as what texture feigns, where it hardly ever does so near by."""
         sighting = sight(self.scan, self.expected(index, search_px), self.options.match)
         fit, closer = sighting.fit, self.placement.surroundings == CLOSE
-        sure = closer and sighting.chance <= CHANCE
+        sure = closer and sighting.chance <= TEXTURE_LIKE_A_FAINT_MARK
         least = (0.0, _FAINT_SIGNIFICANCE) if sure else (_LEAST_LIKENESS, _LEAST_SIGNIFICANCE)
         if fit is not None and (fit.likeness < least[0] or fit.significance < least[1]):
             return Sighting(sighting.predicted_px, True, None, nothing_within(search_px))

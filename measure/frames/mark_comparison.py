@@ -17,6 +17,7 @@ from scipy.special import ndtr
 from measure.fitting.matching import Match
 from measure.fitting.own_shape import OwnShape
 from measure.fitting.picture_model import PIXEL_VARIANCE_PX2
+from measure.probabilities import MARK_UNLIKE_THE_OTHERS
 
 Array = NDArray[np.float64]
 # The standard deviation of a figure from mark to mark, by the variance that so many marks show beyond their own.
@@ -24,7 +25,6 @@ _Spread = Callable[[float, int], float]
 
 _FEWEST_BLURS = 3  # other marks: of fewer nobody knows by how much they differ
 _FEWEST_SHAPES = 2  # the same: how much sizes differ is known beforehand, but not which of two marks is off
-_CHANCE = 0.01  # of doubting any good mark of a frame
 _BLUR_SPREAD = 0.05  # of the logarithm: so much blur differs within a field
 _TELLING = 0.05  # of the same: a standard deviation of the place is wrong by no more where its blur is known so well
 # By so much exposure spreads the marks of a frame in the logarithm of their size and, its edges being uneven, in
@@ -56,7 +56,7 @@ class SharedBlur:
         observation by the root of what it takes from its variance."""
         moved = _log_seen_px(fit.blur_px) - _log_seen_px(self.blur_px)
         off = abs(moved) / np.sqrt(max(self.sigma**2 - fit.blur_sigma**2, 1e-12))
-        return bool(fit.blur_sigma < self.sigma and 2 * ndtr(-off) >= _CHANCE)
+        return bool(fit.blur_sigma < self.sigma and 2 * ndtr(-off) >= MARK_UNLIKE_THE_OTHERS)
 
 
 def shared_blurs(fits: Sequence[Match]) -> list[SharedBlur | None]:
@@ -214,7 +214,7 @@ def _told(own: Array, sigma: Array, index: int, spread: _Spread, fewest: int) ->
     mean, mean_sigma, apart = _mean(own[others], sigma[others], spread)
     predicted = float(np.hypot(mean_sigma, apart))
     off = abs(own[index] - mean) / np.hypot(predicted, sigma[index])
-    return _Told(mean, predicted, bool(2 * ndtr(-off) * len(own) < _CHANCE))
+    return _Told(mean, predicted, bool(2 * ndtr(-off) * len(own) < MARK_UNLIKE_THE_OTHERS))
 
 
 def _mean(values: Array, sigma: Array, spread: _Spread) -> tuple[float, float, float]:

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
 from measure.noise.noise import robust_scale
+from measure.probabilities import POINT_OFF_ITS_RAY
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -14,7 +15,6 @@ Mask = NDArray[np.bool_]
 FEWEST_PAIRS = 16  # twice what the geometry is computed from
 _CONFIDENCE, _TRIALS = 0.9999, 10000  # of MAGSAC: that it finds the geometry, and how often it tries at most
 _NEIGHBOURS = 8  # whose median distance is what lens and film bend
-_CHANCE = 1e-4  # that a right point is called a contradiction
 
 
 def agreeing(first: Array, second: Array, tolerance: float) -> Mask:
@@ -42,7 +42,7 @@ def contradicting(first: Array, second: Array, tolerance: float) -> Mask:
     distance = _sampson(np.asarray(matrix, np.float64)[:3], first, second)
     near = np.asarray(cKDTree(first).query(first, _NEIGHBOURS + 1)[1])[:, 1:]
     alone = distance - np.median(distance[near], axis=1)
-    limit = -float(ndtri(_CHANCE / 2)) * robust_scale(alone)
+    limit = -float(ndtri(POINT_OFF_ITS_RAY / 2)) * robust_scale(alone)
     return np.asarray(np.abs(alone) > limit)
 
 

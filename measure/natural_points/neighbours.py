@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
+from measure.probabilities import POINT_OFF_ITS_NEIGHBOURS
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
@@ -17,7 +19,6 @@ _NEIGHBOURS = 12  # that tell the map about a point: four times its unknowns, fo
 _ROUNDS = 2  # a false point may draw its neighbours' maps: in the second it is none of theirs
 _REWEIGHTINGS = 10  # of least distances
 _LEAST_PX = 0.1  # distances below it weigh alike, and what neighbours scatter at least
-_CHANCE = 1e-4  # that a right point is called astray
 
 
 def astray(first: Array, second: Array) -> Mask:
@@ -32,7 +33,7 @@ def astray(first: Array, second: Array) -> Mask:
             return np.zeros(len(first), dtype=bool)
         ratios = _ratios(first, second, np.flatnonzero(~strange))
         usual, large = np.quantile(ratios, (0.5, float(ndtr(1.0))))
-        strange = np.asarray(ratios > usual - float(ndtri(_CHANCE)) * (large - usual))
+        strange = np.asarray(ratios > usual - float(ndtri(POINT_OFF_ITS_NEIGHBOURS)) * (large - usual))
     return strange
 
 

@@ -22,6 +22,7 @@ from measure.natural_points.neighbours import astray
 from measure.natural_points.tie_candidates import TieCandidate, widened
 from measure.natural_points.tie_frame import TieFrame
 from measure.noise.noise import robust_scale
+from measure.probabilities import POINT_REFUSED
 from measure.reason import Code, Reason
 from measure.scans.parallel import mapped
 
@@ -45,7 +46,6 @@ _UNEVEN = Reason(
 _OTHER_PICTURE = Reason(
     "the picture about the point is unlike that in the other scans: something else", Code.OTHER_SCANS
 )
-_CHANCE = 1e-4  # that a test refuses a right point
 _PRECISE_PX = 0.125  # rms length of the error of the weakest measured point: half a pixel is four times as much
 
 
@@ -194,7 +194,7 @@ def _straightened(points: Sequence[TiePoint]) -> list[TiePoint]:
     known: dict[tuple[int, int], list[Bending]] = defaultdict(list)
     for point in points:
         for frame, piece in point.matched.items():
-            if piece.bending is not None and piece.unevenness >= _CHANCE:
+            if piece.bending is not None and piece.unevenness >= POINT_REFUSED:
                 known[point.candidate.reference, frame].append(piece.bending)
     variances = {pair: bending_variance(bendings) for pair, bendings in known.items()}
     nothing = np.zeros((6, 6))
@@ -226,7 +226,7 @@ def _straight(piece: Matched, variance: Array) -> Matched:
 def _judge(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
     """What speaks against the points, each compared with all others."""
     for point in points:
-        point.refused = {frame: _UNEVEN for frame in point.standing if point.matched[frame].unevenness < _CHANCE}
+        point.refused = {frame: _UNEVEN for frame in point.standing if point.matched[frame].unevenness < POINT_REFUSED}
     _refuse_strange_pictures(points)
     _refuse_contradictions(frames, points, partial(contradicting, tolerance=_FINE_PX), _OFF_LINES)
     _refuse_contradictions(frames, points, astray, _UNLIKE_NEIGHBOURS)
@@ -242,7 +242,7 @@ def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
                 strangeness[frame].append((point, float(np.log(point.matched[frame].variance / np.mean(others)))))
     for frame, rows in strangeness.items():
         values = np.array([value for _, value in rows])
-        limit = np.median(values) - float(ndtri(_CHANCE)) * robust_scale(values)
+        limit = np.median(values) - float(ndtri(POINT_REFUSED)) * robust_scale(values)
         for point, value in rows:
             if value > limit:
                 point.refused[frame] = _OTHER_PICTURE

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scipy.fft import dct
 from scipy.special import ndtri, stdtrit
 
+from measure.probabilities import JPEG_GRID, JPEG_STEP
+
 Array = NDArray[np.float64]
 
 BLOCK_PX = 8
@@ -18,8 +20,6 @@ _PERIODS = 5  # coefficients (u, v) with 0 < u + v below it: up to two periods i
 _STEPS_DN = np.arange(2, 51)  # a step of 1 takes nothing away; 50 is that of quality 15
 _BIN_DN = 0.25
 _LARGEST_DN = 150.0  # of a coefficient that is looked at: three times the largest step
-_CHANCE = 1e-6  # that a picture without such a grid is thought to have one
-_STEP_CHANCE = 0.01  # that a coefficient without a step is given one, where the picture has the grid
 
 
 def earlier_step_dn(grey: NDArray[np.floating]) -> float:
@@ -33,9 +33,9 @@ def earlier_step_dn(grey: NDArray[np.floating]) -> float:
     strength = combs.max(axis=2).sum(axis=1)
     best = int(strength.argmax())
     clearness, steps = combs[best].max(axis=1), _STEPS_DN[combs[best].argmax(axis=1)]
-    if clearness.max() < _limit(_CHANCE, combs.size) or not _stands_out(strength[best], np.delete(strength, best)):
+    if clearness.max() < _limit(JPEG_GRID, combs.size) or not _stands_out(strength[best], np.delete(strength, best)):
         return 0.0
-    return float(steps[clearness > _limit(_STEP_CHANCE, len(_STEPS_DN))].mean())
+    return float(steps[clearness > _limit(JPEG_STEP, len(_STEPS_DN))].mean())
 
 
 def _coefficients(grey: NDArray[np.floating]) -> Array:
@@ -79,5 +79,5 @@ def _limit(chance: float, looks: int) -> float:
 def _stands_out(strength: float, others: Array) -> bool:
     """Whether one of the places differs from all others as chance does not make it (Student's t)."""
     spread = others.std(ddof=1) * np.sqrt(1 + 1 / len(others))
-    limit = -stdtrit(len(others) - 1, _CHANCE / (len(others) + 1))
+    limit = -stdtrit(len(others) - 1, JPEG_GRID / (len(others) + 1))
     return bool(strength - others.mean() > limit * spread)

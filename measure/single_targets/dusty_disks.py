@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from measure.noise.noise import SIGMA_OF_DEVIATION
+from measure.probabilities import LARGE_ERROR, MUCH_DUST
 from measure.reason import NO_REASON, Code, Reason
 from measure.single_targets.disks import FittedDisk
 
 Array = NDArray[np.float64]
 
 _LARGE_PX = 0.3  # the error that a small target must not have
-_LARGE_CHANCE = 0.0015  # of it, that is borne: of 384 such errors in 840 rendered frames it leaves two unflagged
 # What dust that moves a disk by more does to it, rms of 148 rendered disks: to size, stretch, shear, px of the radius
 # (one edge is moved by twice as much as the disk), the contrast's logarithm, and the blur's variance, px².
 # Then to the place with sloping paint against the matched one, px, which less dust does not move.
@@ -35,7 +35,6 @@ _BEFORE, _WHOLE, _DAMAGED = 20.0, (0.9, 0.085, 0.0125, 0.0025), (0.56, 0.36, 0.0
 _MUCH = slice(2, None)
 _FEWEST = 8  # that tell how much targets differ
 _DUST_PX = 4.0  # the shorter half axis up to which dust may pass for a disk or hide its edge: it is seldom larger
-_SHOWN = 0.05  # the probability of much dust that has the disk called unlike the others
 _FORM = slice(0, 3)  # size, stretch and shear among the figures of an appearance
 _ROUNDS, _SETTLED = 60, 1e-4
 _LEAST_SPREAD = 1e-4  # no frame's targets are alike to better than 1 %, nor is the linearisation of their noise
@@ -60,13 +59,13 @@ def doubts(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> list[Reas
 def _doubt(disk: FittedDisk, off: Array, kinds: Array) -> Reason:
     """Of one that dust may look like; off (5,): how far its appearance is from that of the others; kinds (kinds,): the
     probability of each kind of dust."""
-    if kinds[_MUCH].sum() < _SHOWN:
+    if kinds[_MUCH].sum() < MUCH_DUST:
         sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
         chances = chdtrc(2, _LARGE_PX**2 / (sigma**2 + _DUST_MOVES_PX**2))
-        if chances[0] > _LARGE_CHANCE:
+        if chances[0] > LARGE_ERROR:
             return Reason(f"faint: good to {sigma:.2f} px only", Code.IMPRECISE)
         hidden = Reason(f"dust that puts it {_LARGE_PX} px off may hide in it", Code.DUST)
-        return hidden if chances @ kinds > _LARGE_CHANCE else NO_REASON
+        return hidden if chances @ kinds > LARGE_ERROR else NO_REASON
     size, *form, contrast, variance = off
     return Reason(
         f"unlike the other targets: {np.exp(size):.2f} times their size, {np.exp(contrast):.2f} times their "

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.sheet_places import FLAT, SeenSheet, along_plane, sheet_points
+from measure.probabilities import SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.single_targets.common_points import ImagePoints, compared_together
@@ -18,7 +19,6 @@ from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 
-_DOUBTED, _REFUSED = 0.01, 1e-4  # the chance of doubting, or refusing, any right mark of all pictures
 _WITNESSES = 3  # other pictures: two just tell where a point is that lies off its sheet
 
 
@@ -118,11 +118,11 @@ def _judged(scan: MeasuredScan, verdicts: Mapping[str, _Verdict]) -> MeasuredSca
 def _judged_mark(mark: MarkMeasurement, verdict: _Verdict) -> MarkMeasurement:
     """Without another picture nobody knows whether the mark is off its place, or the point on the sheet; of a few which
     one is off."""
-    if verdict.chance > _DOUBTED:
+    if verdict.chance > SHEET_POINT_OFF_PLACE:
         return mark
     witnesses = "the sheet's other points" + (" and other pictures" if verdict.others else "")
     how = f"it lies {verdict.off_px:.2f} px from where {witnesses} put it"
-    if (verdict.others >= _WITNESSES or verdict.is_beyond) and verdict.chance < _REFUSED:
+    if (verdict.others >= _WITNESSES or verdict.is_beyond) and verdict.chance < SHEET_POINT_ELSEWHERE:
         return replace(
             mark, status=Status.REJECTED, reason=Reason(f"another mark, or one disturbed: {how}", Code.OFF_PLACE)
         )

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_vector
+from measure.probabilities import TARGET_ELSEWHERE, TARGET_OFF_PLACE
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.single_targets.shared_offsets import TargetPlaces, compared
@@ -20,8 +21,6 @@ Array = NDArray[np.float64]
 
 _TURN_RAD, _SHIFT = 0.1, 0.1  # how wrong an orientation may be, the latter of the distance
 _STEP = 1e-3  # of these, for derivatives
-_STRANGE = 1e-3  # the chance that a right target lies farther off, below which it is doubted...
-_IMPOSSIBLE = 1e-6  # ...and refused: in a thousand fields of a thousand targets one is
 
 
 def checked_places(
@@ -44,10 +43,10 @@ def checked_places(
 
 def _judged(mark: MarkMeasurement, verdicts: Mapping[str, tuple[float, float]]) -> MarkMeasurement:
     off_px, chance = verdicts.get(mark.point, (0.0, 1.0))
-    if chance > _STRANGE:
+    if chance > TARGET_OFF_PLACE:
         return mark
     how = f"it lies {off_px:.2f} px from where the other targets put it"
-    if chance < _IMPOSSIBLE:
+    if chance < TARGET_ELSEWHERE:
         wrong = Reason(f"another mark, or the point's coordinates are wrong: {how}", Code.OFF_PLACE)
         return replace(mark, status=Status.REJECTED, reason=wrong)
     reason = Reason(f"{how}, as one of {1.0 / chance:.0f} right ones does", Code.OFF_PLACE)
