@@ -73,8 +73,8 @@ def run_adjust(project: Project, reporter: Reporter) -> Summary:
     with unpublished(project) as new:
         with reporter.stage("adjusting") as count:
             count(project.comparator.name, 0, 1)
-            adjustment = adjust_marks(project, _given_marks(project, new))
-        _write_adjustment(project, adjustment, new)
+            # Not kept: what is written takes as much memory, and is read again for the summary.
+            _write_adjustment(project, adjust_marks(project, _given_marks(project, new)), new)
         earlier = project.adjustment_path
         if earlier.exists() and of_file(earlier) != of_file(new.at(earlier)):
             new.remove(project.check_path)  # it belongs to the earlier one

@@ -12,7 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from measure.status import Status
+from pipeline.report.camera_views import fiducial_form
 from pipeline.report.data import ReportData
+from pipeline.report.fiducials import Figure
+from pipeline.report.frame_views import camera_of
 from pipeline.report.marks import current_scans
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.verdict import Verdict, camera_is_calibrated, judge
@@ -20,12 +23,13 @@ from pipeline.results.measured_record import pose_record
 
 STYLES = {"good": "bold green", "look": "bold yellow", "failed": "bold red"}
 Json = dict[str, Any]
+FRAME_ROWS = 50  # of frames at most in a table in the terminal: the report has all
 
 
 @dataclass(frozen=True)
 class Summary:
     """The end of a command. poses: of the scans, each with its evidence, as measurement.json has them. files: what was
-    written, by a word for it."""
+    written, by a word for it. forms: of the fiducials of cameras of which nothing else was adjusted."""
 
     verdict: Verdict
     frames: Mapping[str, Mapping[str, int]]
@@ -33,6 +37,7 @@ class Summary:
     adjustment: Json | None
     check: Json | None
     files: Mapping[str, Path] = field(default_factory=dict)
+    forms: Mapping[str, Figure] = field(default_factory=dict)
 
     def as_json(self) -> Json:
         return {
@@ -56,7 +61,17 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
         counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
         counts[mark.status] += 1
     poses = {name: pose_record(scan.frame.pose) for name, scan in current_scans(data).items() if scan.frame.pose}
-    return Summary(judge(data), frames, poses, data.adjustment, data.check, files)
+    return Summary(judge(data), frames, poses, data.adjustment, data.check, files, _forms(data))
+
+
+def _forms(data: ReportData) -> dict[str, Figure]:
+    stored, covariance = data.adjustment, data.covariance
+    if stored is None or covariance is None or not stored["converged"]:
+        return {}
+    uncalibrated = [name for name, camera in stored["cameras"].items() if not camera_is_calibrated(camera)]
+    images = {name: [image for image in stored["images"] if camera_of(data, image) == name] for name in uncalibrated}
+    found = {name: fiducial_form(name, stored, covariance, images[name]) for name in uncalibrated}
+    return {name: form for name, form in found.items() if form is not None}
 
 
 def print_summary(summary: Summary, console: Console) -> None:
@@ -74,6 +89,8 @@ def print_summary(summary: Summary, console: Console) -> None:
     if summary.adjustment:
         calibrated = any(camera_is_calibrated(camera) for camera in summary.adjustment["cameras"].values())
         console.print((_camera_table if calibrated else _film_table)(summary.adjustment))
+        for name, form in summary.forms.items():
+            console.print(_form_table(name, form))
     for note in summary.verdict.notes:
         console.print(Text(note, style="dim"))
     for word, path in summary.files.items():
@@ -87,11 +104,17 @@ def _main_numbers(adjustment: Json) -> Json:
 
 def _frame_table(frames: Mapping[str, Mapping[str, int]], poses: Mapping[str, Json]) -> Table:
     columns = ("image", "pose", *Status) if poses else ("image", *Status)
-    table = Table(*(str(column) for column in columns), title="Marks", title_justify="left")
+    title, fewest_measured = "Marks", sorted(frames, key=lambda name: frames[name][str(Status.MEASURED)])
+    shown = set(fewest_measured[:FRAME_ROWS])
+    if len(shown) < len(frames):
+        title += f"; the {len(shown)} of {len(frames)} frames with the fewest measured"
+    table = Table(*(str(column) for column in columns), title=title, title_justify="left")
     for name, counts in frames.items():
-        pose = poses.get(name)
-        told = "" if pose is None else pose["name"] + ("" if pose["decided"] else ", assumed")
-        table.add_row(Text(name), *([told] if poses else []), *(str(counts[status]) for status in Status))
+        if name in shown:
+            pose = poses.get(name)
+            told = "" if pose is None else pose["name"] + ("" if pose["decided"] else ", assumed")
+            row = [told] if poses else []
+            table.add_row(Text(name), *row, *(str(counts[status]) for status in Status))
     return table
 
 
@@ -102,11 +125,31 @@ def _film_table(adjustment: Json) -> Table:
     if datum:
         title += f"; given fiducials: rms {datum['rms_x_um']:.2f}, {datum['rms_y_um']:.2f} um"
     columns = ("image", "transformation", "fiducials", "rms x, um", "rms y, um")
+    squares: dict[str, list[tuple[float, float]]] = {}
+    for row in adjustment["residuals"]:
+        squares.setdefault(row["image"], []).append((row["vx_um"] ** 2, row["vy_um"] ** 2))
+    rms = {name: np.sqrt(np.mean(of_image, axis=0)) for name, of_image in squares.items()}
+    worst = sorted(rms, key=lambda name: -float(np.hypot(*rms[name])))[:FRAME_ROWS]
+    shown = [name for name in adjustment["images"] if name in set(worst)]
+    if len(shown) < len(rms):
+        title += f"; the {len(shown)} of {len(rms)} frames with the largest residuals"
     table = Table(*columns, title=title, title_justify="left")
-    for name, image in adjustment["images"].items():
-        v_um = np.array([(row["vx_um"], row["vy_um"]) for row in adjustment["residuals"] if row["image"] == name])
-        rms = [f"{value:.2f}" for value in np.sqrt((v_um**2).mean(axis=0))]
-        table.add_row(Text(name), image["transformation"]["kind"], str(len(v_um)), *rms)
+    for name in shown:
+        kind = adjustment["images"][name]["transformation"]["kind"]
+        table.add_row(Text(name), kind, str(len(squares[name])), *(f"{value:.2f}" for value in rms[name]))
+    return table
+
+
+def _form_table(name: str, form: Figure) -> Table:
+    """Where marks stand otherwise than they are given, free of the datum, and the distances across."""
+    title = f"Form of the fiducials of {name}, less the given one, free of what its films take up"
+    table = Table("mark", "x, um", "sigma", "y, um", "sigma", title=title, title_justify="left")
+    sigmas = np.sqrt(np.maximum(np.diag(form.covariance_um2), 0.0)).reshape(-1, 2)
+    for id, change, sigma in zip(form.ids, form.change_um, sigmas, strict=True):
+        table.add_row(Text(id), *(f"{value:.3f}" for pair in zip(change, sigma, strict=True) for value in pair))
+    for each in form.distances:
+        between = Text(f"{each.start} to {each.end}: {each.length_mm:.4f} mm")
+        table.add_row(between, f"{each.change_um:.3f}", f"{each.sigma_um:.3f}", "", "")
     return table
 
 

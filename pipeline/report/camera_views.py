@@ -19,6 +19,7 @@ from pipeline.results.adjustment_reader import Covariance
 PLOT_PX = 560.0
 LONGEST_VECTOR_PX = 60.0
 CURVE_TABLE_ROWS = 6
+FINE_UM = 0.05  # standard deviation of a form below which tenths of a micrometre do not show it
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,13 @@ class CameraView:
     """A camera, ready to print; None or empty where the files do not hold what is needed."""
 
     name: str
+    calibrated: bool
     images: int
     radius_mm: float
     parameters: list[ParameterRow]
     groups: list[str]
     in_given_figure: list[tuple[str, str, str]]
+    distances: list[fiducials.Distance]
     correlations: list[tuple[str, str, float]]
     trade_offs: list[str]
     curves: Markup | None
@@ -87,18 +90,22 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
     images = [image for image in stored["images"] if camera_of(data, image) == name]
     by_image = residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
-    covariance = data.covariance if stored["converged"] and camera_is_calibrated(camera) else None
+    known = data.covariance if stored["converged"] else None
+    calibrated = camera_is_calibrated(camera)
+    covariance = known if calibrated else None
     radius_mm, frame_mm = _observed_radius_mm(camera, rows), data.frame_mm.get(name)
-    form = fiducials.figure(name, camera, covariance) if covariance else None
+    form = fiducial_form(name, stored, known, images) if known else None
     curve = _curves(name, camera, covariance, radius_mm, frame_mm) if covariance else None
     check: Json | None = data.check["cameras"].get(name) if data.check else None
     return CameraView(
         name=name,
+        calibrated=calibrated,
         images=len(images),
         radius_mm=radius_mm,
-        parameters=parameter_rows(name, camera, stored["sigma0"] or 1.0, radius_mm),
+        parameters=parameter_rows(name, camera, stored["sigma0"] or 1.0, radius_mm) if calibrated else [],
         groups=group_sentences(camera),
-        in_given_figure=_in_given_figure(form) if form else [],
+        in_given_figure=_in_given_figure(form) if form and calibrated else [],
+        distances=form.distances if form else [],
         correlations=high_correlations(name, camera, covariance) if covariance else [],
         trade_offs=_trade_offs(name, stored),
         curves=lens.curves_plot(curve, radius_mm) if curve else None,
@@ -133,6 +140,15 @@ def _trade_offs(name: str, stored: Json) -> list[str]:
         for each in stored["correlations"]
         if each["parameters"][0].startswith(f"IO.{name}.")
     ]
+
+
+def fiducial_form(name: str, stored: Json, covariance: Covariance, images: list[str]) -> fiducials.Figure | None:
+    """The figure of a camera's fiducials, free of its datum: with its interior orientation, or by its films alone."""
+    camera = stored["cameras"][name]
+    if camera_is_calibrated(camera):
+        return fiducials.figure(name, camera, covariance)
+    kinds = {stored["images"][image]["transformation"]["kind"] for image in images}
+    return fiducials.figure_of_films(name, camera, covariance, kinds)
 
 
 def _in_given_figure(form: fiducials.Figure) -> list[tuple[str, str, str]]:
@@ -186,9 +202,10 @@ def _fiducial_row(id: str, fiducial: Json, form: fiducials.Figure | None) -> Fid
     changed = changed_sigma = (fixed(None), fixed(None))
     if form and id in form.ids:
         at = form.ids.index(id)
-        change, sigma = form.change_um[at], np.sqrt(np.maximum(np.diag(form.covariance_um2[at]), 0.0))
-        changed = (fixed(change[0], 1, sign=True), fixed(change[1], 1, sign=True))
-        changed_sigma = (fixed(sigma[0], 1), fixed(sigma[1], 1))
+        change, sigma = form.change_um[at], np.sqrt(np.maximum(np.diag(form.of_marks_um2[at]), 0.0))
+        digits = 1 if sigma.min() >= FINE_UM else 3
+        changed = (fixed(change[0], digits, sign=True), fixed(change[1], digits, sign=True))
+        changed_sigma = (fixed(sigma[0], digits), fixed(sigma[1], digits))
     return FiducialRow(
         id=id,
         x=value_and_sigma(x["value"], x["sigma"]),

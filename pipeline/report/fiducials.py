@@ -1,6 +1,6 @@
 """Fiducial marks, given against estimated, as a figure that is free of the datum in which the camera stands."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,11 +20,23 @@ MARGIN_PX = 58.0
 
 
 @dataclass(frozen=True)
-class Figure:
-    """The camera, laid over its given fiducials by the shift, rotation and scale that fit them best.
+class Distance:
+    """Between two marks, in the given figure: mm, less the given one in um, and its standard deviation in um."""
 
-    ids (n); given_mm (n, 2); change_um (n, 2): what is left of estimated less given; covariance_um2 (n, 2, 2) of each
-    mark's change. interior_mm (3,): c, x0', y0' laid over along with the marks, interior_sigma_mm (3,).
+    start: str
+    end: str
+    length_mm: float
+    change_um: float
+    sigma_um: float
+
+
+@dataclass(frozen=True)
+class Figure:
+    """The camera, laid over its given fiducials by what its datum leaves open, and fits them best.
+
+    ids (n); given_mm (n, 2); change_um (n, 2): what is left of estimated less given; covariance_um2 (2n, 2n) of all
+    changes. interior_mm (3,): c, x0', y0' laid over along with the marks, interior_sigma_mm (3,); empty without an
+    interior orientation.
     """
 
     ids: tuple[str, ...]
@@ -34,6 +46,29 @@ class Figure:
     interior_mm: Array
     interior_sigma_mm: Array
 
+    @property
+    def of_marks_um2(self) -> Array:
+        """(n, 2, 2) of each mark's change."""
+        at = np.arange(len(self.ids))
+        return self.covariance_um2.reshape(len(at), 2, len(at), 2)[at, :, at, :]
+
+    @property
+    def distances(self) -> list[Distance]:
+        """From every mark to that which lies farthest from it."""
+        apart = np.linalg.norm(self.given_mm[:, None] - self.given_mm, axis=2)
+        pairs = np.sort(np.stack([np.arange(len(apart)), apart.argmax(axis=1)], axis=1), axis=1)
+        return [self._distance(int(i), int(j)) for i, j in np.unique(pairs, axis=0)]
+
+    def _distance(self, i: int, j: int) -> Distance:
+        changed_mm = self.given_mm + 1e-3 * self.change_um
+        vector_mm = changed_mm[j] - changed_mm[i]
+        length_mm, given_mm = np.linalg.norm(vector_mm), np.linalg.norm(self.given_mm[j] - self.given_mm[i])
+        by_places = np.zeros((len(self.ids), 2))
+        by_places[j], by_places[i] = vector_mm / length_mm, -vector_mm / length_mm
+        variance_um2 = float(by_places.ravel() @ self.covariance_um2 @ by_places.ravel())
+        change_um = 1e3 * float(length_mm - given_mm)
+        return Distance(self.ids[i], self.ids[j], float(length_mm), change_um, float(np.sqrt(max(variance_um2, 0.0))))
+
 
 def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
     """A camera's entry of adjustment.json, free of its datum; None with fewer than three given fiducials.
@@ -42,35 +77,45 @@ def figure(name: str, camera: Json, covariance: Covariance) -> Figure | None:
     the interior orientation share. Values are laid over the given marks by a Helmert transformation, and the covariance
     by the S-transformation (Baarda 1973) C' = S C S' with S = I - G (G_f'G_f)^-1 G_f', G_f the rows of the marks.
     """
-    known = {id: fiducial for id, fiducial in camera["fiducials"].items() if _given(fiducial) is not None}
-    if len(known) < 3:
+    ids, given, estimated = _marks(camera)
+    if len(ids) < 3:
         return None
-    count = 2 * len(known)
     point = camera["principal_point_mm"]
     c, x0, y0 = (q["value"] for q in (camera["principal_distance_mm"], point["x"], point["y"]))
-    given = np.array([_given(fiducial) for fiducial in known.values()])
-    estimated = np.array([(fiducial["x_mm"]["value"], fiducial["y_mm"]["value"]) for fiducial in known.values()])
     turn_and_scale, shift = _helmert(estimated, given)
-
-    marks = [f"FID.{name}.{id}.{axis}" for id in known for axis in "xy"]
-    s = _s_transformation(estimated, c, (x0, y0))
-    reduced = s @ covariance.of([*marks, *(f"IO.{name}.{each}" for each in ("c", "x0", "y0"))]) @ s.T
-    blocks = reduced[:count, :count].reshape(len(known), 2, len(known), 2)
-    at = np.arange(len(known))
+    interior = [f"IO.{name}.{each}" for each in ("c", "x0", "y0")]
+    s = _s_transformation(_similarities(estimated, c, (x0, y0)), 2 * len(ids))
+    reduced = s @ covariance.of([*_names(name, ids), *interior]) @ s.T
     principal_point = turn_and_scale @ (x0, y0) + shift
     return Figure(
-        ids=tuple(known),
+        ids=ids,
         given_mm=given,
         change_um=1e3 * (estimated @ turn_and_scale.T + shift - given),
-        covariance_um2=1e6 * blocks[at, :, at, :],
+        covariance_um2=1e6 * reduced[:-3, :-3],
         interior_mm=np.array([c * np.sqrt(np.linalg.det(turn_and_scale)), *principal_point]),
-        interior_sigma_mm=np.sqrt(np.maximum(np.diag(reduced)[count:], 0.0)),
+        interior_sigma_mm=np.sqrt(np.maximum(np.diag(reduced)[-3:], 0.0)),
     )
+
+
+def figure_of_films(name: str, camera: Json, covariance: Covariance, kinds: Iterable[str]) -> Figure | None:
+    """The same of a camera of which only fiducials were adjusted, with films of these kinds of transformation.
+
+    Nothing but the films holds the marks' figure: its datum takes up all that each film can, of an affine one
+    affinity and shear besides, of others at least as much. None where that is more than the marks tell.
+    """
+    ids, given, estimated = _marks(camera)
+    motions = _common_to_films(estimated, set(kinds)) if len(ids) else np.empty((0, 0))
+    if 2 * len(ids) <= motions.shape[1]:
+        return None
+    s = _s_transformation(motions, 2 * len(ids))
+    change_mm = (s @ (estimated - given).ravel()).reshape(-1, 2)
+    covariance_mm2 = s @ covariance.of(_names(name, ids)) @ s.T
+    return Figure(ids, given, 1e3 * change_mm, 1e6 * covariance_mm2, np.empty(0), np.empty(0))
 
 
 def figure_plot(change: Figure) -> Markup:
     """The given places, the change of each mark as a stroke, and the 95 % ellipse about its end."""
-    axes, angles = ellipse_axes(change.covariance_um2)
+    axes, angles = ellipse_axes(change.of_marks_um2)
     radius = np.sqrt(chdtri(2, 0.05)) * axes
     reach = np.hypot(*change.change_um.T) + radius.max(axis=1)
     px_per_um = svg.round_step(LONGEST_PX / float(reach.max())) if reach.max() > 0.0 else 1.0
@@ -102,9 +147,21 @@ def figure_plot(change: Figure) -> Markup:
     )
 
 
+def _marks(camera: Json) -> tuple[tuple[str, ...], Array, Array]:
+    """The ids of the given marks, where they are given and where they are estimated (n, 2)."""
+    known = {id: fiducial for id, fiducial in camera["fiducials"].items() if _given(fiducial) is not None}
+    given = np.array([_given(fiducial) for fiducial in known.values()]).reshape(-1, 2)
+    estimated = np.array([(fiducial["x_mm"]["value"], fiducial["y_mm"]["value"]) for fiducial in known.values()])
+    return tuple(known), given, estimated.reshape(-1, 2)
+
+
 def _given(fiducial: Json) -> tuple[float, float] | None:
     x, y = fiducial["x_mm"].get("given"), fiducial["y_mm"].get("given")
     return None if x is None or y is None else (x["value"], y["value"])
+
+
+def _names(camera: str, ids: Iterable[str]) -> list[str]:
+    return [f"FID.{camera}.{id}.{axis}" for id in ids for axis in "xy"]
 
 
 def _helmert(source: Array, target: Array) -> tuple[Array, Array]:
@@ -116,22 +173,45 @@ def _helmert(source: Array, target: Array) -> tuple[Array, Array]:
     return matrix, target.mean(axis=0) - matrix @ source.mean(axis=0)
 
 
-def _s_transformation(marks: Array, c: float, principal_point: tuple[float, float]) -> Array:
-    """(2n + 3, 2n + 3): takes the marks' common shift, rotation and scale out of marks, c, x0' and y0'."""
-    center = marks.mean(axis=0)
-    x, y = (np.vstack([marks, principal_point]) - center).T
+def _s_transformation(motions: Array, marks: int) -> Array:
+    """(m, m): takes motions (m, d) out, as the first rows, those of the marks, have them."""
+    of_marks = motions.copy()
+    of_marks[marks:] = 0.0
+    return np.asarray(np.eye(len(motions)) - motions @ np.linalg.solve(of_marks.T @ of_marks, of_marks.T))
+
+
+def _similarities(marks: Array, c: float, principal_point: tuple[float, float]) -> Array:
+    """(2n + 3, 4): how marks, c, x0' and y0' change with their common shift, rotation and scale."""
+    x, y = (np.vstack([marks, principal_point]) - marks.mean(axis=0)).T
     ones, zeros = np.ones(len(x)), np.zeros(len(x))
     moved = [(ones, zeros, 0.0), (zeros, ones, 0.0), (-y, x, 0.0), (x, y, c)]
-    g = np.stack([_in_order(dx, dy, dc) for dx, dy, dc in moved], axis=1)
-    of_marks = g.copy()
-    of_marks[2 * len(marks) :] = 0.0
-    return np.asarray(np.eye(len(g)) - g @ np.linalg.solve(of_marks.T @ of_marks, of_marks.T))
+    return np.stack([_in_order(dx, dy, dc) for dx, dy, dc in moved], axis=1)
 
 
 def _in_order(dx: Array, dy: Array, dc: float) -> Array:
     """Changes of the marks and, last, of the principal point, in the order of the covariance."""
     changes = np.stack([dx, dy], axis=1)
     return np.concatenate([changes[:-1].ravel(), [dc], changes[-1]])
+
+
+def _common_to_films(marks: Array, kinds: set[str]) -> Array:
+    """(2n, d): how marks (n, 2) change with what films of all these kinds take up."""
+    x, y = ((marks - marks.mean(axis=0)) / max(float(np.ptp(marks)), 1.0)).T
+    ones, zeros = np.ones(len(x)), np.zeros(len(x))
+    moved = [(ones, zeros), (zeros, ones), (-y, x), (x, y)]
+    z, order = x + 1j * y, min((int(kind[:-1].partition("(")[2]) for kind in kinds if "(" in kind), default=1)
+    if all(kind.startswith("conformal") for kind in kinds):
+        moved += [(w.real, w.imag) for k in range(2, order + 1) for w in (z**k, 1j * z**k)]
+    elif not any(kind.startswith(("none", "congruent", "similarity", "conformal")) for kind in kinds):
+        moved += [(x, -y), (y, x)]
+        if kinds == {"projective"}:
+            moved += [(x * x, x * y), (x * y, y * y)]
+        elif kinds == {"bilinear"}:
+            moved += [(x * y, zeros), (zeros, x * y)]
+        elif all(kind.startswith("polynomial") for kind in kinds):
+            terms = [x ** (degree - k) * y**k for degree in range(2, order + 1) for k in range(degree + 1)]
+            moved += [pair for term in terms for pair in ((term, zeros), (zeros, term))]
+    return np.stack([np.stack(pair, axis=1).ravel() for pair in moved], axis=1)
 
 
 def ellipse_axes(covariance: Array) -> tuple[Array, Array]:

@@ -55,8 +55,12 @@ def _environment() -> Environment:
 def _context(data: ReportData) -> dict[str, Any]:
     shots = frames(data)
     adjustment = data.adjustment
+    cameras = camera_views(data)
+    calibrated = any(camera.calibrated for camera in cameras)
     return {
         "project": data.project,
+        "title": "Calibration report" if calibrated or not adjustment else "Film report",
+        "calibrated": calibrated,
         "version": version("reseau"),
         "made_from": ", ".join(f"{name} {fingerprint}" for name, fingerprint in data.made_from.items()) or "memory",
         "unit": data.unit,
@@ -68,7 +72,7 @@ def _context(data: ReportData) -> dict[str, Any]:
         "points_word": _points_word(shots),
         "measured": bool(data.measurement),
         "has_pictures": data.thumbnail is not None,
-        "cameras": camera_views(data),
+        "cameras": cameras,
         "scanners": scanner_views(data),
         "fractions": list(_fractions(shots)),
         "least_marks": LEAST_MARKS,

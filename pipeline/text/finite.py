@@ -6,11 +6,16 @@ from typing import Any
 
 
 def without_nan(value: Any) -> Any:
-    """The same with null for every number that is not finite: JSON knows no others."""
+    """The same with null for every number that is not finite: JSON knows no others.
+
+    What holds none is handed back as it is: a copy of a large result would take as much memory again.
+    """
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {key: without_nan(item) for key, item in value.items()}
+        cleaned = {key: without_nan(item) for key, item in value.items()}
+        return cleaned if any(cleaned[key] is not item for key, item in value.items()) else value
     if isinstance(value, list | tuple):
-        return [without_nan(item) for item in value]
+        items = [without_nan(item) for item in value]
+        return items if any(new is not old for new, old in zip(items, value, strict=True)) else value
     return value

@@ -1,6 +1,7 @@
 """Frames that show fiducial marks alone: their film transformations are adjusted, and nothing else is claimed."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,10 @@ def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.C
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert report.count("No exterior orientation") == 3
     assert "Exterior orientation</caption>" not in report
+    assert "Film report</p>" in report
+    assert not any(
+        word in report for word in ("OpenCV</h2>", "Calibration report", "Distortion</h2>", "Parameters</h2>")
+    )
     result = result_of(project)
     assert result["converged"]
     assert (result["unknowns"], result["redundancy"]) == (18, 8)
@@ -102,3 +107,22 @@ def test_the_film_transformation_can_be_chosen(tmp_path: Path, capsys: pytest.Ca
     """No lens to choose, but the kind of film: these marks have two scales that differ by 0.2 %."""
     assert run(["choose", str(write_project(tmp_path, {"a": 5, "b": 5}))]) == 0
     assert "The data ask for affine, no distortion" in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_form_of_the_fiducials_is_told_where_they_are_estimated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Marks with a datum of 1 mm: no figure of mm is left in the form, and the dashes are gone."""
+    project = write_project(tmp_path, {f"f{i}": 5 for i in range(60)})
+    camera = tmp_path / "camera.toml"
+    camera.write_text(camera.read_text(encoding="utf-8").replace("sigma_mm = 0\n", "sigma_mm = 1\n"), encoding="utf-8")
+    assert run(["run", str(project)]) == 0
+    printed = capsys.readouterr().out
+    assert "Form of the fiducials of K" in printed
+    assert "the 50 of 60 frames" in " ".join(printed.split())
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    form = report[report.index("Fiducial marks, given against estimated") :]
+    sigmas_um = [float(text) for pair in re.findall(r">([\d.]+) × ([\d.]+)</td></tr>", form)[:5] for text in pair]
+    assert len(sigmas_um) == 10
+    assert 0.05 < max(sigmas_um) < 1e3 * SIGMA_MM / np.sqrt(60)
+    assert "Distances across" in form
