@@ -91,7 +91,8 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
     by_image = residuals_by_image(data)
     rows = [row for image in images for row in by_image.get(image, [])]
     known = data.covariance if stored["converged"] else None
-    calibrated = camera_is_calibrated(camera)
+    # Where there is no solution, none of what is missing was left out.
+    calibrated = camera_is_calibrated(camera) or not stored["converged"]
     covariance = known if calibrated else None
     radius_mm, frame_mm = _observed_radius_mm(camera, rows), data.frame_mm.get(name)
     form = fiducial_form(name, stored, known, images) if known else None

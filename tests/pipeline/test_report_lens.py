@@ -184,7 +184,7 @@ def test_an_uncertain_datum_leaves_the_ellipses_as_they_are() -> None:
     datum = shift @ shift.T + rotation @ rotation.T
     free, bound = changed(GIVEN, local + datum), changed(GIVEN, local)
     np.testing.assert_allclose(free.covariance_um2, bound.covariance_um2, atol=1e-6)
-    assert np.all(np.sqrt(np.linalg.eigvalsh(free.covariance_um2)) < 3.1)
+    assert np.all(np.sqrt(np.linalg.eigvalsh(free.of_marks_um2)) < 3.1)
 
 
 def test_one_displaced_mark_is_the_one_that_changed_most() -> None:
