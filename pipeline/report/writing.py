@@ -7,7 +7,7 @@ from measure.writing.line import Line
 from pipeline.report import svg
 from pipeline.results.measured_scan import MeasuredScan
 
-_WIDTH_PX = 640.0
+_WIDTH_PX = 1000.0  # plates of 20 mm on film of 230 are read
 _LEAST_PX = 7.0  # of letters
 
 
@@ -19,7 +19,7 @@ def written(scan: MeasuredScan | None) -> Markup | None:
     zoom = _WIDTH_PX / max(scan.width_px, scan.height_px)
     width, height = scan.width_px * zoom, scan.height_px * zoom
     evidence = " ".join(scan.frame.pose.evidence if scan.frame.pose else ())
-    drawn = [svg.line([0, width, width, 0], [0, 0, height, height], "scan", closed=True)]
+    drawn = [svg.line([1, width - 1, width - 1, 1], [1, 1, height - 1, height - 1], "scan", closed=True)]
     drawn += [_line(line, zoom, f'"{line.text}"' in evidence) for line in scan.frame.writing]
     return svg.picture(width, height, "What is written about the frame, as it lies in the scan", *drawn, class_="film")
 
