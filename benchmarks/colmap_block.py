@@ -22,7 +22,6 @@ from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.blocks.block_stage import OrientedBlock, run_block
 from pipeline.blocks.mapping import run_mapping
 from pipeline.blocks.ties import similarity
-from pipeline.exchange.colmap_format import imported
 from pipeline.files.points_file import GivenPoints
 from pipeline.files.project_file import Project, read_project
 from pipeline.progress import Reporter
@@ -157,7 +156,7 @@ def with_control(project: Project, scene: Scene) -> Project:
         ObjectPoint(f"control-{number}", *(Prior(float(value), CONTROL_SIGMA_M) for value in xyz))
         for number, xyz in enumerate(given)
     ]
-    settings = replace(project.adjust, datum="control", robust=True, variance_components=True)
+    settings = replace(project.adjust, datum="control")
     return replace(project, given_points=GivenPoints(tuple(points), {}), adjust=settings)
 
 
@@ -208,14 +207,22 @@ def tell(adjustment: Adjustment, scene: Scene) -> None:
         for mark in camera.fiducials
         for axis, value in zip("xy", mark.xy_mm, strict=True)
     ]
+    ground = np.array(
+        [
+            [adjustment.value(f"PT.{point.id}.{axis}") for axis in "XYZ"]
+            for point in adjustment.network.points
+            if point.id.startswith("tie-")
+        ]
+    )
+    above = ground[:, 2] - scene_terrain(scene).heights(ground[:, :2])
+    print(f"ground: {np.mean(above):+.3f} m, rms {np.sqrt(np.mean(above**2)):.3f} m beside the terrain")
     print(f"fiducials: rms {np.sqrt(np.mean(np.square(worst))):.2f}, at most {max(worst):.2f} sigmas")
 
 
 def tell_alone(block: OrientedBlock, scene: Scene) -> None:
     """COLMAP by itself, its camera estimated as it does by default, its block laid on the true stations."""
-    pycolmap = imported()
     folder = block.project.comparator.parent
-    alone = run_mapping(pycolmap, block.pictures, folder, True)
+    alone = run_mapping(block.pictures, folder, True)
     truth = {image.name: np.array(image.exterior) for image in scene.images}
     names = sorted(alone.poses)
     stations = np.array([-rotation.T @ shift for rotation, shift in (alone.poses[name] for name in names)])

@@ -39,8 +39,7 @@ def mapped(
 ) -> Mapped:
     """The largest part of the block that COLMAP orients. refine_camera: let it estimate the camera, too, as it does by
     default. Raises InputError where it orients nothing."""
-    pycolmap = imported()
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap = quiet_colmap()
     database = folder / "colmap.db"
     for left in folder.glob("colmap.db*"):
         left.unlink()
@@ -48,11 +47,19 @@ def mapped(
         own = [picture for picture in pictures if picture.camera == camera]
         _extract(pycolmap, database, folder, own, cameras[camera])
     _match(pycolmap, database, len(pictures))
-    return run_mapping(pycolmap, pictures, folder, refine_camera)
+    return run_mapping(pictures, folder, refine_camera)
 
 
-def run_mapping(pycolmap: Any, pictures: Sequence[BlockPicture], folder: Path, refine_camera: bool) -> Mapped:
+def quiet_colmap() -> Any:
+    """pycolmap, which then tells of errors only."""
+    pycolmap = imported()
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    return pycolmap
+
+
+def run_mapping(pictures: Sequence[BlockPicture], folder: Path, refine_camera: bool) -> Mapped:
     """From the matches in the database to poses and points."""
+    pycolmap = quiet_colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
     options.min_model_size = 3
