@@ -186,3 +186,11 @@ def test_a_frame_that_lies_otherwise_is_read_as_a_whole(pose: str, tmp_path: Pat
     assert {each.side for each in other.writing or ()} == {"left", "right"}
     assert other.pose is not None
     assert (other.pose.name, other.pose.decided) == (pose, True)
+
+
+def test_a_known_line_is_one_that_says_the_same_and_lies_so_plainly() -> None:
+    assert TITLE.is_seen_in(line("RUN 20  CANBERRA  16.5.68", "90", "left"))
+    assert not TITLE.is_seen_in(line("RUN 20  CANBERRA  16.5.68", "90m", "left"))
+    assert not TITLE.is_seen_in(line("RUN 20  CANBERRA  16.5.68", "270", "left"))
+    assert not TITLE.is_seen_in(line("PROPERTY OF THE ARCHIVE", "90", "left"))
+    assert not TITLE.is_seen_in(line("RUN 20  CANBERRA  16.5.68", "90", "left", share=0.9))

@@ -23,6 +23,7 @@ from pipeline.files.images_file import read_images
 from pipeline.files.points_file import read_points
 from pipeline.files.project_file import Project, read_project
 from pipeline.files.template_table import saved_in
+from pipeline.measuring.measure_stage import check_measurable
 from pipeline.results.comparator_file import (
     comparator_from_pixel,
     pixel_from_comparator,
@@ -369,11 +370,30 @@ def test_images_are_called_by_their_path_below_the_folder_that_all_share(
 
 
 def test_an_image_that_is_left_out_may_stand_in_images_csv(tmp_path: Path) -> None:
-    written(tmp_path, "images.csv", "image\nscans/a\nb\nc\n")
-    said = 'scans = ["scans/*.tif"]\nexclude = ["scans/b.tif"]\n[object]\nimages = "images.csv"'
+    """One that is neither found nor left out has no scan, and is told so."""
+    written(tmp_path, "images.csv", "image\na\nb\nc\n")
+    said = 'scans = ["scans/*.tif"]\nexclude = ["scans/b.tif"]\n[object]\nimages = "images.csv"\n[ties]'
     project = project_of(tmp_path, said, "scans/a.tif", "scans/b.tif")
     assert project.left_out == {"b"}
     assert set(project.scans) == {"a"}
+    assert check_measurable(project) == ("a", "c")
+
+
+@pytest.mark.parametrize(
+    ("columns", "said", "reads"),
+    [
+        ("image", "", "pose"),
+        ("image,camera_number", "", "all"),
+        ("image,run,date", 'writing = "none"', "none"),
+        ("image,camera", 'writing = "all"', "all"),
+    ],
+)
+def test_a_column_for_what_is_written_asks_for_it_on_all_scans(
+    tmp_path: Path, columns: str, said: str, reads: str
+) -> None:
+    written(tmp_path, "images.csv", f"{columns}\na{',' * columns.count(',')}\n")
+    project = f'scans = ["a.tif"]\n[object]\nimages = "images.csv"\n[measure]\n{said}'
+    assert project_of(tmp_path, project, "a.tif").reads == reads
 
 
 def test_two_files_of_one_name_in_a_folder_are_refused_and_so_is_leaving_all_out(tmp_path: Path) -> None:
