@@ -174,9 +174,9 @@ def _check_shapes(observations: Observations) -> None:
 def _check_names(network: Network) -> None:
     observations = network.observations
     image, point, kind = observations.image, observations.point, observations.kind
-    strangers = set(image) - network.image_by_name.keys()
-    if strangers:
-        row = next(i for i, name in enumerate(image) if name in strangers)
+    unknown = set(image) - network.image_by_name.keys()
+    if unknown:
+        row = next(i for i, name in enumerate(image) if name in unknown)
         raise AdjustmentError(
             f"{kind[row]} {point[row]} is observed in image {image[row]}, which is not in the network. Add the image."
         )

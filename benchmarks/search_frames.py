@@ -86,6 +86,14 @@ def draw_case(seed: int, index: int) -> Case:
     return case_of(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif")
 
 
+def is_overexposed(seed: int, index: int) -> bool:
+    """Of that frame, without drawing it."""
+    rng = np.random.default_rng([seed, index])
+    kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
+    _layout(rng, kind, symmetry)
+    return kind != "wing" and _tones(rng)[1] == "overexposed"
+
+
 def case_of(
     rng: Generator, kind: str, symmetry: str, layout: FiducialLayout, name: str, tones: Tones | None = None
 ) -> Case:

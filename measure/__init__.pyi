@@ -17,6 +17,8 @@ from .marks.shapes import polygon as polygon
 from .marks.shapes import ring_cross as ring_cross
 from .marks.shapes import ring_dot as ring_dot
 from .match_options import MatchOptions as MatchOptions
+from .reason import Code as Code
+from .reason import Reason as Reason
 from .results import FrameMeasurement as FrameMeasurement
 from .results import MarkMeasurement as MarkMeasurement
 from .results import Pose as Pose

@@ -44,8 +44,8 @@ def test_package_imports_only_what_the_architecture_allows(package: str) -> None
     assert files
     for file in files:
         names = imported(file)
-        strangers = (names & PACKAGES) - ALLOWED[package] - {package}
-        assert not strangers, f"{file.relative_to(ROOT)} imports {sorted(strangers)}"
+        forbidden = (names & PACKAGES) - ALLOWED[package] - {package}
+        assert not forbidden, f"{file.relative_to(ROOT)} imports {sorted(forbidden)}"
         pictures = names & FORBIDDEN_LIBRARIES.get(package, set())
         assert not pictures, f"{file.relative_to(ROOT)} imports {sorted(pictures)}"
 

@@ -139,10 +139,10 @@ class Scanner:
     half_mm: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        strangers = sorted(name for name in self.terms if not is_term(name))
-        if strangers:
+        unknown = sorted(name for name in self.terms if not is_term(name))
+        if unknown:
             raise ValueError(
-                f"a scanner's bend has no term {strangers[0]}; it has stretch, shear, tilt_x, tilt_y, and a20, b11 and "
+                f"a scanner's bend has no term {unknown[0]}; it has stretch, shear, tilt_x, tilt_y, and a20, b11 and "
                 f"the like with the degrees in x and y, together 2 to 6"
             )
         if not (np.isfinite(self.center_mm).all() and all(0.0 < half < np.inf for half in self.half_mm)):

@@ -160,11 +160,11 @@ def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Q
     quantities: list[Quantity] = list(zip(("c", "x0", "y0"), priors, starts, strict=True))
     names = parameter_names(camera.distortion.family)
     given = camera.distortion.parameters
-    strangers = sorted(set(given) - set(names))
-    if strangers:
+    unknown = sorted(set(given) - set(names))
+    if unknown:
         raise AdjustmentError(
             f"camera {camera.name}: the distortion family {camera.distortion.family} has no parameter "
-            f"{', '.join(strangers)}; it has {', '.join(names) or 'none at all'}."
+            f"{', '.join(unknown)}; it has {', '.join(names) or 'none at all'}."
         )
     return quantities + [(name, given.get(name, Prior(0.0, 0.0)), None) for name in names]
 

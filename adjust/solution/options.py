@@ -57,10 +57,10 @@ class Options:
             )
         if self.robust and self.snooping:
             raise ValueError("robust estimation and data snooping both take out gross errors: choose one of them")
-        strangers = sorted(set(self.groups) - {*MEASURED_KINDS, *PRIOR_GROUPS})
-        if strangers:
+        unknown = sorted(set(self.groups) - {*MEASURED_KINDS, *PRIOR_GROUPS})
+        if unknown:
             raise ValueError(
-                f"there is no group {', '.join(strangers)}: variance components are those of "
+                f"there is no group {', '.join(unknown)}: variance components are those of "
                 f"{', '.join((*MEASURED_KINDS, *PRIOR_GROUPS))}"
             )
 

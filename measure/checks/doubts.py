@@ -14,7 +14,6 @@ from measure.status import Status
 Array = NDArray[np.float64]
 
 TOLD = np.log(100.0)  # log-odds at which one cause rather than another is taken for what is off
-MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
 
 
 @dataclass(frozen=True)

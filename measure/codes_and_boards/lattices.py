@@ -24,7 +24,7 @@ def grid_places(points_px: Array, looks: Array, places: list[Place]) -> list[dic
     many but for half a line of the grid. A lattice as large as the grid goes before a larger one. Empty where no
     outline fits; the grid is never mirrored.
 
-    points_px (n, 2) may hold strangers; looks (n, k): figures of a point's looks, in which neighbours differ little,
+    points_px (n, 2) may hold others, too; looks (n, k): figures of a point's looks, in which neighbours differ little,
     logarithms of size and contrast. The grid's outline must be seen, a fifth of its places may be missing.
     """
     best: list[dict[Place, int]] = []
@@ -135,7 +135,7 @@ def _unit_steps(places: list[Place]) -> list[Integers]:
 
 
 def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integers]:
-    """Shifts that lay the grid's outline about a lattice's nodes. Strangers beside the grid may widen the nodes'
+    """Shifts that lay the grid's outline about a lattice's nodes. Other points beside the grid may widen the nodes'
     outline by a line or two."""
     grid = np.array([(column, row) for row, column in places])
     size = grid.max(axis=0) + 1

@@ -38,14 +38,14 @@ class Dots:
 @dataclass(frozen=True, eq=False)
 class Naming:
     """places_px (n, 2), pixel_from_disk (n, 2, 2): where and how the points of the sheet should be seen, nan where they
-    cannot; named: the dot of each point; gate_px: how far a dot may lie from its place; strangers: coded dots (index)
+    cannot; named: the dot of each point; gate_px: how far a dot may lie from its place; misread: coded dots (index)
     that are not the point that their code says."""
 
     places_px: Array
     pixel_from_disk: Array
     named: Mapping[int, int]
     gate_px: float
-    strangers: tuple[int, ...]
+    misread: tuple[int, ...]
 
 
 def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | str:
@@ -67,7 +67,7 @@ def name_dots(sheet: Array, dots: Dots, size_px: tuple[int, int]) -> Naming | st
         naming = _grown(views[index], sheet, dots)
         if naming is not None and (best is None or len(naming.named) > len(best.named)):
             best = naming
-        if best is not None and not best.strangers:
+        if best is not None and not best.misread:
             break
     if best is None:
         return f"the {len(dots.coded)} coded targets recognised do not put the other points of the sheet where dots are"
@@ -185,10 +185,10 @@ def _tested(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     }
     expected = int(np.sum(np.all((places >= 0.0) & (places <= np.array(view.size_px) - 1.0), axis=1)))
     right = sum(named.get(point) == dot for dot, point in dots.coded.items())
-    strangers = tuple(dot for dot, point in dots.coded.items() if named.get(point) != dot)
-    if len(named) < max(min(_LEAST_NAMED, len(sheet)), _LEAST_SHARE * expected) or right < 2 or right <= len(strangers):
+    misread = tuple(dot for dot, point in dots.coded.items() if named.get(point) != dot)
+    if len(named) < max(min(_LEAST_NAMED, len(sheet)), _LEAST_SHARE * expected) or right < 2 or right <= len(misread):
         return None
-    return Naming(places, shapes, named, gate_px, strangers)
+    return Naming(places, shapes, named, gate_px, misread)
 
 
 def _unevenness(sheet: Array, points: Indices, residuals: Array) -> Array:

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from measure.covariance import Cause, Covariance
 from measure.fitting.border_search import is_overwhelming, likely_border
 from measure.fitting.bordered_model import BorderedModel
-from measure.fitting.changed_tone import covariance_of_changed_tone
 from measure.fitting.clipping import Sides, clear_of_ends
 from measure.fitting.generators import is_round
-from measure.fitting.landscape import covariance_of_landscape
+from measure.fitting.hidden_causes import covariance_of_changed_tone, covariance_of_landscape
 from measure.fitting.linear_fit import LinearFit
 from measure.fitting.own_shape import OwnShape, own_shape
 from measure.fitting.picture_fit import EDGE_BLURS, PictureFit

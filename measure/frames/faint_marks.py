@@ -1,7 +1,7 @@
 """A mark that is barely there, at a place that the other marks give: its lines against the texture about it.
 
-Alone such a mark is one of many patterns of chance. Where the constellation is sure, only chance patterns as strong
-and as near to the predicted place are its rivals: how many of them the texture would give is known (Adler, The
+Alone such a mark cannot be told from the many places where noise looks like it. Where the constellation is sure, only
+those as strong and as near to the predicted place are its rivals: how many the texture would give is known (Adler, The
 Geometry of Random Fields, 1981: excursions of a Gaussian field), and so is, from the same texture, how far it pulls
 the mark from its true place.
 """

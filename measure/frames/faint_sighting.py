@@ -113,7 +113,7 @@ def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark
         away = float(np.hypot(*(sighting.fit.center_px - seen.fit.center_px)))
     # That the same pixels answer twice proves nothing of a clear mark that agreed with the others anyway.
     again = clear and bool(sighter.belongs[index]) and away <= _SAME_PX
-    sighter.vouched[index] = seen is not None and (bool(sighter.vouched[index]) or not again)
+    sighter.certain[index] = seen is not None and (bool(sighter.certain[index]) or not again)
     if seen is None and not clear:
         sighter.sightings[index] = Sighting(sighting.predicted_px, True, None, unseen)
     elif seen is not None and (not clear or away > _SAME_PX):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.film import AFFINITY_SIGMA
-from measure.probabilities import TRUE_MARK_A_STRANGER
+from measure.probabilities import TRUE_MARK_AN_OUTLIER
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array) -> F
     return FrameFit(np.column_stack([linear, [shift_x, shift_y]]), residuals, chi_square, 2 * len(camera_mm) - 4)
 
 
-def strangers(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, gate_mm: float) -> NDArray[np.bool_]:
+def outliers(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, gate_mm: float) -> NDArray[np.bool_]:
     """(n,) which marks do not belong: one by one, the mark that disagrees most with the others is taken out, until
     none is off by more than the gate or by what the others' own scatter allows, or only three are left."""
     out = np.zeros(len(camera_mm), dtype=bool)
@@ -67,12 +67,12 @@ def strangers(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, gate
             )
             off = np.hypot(*(up_mm[kept] - predicted).T)
             chance = np.array([_chance(*pair) for pair in zip(size * off, fits, strict=True)])
-            strange = (size > _LEAST_GATE * gate_mm) & (chance < TRUE_MARK_A_STRANGER / len(kept)) | (size > gate_mm)
-            worst = int(np.where(strange, chance, 2.0).argmin())
+            outlying = (size > _LEAST_GATE * gate_mm) & (chance < TRUE_MARK_AN_OUTLIER / len(kept)) | (size > gate_mm)
+            worst = int(np.where(outlying, chance, 2.0).argmin())
         else:
-            strange = size > gate_mm
+            outlying = size > gate_mm
             worst = int(np.argmin([fit.chi_square for fit in fits]))
-        if not strange.any():
+        if not outlying.any():
             break
         out[kept[worst]] = True
     return out
@@ -82,7 +82,7 @@ def _chance(product_mm2: float, others: FrameFit) -> float:
     """The probability of a misfit: of the residual times the distance from where the others alone put the mark, over
     the others' variance, which is the square of the residual studentised without it, on two degrees of freedom.
 
-    The variance is from the median, which other strangers do not widen: half of Rayleigh's squares are below 2 ln 2.
+    The variance is from the median, which other outliers do not widen: half of Rayleigh's squares are below 2 ln 2.
     """
     free = others.redundancy
     squares = np.sum(others.residuals_mm**2, axis=1)

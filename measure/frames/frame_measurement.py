@@ -41,9 +41,9 @@ def _sighted(scan: Scan, layout: FiducialLayout, placement: Placement, options: 
     if sighter.belongs.sum() >= 2 and not sighter.sure():
         if len(layout.marks) > MANY:
             look_for_faint(sighter, sighter.faint_px)
-            sighter.vouched[:] = False  # so far from its place a mark still has to agree with the others
+            sighter.certain[:] = False  # so far from its place a mark still has to agree with the others
         else:
-            sighter.look_astray([index for index in everything if not sighter.clear(index)])
+            sighter.look_elsewhere([index for index in everything if not sighter.clear(index)])
         sighter.judge()
     for _ in range(_ROUNDS):
         if sighter.sure():

@@ -12,7 +12,7 @@ from measure.fitting.matching import Match
 from measure.frames.channels import best_weights
 from measure.frames.first_look import strongest
 from measure.frames.frame import CLEAR_LIKENESS, Frame
-from measure.frames.frame_fit import fit_frame, strangers
+from measure.frames.frame_fit import fit_frame, outliers
 from measure.frames.refinement import Sighting, nothing_within, sight
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
@@ -50,7 +50,7 @@ class FrameSighter:
 
     camera (n, 2): given places, mm; turn (2, 2): of the pose; pitch (2,): mm of a pixel. pixel_from_camera (2, 3): as
     the placement has it, or the marks that belong. sightings: None for a mark that was not looked at yet. belongs (n,):
-    marks that were seen and agree; vouched (n,): those that stand out so much of their texture that they need not.
+    marks that were seen and agree; certain (n,): those that stand out so much of their texture that they need not.
     weights: of the channels. prior_tone: what was believed of the scan's curve; tone: what its marks made of that.
     gate_px, first_search_px, near_px, faint_px: how far from its predicted place a mark is
     looked for: where the others give it, where only the placement does, there on film that is hardly deformed, and
@@ -72,7 +72,7 @@ class FrameSighter:
         self.pixel_from_camera = placement.pixel_from_camera
         self.sightings: list[Sighting | None] = [None] * len(layout.marks)
         self.belongs: Mask = np.zeros(len(layout.marks), dtype=bool)
-        self.vouched: Mask = np.zeros(len(layout.marks), dtype=bool)
+        self.certain: Mask = np.zeros(len(layout.marks), dtype=bool)
         self.weights: tuple[float, ...] | None = None
         gate_px = options.gate_mm / float(self.pitch.mean())
         self.first_search_px = first_search_px(placement, layout, options)
@@ -122,17 +122,17 @@ class FrameSighter:
             if seen.fit is not None and seen.chance <= TEXTURE_LIKE_A_FAINT_MARK and _is_plain(seen.fit):
                 self.sightings[index] = replace(seen, closer=True)
 
-    def look_astray(self, indices: Sequence[int]) -> None:
+    def look_elsewhere(self, indices: Sequence[int]) -> None:
         """Look at marks where the others put them, first near by, then as far off as one may lie that keeps the gate:
         so far only what is plainly there counts."""
         for index in indices:
             self.look([index], self.gate_px)
-            near, far_px = self.sightings[index], self._astray_px(index)
+            near, far_px = self.sightings[index], self._elsewhere_px(index)
             if not self.clear(index) and far_px > self.gate_px:
                 self.look([index], far_px)
                 self.sightings[index] = self.sightings[index] if self.clear(index) else near
 
-    def _astray_px(self, index: int) -> float:
+    def _elsewhere_px(self, index: int) -> float:
         """A mark that is fitted pulls the frame to itself, and the more the fewer the others are: its distance from
         where they alone put it is its residual times one more than their prediction's variance, a mark's being one."""
         others = np.flatnonzero(self.belongs & (np.arange(len(self.belongs)) != index))
@@ -150,7 +150,7 @@ class FrameSighter:
             return
         index = np.flatnonzero(found)
         up, sigma = self._up_mm(index), self._sigma_mm(index)
-        out = strangers(self.camera[index], up, sigma, self.turn, self.options.gate_mm) & ~self.vouched[index]
+        out = outliers(self.camera[index], up, sigma, self.turn, self.options.gate_mm) & ~self.certain[index]
         self.belongs[index[out]] = False
         fit = fit_frame(self.camera[index[~out]], up[~out], sigma[~out], self.turn)
         self.pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / self.pitch[:, None]

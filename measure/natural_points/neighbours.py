@@ -21,20 +21,20 @@ _REWEIGHTINGS = 10  # of least distances
 _LEAST_PX = 0.1  # distances below it weigh alike, and what neighbours scatter at least
 
 
-def astray(first: Array, second: Array) -> Mask:
+def outliers(first: Array, second: Array) -> Mask:
     """Which points (n, 2) of two frames, in px, lie elsewhere in the second than their neighbours in the first put
     them, farther in units of the neighbours' scatter than relief does it to any others; none where points are too few.
 
     Above their median these ratios are taken as lognormal: relief makes their tail longer than that of normal errors.
     """
-    strange = np.zeros(len(first), dtype=bool)
+    off = np.zeros(len(first), dtype=bool)
     for _ in range(_ROUNDS):
-        if np.count_nonzero(~strange) <= 2 * _NEIGHBOURS:
+        if np.count_nonzero(~off) <= 2 * _NEIGHBOURS:
             return np.zeros(len(first), dtype=bool)
-        ratios = _ratios(first, second, np.flatnonzero(~strange))
+        ratios = _ratios(first, second, np.flatnonzero(~off))
         usual, large = np.quantile(ratios, (0.5, float(ndtr(1.0))))
-        strange = np.asarray(ratios > usual - float(ndtri(POINT_OFF_ITS_NEIGHBOURS)) * (large - usual))
-    return strange
+        off = np.asarray(ratios > usual - float(ndtri(POINT_OFF_ITS_NEIGHBOURS)) * (large - usual))
+    return off
 
 
 def _ratios(first: Array, second: Array, trusted: Indices) -> Array:

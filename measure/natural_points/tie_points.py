@@ -18,7 +18,7 @@ from scipy.special import ndtri
 from measure.natural_points.bending import Bending, bending_variance
 from measure.natural_points.epipolar import contradicting
 from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
-from measure.natural_points.neighbours import astray
+from measure.natural_points.neighbours import outliers
 from measure.natural_points.tie_candidates import TieCandidate, widened
 from measure.natural_points.tie_frame import TieFrame
 from measure.noise.noise import robust_scale
@@ -229,7 +229,7 @@ def _judge(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
         point.refused = {frame: _UNEVEN for frame in point.standing if point.matched[frame].unevenness < POINT_REFUSED}
     _refuse_strange_pictures(points)
     _refuse_contradictions(frames, points, partial(contradicting, tolerance=_FINE_PX), _OFF_LINES)
-    _refuse_contradictions(frames, points, astray, _UNLIKE_NEIGHBOURS)
+    _refuse_contradictions(frames, points, outliers, _UNLIKE_NEIGHBOURS)
 
 
 def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:

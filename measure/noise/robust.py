@@ -13,6 +13,8 @@ Mask = NDArray[np.bool_]
 
 Real = TypeVar("Real", np.float32, np.float64)
 
+MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
+STUDENT_FREEDOM = 4.0  # of Student's t: a fifth of false observations moves little
 _TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 _SMOOTHING_PX = 0.8  # of residuals: hardly more than a pixel, so that the finest specks stand out too
 
@@ -30,6 +32,12 @@ def tukey_loss(residuals: Array, scale_dn: float) -> float:
         return float(np.sum(residuals**2))
     limit = _TUKEY * scale_dn
     return float(np.sum(1 - np.clip(1 - (residuals / limit) ** 2, 0.0, None) ** 3) * limit**2 / 3)
+
+
+def student_weights(squares: Array, dimensions: float) -> Array:
+    """Of observations of so many dimensions that lie so many standard deviations off, squared, in Student's t
+    distribution (Lange, Little and Taylor 1989)."""
+    return np.asarray((STUDENT_FREEDOM + dimensions) / (STUDENT_FREEDOM + squares))
 
 
 def solution(normal: Array, right: Array, free: Mask) -> Array | None:

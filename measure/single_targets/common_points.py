@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.noise.robust import STUDENT_FREEDOM, student_weights
 from measure.single_targets.shared_offsets import Comparison, TargetPlaces, compared
 
 Array = NDArray[np.float64]
 
 _ROUNDS = 3  # of comparing the images and gathering what they say of the points
 _SPREADS, _STEPS = 10, 8  # of the points' spread anew, and of weights in each
-_FREEDOM = 4.0  # of Student's t
 _SPREAD = 0.01  # of the points' extent: what it is taken for at first
 _LEAST = 1e-6  # of the extent: no spread is smaller
 
@@ -145,7 +145,7 @@ class _Readings:
         ends = [self._settled(*start, spread) for start in starts]
         likely = np.array([self._log_likelihood(*end) for end in ends])
         best = likely.argmax(axis=0)
-        readings, priors = (np.stack([self._weight(end[k], 2.0 + k) for end in ends]) for k in (0, 1))
+        readings, priors = (np.stack([student_weights(end[k], 2.0 + k) for end in ends]) for k in (0, 1))
         which = np.arange(len(best))
         return readings[best, :, which].T, priors[best, which]
 
@@ -156,14 +156,10 @@ class _Readings:
             far = self.squares - 2.0 * np.einsum("ma,ima->im", off, self.right)
             far = np.maximum(far + np.einsum("ma,imab,mb->im", off, self.normal, off), 0.0)
             of_off = ((off / spread) ** 2).sum(axis=1)
-            weights, of_prior = self._weight(far, 2.0), self._weight(of_off, 3.0)
+            weights, of_prior = student_weights(far, 2.0), student_weights(of_off, 3.0)
         return far, of_off
-
-    @staticmethod
-    def _weight(squares: Array, dimensions: float) -> Array:
-        return np.asarray((_FREEDOM + dimensions) / (_FREEDOM + squares))
 
     def _log_likelihood(self, far: Array, of_off: Array) -> Array:
         """(m,) but for a constant."""
-        readings = np.where(self.squares > 0.0, -(_FREEDOM + 2.0) / 2.0 * np.log1p(far / _FREEDOM), 0.0)
-        return np.asarray(readings.sum(axis=0) - (_FREEDOM + 3.0) / 2.0 * np.log1p(of_off / _FREEDOM))
+        readings = np.where(self.squares > 0.0, -(STUDENT_FREEDOM + 2.0) / 2.0 * np.log1p(far / STUDENT_FREEDOM), 0.0)
+        return np.asarray(readings.sum(axis=0) - (STUDENT_FREEDOM + 3.0) / 2.0 * np.log1p(of_off / STUDENT_FREEDOM))

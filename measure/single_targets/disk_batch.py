@@ -36,8 +36,8 @@ def disks_among(block: Block, patches: Patches) -> Patches:
     """Those patches that a disk explains, the strongest first, as fitted: a place within a tenth of a pixel or so."""
     starts = _states(patches)
     none = starts.part(np.zeros(0, np.intp))
-    hopeful = joined(none, *map(_hopeful, _groups(block, starts, _every(starts.radius))))
-    fitted = joined(none, *map(_fitted, _groups(block, hopeful, np.ones(len(hopeful.blur), np.intp))))
+    promising = joined(none, *map(_promising, _groups(block, starts, _every(starts.radius))))
+    fitted = joined(none, *map(_fitted, _groups(block, promising, np.ones(len(promising.blur), np.intp))))
     return Patches(fitted.centers, fitted.shapes, fitted.greys[:, 0]).by_strength()
 
 
@@ -62,7 +62,7 @@ def _groups(block: Block, disks: DiskStates, every: NDArray[np.intp]) -> Iterato
         yield _Group.of(block, disks.part(chosen), areas.part(chosen).pixels(block))
 
 
-def _hopeful(group: "_Group") -> DiskStates:
+def _promising(group: "_Group") -> DiskStates:
     """Those that look like disks, as their outlines have them and still after some steps."""
     group = group.part(group.misfit() < _HOPELESS)
     if not len(group.grey):

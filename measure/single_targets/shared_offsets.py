@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import fdtrc
 
+from measure.noise.robust import MEDIAN_EFFICIENCY, student_weights
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -20,10 +22,8 @@ Mask = NDArray[np.bool_]
 # its third, fifth and seventh degree; of the other polynomials of the second to the fifth, of which the targets choose.
 _PLAIN, _RADIAL, _BENDING = 0.1, (0.03, 0.01, 0.003), (1e-5, 1e-4, 1e-3, 1e-2)
 _DEGREES = 5
-_FREEDOM = 4.0  # of Student's t: a fifth of wrong names moves little
 _ROUNDS, _SETTLED = 60, 1e-3
 _MEDIAN = 2.0 * float(np.log(2.0))  # of chi-square (2)
-_EFFICIENCY = 0.37  # of a scale told by a median: as good as by the squares of so many of the observations
 _NEIGHBOURS = 8  # that tell where the image bends more than the regression
 _LEAST_PX2 = 0.01**2  # the variance that no prediction falls short of
 
@@ -96,7 +96,7 @@ def _fitted(design: Array, offsets: Array, targets: TargetPlaces, seen_px2: Arra
     """Student's t by expectation and maximisation, the scatter anew in each round."""
     off, predicted, unknowns = offsets - np.median(offsets, axis=0), np.zeros_like(seen_px2), design.shape[2]
     variances, more_px2 = _scatter(off, predicted, targets, seen_px2)
-    weights = _weights(_squares(off, variances))
+    weights = student_weights(_squares(off, variances), 2.0)
     fit = None
     for _ in range(_ROUNDS):
         spread = variances / weights[:, None, None]
@@ -109,7 +109,7 @@ def _fitted(design: Array, offsets: Array, targets: TargetPlaces, seen_px2: Arra
         off = (spread @ without @ residuals[..., None])[..., 0]
         predicted = hat + hat @ without @ hat
         squares = _squares(off, variances + predicted)
-        before, weights = weights, _weights(squares)
+        before, weights = weights, student_weights(squares, 2.0)
         fit = _Fit(off, squares, float(np.einsum("nij,nji->", hat, by_weight)), predicted, more_px2)
         variances, more_px2 = _scatter(off, predicted, targets, seen_px2)
         if np.abs(weights - before).max() < _SETTLED:
@@ -121,11 +121,6 @@ def _fitted(design: Array, offsets: Array, targets: TargetPlaces, seen_px2: Arra
 def _squares(off: Array, covariances: Array) -> Array:
     """(n,) of how far n targets lie off, in their standard deviations."""
     return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances), off))
-
-
-def _weights(squares: Array) -> Array:
-    """(n,) of observations that lie so far off, in Student's t distribution."""
-    return (_FREEDOM + 2.0) / (_FREEDOM + squares)
 
 
 def _scatter(off: Array, predicted: Array, targets: TargetPlaces, seen_px2: Array) -> tuple[Array, Array]:
@@ -159,7 +154,7 @@ def _chances(fit: _Fit, targets: TargetPlaces) -> Array:
     chance = np.ones(len(fit.squares))
     for group in (targets.is_free, ~targets.is_free):
         share = group.sum() / len(group)
-        freedom = _EFFICIENCY * share * (2.0 * len(group) - fit.unknowns)
+        freedom = MEDIAN_EFFICIENCY * share * (2.0 * len(group) - fit.unknowns)
         if freedom > 1.0:
             chance[group] = fdtrc(2, freedom, fit.squares[group] / np.maximum(local[group], 1.0) / 2.0)
     return chance

@@ -76,10 +76,10 @@ def setup_of(scene_file: SceneFile) -> Setup:
             f"{scene_file.path}: [field] has no targets, and nobody knows beforehand where natural points will be. "
             "To plan such a field, give as many targets as points are hoped for, in a [[field.scatter]]."
         )
-    strangers = set(settings.control_points) - {target.id for target in targets}
-    if strangers:
+    unknown = set(settings.control_points) - {target.id for target in targets}
+    if unknown:
         raise InputError(
-            f"{scene_file.path}: [design] control_points: the field has no target {min(strangers)!r}. Its targets are "
+            f"{scene_file.path}: [design] control_points: the field has no target {min(unknown)!r}. Its targets are "
             f"{targets[0].id!r} to {targets[-1].id!r}."
         )
     points = []

@@ -111,9 +111,9 @@ def _variance_components(table: Table) -> bool | tuple[str, ...]:
         return table.flag("variance_components", False)
     names = table.texts("variance_components")
     known = (*MEASURED_KINDS, *PRIOR_GROUPS)
-    strangers = [name for name in names if name not in known]
-    if strangers:
-        raise table.error("variance_components", f"names {strangers[0]!r}; possible are {', '.join(known)}.")
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise table.error("variance_components", f"names {unknown[0]!r}; possible are {', '.join(known)}.")
     return names
 
 

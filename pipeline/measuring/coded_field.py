@@ -49,15 +49,15 @@ def measure_coded_field(
         marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in points.ids)
         return marks, (*notes, f"No target has a name: {named}.")
     ids = {dot: points.ids[point] for dot, point in read.items()}
-    strangers = [(id, found[dot]) for dot, id in ids.items() if named.candidates.get(id) is not found[dot]]
-    if strangers:
-        others = listed(sorted({id for id, _ in strangers}))
+    misread = [(id, found[dot]) for dot, id in ids.items() if named.candidates.get(id) is not found[dot]]
+    if misread:
+        others = listed(sorted({id for id, _ in misread}))
         notes = (*notes, f"Rings that read as {others} lie where the field has another point, or none.")
     predictions = named.predictions(_of_size(field, named, measured), measured)
     contradicted = {
         one.point: MarkMeasurement(one.point, "target", one.center_px, None, Status.REJECTED, reason)
         for one in predictions
-        if (reason := _contradiction(one, strangers))
+        if (reason := _contradiction(one, misread))
     }
     sought = [one for one in predictions if one.point not in contradicted]
     seen = {mark.point: mark for mark in measure_disks(scan, sought, TargetOptions(points.settings.polarity))}
@@ -67,10 +67,10 @@ def measure_coded_field(
     return checked_places(marks, field, named.model, measured), notes
 
 
-def _contradiction(prediction: TargetPrediction, strangers: Sequence[tuple[str, Candidate]]) -> Reason:
+def _contradiction(prediction: TargetPrediction, misread: Sequence[tuple[str, Candidate]]) -> Reason:
     """Why a point is not what lies at its place, if a ring there says so."""
     reach = float(prediction.half_axes_px[0]) + prediction.search_px
-    for id, dot in strangers:
+    for id, dot in misread:
         if id != prediction.point and np.hypot(*(dot.center_px - prediction.center_px)) < reach:
             return Reason(f"the ring at its place reads as {id}", Code.UNNAMED)
     return NO_REASON

@@ -103,5 +103,5 @@ def none_coded(found: Sequence[Candidate], numbers: dict[int, int], coded: Coded
         return "no dot was found"
     if not numbers:
         return f"none of the {len(found)} dots found has a ring of {bits} segments about it that can be read"
-    strangers = ", ".join(str(number) for number in sorted(set(numbers.values()))[:8])
-    return f"the codes read ({strangers}) are those of no point of the sheet, or were read at more than one place"
+    read = ", ".join(str(number) for number in sorted(set(numbers.values()))[:8])
+    return f"the codes read ({read}) are those of no point of the sheet, or were read at more than one place"

@@ -39,9 +39,9 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
         unnamed = Reason(naming, Code.UNNAMED)
         marks = tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, unnamed) for id in sheet.ids)
         return marks, (*notes, f"No target has a name: {naming}.")
-    strangers = [sheet.ids[coded[dot]] for dot in naming.strangers]
-    if strangers:
-        notes = (*notes, f"Rings that read as {listed(strangers)} lie where the sheet has another point, or none.")
+    misread = [sheet.ids[coded[dot]] for dot in naming.misread]
+    if misread:
+        notes = (*notes, f"Rings that read as {listed(misread)} lie where the sheet has another point, or none.")
     options = TargetOptions("light" if _sign(found, coded) > 0.0 else "dark")
     predictions = _predictions(sheet, found, naming)
     measured = {mark.point: mark for mark in measure_disks(scan, predictions, options)}

@@ -30,10 +30,10 @@ _NO_FRAME = Reason(
 
 def check_tie_names(project: Project) -> None:
     """Raises InputError where a given point has a name that a natural point would take."""
-    strangers = sorted(id for id in project.object_points if _TIE_NAME.fullmatch(id)) if project.ties else []
-    if strangers:
+    reserved = sorted(id for id in project.object_points if _TIE_NAME.fullmatch(id)) if project.ties else []
+    if reserved:
         raise InputError(
-            f"{project.path}: the given points hold {strangers[0]!r}, a name that [ties] gives to natural points. "
+            f"{project.path}: the given points hold {reserved[0]!r}, a name that [ties] gives to natural points. "
             "Rename it in points.csv."
         )
 

@@ -204,13 +204,13 @@ class Table:
     def done(self) -> None:
         """Refuse every key that nothing has asked for, all of them in one message."""
         known = sorted(self._known)
-        strangers = [key for key in self.values if key not in self._known]
+        unknown = [key for key in self.values if key not in self._known]
         messages = [
             str(self.error(key, f"is no key of this table.{did_you_mean(key, known)} Known here: {_listed(known)}."))
-            for key in strangers[:LISTED]
+            for key in unknown[:LISTED]
         ]
-        if len(strangers) > LISTED:
-            messages.append(f"{self.file}: {len(strangers) - LISTED} more keys are not known.")
+        if len(unknown) > LISTED:
+            messages.append(f"{self.file}: {len(unknown) - LISTED} more keys are not known.")
         if messages:
             raise InputError("\n".join(messages))
 
@@ -218,8 +218,8 @@ class Table:
         self._known.add(key)
         value = self.values.get(key, default)
         if value is None:
-            strangers = [name for name in self.values if name not in self._known]
-            near = nearest(key, strangers)
+            unknown = [name for name in self.values if name not in self._known]
+            near = nearest(key, unknown)
             raise self.error(key, "is missing. Add it" + (f", or rename {near!r} to it." if near else "."))
         return value
 

@@ -5,7 +5,7 @@ import pytest
 from brute_marks import Array
 
 from measure.film import AFFINITY_SIGMA
-from measure.frames.frame_fit import fit_frame, strangers
+from measure.frames.frame_fit import fit_frame, outliers
 from measure.marks.poses import POSES, up_from_camera
 
 SQUARE = np.array([(100.0, -100.0), (-100.0, -100.0), (-100.0, 100.0), (100.0, 100.0)])
@@ -59,16 +59,16 @@ def test_one_mark_does_not_determine_a_frame() -> None:
         fit_frame(EIGHT[:1], EIGHT[:1], np.ones(1), np.eye(2))
 
 
-def test_the_strangers_are_found_and_no_others() -> None:
+def test_the_outliers_are_found_and_no_others() -> None:
     rng, turn = np.random.default_rng(4), up_from_camera("180")
     up = seen(EIGHT, turn) + rng.normal(0, 0.005, (8, 2))
-    assert not strangers(EIGHT, up, np.full(8, 0.005), turn, 0.3).any()
+    assert not outliers(EIGHT, up, np.full(8, 0.005), turn, 0.3).any()
     up[2] += (0.9, -0.4)
     up[5] += (0.0, 0.6)
-    assert np.flatnonzero(strangers(EIGHT, up, np.full(8, 0.005), turn, 0.3)).tolist() == [2, 5]
+    assert np.flatnonzero(outliers(EIGHT, up, np.full(8, 0.005), turn, 0.3)).tolist() == [2, 5]
     four = seen(SQUARE, turn)
     four[1] += (1.5, 0.0)
-    assert np.flatnonzero(strangers(SQUARE, four, np.full(4, 0.005), turn, 0.3)).size == 1
+    assert np.flatnonzero(outliers(SQUARE, four, np.full(4, 0.005), turn, 0.3)).size == 1
 
 
 def test_with_many_marks_their_own_scatter_is_the_gate() -> None:
@@ -76,16 +76,16 @@ def test_with_many_marks_their_own_scatter_is_the_gate() -> None:
     rng, turn = np.random.default_rng(6), up_from_camera("0")
     up = seen(grid, turn) + rng.normal(0, 0.005, grid.shape)
     up[7] += (0.1, 0.0)  # well inside of the gate, far outside of the others' scatter
-    assert np.flatnonzero(strangers(grid, up, np.full(25, 0.005), turn, 0.3)).tolist() == [7]
+    assert np.flatnonzero(outliers(grid, up, np.full(25, 0.005), turn, 0.3)).tolist() == [7]
 
 
-def test_two_strangers_do_not_hide_each_other() -> None:
+def test_two_outliers_do_not_hide_each_other() -> None:
     grid = np.array([(10.0 * i, 10.0 * j) for i in range(-2, 3) for j in range(-2, 2)])
     rng, turn = np.random.default_rng(7), up_from_camera("0")
     up = seen(grid, turn) + rng.normal(0, 0.005, grid.shape)
     up[3] += (0.28, 0.0)
     up[16] += (-0.25, 0.05)
-    assert np.flatnonzero(strangers(grid, up, np.full(20, 0.005), turn, 0.3)).tolist() == [3, 16]
+    assert np.flatnonzero(outliers(grid, up, np.full(20, 0.005), turn, 0.3)).tolist() == [3, 16]
 
 
 @pytest.mark.parametrize("stretch", [0.0008, 0.003])

@@ -97,8 +97,8 @@ def test_bent_ground_moves_the_place_as_its_bending_says() -> None:
 def test_another_picture_stands_out_by_its_variance() -> None:
     rng = np.random.default_rng(3)
     three = pieces(rng, 4.0)
-    stranger = Piece(picture(texture(rng), MAPS[1]), (-HALF, -HALF), MAPS[1])
-    matched = match_pieces([three[0], stranger, three[2]], 0)
+    other = Piece(picture(texture(rng), MAPS[1]), (-HALF, -HALF), MAPS[1])
+    matched = match_pieces([three[0], other, three[2]], 0)
     assert any(each.reason for each in matched) or matched[1].variance > 2.0 * matched[2].variance
 
 

@@ -82,7 +82,7 @@ def test_a_fifth_missing_and_a_fifth_false(columns: int, rows: int, codes: int, 
         assert isinstance(naming, Naming), naming
         assert view.wrong(naming) == 0
         assert len(naming.named) >= 0.93 * np.sum(view.origin >= 0)
-        assert not naming.strangers
+        assert not naming.misread
 
 
 def test_codes_misread_are_outvoted_or_nothing_is_named() -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from measure.natural_points.tracks import join_tracks
+from measure.natural_points.tie_candidates import join_tracks
 
 
 def pairs(*rows: tuple[int, int]) -> np.ndarray:

@@ -1,8 +1,13 @@
-"""What the place of a notch is uncertain by where a landscape lies in it.
+"""What a place is uncertain by that its residuals do not show: light that is uneven in the mark, tones that changed.
 
 A notch is cut into the frame's border and exposed as the frame is: its light is no more even than the terrain.
 A slope of that light is a shift of the edges where it ends, and leaves little else in a small notch. How uneven it may
 be, the frame beside the notch shows.
+
+An edge between dark and light is a slope of grey values. Light that is stronger than in the pictures that a chip was
+learned from climbs that slope elsewhere: the film saturates, or what glows beside it does not grow as it does. Its half
+tones then are lighter or darker between the same ends, and where all edges face one side that is a shift and leaves
+next to nothing else.
 """
 
 import numpy as np
@@ -15,6 +20,10 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _LEAST_PX = 400  # of the frame beside the notch: fewer do not tell how uneven it is
+# Of the contrast and the logarithm of its change, how much half tones are off: anything between nothing and what a glow
+# makes that stays as it is while the light changes, which is a half.
+_BENT = 0.5 / np.sqrt(3)
+_MOST = 1.0  # of that logarithm: more is another scanner's scale
 
 
 def covariance_of_landscape(light: Array, beside: Mask, moved: Array) -> Array:
@@ -33,3 +42,15 @@ def covariance_of_landscape(light: Array, beside: Mask, moved: Array) -> Array:
     covariance = products(moved, correlated(moved, landscape))
     sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)  # far lags are chance, and may leave less than nothing
+
+
+def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_change: float) -> Array:
+    """(2, 2) px2 of a place, for what the tones may have changed.
+
+    half_tones (height, width): grey values, the picture's contrast in the middle between dark and light, none at both
+    ends; by_grey (unknowns, height, width): the unknowns' derivatives by the grey values, column and row first.
+    contrast_change: the contrast over that of the pictures that the chip was learned from.
+    """
+    bent = _BENT * min(abs(float(np.log(contrast_change))), _MOST)
+    moved = bent * products(by_grey[:2], half_tones[None])
+    return np.asarray(moved @ moved.T)

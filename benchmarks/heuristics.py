@@ -1,0 +1,209 @@
+"""What each heuristic brings: the same pictures measured with it, and with it switched off.
+
+PYTHONPATH=tests/measure python benchmarks/heuristics.py [--only NAME] [--count 24]
+
+Each row is one heuristic: the figure that it is there for, with it and without. The last rows compare a method of
+scikit-image with what is used in its place, on the same pictures.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+from dusty_marks import frame_of_disks
+from faint_marks import drawn_frame, measured_faint
+from large_networks import strip
+from measured_marks import CONTRAST, GROUND, drawn, measured, start_off
+from numpy.typing import NDArray
+from search_frames import draw_case, is_overexposed
+from skimage.measure import EllipseModel, find_contours
+from skimage.registration import phase_cross_correlation
+from true_marks import KIND, Border, TrueMark, over_border, some_mark
+
+import measure.fitting.matching as matching
+import measure.frames.frame_measurement as frame_measurement
+import measure.single_targets.targets as targets
+from adjust.linear_algebra import fronts
+from adjust.solution.adjustment import adjust
+from measure.fiducials import measure_fiducials
+from measure.fitting.picture_fit import PictureFit
+from measure.reason import NO_REASON
+from measure.search.frame_search import FrameSearch
+
+Array = NDArray[np.float64]
+
+SEED, SNR, LARGE_PX, LEAST_CONTOUR = 5, 20.0, 0.5, 12
+
+
+def borders(count: int) -> str:
+    """Marks over an edge of the ground of 0.8 of their contrast: rms error, and how many were flagged or lost."""
+    rng, errors, lost = np.random.default_rng(SEED), [], 0
+    for _number in range(count):
+        mark, sign = some_mark(KIND["ring-cross"], 1.0, rng), int(rng.choice((-1, 1)))
+        border = Border(rng.uniform(-8, 8), rng.uniform(-np.pi, np.pi), rng.uniform(-0.01, 0.01))
+        light = over_border(mark, 0.8 * int(rng.choice((-1, 1))), border, False, sign)
+        noise = rng.standard_normal(light.shape) / SNR
+        found = measured(mark, GROUND + CONTRAST * (1 + light + noise), rng, off=start_off(mark, rng))
+        lost += found is None or bool(found.flagged)
+        errors += [] if found is None or found.flagged else [found.center_px - mark.place[:, 2]]
+    return f"{_rms(errors)} px, {lost} of {count} not measured"
+
+
+def faint(count: int) -> str:
+    """Marks of a frame at twice the noise, three of eight: how many are found, and their rms error."""
+    rng, errors, of = np.random.default_rng(SEED), [], 0
+    for _number in range(max(count // 6, 1)):
+        frame = drawn_frame(KIND["ring-cross"], 1.6, rng)
+        for mark, found, _noise in measured_faint(frame, 2.0, rng):
+            of += 1
+            errors += [] if found is None else [found.center_px - mark.place[:, 2]]
+    return f"{len(errors)} of {of} found, {_rms(errors)} px"
+
+
+def exposed_frame(count: int) -> str:
+    """Overexposed frames, with marks that are no part of their edges: how many are found, how many marks, how many of
+    them wrongly."""
+    frames = marks = wrong = 0
+    chosen = [index for index in range(40 * count) if is_overexposed(SEED, index)][: max(count // 3, 1)]
+    for index in chosen:
+        case = draw_case(SEED, index)
+        pitch_um = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
+        frame = measure_fiducials(case.scan, case.layout, pitch_um)
+        seen = [mark for mark in frame.marks if mark.status.is_observation and mark.center_px is not None]
+        off = [float(np.hypot(*(np.asarray(mark.center_px) - case.centers_px[mark.point]))) for mark in seen]
+        frames, marks, wrong = frames + bool(off), marks + len(off), wrong + sum(one > LARGE_PX for one in off)
+    return f"{frames} of {len(chosen)} frames found, {marks} marks, {wrong} wrong"
+
+
+def dusty_disks(count: int) -> str:
+    """Small disks among dust: those called measured that lie more than half a pixel off, and good ones doubted."""
+    rng, wrong, doubted, of = np.random.default_rng(SEED), 0, 0, 0
+    for _number in range(max(count // 3, 1)):
+        found, dusts = frame_of_disks((0.0, 0.05), (1.8, 3.5), (10.0, 30.0), (0.8, 1.3), rng)
+        for each, dust in zip(found, dusts, strict=True):
+            of += 1
+            wrong += not each.flagged and float(np.hypot(*each.error_px)) > LARGE_PX
+            doubted += each.flagged and dust == 0.0
+    return f"{wrong} of {of} wrong and called measured, {doubted} clean ones doubted"
+
+
+def rounding(count: int) -> str:
+    """Marks of ten grey values' contrast, with less noise than a step: rms error."""
+    rng, errors = np.random.default_rng(SEED), []
+    for _number in range(count):
+        mark = some_mark(KIND["ring-cross"], 1.0, rng)
+        grey = np.rint(60 + 10 * mark.picture + 0.1 * rng.standard_normal(mark.picture.shape))
+        found = measured(mark, grey, rng, 255, off=start_off(mark, rng))
+        errors += [] if found is None or found.flagged else [found.center_px - mark.place[:, 2]]
+    return f"{_rms(errors)} px, {count - len(errors)} not measured"
+
+
+def one_front(count: int) -> str:
+    """A strip of images: CPU seconds of its adjustment."""
+    scene = strip(8 * count)
+    start = time.process_time()
+    adjust(scene.network, scene.start)
+    return f"{time.process_time() - start:.2f} s for {8 * count} images"
+
+
+def ellipse_model(count: int) -> str:
+    """Ellipses by least-squares matching; by EllipseModel through the contour at half the contrast."""
+    rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
+    for _number in range(count):
+        mark = some_mark(KIND["ellipse"], 1.0, rng)
+        grey, _sign = drawn(mark, rng)
+        noisy = grey + CONTRAST / SNR * rng.standard_normal(grey.shape)
+        found, place = measured(mark, noisy, rng, off=start_off(mark, rng)), mark.place[:, 2]
+        ours += [] if found is None else [found.center_px - place]
+        theirs += [by_contour(noisy, place) - place]
+    return f"{_rms(ours)} px; EllipseModel {_rms(theirs)} px"
+
+
+def by_contour(grey: Array, about_px: Array) -> Array:
+    """(2,) the centre of an ellipse through the contour half way between the ground and the mark that lies about a
+    place."""
+    col, row = np.rint(about_px).astype(int)
+    level = (np.median(grey) + grey[row - 1 : row + 2, col - 1 : col + 2].mean()) / 2
+    contours = [each[:, ::-1] for each in find_contours(grey, level) if len(each) >= LEAST_CONTOUR]
+    nearest = min(contours, key=lambda each: float(np.hypot(*(each.mean(axis=0) - about_px))))
+    model = EllipseModel.from_estimate(nearest)
+    return np.asarray(model.center) if model else np.full(2, np.nan)
+
+
+def phase_correlation(count: int) -> str:
+    """The same mark in two scans, shifted: by matching the drawing in both; by phase_cross_correlation, 1/100 px."""
+    rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
+    for _number in range(count):
+        first = some_mark(KIND["ring-cross"], 1.0, rng)
+        shift = rng.uniform(-0.5, 0.5, 2)
+        place = first.place + np.column_stack([np.zeros((2, 2)), shift])
+        second = TrueMark(first.kind, place, first.size, first.blur_px)
+        pictures = [
+            GROUND + CONTRAST * (each.picture + rng.standard_normal(each.picture.shape) / SNR)
+            for each in (first, second)
+        ]
+        here, there = (
+            measured(each, grey, rng, off=start_off(each, rng))
+            for each, grey in zip((first, second), pictures, strict=True)
+        )
+        if here is not None and there is not None:
+            ours.append(there.center_px - here.center_px - shift)
+        moved, _error, _phase = phase_cross_correlation(pictures[1], pictures[0], upsample_factor=100)
+        theirs.append(np.asarray(moved)[::-1] - shift)
+    return f"{_rms(ours)} px; phase_cross_correlation {_rms(theirs)} px"
+
+
+def _rms(errors: Sequence[Array]) -> str:
+    return f"{np.sqrt(np.nanmean(np.square(errors))):.4f}" if len(errors) else "-"
+
+
+@contextmanager
+def put(where: Any, name: str, instead: Any) -> Iterator[None]:
+    """Another value in the place of one, for a while."""
+    before = getattr(where, name)
+    setattr(where, name, instead)
+    try:
+        yield
+    finally:
+        setattr(where, name, before)
+
+
+def _lone(disks: Sequence[Any], _predicted: Sequence[Array]) -> list[Any]:
+    return [NO_REASON for _ in disks]
+
+
+Study = Callable[[int], str]
+SWITCHED: dict[str, tuple[Study, Any, str, Any]] = {
+    "borders of the ground": (borders, matching, "_with_border", lambda _given, _part, fit: fit),
+    "faint marks": (faint, frame_measurement, "look_for_faint", lambda _sighter, _reach_px: None),
+    "exposed frame": (exposed_frame, FrameSearch, "within_its_edges", lambda _self, _hypotheses: []),
+    "dusty disks": (dusty_disks, targets, "doubts", _lone),
+    "rounding": (rounding, PictureFit, "unround", lambda _self: None),
+    "fronts": (one_front, fronts, "FRONT_COST", 1e30),
+}
+COMPARED: dict[str, Study] = {"EllipseModel": ellipse_model, "phase_cross_correlation": phase_correlation}
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--only", choices=[*SWITCHED, *COMPARED])
+    parser.add_argument("--count", type=int, default=24)
+    given = parser.parse_args()
+    for name, (study, where, what, instead) in SWITCHED.items():
+        if given.only in (None, name):
+            run = partial(study, given.count)
+            kept = run()
+            with put(where, what, instead):
+                print(f"| {name} | {kept} | {run()} |", flush=True)
+    for name, study in COMPARED.items():
+        if given.only in (None, name):
+            print(f"| {name} | {study(given.count)} | |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
