@@ -60,9 +60,9 @@ def copies(scan: Scan) -> dict[str, Scan]:
     }
 
 
-def measured(scan: Scan, camera: str, tone: Tone) -> FrameMeasurement:
+def measured(scan: Scan, camera: str, tone: Tone, pitch_um: tuple[float, float] | None) -> FrameMeasurement:
     layout = read_camera(camera_path(f"library:{camera}", Path())).layout()
-    return measure_fiducials(scan.seen_through(tone), layout, None, FiducialOptions(pose="0"))
+    return measure_fiducials(scan.seen_through(tone), layout, pitch_um, FiducialOptions(pose="0"))
 
 
 def main() -> None:
@@ -77,7 +77,7 @@ def main() -> None:
         if options.frame not in frame:
             continue
         with open_scan(options.folder / f"{frame}.jpeg") as scan:
-            results = {name: measured(copy, camera, tone) for name, copy in copies(scan).items()}
+            results = {name: measured(copy, camera, tone, scan.pitch_um) for name, copy in copies(scan).items()}
         for name, result in results.items():
             curve = result.tone.tone if result.tone else "no frame"
             statuses = ", ".join(f"{mark.point} {mark.status}" for mark in result.marks if mark.center_px is not None)

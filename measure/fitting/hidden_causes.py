@@ -27,13 +27,13 @@ _MOST = 1.0  # of that logarithm: more is another scanner's scale
 
 
 def covariance_of_landscape(light: Array, beside: Mask, moved: Array) -> Array:
-    """(2, 2) px2 of a place, for a landscape in the mark that varies as beside it.
+    """(n, n) of figures, column and row of a place for example, for a landscape in the mark that varies as beside it.
 
-    light (height, width): grey values, and beside, alike, which of them show the frame; moved (2, height, width) of the
-    mark's window: derivatives of its column and row by the grey values, as much of them as its light has part in.
+    light (height, width): grey values, and beside, alike, which of them show the frame; moved (n, height, width) of the
+    mark's window: derivatives of the figures by the grey values, as much of them as its light has part in.
     """
     if beside.sum() < _LEAST_PX:
-        return np.zeros((2, 2))
+        return np.zeros((len(moved),) * 2)
     reach = max(moved.shape[1:])
     lags = autocovariance(np.where(beside, light - light[beside].mean(), 0.0), beside, reach)
     # The noise of single pixels counts already; what neighbours have in common is the landscape.

@@ -55,7 +55,8 @@ class Match:
     contrast_dn: the mark's light less the background's, negative for a dark mark; stored_contrast_dn: the same of the
     grey values that the file has. noise_dn: standard deviation of
     one pixel, of a chip's picture after smoothing. damaged_fraction: share of the pixels about the mark, within
-    plain_px of it, that were cut out. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
+    plain_px of it, that were cut out; lost_fraction: of what tells its place in the direction in which least of that is
+    left, what was. redundancy: pixels used less unknowns. neighbour_correlation: of the residuals;
     they were taken as white where covariance_is_white. likeness: correlation of the fitted picture with the window,
     less its plane background: 1 for a perfect mark, 0 for none.
     significance: the contrast over its own standard deviation. blur_sigma: of the logarithm of the blur, the pixel's
@@ -75,6 +76,7 @@ class Match:
     noise_dn: float
     blur_px: float
     damaged_fraction: float
+    lost_fraction: float
     redundancy: int
     neighbour_correlation: float
     covariance_is_white: bool
@@ -313,6 +315,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
         noise_dn=float(np.sqrt(noise.variance_dn2)),
         blur_px=model.scan_blur_px,
         damaged_fraction=fit.damaged_fraction,
+        lost_fraction=1.0 if fit.reason else fit.lost_fraction,
         redundancy=int(used.sum()) - len(model.design),
         neighbour_correlation=noise.neighbour_correlation,
         covariance_is_white=noise.is_white,
@@ -357,9 +360,7 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))
         place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))
-    if about.frame.any():
-        landscape = covariance_of_landscape(about.grey, about.frame, by_grey[:2] * model.design[-GREY])
-        place = place.plus(Cause.LANDSCAPE, landscape)
+    place = place.plus(Cause.LANDSCAPE, _by_landscape(by_grey[:2], model, about))
     linear = LinearFit(model.residuals, used, model.design, by_grey, noise, model.steadiness)
     freedom = model.options.freedom
     tells_shape = freedom == "similarity" and not is_round(model.mark)
@@ -370,11 +371,16 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
         edges=edge_place(linear, model.blur_px),
         sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
         own_shape=own_shape(linear, model.linear, model.departures()) if tells_shape else None,
-        tone=_tone(fit, linear),
+        tone=_tone(fit, linear, about),
     )
 
 
-def _tone(fit: PictureFit, linear: LinearFit) -> ToldTone | None:
+def _by_landscape(by_grey: Array, model: PictureModel, about: _Surroundings) -> Array:
+    """(n, n) of figures whose derivatives by the grey values are by_grey (n, height, width)."""
+    return covariance_of_landscape(about.grey, about.frame, by_grey * model.design[-GREY])
+
+
+def _tone(fit: PictureFit, linear: LinearFit, about: _Surroundings) -> ToldTone | None:
     """What the picture says of the tone curve, None where that is known, or the mark is a chip, cut from scans of the
     same curve."""
     model, coding = fit.model, fit.coding
@@ -382,9 +388,13 @@ def _tone(fit: PictureFit, linear: LinearFit) -> ToldTone | None:
         return None
     if model.background_px is not None:
         return untold_tone(linear, model.light, model.detail, coding.tone, coding.full_scale_dn)
-    drawn = model.drawn
+    drawn, linear = model.drawn, replace(linear, noise=linear.noise.at_least(fit.floor_dn**2))
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
-    return told_tone(linear, drawn, model.grey, clear, coding.tone, coding.full_scale_dn)
+
+    def by_landscape(by_grey: Array) -> Array:
+        return _by_landscape(by_grey, model, about)
+
+    return told_tone(linear, drawn, model.grey, clear, coding.tone, coding.full_scale_dn, by_landscape)
 
 
 def _blur_sigma(model: PictureModel, covariance: Array) -> float:

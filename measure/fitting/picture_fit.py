@@ -134,8 +134,8 @@ class PictureFit:
         if coding.tone.is_identity or isinstance(model.mark, MarkTemplate):
             return
         drawn, shown = model.drawn, np.abs(model.design[-GREY] / model.steadiness)
-        slopes = coding.tone.slopes(drawn, coding.full_scale_dn)
-        model.take_steadiness(steadiness(model.light - drawn, slopes, shown < _GROUND * shown.max(), self.telling))
+        ground = shown < _GROUND * shown.max()
+        model.take_steadiness(steadiness(model.light - drawn, drawn / coding.full_scale_dn, ground, self.telling))
 
     def _is_plain(self) -> bool:
         """Whether undamaged pixels far from the mark vary as the nearer ones do."""
@@ -228,6 +228,16 @@ class PictureFit:
         """Of the pixels about the mark, as far as the ground has to be plain there: those on damage or next to it."""
         near = self.area & ~self.far
         return 1.0 - float((near & self._clear).sum() / max(near.sum(), 1))
+
+    @property
+    def lost_fraction(self) -> float:
+        """What lies on damage of what the picture tells of the place, in the direction in which least is left."""
+        priors = np.diag(self.model.prior_weights()) * self.variance_dn2
+        by_all, by_used = (
+            np.linalg.inv(products(self.model.design * pixels, self.model.design) + priors)[:2, :2]
+            for pixels in (self.area, self.used)
+        )
+        return 1.0 - float(1 / np.linalg.eigvals(by_used @ np.linalg.inv(by_all)).real.max())
 
     @property
     def _clear(self) -> Mask:

@@ -38,6 +38,14 @@ class Coding:
         above, below = (self.tone.light(self.stored + way * step / 2, self.full_scale_dn) for way in (1, -1))
         return np.asarray(above - below, float)
 
+    def light_of_step_dn(self, light: NDArray[np.floating], step_dn: float) -> Array:
+        """How much more light than this grey values are that are a step larger."""
+        if self.tone.is_identity:
+            return np.full(light.shape, step_dn)
+        code = self.tone.code(light, self.full_scale_dn)
+        above, at = (self.tone.light(code + more, self.full_scale_dn) for more in (step_dn, 0.0))
+        return np.asarray(above - at, float)
+
     def stored_contrast_dn(self, ground: float, contrast: float) -> float:
         """The difference of grey values that a contrast in light is, on ground of such light."""
         if self.tone.is_identity:

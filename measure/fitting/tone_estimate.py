@@ -22,9 +22,19 @@ _LEAST_SHOWN = 1e-6  # of uneven light that the picture hardly tells from the un
 _LEAST_VARIANCE = 1e-9  # of a combination of departures that the picture hardly shows, over that of the others
 
 
-def told_tone(fit: LinearFit, drawn: Array, grey: Array, clear: Mask, tone: Tone, full_scale_dn: float) -> ToldTone:
+def told_tone(
+    fit: LinearFit,
+    drawn: Array,
+    grey: Array,
+    clear: Mask,
+    tone: Tone,
+    full_scale_dn: float,
+    by_landscape: Callable[[Array], Array],
+) -> ToldTone:
     """Beside the unknowns of a linearised fit. drawn, grey (height, width): the light that it draws, and that it was
     fitted to; clear, alike: where that is not near an end of the scanner's range, which changes what noise does.
+    by_landscape: what a landscape in the mark adds to the covariance (n, n) of figures whose derivatives by the grey
+    values are (n, height, width).
 
     With the departures d the residuals are r + H d - D x. The score H'r of what D leaves of H grows with d by N and has
     the covariance S that the noise gives it: N' S^-1 N is the information, also where the noise is not white. H is
@@ -37,7 +47,7 @@ def told_tone(fit: LinearFit, drawn: Array, grey: Array, clear: Mask, tone: Tone
     left = _beside(fit, changes * clear)
     normal = products(left, changes)
     score = -products(left, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
-    covariance = fit.covariance(left)
+    covariance = fit.covariance(left) + by_landscape(left)
     covariance += _LEAST_VARIANCE * max(float(np.trace(covariance)), 1e-30) * np.eye(len(covariance))
     said = SaidOfTone.by_score(normal, score + normal @ tone.mean, covariance)
     return _told(fit, said, tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
@@ -70,7 +80,8 @@ def _beside(fit: LinearFit, changes: Array) -> Array:
 
 
 def _uneven(shown: Array, about: Array) -> Array:
-    """(8, height, width) slopes and bends of the light of a mark's picture, and bends of that about it."""
+    """(8, height, width) slopes and bends of the light of a mark's picture, and bends of that about it. shown, about
+    (height, width): the picture and 1, times the steadiness."""
     height, width = shown.shape
     col = np.broadcast_to(np.linspace(-1.0, 1.0, width), shown.shape)
     row = np.broadcast_to(np.linspace(-1.0, 1.0, height)[:, None], shown.shape)

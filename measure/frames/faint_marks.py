@@ -3,17 +3,19 @@
 Alone such a mark cannot be told from the many places where noise looks like it. Where the constellation is sure, only
 those as strong and as near to the predicted place are its rivals: how many the texture would give is known (Adler, The
 Geometry of Random Fields, 1981: excursions of a Gaussian field), and so is, from the same texture, how far it pulls
-the mark from its true place.
+the mark from its true place. How strong the texture is beside the lines depends on the tone curve: where that is not
+known, the mark is sought by two curves, and how far apart it is seen is in its covariance.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Covariance
+from measure.covariance import Cause, Covariance
 from measure.fitting.matching import Match
+from measure.fitting.scan_window import Coding
 from measure.marks.rendering import extent_px, picture
 from measure.reason import NO_REASON
 from measure.scans.scan import Scan
@@ -53,11 +55,29 @@ class FaintMark:
 
 def find_faint(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
     """The strongest response to the mark within the search radius of its predicted place, None where there is no
-    contrast.
+    contrast by any curve that the scan's may be.
 
     extreme_dn: the lightest or darkest grey value of the scan, which a mark of that polarity cannot pass: on ground as
     light or as dark it does not show.
     """
+    seen = [_found(scan.seen_through(curve), expected, extreme_dn, blur_px) for curve in scan.tone.ends]
+    both = [each for each in seen if each is not None]
+    if len(both) < len(seen):
+        return None
+    less_sure = max(both, key=lambda each: each.chance)
+    centers = np.array([each.fit.center_px for each in both])
+    half, center = (centers[0] - centers[-1]) / 2, centers.mean(axis=0)
+    fit = replace(
+        less_sure.fit,
+        center_px=center,
+        pixel_from_mark=np.column_stack([less_sure.fit.pixel_from_mark[:, :2], center]),
+        place_covariance=less_sure.fit.place_covariance.plus(Cause.TONE, np.outer(half, half)),
+    )
+    return FaintMark(fit, less_sure.chance)
+
+
+def _found(scan: Scan, expected: MarkPrediction, extreme_dn: float, blur_px: float) -> FaintMark | None:
+    """By the scan's one curve."""
     field = _Field(scan, expected, extreme_dn)
     center, reach_px = expected.center_px - field.origin, expected.search_px
     for _ in range(_ROUNDS):
@@ -106,12 +126,15 @@ class _Field:
         first = np.floor(self.predicted).astype(int) - side
         self.origin = first.astype(float)
         window = (int(first[0]), int(first[1]), 2 * side + 1, 2 * side + 1)
-        grey = scan.window(*window, expected.weights)
-        ground = cv2.GaussianBlur(grey, (0, 0), self.coarse_px)
-        detail = grey - ground
+        light = scan.light(*window, expected.weights)
+        self.coding = Coding(None, scan.tone, scan.full_scale_dn)
+        self.ground_dn = ground = np.asarray(cv2.GaussianBlur(light, (0, 0), self.coarse_px), np.float32)
+        detail = light - ground
         spread = cv2.GaussianBlur(detail**2, (0, 0), _TEXTURE * self.coarse_px)
-        self.texture_dn: Array = np.sqrt(spread + (FAINT * scan.full_scale_dn) ** 2)
-        room_dn = np.maximum(self.polarity * (extreme_dn - ground), 0.0)
+        least_dn = np.abs(self.coding.light_of_step_dn(ground, FAINT * scan.full_scale_dn))
+        self.texture_dn: Array = np.sqrt(spread + least_dn**2)
+        extreme = float(scan.tone.light(np.array(extreme_dn), scan.full_scale_dn))
+        room_dn = np.maximum(self.polarity * (extreme - ground), 0.0)
         self.room_dn = np.where(scan.inside(*window), room_dn, 0.0).astype(np.float32)
         self.room = self.room_dn / self.texture_dn  # what a mark could change, over what the texture changes
         self.detail: Array = np.asarray(np.clip(detail / self.texture_dn, -_CLIP, _CLIP) * self.polarity, dtype=float)
@@ -153,10 +176,13 @@ class _Field:
             place_covariance=Covariance.of_noise(inverse @ slopes @ inverse),
             pixel_from_mark=np.column_stack([self.linear, place]),
             contrast_dn=contrast_dn,
-            stored_contrast_dn=contrast_dn,
+            stored_contrast_dn=self.coding.stored_contrast_dn(
+                float(np.average(self.ground_dn[patch], weights=lit)), contrast_dn
+            ),
             noise_dn=float(np.average(self.texture_dn[patch], weights=lit)),
             blur_px=blur_px,
-            damaged_fraction=1 - float((lit > _LINE * lit.max()).sum() / (lines > _LINE * lines.max()).sum()),
+            damaged_fraction=max(1 - float((lit > _LINE * lit.max()).sum() / (lines > _LINE * lines.max()).sum()), 0.0),
+            lost_fraction=0.0,
             redundancy=int((lit > 0).sum()) - 3,
             neighbour_correlation=_neighbour_correlation(self.detail, texture),
             covariance_is_white=False,

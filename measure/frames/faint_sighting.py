@@ -49,7 +49,7 @@ def look_for_faint(sighter: FrameSighter, reach_px: float) -> None:
         return
     # The marks that agree tell both better than a faint mark does itself.
     blur_px = float(np.median([fit.blur_px for fit in agreeing.values()]))
-    usual_dn = float(np.median([abs(fit.contrast_dn) for fit in agreeing.values()]))
+    usual_dn = float(np.median([abs(fit.stored_contrast_dn) for fit in agreeing.values()]))
     extremes = _extremes_dn(sighter)
     reached = _reached_dn(sighter, agreeing)
     for index, sighting in faint:
@@ -123,5 +123,5 @@ def _take(sighter: FrameSighter, index: int, sighting: Sighting, seen: FaintMark
 
 def _is_certain(sighter: FrameSighter, seen: FaintMark) -> bool:
     """Whether neither texture nor rounding feigns it."""
-    strong = abs(seen.fit.contrast_dn) >= _FAINT_CONTRAST * sighter.scan.full_scale_dn
+    strong = abs(seen.fit.stored_contrast_dn) >= _FAINT_CONTRAST * sighter.scan.full_scale_dn
     return seen.chance <= TEXTURE_LIKE_A_FAINT_MARK and strong

@@ -26,6 +26,7 @@ _AGREEING, _AGREEING_SHARE = 3, 0.3  # marks, and of those in the scan: two fit 
 _CHECKED = 4  # marks that agree: an affine transformation through them has a check
 WRONG_PX = 0.5  # an error that a mark called measured must not have
 _PLAIN_SIGMA_PX = 0.25  # in plain noise a standard deviation says all; on a landscape it knows of in part only
+_MOST_LOST = 0.85  # of what tells a mark's place: what is left may be an end of a line, or another's
 _MOST_UNLIKE = 0.03  # of a mark that its drawing may lack: with more gone, what is left may still be another's
 _FAR = 4.0  # times the scatter of the others, a median: nearly five standard deviations
 _LEAST_SCATTER_MM = 2 * SCATTER_MM  # of few marks, which may agree by chance better than film keeps them
@@ -147,6 +148,9 @@ class Frame:
             reasons.append(Reason(f"its contrast is only {fit.snr:.1f} times the noise", Code.CONTRAST))
         if fit.damaged_fraction > CLEAR_DAMAGE + min(self._unlike_drawing, _MOST_UNLIKE):
             reasons.append(Reason(f"{fit.damaged_fraction:.0%} of it is damaged", Code.COVERED))
+        elif fit.lost_fraction > _MOST_LOST:
+            told = f"{fit.lost_fraction:.0%} of what tells its place in one direction is damaged"
+            reasons.append(Reason(told, Code.COVERED))
         sigma_px = largest_sigma_px(fit.covariance_px2)
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX
         if may_be_wrong(fit.covariance_px2) and not is_plain:

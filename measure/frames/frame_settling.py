@@ -2,6 +2,7 @@
 and doubted where they look unlike the others."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from measure.covariance import Cause
 from measure.fitting.generators import is_round
 from measure.fitting.matching import Match
-from measure.frames.frame import WRONG_PX
+from measure.frames.frame import CLEAR_LIKENESS, WRONG_PX
+from measure.frames.frame_edges import told_by_edges
 from measure.frames.frame_sighter import FrameSighter
 from measure.frames.mark_comparison import (
     SharedBlur,
@@ -28,7 +30,7 @@ from measure.noise.noise import may_be_noise
 from measure.probabilities import LARGE_ERROR
 from measure.reason import Code, Reason
 from measure.scans.told_tone import FrameTone, ToldTone
-from measure.scans.tone import Tone
+from measure.scans.tone import SaidOfTone, Tone
 
 Array = NDArray[np.float64]
 
@@ -36,9 +38,7 @@ _STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
 # Whether marks that contradict one another are doubted, in each round of matching by a better curve: far off all do.
 _TONE_ROUNDS = (False, False, False, True, True)
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # powers; of a contradiction that needs none of them
-_CONTRADICTED = (
-    1.0  # likewise, with which marks are not measured: chi-square over its degrees of freedom, beyond chance
-)
+_CONTRADICTED, _FAR_PX = 1.0, 0.05  # of a contradiction, and of what is not known of any curve: marks are doubted
 _MOVED = 0.3  # of its standard deviation that a mark may still move
 _SETTLED_PX = 1.5  # about a mark that was matched already
 
@@ -64,16 +64,17 @@ def _settle_from(sighter: FrameSighter, tone: Tone) -> None:
     unsettled = {index for index, fit in _clear(sighter).items() if _leans_or_is_strained(sighter, index, fit)}
     if tone is not sighter.scan.tone:
         sighter.scan, unsettled = sighter.scan.seen_through(tone), set(_told_of_tone(sighter))
+    edges = _told_by_edges(sighter)
     for doubting in _TONE_ROUNDS:
-        unsettled |= _moved_by_tone(sighter, doubting)
+        unsettled |= _moved_by_tone(sighter, _frame_tone(sighter, edges, doubting))
         if not unsettled:
             continue
         frame_sigma = _frame_sigma(sighter)
         for index in sorted(unsettled):
             _match_again(sighter, index, sighter.options.match, frame_sigma)
         sighter.judge()
-        unsettled = set()
-    sighter.tone = FrameTone.of(sighter.prior_tone, _told_of_tone(sighter), sighter.scan.tone)
+        edges, unsettled = _told_by_edges(sighter), set()
+    sighter.tone = _frame_tone(sighter, edges, doubting=True)
 
 
 def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: Match) -> bool:
@@ -81,16 +82,27 @@ def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: Match) -> bool
     return leans_on_frame(mark) or strained_px(mark, fit.pixel_from_mark[:, :2], linear) > _STRAINED * fit.sigma_px
 
 
-def _moved_by_tone(sighter: FrameSighter, doubting: bool) -> set[int]:
-    """The marks that say something of the tone curve, if what all of them say moves any; the scan is then seen through
-    that."""
+def _moved_by_tone(sighter: FrameSighter, found: FrameTone) -> set[int]:
+    """The marks that say something of the curve, if what was found moves any; the scan is then seen through that."""
     told, before = _told_of_tone(sighter), sighter.scan.tone
-    found = FrameTone.of(sighter.prior_tone, told, before, doubting)
     clear = _clear(sighter)
     if not any(found.moves_px(one, before) > _MOVED * clear[index].sigma_px for index, one in told.items()):
         return set()
     sighter.scan = sighter.scan.seen_through(found.step_from(before))
     return set(told)
+
+
+def _frame_tone(sighter: FrameSighter, edges: Sequence[SaidOfTone], doubting: bool) -> FrameTone:
+    """By the marks and the frame's edges; doubting: as `FrameTone.of` takes it."""
+    return FrameTone.of(sighter.prior_tone, _told_of_tone(sighter), sighter.scan.tone, doubting, edges)
+
+
+def _told_by_edges(sighter: FrameSighter) -> list[SaidOfTone]:
+    """By the frame's edges beside the marks, where one of these leans on the curve. What lossy compression rounds away
+    is alike all along an edge, and looks like a curve."""
+    if sighter.scan.is_lossy or not _leans_on_tone(sighter):
+        return []
+    return told_by_edges(sighter.scan, sighter.layout, sighter.pixel_from_camera, sighter.weights)
 
 
 def _leans_on_tone(sighter: FrameSighter) -> bool:
@@ -104,16 +116,16 @@ def _told_of_tone(sighter: FrameSighter) -> dict[int, ToldTone]:
 
 
 def count_tone(sighter: FrameSighter) -> None:
-    """What is not known of the tone curve, in the covariance of every mark that it moves. Where the marks agree on no
-    curve, something else is in their edges, and those that lean on the curve are doubted."""
-    for index, fit in _clear(sighter).items():
-        if fit.tone is None:
-            continue
-        sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(fit.tone))
-        sighter.widen(index, Cause.TONE, sighter.tone.covariance_of_own_px2(fit.tone, sighter.prior_tone))
-        if sighter.tone.contradiction > _CONTRADICTED and fit.tone.leans_px > fit.sigma_px:
-            told = "the marks' edges agree on no tone curve: they are not as drawn, or lit unevenly"
-            sighter.doubt(index, Reason(told, Code.TONE))
+    """What is not known of the tone curve, in the covariance of each mark that it moves. Where the marks agree on none,
+    something else is in their edges, and those that a curve moves far are doubted."""
+    for index, sighting in enumerate(sighter.sightings):
+        told = None if sighting is None or sighting.fit is None else sighting.fit.tone
+        if told is not None:
+            sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(told, sighter.prior_tone))
+            sighter.widen(index, Cause.TONE, sighter.tone.covariance_of_own_px2(told, sighter.prior_tone))
+            if sighter.tone.contradiction > _CONTRADICTED and told.leans_px > _FAR_PX:
+                reason = "the marks' edges agree on no tone curve: they are not as drawn, or lit unevenly"
+                sighter.doubt(index, Reason(reason, Code.TONE))
 
 
 def share_blur(sighter: FrameSighter) -> None:
@@ -233,9 +245,10 @@ def _frame_sigma(sighter: FrameSighter) -> float:
 
 
 def _match_again(sighter: FrameSighter, index: int, options: MatchOptions, frame_sigma: float) -> None:
-    """Where it was found, with the frame's rotation and scale where it leans on them."""
+    """Where it was found, with the frame's rotation and scale where it leans on them. What does not look like the mark
+    any longer, a line along which it slid, is no better than what did."""
     fit = _matched(sighter, index, options, frame_sigma)
-    if fit is not None:
+    if fit is not None and (fit.likeness >= CLEAR_LIKENESS or not sighter.clear(index)):
         _take(sighter, index, fit)
 
 

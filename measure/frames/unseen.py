@@ -40,10 +40,10 @@ def reason_unseen(ground: Ground, usual_dn: float, reach_px: float, seen: FaintM
         )
     within = f"within {reach_px:.0f} px of its place"
     could = min(ground.room_dn, usual_dn)
-    if seen is not None and abs(seen.fit.contrast_dn) < _SHOWS * could:
+    if seen is not None and abs(seen.fit.stored_contrast_dn) < _SHOWS * could:
         return Reason(
             f"nothing {within} looks like it: what does so most changes the ground by "
-            f"{_grey(abs(seen.fit.contrast_dn))}, where the mark could by {could:.0f}",
+            f"{_grey(abs(seen.fit.stored_contrast_dn))}, where the mark could by {could:.0f}",
             Code.NOT_FOUND,
         )
     return Reason(

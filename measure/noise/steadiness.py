@@ -1,9 +1,10 @@
 """Noise that grows with light: by how much, as the pixels of a fit show it.
 
-A sensor's own noise is alike in light. What is added to grey values, or rounded or compressed away of them, is alike in
-these, and in light as many times larger as light grows faster with them; grain lies between. So noise is taken to grow
-as a power of that slope, from 0, alike in light, to 1, alike in grey values. What seems to grow faster is no noise: it
-is a mark that is not as drawn, and to weigh it down would fit less and less of it.
+A sensor's own noise is alike in light. What is added to grey values that are a power of light, or rounded or compressed
+away of them, is alike in these, and in light the larger the more light there is; grain lies between. So the standard
+deviation of noise is taken to grow as a power of light, from 0, alike in light, to that of noise alike in grey values
+of a gamma of 2.2: the same however a file codes light. What seems to grow faster is no noise: it is a mark that is not
+as drawn, and to weigh it down would fit less and less of it.
 """
 
 import numpy as np
@@ -14,7 +15,7 @@ from measure.noise.noise import robust_scale
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_POWER, _POWER_SIGMA, _MOST = 0.75, 0.5, 1.0  # of the slope: what is believed of any scan
+_POWER, _POWER_SIGMA, _MOST = 0.4, 0.25, 1 - 1 / 2.2  # of light: what is believed of any scan
 _OTHER, _SAME = (
     0.5,
     0.15,
@@ -22,19 +23,21 @@ _OTHER, _SAME = (
 _GREATEST = 0.98  # of the pixels change less than what is called the greatest change
 _FEWEST = 12  # pixels that tell how noisy they are
 _SCALE_VARIANCE = 1.36  # of the logarithm of a robust scale, times the number of values it is of
-_LEAST = 0.05  # of the slope's logarithm: noise hardly changes with less
+_LEAST = 0.1  # of light's logarithm: noise hardly changes with less
+_DARKEST = 5e-4  # of full scale: nearer to black no scanner's noise is less
 
 
-def steadiness(residuals: Array, slopes: Array, ground: Mask, used: Mask) -> Array:
+def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Array:
     """(height, width): the standard deviation of the ground's noise over that of each pixel.
 
-    residuals (height, width): light that a fit left; slopes, alike: by how much light grows with the grey value;
-    ground, used, alike: the ordinary pixels, and those that count. Damage hardly does: scales are medians.
+    residuals (height, width): light that a fit left; light, alike: what it draws, of full scale; ground, used,
+    alike: the ordinary pixels, and those that count. Damage hardly does: scales are medians.
     """
     at_ground = ground & used
     if not at_ground.any():
         return np.ones_like(residuals)
-    change = np.log(slopes / np.median(slopes[at_ground]))
+    light = np.maximum(light, _DARKEST)
+    change = np.log(light / np.median(light[at_ground]))
     size = np.abs(change)
     greatest = float(np.quantile(size[used], _GREATEST))
     if greatest < _LEAST:

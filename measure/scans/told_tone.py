@@ -1,6 +1,6 @@
 """What marks say of the tone curve of their scan, and what is not known of it in their places."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,11 +43,18 @@ class FrameTone:
     contradiction: float = 0.0
 
     @classmethod
-    def of(cls, prior: Tone, told: Mapping[int, ToldTone], matched_by: Tone, doubting: bool = True) -> "FrameTone":
-        """By what each mark says; doubting: as `Tone.told` takes it."""
+    def of(
+        cls,
+        prior: Tone,
+        told: Mapping[int, ToldTone],
+        matched_by: Tone,
+        doubting: bool = True,
+        edges: Sequence[SaidOfTone] = (),
+    ) -> "FrameTone":
+        """By what each mark says, and edges that are no marks; doubting: as `Tone.told` takes it."""
         if not told:
             return cls(prior)
-        each = [one.said for one in told.values()]
+        each = [*(one.said for one in told.values()), *edges]
         tone, said = prior.told(each, doubting)
         least, greatest = min(one.least for one in told.values()), max(one.greatest for one in told.values())
         apart = tone.mean - matched_by.mean
@@ -64,10 +71,15 @@ class FrameTone:
         """How far a mark lies elsewhere by this curve than by the one before."""
         return float(np.hypot(*(told.on_place @ (self.tone.mean - before.mean))))
 
-    def covariance_px2(self, told: ToldTone) -> Array:
+    def covariance_px2(self, told: ToldTone, prior: Tone) -> Array:
         """(2, 2) of a mark's place, for what is not known of the curve, whose variance of unit weight is by how much
-        the marks contradict one another on it: as much then moves them that is no curve."""
-        return np.asarray((1 + self.contradiction) * told.on_place @ self.tone.covariance @ told.on_place.T)
+        the marks contradict one another on it: as much then moves them that is no curve. Where they agree on none, it
+        is as unknown as it was before."""
+        agreed = 1 / (1 + self.contradiction**2)
+        off = self.tone.mean - prior.mean
+        covariance = agreed * (1 + self.contradiction) * self.tone.covariance
+        covariance = covariance + (1 - agreed) * (prior.covariance + np.outer(off, off))
+        return np.asarray(told.on_place @ covariance @ told.on_place.T)
 
     def covariance_of_own_px2(self, told: ToldTone, prior: Tone) -> Array:
         """(2, 2) of a mark's place, for how far the curve that its own picture wants would move it from here, beyond

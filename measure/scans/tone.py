@@ -19,7 +19,6 @@ _PIECES = 1024  # of the range of codes, in which a curve is straight
 _NODES = np.linspace(0.0, 1.0, _PIECES + 1)
 _MIDDLES = (_NODES[1:] + _NODES[:-1]) / 2
 _TOE = 0.005  # of full scale: the slope of a power has no logarithm at black
-_DARKEST = 0.02  # of full scale: nearer to black the slope of a power is nearly nothing, and no scanner's noise is
 # What is believed of a curve of which nothing is said: between linear and sRGB, and a scanner may bend it further. The
 # waves are Legendre's polynomials; their standard deviations let S-curves be that a scanner's "contrast" makes.
 _POWER, _POWER_SIGMA = 1.6, 0.6
@@ -137,6 +136,14 @@ class Tone:
         """The same with other departures."""
         return replace(self, mean=mean)
 
+    @property
+    def ends(self) -> tuple["Tone", ...]:
+        """The curves that it may be: itself where it is known, else one standard deviation of power to either side."""
+        if self.is_known:
+            return (self,)
+        sigma = np.sqrt(self.covariance[0, 0]) * np.eye(len(_SIGMAS))[0]
+        return self.at(self.mean - sigma), self.at(self.mean + sigma)
+
     def told(self, each: Sequence[SaidOfTone], doubting: bool = True) -> tuple["Tone", SaidOfTone | None]:
         """What is believed when pictures have said something, too, and what that is together. What the file says they
         may contradict. doubting: whether they count by how well they agree; far from the curve they need not."""
@@ -193,11 +200,6 @@ class Tone:
     def code(self, light: NDArray[np.floating], full_scale: float) -> Array:
         """The grey value that such light is stored as."""
         return np.asarray(full_scale * np.interp(np.asarray(light) / full_scale, self._table, _NODES))
-
-    def slopes(self, light: NDArray[np.floating], full_scale: float) -> Array:
-        """(...) by how much light grows with the code, 1 for a linear curve, at codes that stand for this light."""
-        share = np.maximum(self.code(light, full_scale) / full_scale, _DARKEST)
-        return np.asarray(np.interp(share, _MIDDLES, np.diff(self._table) * _PIECES))
 
     def changes(self, light: NDArray[np.floating], full_scale: float) -> Array:
         """(k, ...) what light becomes more of for each departure of 1, at codes that stand for this light."""

@@ -6,8 +6,10 @@ import numpy as np
 from brute_marks import Array, brute_picture, written_scan
 from scipy.ndimage import gaussian_filter
 
+from measure.covariance import Cause
 from measure.frames.faint_marks import FaintMark, find_faint
 from measure.marks.shapes import MarkShape, cross
+from measure.scans.tone import Tone, power
 from measure.search.prediction import MarkPrediction
 
 CROSS = MarkShape(cross(0.5, 0.05), "dark")
@@ -62,3 +64,23 @@ def test_bare_texture_answers_as_often_as_chance_says(tmp_path: Path) -> None:
 def test_where_the_ground_is_black_nothing_is_seen(tmp_path: Path) -> None:
     black = np.zeros((SIDE_PX * STEP_PX,) * 2)
     assert all(found is None for found in seen_at(black, places(1)[:3], tmp_path))
+
+
+def test_what_the_tone_curve_moves_a_faint_mark_by_is_in_its_covariance(tmp_path: Path) -> None:
+    """A cross on ground that is darker to one side: how much each of its lines counts depends on the curve."""
+    grey = textured(5) * np.linspace(0.5, 1.6, SIDE_PX * STEP_PX)
+    place = places(5)[12]
+    grey -= 6000 * brute_picture(CROSS, np.column_stack([LINEAR, place]), grey.shape[1], grey.shape[0], 0.7)
+    expected = MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1)
+    with written_scan(grey, tmp_path) as scan:
+        prior = Tone.unknown()
+        seen = find_faint(scan.seen_through(prior), expected, 0.0, 0.7)
+        ends = [find_faint(scan.seen_through(Tone(power(value))), expected, 0.0, 0.7) for value in (1.0, 2.2)]
+    assert seen is not None
+    assert ends[0] is not None
+    assert ends[1] is not None
+    half = (ends[1].fit.center_px - ends[0].fit.center_px) / 2
+    assert np.hypot(*half) > 1e-4
+    np.testing.assert_allclose(seen.fit.place_covariance.parts[Cause.TONE], np.outer(half, half), rtol=0.25)
+    np.testing.assert_allclose(seen.fit.center_px, ends[0].fit.center_px + half, atol=0.002)
+    assert Cause.TONE not in ends[0].fit.place_covariance.parts

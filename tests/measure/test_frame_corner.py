@@ -5,13 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from brute_marks import written_scan
-from drawn import drawn, transformed
+from drawn import drawn, scan_of, transformed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.marks.shapes import FiducialLayout, LayoutMark, frame_corner
+from measure.fitting.matching import Match
+from measure.frames.frame_edges import told_by_edges
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, frame_corner, polygon
+from measure.scans.tone import Tone, power
 from measure.search.prediction import MarkPrediction
 from measure.special_marks.frame_corner import corner_of_edges
 from measure.status import Status
@@ -85,3 +88,45 @@ def test_no_corner_is_seen_in_a_landscape(tmp_path: Path) -> None:
         fit = corner_of_edges(scan, corner, MarkPrediction(corner, start, 10.0, 1))
     assert not fit.converged
     assert "edge of the frame" in fit.reason
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> None:
+    corner = frame_corner((-10.0, 10.0), 5.0)
+    start = np.column_stack([MATRIX[:, :2], MATRIX @ (-10.0, 10.0, 1.0)])
+    scan = scan_of(65535 * (picture(4) / 65535) ** (1 / gamma))
+    tone = Tone(power(gamma), covariance=np.eye(5))
+
+    def fitted(tone: Tone) -> Match:
+        fit = corner_of_edges(scan.seen_through(tone), corner, MarkPrediction(corner, start, 6.0, 1))
+        assert fit.converged
+        return fit
+
+    told = fitted(tone).tone
+    assert told is not None
+    for k in range(2):
+        more, less = (fitted(tone.at(way * 0.1 * np.eye(5)[k])).center_px for way in (1, -1))
+        np.testing.assert_allclose((more - less) / 0.2, told.on_place[:, k], atol=0.1)
+    assert np.hypot(*told.on_place[:, 0]) > 0.15
+    assert told.said.square < 25  # of 5 figures, by the true curve
+    assert fitted(Tone(power(gamma))).tone is None
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_the_frames_edges_beside_its_marks_tell_the_curve(gamma: float) -> None:
+    wedge = MarkShape(polygon(((0.0, 0.0), (1.4, 0.7), (1.4, -0.7))))
+    places = ((9.2, 0.0), (-9.2, 0.0), (0.0, 9.2), (0.0, -9.2))
+    marks = FiducialLayout(
+        tuple(LayoutMark(str(n), at, (0.0, 0.0), wedge) for n, at in enumerate(places)), (20.0, 20.0)
+    )
+    scan = scan_of(65535 * (picture(5) / 65535) ** (1 / gamma))
+    by_truth = Tone(power(gamma), covariance=np.eye(5))
+    (said,) = told_by_edges(scan.seen_through(by_truth), marks, MATRIX, None)
+    assert said.square < 25  # of 5 figures
+    other = by_truth.like_power(gamma + 0.5)
+    (said,) = told_by_edges(scan.seen_through(other), marks, MATRIX, None)
+    prior = Tone(power(gamma + 0.5), covariance=4 * np.eye(5))
+    found, _ = prior.told([said])
+    value, sigma = found.power_between(0.2, 0.5)
+    assert abs(value - gamma) < 3 * sigma
+    assert sigma < 0.7 * prior.power_between(0.2, 0.5)[1]

@@ -101,3 +101,12 @@ def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause() -> None
     assert after is not None
     np.testing.assert_allclose(after.covariance_px2 - before.covariance_px2, 2 * added, atol=1e-12)
     np.testing.assert_allclose(after.place_covariance.parts[Cause.TOUCHED], 2 * added, atol=1e-12)
+
+
+def test_a_mark_whose_place_hangs_on_a_remnant_is_weak_however_little_of_it_is_damaged() -> None:
+    frame, _ = frame_of(np.random.default_rng(3), 1.0, 1.0)
+    sighting = frame.sightings[0]
+    assert sighting.fit is not None
+    for lost, status in ((0.5, Status.MEASURED), (0.95, Status.WEAK)):
+        one = replace(sighting, fit=replace(sighting.fit, damaged_fraction=0.05, lost_fraction=lost))
+        assert replace(frame, sightings=(one, *frame.sightings[1:])).verdict(0)[0] is status

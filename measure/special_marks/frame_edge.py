@@ -1,0 +1,284 @@
+"""An edge of the exposed frame: a straight line, by many profiles across it.
+
+Across an edge the light is a step under the scanner's blur, an error function; it is fitted to every profile. The line
+through them is a robust one (Tukey), for stamps, dust and marks lie on the edge too. The landscape's contrast with the
+border differs from profile to profile, the place does not. A neighbouring frame's edge steps the other way.
+
+What a wrong tone curve leaves of a step is alike in all profiles, and the scatter among them says how well it is known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.special import erf
+
+from measure.noise.noise import robust_scale
+from measure.noise.robust import tukey_weights
+from measure.scans.scan import Scan
+from measure.scans.tone import SaidOfTone, Tone
+from measure.search.candidates import FAINT
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PROFILES = 60  # along an edge, each the median over its share of it
+_LEAST_SHARE = 0.5  # of the profiles that lie on the line: with fewer it may be another line
+_LEAST_SNR = 3.0  # of the step in one profile: less is texture
+_ABOUT_PX = 5.0  # about the line: what an edge under any usual blur takes
+_STEP_PX = 0.5  # of the samples across the edge
+_SMOOTH_PX = 1.5  # across the edge, before its slope is taken
+_TILT = 0.02  # rad: the placement knows the edge's direction better
+_ITERATIONS = 12  # of the steps across an edge
+_ROUNDS = 20  # of Tukey's line, which rests after a few
+_START_BLUR_PX = 1.5  # about that of scans
+_RIM_PX = 2.0  # of a profile: a step so near its end may be another's
+_MOST_ALIKE = 0.9  # correlation of neighbouring profiles: nineteen count as one
+_BLUR_RANGE_PX = (0.3, 4.0)
+_SCATTER_FLOOR_PX = 0.01  # under the scatter about a line: clean pictures have none
+_LEAST = 1e-6  # of the variance of all that edges show: what they hardly show
+_DRAWN = 0.005  # of a step: what is left of it below that may be the drawing's own
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeTone:
+    """What an edge says of the tone curve. Of each profile: scores (n, k), as `SaidOfTone.by_score` takes them, normal
+    (n, k, k), by which these grow with the departures, and floor (n, k, k), the covariance that they have at least.
+    on_line (2, k): by how much the offset and slope change for each departure of 1. least, greatest: the codes between
+    which it steps, shares of full scale."""
+
+    scores: Array
+    normal: Array
+    floor: Array
+    on_line: Array
+    least: float
+    greatest: float
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """across = offset + slope * along, px from the start; covariance (2, 2) of both; share: of the profiles that lie on
+    it; contrast_dn, noise_dn, blur_px, likeness: medians over these; tone: None where the curve is known."""
+
+    offset: float
+    slope: float
+    covariance: Array
+    share: float
+    contrast_dn: float
+    noise_dn: float
+    blur_px: float
+    likeness: float
+    count: int
+    tone: EdgeTone | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Where an edge is expected to run: from the start (2,) in the scan along, the frame's inside lying across, both
+    (2,) of length 1."""
+
+    scan: Scan
+    start: Array
+    along: Array
+    across: Array
+    weights: Sequence[float] | None
+
+    def profiles(self, middle: Array, offset: Array, share: float, half: float) -> tuple[Array, Mask]:
+        """(n, samples) light across the edge about an offset (n,), each the median over its share of the edge, and
+        which of them lie in the scan. A median is the same through any curve, and where noise is cut off at black."""
+        s = np.arange(-round(half / _STEP_PX), round(half / _STEP_PX) + 1) * _STEP_PX
+        run = np.linspace(-0.5, 0.5, max(int(share), 2), endpoint=False) * share
+        slope = np.gradient(offset, middle) if len(middle) > 1 else np.zeros(1)
+        t = middle[:, None, None] + run[:, None]
+        q = (offset[:, None] + slope[:, None] * run)[:, :, None] + s
+        places = (
+            self.start[:, None, None, None] + self.along[:, None, None, None] * t + self.across[:, None, None, None] * q
+        )
+        low = np.floor(places.min(axis=(1, 2, 3))).astype(int) - 2
+        size = np.ceil(places.max(axis=(1, 2, 3))).astype(int) + 3 - low
+        window = self.scan.light(int(low[0]), int(low[1]), int(size[0]), int(size[1]), self.weights)
+        col, row = places - low[:, None, None, None]
+        grey = map_coordinates(window, [row, col], order=1, mode="nearest")
+        limit = np.array([self.scan.width_px, self.scan.height_px])[:, None, None, None] - 1
+        inside = ((places >= 0) & (places <= limit)).all(axis=(0, 2, 3))
+        return np.asarray(np.median(grey, axis=1), dtype=float), np.asarray(inside)
+
+
+def edge_along(
+    course: Course, extent: tuple[float, float], search_px: float, polarity: int, count: int = PROFILES
+) -> Edge | None:
+    """The edge that runs along from the start between two distances, px; None where it is not to be seen as one line.
+    polarity: 1 where the frame's inside is lighter than its outside, -1 where it is darker, 0 where nobody knows;
+    count: of profiles."""
+    share = (extent[1] - extent[0]) / count
+    middle: Array = np.asarray(extent[0] + share * (np.arange(count) + 0.5), dtype=float)
+    half = round(search_px + _ABOUT_PX)
+    near, inside = course.profiles(middle, np.zeros(count), share, half)
+    near, middle = near[inside], middle[inside]
+    if len(middle) < _LEAST_SHARE * count:
+        return None
+    if not polarity:
+        polarity = int(np.sign(np.median(near[:, -1] - near[:, 0])))
+    line = _straightest(near * polarity, middle, half)
+    found, _ = course.profiles(middle, line[0] + line[1] * middle, share, _ABOUT_PX)
+    steps = _fit_steps(found)
+    good = steps.good & (steps.contrast * polarity > FAINT * course.scan.full_scale_dn)
+    good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
+    if good.sum() < _LEAST_SHARE * count:
+        return None
+    place = line[0] + line[1] * middle[good] + steps.place[good]
+    return _line(course.scan, middle[good], place, steps, good, len(middle))
+
+
+def said_by_edges(edges: Sequence[EdgeTone], tone: Tone) -> SaidOfTone:
+    """What several of them say of the curve by which they were fitted, known as well as the scatter of their profiles
+    says, and that from edge to edge: what is alike along an edge, a landscape or what JPEG made of it, counts once."""
+    scores, normal, floor = (
+        np.concatenate([getattr(edge, name) for edge in edges]) for name in ("scores", "normal", "floor")
+    )
+    least = floor.mean(axis=0)
+    by_profile = np.cov(scores.T) + least + _LEAST * np.trace(least) * np.eye(len(least))
+    off = np.array([(edge.scores - scores.mean(axis=0)).sum(axis=0) / np.sqrt(len(edge.scores)) for edge in edges])
+    square = float(np.sum(off * np.linalg.solve(by_profile, off.T).T))
+    more = max(square / (scores.shape[1] * max(len(edges) - 1, 1)), 1.0)
+    total = normal.sum(axis=0)
+    return SaidOfTone.by_score(total, scores.sum(axis=0) + total @ tone.mean, more * len(scores) * by_profile)
+
+
+def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
+    """Offset and slope of the straight line along which most profiles step up: a stone's edge may be stronger in some
+    of them, and so counts no more there than the frame's does elsewhere."""
+    rise = np.gradient(cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX / _STEP_PX, sigmaY=1e-3), axis=1)
+    rise = np.clip(rise, 0.0, float(np.median(rise.max(axis=1))))
+    middle = float(along.mean())
+    tilts = np.linspace(-_TILT, _TILT, 2 * int(np.ceil(_TILT * float(np.ptp(along)) / 2 / _STEP_PX)) + 1)
+    samples = np.arange(grey.shape[1])
+    votes = np.empty((len(tilts), grey.shape[1]))
+    for index, tilt in enumerate(tilts):
+        moved = np.rint(tilt * (along - middle) / _STEP_PX).astype(int)
+        column = samples[None, :] + moved[:, None]
+        inside = (column >= 0) & (column < len(samples))
+        votes[index] = (np.take_along_axis(rise, np.clip(column, 0, len(samples) - 1), axis=1) * inside).sum(axis=0)
+    best, place = np.unravel_index(int(votes.argmax()), votes.shape)
+    return float(place * _STEP_PX - half - tilts[best] * middle), float(tilts[best])
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """(n,) of every profile: where it steps (px), by how much, under which blur, and how well that describes it; drawn,
+    residuals (n, samples) and design (n, samples, 4): the light by that, what it leaves, and its derivatives."""
+
+    place: Array
+    contrast: Array
+    blur: Array
+    noise: Array
+    likeness: Array
+    good: Mask
+    drawn: Array
+    residuals: Array
+    design: Array
+
+
+def _fit_steps(grey: Array) -> _Steps:
+    """The step level + contrast * Phi((s - place) / blur) in every profile, by Gauss-Newton."""
+    s = (np.arange(grey.shape[1]) - (grey.shape[1] - 1) / 2) * _STEP_PX
+    count = len(grey)
+    place, blur = np.zeros(count), np.full(count, _START_BLUR_PX)
+    contrast, level = np.zeros(count), np.zeros(count)
+    for rounds_left in range(_ITERATIONS, -1, -1):
+        z = (s - place[:, None]) / blur[:, None]
+        step = (1 + erf(z / np.sqrt(2))) / 2
+        slope = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / blur[:, None]
+        level, contrast = _linear(step, grey)
+        by_place, by_blur = -contrast[:, None] * slope, -contrast[:, None] * slope * z
+        design = np.stack([by_place, by_blur, step, np.ones_like(step)], axis=2)
+        residuals = grey - level[:, None] - contrast[:, None] * step
+        if not rounds_left:
+            break
+        normal = np.einsum("nsi,nsj->nij", design, design)
+        normal += np.eye(4) * (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12)
+        change = np.linalg.solve(normal, np.einsum("nsi,ns->ni", design, residuals)[..., None])[..., 0]
+        place = place + np.clip(change[:, 0], -1.0, 1.0)
+        blur = np.clip(blur + np.clip(change[:, 1], -0.5, 0.5), *_BLUR_RANGE_PX)
+    noise = np.sqrt((residuals**2).mean(axis=1))
+    spread = np.maximum(grey.std(axis=1), 1e-12)
+    likeness = np.sqrt(np.clip(1 - (noise / spread) ** 2, 0.0, 1.0))
+    good = np.abs(place) < s[-1] - _RIM_PX
+    return _Steps(place, contrast, blur, noise, likeness, good, grey - residuals, residuals, design)
+
+
+def _linear(step: Array, grey: Array) -> tuple[Array, Array]:
+    """Level and contrast (n,) that put the steps best through the grey values."""
+    centred = step - step.mean(axis=1, keepdims=True)
+    contrast = (centred * grey).sum(axis=1) / np.maximum((centred**2).sum(axis=1), 1e-12)
+    return grey.mean(axis=1) - contrast * step.mean(axis=1), contrast
+
+
+def _line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask, asked: int) -> Edge | None:
+    """Tukey's line, its covariance from the scatter about it and from how far along the edge that is alike."""
+    offset, slope, weights = float(np.median(across)), 0.0, np.ones(len(along))
+    for _ in range(_ROUNDS):
+        slope, offset = (float(value) for value in np.polyfit(along, across, 1, w=np.sqrt(weights)))
+        residuals = across - offset - slope * along
+        weights = tukey_weights(residuals, max(robust_scale(residuals), _SCATTER_FLOOR_PX))
+        if (weights > 0).sum() < _LEAST_SHARE * asked:
+            return None
+    on = weights > 0
+    design = np.stack([np.ones_like(along), along], axis=1)
+    inverse = np.linalg.inv((design * weights[:, None]).T @ design)
+    residuals = across - offset - slope * along
+    variance = float((residuals[on] ** 2).sum() / max(int(on.sum()) - 2, 1)) + _SCATTER_FLOOR_PX**2
+    kept = np.flatnonzero(good)[on]
+    return Edge(
+        offset,
+        slope,
+        np.asarray(inverse * variance * _alike(residuals, on), dtype=float),
+        float(on.sum() / asked),
+        float(np.median(steps.contrast[kept])),
+        float(np.median(steps.noise[kept])),
+        float(np.median(steps.blur[kept])),
+        float(np.median(steps.likeness[kept])),
+        int(on.sum()),
+        None
+        if scan.tone.is_known
+        else _told(scan, steps, kept, np.asarray(inverse @ (design * weights[:, None]).T)[:, on]),
+    )
+
+
+def _alike(residuals: Array, on: Mask) -> float:
+    """How many neighbouring residuals count as one, their correlation falling geometrically with the distance."""
+    pairs = on[1:] & on[:-1]
+    if not pairs.any():
+        return 1.0
+    next_to = float((residuals[1:] * residuals[:-1])[pairs].mean() / max((residuals[on] ** 2).mean(), 1e-12))
+    alike = float(np.clip(next_to, 0.0, _MOST_ALIKE))
+    return (1 + alike) / (1 - alike)
+
+
+def _told(scan: Scan, steps: _Steps, kept: NDArray[np.intp], by_place: Array) -> EdgeTone:
+    """By the profiles kept, (n,) of all; by_place (2, n): derivatives of the line's offset and slope by their places.
+
+    As `fitting.tone_estimate` has it for marks. Light that is uneven on either side says nothing of the curve, nor does
+    the shape of the blur, as long as it is even; pixels and what lies between them make it no Gaussian."""
+    drawn, design = steps.drawn[kept], steps.design[kept]
+    z = ((np.arange(drawn.shape[1]) - (drawn.shape[1] - 1) / 2) * _STEP_PX - steps.place[kept, None])[..., None]
+    z = z / steps.blur[kept, None, None]
+    changes = np.moveaxis(scan.tone.changes(drawn, scan.full_scale_dn), 0, -1)
+    s = np.linspace(-1.0, 1.0, drawn.shape[1])[:, None]
+    step, slope = design[:, :, 2:3], design[:, :, :1]
+    by_shape = [slope * z**3, slope * z**5]
+    uneven = np.concatenate([design, *by_shape, step * s, step * s**2, 0 * step + s, 0 * step + s**2], axis=2)
+    left = changes - uneven @ np.linalg.pinv(uneven) @ changes
+    own = left * (_DRAWN * steps.contrast[kept, None, None])
+    codes = scan.tone.code(np.quantile(drawn, (0.0, 1.0)), scan.full_scale_dn) / scan.full_scale_dn
+    return EdgeTone(
+        scores=-np.einsum("nsk,ns->nk", left, steps.residuals[kept]),
+        normal=np.einsum("nsk,nsj->nkj", left, changes),
+        floor=np.einsum("nsk,nsj->nkj", own, own),
+        on_line=by_place @ (np.linalg.pinv(design) @ changes)[:, 0],
+        least=float(codes[0]),
+        greatest=float(codes[1]),
+    )
