@@ -1,13 +1,17 @@
 """BINGO's image coordinates: mm, refined, that is free of film and lens."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.resampling.frame_chain import Lens
+
+Array = NDArray[np.float64]
 
 CONVENTION = Convention(
     (float("nan"), float("nan")),
-    "no pixels: x right, y up in mm from the centre of the fiducial frame",
+    "no pixels: x right, y up in mm from the fiducial frame's middle, of a digital camera from its principal point",
     "support.pix4d.com, article 203590305: a line with image and camera, one a point with x and y in mm from the "
     "centre of the image, an empty line behind each image. Which way y points it does not say: up, as everywhere in "
     "photogrammetry",
@@ -22,16 +26,12 @@ def write(block: Block, options: ExportOptions) -> Written:
         if frame.model is None:
             left_out.append(f"{frame.image}: it has no part in the adjustment, so its film is not known.")
             continue
-        text, folded = _image(frame)
+        text, folded = _image(frame, _origin(block, frame))
         texts.append(text)
         left_out += folded
     assert block.adjustment is not None
-    interior = [
-        f"Camera {_word(name)}: c = {camera['principal_distance_mm']['value']:.5f} mm, principal point "
-        f"{camera['principal_point_mm']['x']['value']:.5f}, {camera['principal_point_mm']['y']['value']:.5f} mm, no "
-        "distortion."
-        for name, camera in block.adjustment["cameras"].items()
-    ]
+    cameras = {frame.camera: frame for frame in block.frames if frame.lens is not None}
+    interior = [_interior(name, frame.lens, _origin(block, frame)) for name, frame in cameras.items() if frame.lens]
     return Written(
         {"bingo.txt": "\n".join(texts)},
         (
@@ -44,14 +44,26 @@ def write(block: Block, options: ExportOptions) -> Written:
     )
 
 
-def _image(frame: OutFrame) -> tuple[str, list[str]]:
+def _origin(block: Block, frame: OutFrame) -> Array:
+    """The middle of the fiducial frame; of a digital camera, which has none, the principal point."""
+    if block.camera_file(frame.camera).fiducials or frame.lens is None:
+        return np.zeros(2)
+    return frame.lens.interior[1:]
+
+
+def _interior(camera: str, lens: Lens, origin: Array) -> str:
+    x, y = lens.interior[1:] - origin
+    return f"Camera {_word(camera)}: c = {lens.interior[0]:.5f} mm, principal point {x:.5f}, {y:.5f} mm, no distortion."
+
+
+def _image(frame: OutFrame, origin: Array) -> tuple[str, list[str]]:
     """The lines of an image, and the points whose lens could not be taken out."""
     assert frame.model is not None
     marks = frame.observed(fiducials=False)
     places = np.array([mark.xy_mm for mark in marks], dtype=float).reshape(-1, 2)
     refined, found = frame.model.ideal_from_observed(frame.model.camera_from_comparator(places))
     lines = [f"{_word(frame.image)} {_word(frame.camera)}"]
-    for mark, (x, y), usable in zip(marks, refined.tolist(), found, strict=True):
+    for mark, (x, y), usable in zip(marks, (refined - origin).tolist(), found, strict=True):
         lines += [f"{_word(mark.point)} {x:.6f} {y:.6f}"] if usable else []
     lost = [
         f"{frame.image}, point {mark.point}: the lens folds there."

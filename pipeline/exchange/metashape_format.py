@@ -25,6 +25,7 @@ CONVENTION = Convention(
     "y'f, x' = x(...) + P1 (r2 + 2x2) + 2 P2 xy; Python reference: Sensor.film_camera, pixel_size, "
     "calibrateFiducials(resolution in mm), Marker.Type.Fiducial",
 )
+_TOLD = 3  # images whose reason a message tells
 NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
 
 
@@ -38,7 +39,7 @@ def write(block: Block, options: ExportOptions) -> Written:
         else:
             frames.append(frame)
     if not frames:
-        raise InputError(f"metashape: no image can go out. {' '.join(left_out)}")
+        raise InputError(f"metashape: no image can go out. {' '.join(left_out[:_TOLD])}")
     files: dict[str, str | bytes] = {}
     notes = []
     for camera in dict.fromkeys(frame.camera for frame in frames if frame.is_oriented):

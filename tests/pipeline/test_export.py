@@ -381,6 +381,11 @@ def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypat
         folder = exported(project, format, tmp_path)
         off = np.linalg.norm(reader(folder, "f1", POINTS) - pixels[1], axis=1)
         assert off.max() < 1.05 * told_misfit_px(folder) + SAME_PX
+    folder = exported(project, "bingo", tmp_path)
+    rows = [line.split() for line in (folder / "bingo.txt").read_text(encoding="utf-8").splitlines()[1:101]]
+    ideal = ideal_mm(0, here) - (here.x0, here.y0)
+    np.testing.assert_allclose([[float(x), float(y)] for _, x, y in rows], ideal, atol=2e-6)
+    assert "principal point 0.00000, 0.00000" in (folder / "README.txt").read_text(encoding="utf-8")
     folder = exported(project, "micmac", tmp_path)
     assert not (folder / "Ori-InterneScan").exists()
     off = np.linalg.norm(micmac_px(folder, "f3", POINTS, "") - pixels[3], axis=1)
