@@ -2,7 +2,7 @@
 
 Nothing was exposed beyond the frame. A wing is no darker there than all else, and merges into the border; a notch is
 exposed as the frame is, and merges into that. So the drawing of a wing is true within the frame alone, and that of a
-notch beyond its edge.
+notch beyond its edge. A dark mark beyond the edge stands in a pocket that was exposed, too: all of it is true.
 """
 
 from dataclasses import replace
@@ -21,7 +21,8 @@ _EDGE_MM = 0.1  # so near to the frame's edge a drawing ends on it
 
 def at_border(layout: FiducialLayout) -> FiducialLayout:
     """The layout with the drawings of solid marks known where they are true: of those whose points lie in the frame,
-    and that reach its edge, within the frame; of those with a point on its edge or beyond, beyond the edge."""
+    and that reach its edge, within the frame; of those with a point on its edge or beyond, beyond the edge, unless they
+    are dark."""
     return replace(layout, marks=tuple(_at_border(mark, np.array(layout.frame_mm) / 2) for mark in layout.marks))
 
 
@@ -31,6 +32,8 @@ def _at_border(mark: LayoutMark, half_mm: Array) -> LayoutMark:
         return mark
     drawn = at + drawn_outline_mm(shape)
     beyond = np.abs(at) >= half_mm - _EDGE_MM
+    if beyond.any() and shape.polarity == "dark":
+        return mark
     if beyond.any():
         outwards = np.where(beyond, np.sign(at), 0.0)
         if beyond.all() or (drawn @ outwards).min() > half_mm[beyond][0] + _EDGE_MM:

@@ -57,7 +57,8 @@ class Trial:
 class Identification:
     """The trials, best first, and what follows from them. unreported: by name, what cameras without any calibration
     report rest on. pitch_um: of the scan in x and y, as given or as its file has it. plate: what the camera's own plate
-    says, by field; contradicted: by name, how it says that it is of no such camera."""
+    says, by field; contradicted: by name, how it says that it is of no such camera. alike: by name, other cameras whose
+    marks are drawn much like its own."""
 
     scan: Path
     trials: tuple[Trial, ...]
@@ -65,6 +66,7 @@ class Identification:
     pitch_um: tuple[float, float] | None = None
     plate: Mapping[str, str] = field(default_factory=dict)
     contradicted: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    alike: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @property
     def best(self) -> tuple[Trial, ...]:
@@ -90,7 +92,16 @@ class Identification:
         named = [name for trial in self.best for name in trial.cameras if name in self.unreported]
         told += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
         against = self.against_pitch()
-        return told + self._of_plate() + (f" {against}" if against else "")
+        return told + self._of_forms() + self._of_plate() + (f" {against}" if against else "")
+
+    def _of_forms(self) -> str:
+        """That a name rests on the form of wings, notches or arrows alone, of which others have much the same."""
+        best = [name for trial in self.best for name in trial.cameras]
+        others = [other for name in best for other in self.alike.get(name, ()) if other not in best]
+        if not others:
+            return ""
+        told = " or ".join(dict.fromkeys(others))
+        return f" That rests on the form of its marks alone, and {told} has marks much like them: compare the drawings."
 
     def _of_plate(self) -> str:
         """What the plate says of the cameras that stand out."""

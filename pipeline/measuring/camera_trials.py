@@ -12,6 +12,7 @@ from adjust.initial_values.fiducial_fit import fit_transformation
 from measure.fiducial_options import FiducialOptions
 from measure.frames.camera_recognition import likeness
 from measure.frames.frame import Frame
+from measure.marks.frame_border import at_border
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.scans.scan import open_scan
 from measure.writing.networks import networks
@@ -19,6 +20,7 @@ from measure.writing.reading import read_writing
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, plate_of
+from pipeline.measuring.drawn_alike import drawn_alike
 from pipeline.measuring.layout_search import LayoutSearch, Tried, same_marks
 from pipeline.progress import Count, Reporter
 
@@ -45,7 +47,7 @@ def identify(
     """
     with open_scan(path, max_pixels) as whole, reporter.stage("trying") as count:
         search, given = LayoutSearch(whole), whole.pitch_um if pitch_um is None else (pitch_um, pitch_um)
-        layouts = {names: cameras[names[0]].layout() for names in _alike(cameras)}
+        layouts = {names: at_border(cameras[names[0]].layout()) for names in _alike(cameras)}
         trials = list[Trial]()
         if given is not None:
             trials = _as_given(search, layouts, given, count)
@@ -57,7 +59,7 @@ def identify(
     plate = _plate(path, max_pixels) if any(trial.stands_out for trial in trials) else {}
     told = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in told.items() if against}
-    return Identification(path, ranked, unreported, given, plate, contradicted)
+    return Identification(path, ranked, unreported, given, plate, contradicted, drawn_alike(layouts))
 
 
 def _plate(path: Path, max_pixels: int | None) -> dict[str, str]:
@@ -110,9 +112,10 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
 
 def _expected_at_most(seen: Trial, marks: int) -> float:
     """How many constellations chance may make of a layout of so many marks for it to be measured after a trial that
-    stands out. Where that has more marks, nine crosses of a lattice, say, answer to a lattice of nine; but chance makes
-    nine so much more easily than twenty-five."""
-    return min(_BY_CHANCE, _ODDS * seen.expected) if seen.found > marks else _BY_CHANCE
+    stands out: where that is certain, the other has to be so, too. Where it has more marks, nine crosses of a lattice,
+    say, answer to a lattice of nine; but chance makes nine so much more easily than twenty-five."""
+    most = _CERTAIN if seen.expected <= _CERTAIN else _BY_CHANCE
+    return min(most, _ODDS * seen.expected) if seen.found > marks else most
 
 
 def _not_looked_at(names: Names, each: Tried) -> Trial:

@@ -62,10 +62,10 @@ class LayoutSearch:
         return self._tried(layout, bold, picture, hypotheses)
 
     def at_any_pitch(self, layout: FiducialLayout) -> Tried:
-        """Where the frame may fill the scan."""
+        """Where the frame may fill the scan, its pixels being square."""
         bold = _boldest(layout)
         picture = self._coarse_solid if all(_is_solid(mark) for mark in bold.marks) else self._coarse
-        return self._tried(layout, bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions()))
+        return self._tried(layout, bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions())[:1])
 
     def refined(self, coarse: Tried) -> Tried:
         """At the pitch that the best answer came to, in a larger picture."""

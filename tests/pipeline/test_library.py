@@ -23,7 +23,8 @@ from pipeline.files.library import library_names, library_path, read_library
 from pipeline.files.project_file import read_project
 from pipeline.measuring import camera_trials
 from pipeline.measuring.camera_answer import Identification, Trial
-from pipeline.measuring.camera_trials import identify
+from pipeline.measuring.camera_trials import _alike, identify
+from pipeline.measuring.drawn_alike import drawn_alike
 from pipeline.progress import Reporter
 from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.rendered.scene_file import render_project
@@ -284,3 +285,17 @@ def test_cameras_that_come_close_are_all_named() -> None:
     assert "c comes close with 0.85" in found.sentence()
     without_report = replace(found, unreported={"c": "made from one frame", "d": "nobody knows"})
     assert without_report.sentence().endswith("c rests on no calibration report: made from one frame.")
+
+
+def test_wings_of_much_the_same_form_are_told_beside_a_name_that_rests_on_them() -> None:
+    layouts = {names: LIBRARY[names[0]].layout() for names in _alike(LIBRARY)}
+    alike = drawn_alike(layouts)
+    assert "fairchild-k17-small-flat-153" in alike["fairchild-k17-curved-flat-305"]
+    assert "fairchild-t12-notch-152" in alike["fairchild-t11-notch-153"]
+    assert "wing-hollow-153" not in alike
+    assert RENDERED not in alike  # its marks are lines
+    found = Identification(Path("a.tif"), (trial(("a",), 0.9), trial(("c",), 0.4)), alike={"a": ("b", "d")})
+    assert found.sentence().endswith(
+        " That rests on the form of its marks alone, and b or d has marks much like them: compare the drawings."
+    )
+    assert "form of its marks" not in replace(found, alike={"c": ("a",)}).sentence()
