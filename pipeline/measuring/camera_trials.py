@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ Names = tuple[str, ...]
 _FEW = 3  # of the answers while the pitch is sought: those that are tried at the pitch that each comes to
 _CERTAIN = 0.01  # constellations expected by chance: no mark need be matched in wrong places to know better
 _BY_CHANCE = 1.0  # constellation expected: chance may have made it
+_HOPELESS = 100.0  # likewise: so many answer as well that its marks need not be looked at
 _ODDS = 1000.0  # times what chance makes of another camera's marks: that one is seen, and not this
 _AFFINE = 6  # parameters
 
@@ -47,7 +49,7 @@ def identify(
     """
     with open_scan(path, max_pixels) as whole, reporter.stage("trying") as count:
         search, given = LayoutSearch(whole), whole.pitch_um if pitch_um is None else (pitch_um, pitch_um)
-        layouts = {names: at_border(cameras[names[0]].layout()) for names in _alike(cameras)}
+        layouts = {names: _as_seen(cameras[names[0]].layout()) for names in _alike(cameras)}
         trials = list[Trial]()
         if given is not None:
             trials = _as_given(search, layouts, given, count)
@@ -60,6 +62,15 @@ def identify(
     told = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in told.items() if against}
     return Identification(path, ranked, unreported, given, plate, contradicted, drawn_alike(layouts))
+
+
+def _as_seen(layout: FiducialLayout) -> FiducialLayout:
+    """With the drawings of wings known within the frame alone. What is left of a mark beyond the frame's edge is hardly
+    more than a corner, and answers to many a thing: it is taken as drawn."""
+    half_mm = np.array(layout.frame_mm) / 2
+    pairs = zip(layout.marks, at_border(layout).marks, strict=True)
+    marks = tuple(seen if (np.abs(given.xy_mm) < half_mm).all() else given for given, seen in pairs)
+    return replace(layout, marks=marks)
 
 
 def _plate(path: Path, max_pixels: int | None) -> dict[str, str]:
@@ -95,14 +106,15 @@ def _at_any_pitch(search: LayoutSearch, layouts: Mapping[Names, FiducialLayout],
 
 
 def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) -> list[Trial]:
-    """Of every layout, those first that answer better than chance. Once one of these stands out, the marks of another
-    are looked at only where it answers better than chance too, and may be more than a part of what was found."""
+    """Of every layout, those first that answer better than chance. The marks of none are looked at that chance answers
+    as well a hundred times; and once one stands out, only of those that answer better than chance too, and may be more
+    than a part of what was found."""
     trials: list[Trial] = []
     ranked = sorted(tries, key=lambda names: tries[names].answer.expected)
     for done, names in enumerate(ranked, len(ranked)):
         each = tries[names]
         limits = [_expected_at_most(trial, len(each.layout.marks)) for trial in trials if trial.stands_out]
-        if limits and each.answer.expected > min(limits):
+        if each.answer.expected > min([*limits, _HOPELESS]):
             trials.append(_not_looked_at(names, each))
         else:
             count(", ".join(names), done, 2 * len(ranked))
