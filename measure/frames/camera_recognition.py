@@ -21,7 +21,6 @@ from measure.search.pitches import PitchHypothesis
 _COMPARED = 5  # best placements: the one that chance makes least is among them
 _QUICK = Effort(held_bytes=84 << 20, half_px=16)
 _PLACES = 2  # that are looked at, each in the poses that answer there
-_PLAIN = 0.8  # likeness from which on no other pose need be looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,21 +49,19 @@ def answer(
 
 
 def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.0) -> Frame | None:
-    """The frame as its marks look at the first of the best places where they agree, in the pose in which they look most
-    as drawn, None where they do nowhere. times: how many pixels a side the scan has for one of what answered, a
-    thumbnail of it."""
-    places, best = list[Placement](), None
+    """The frame as its marks look at the first of the best placements where they agree, at one of two places in any of
+    the poses that answer there, None where they do nowhere. times: how many pixels a side the scan has for one of what
+    answered, a thumbnail of it."""
+    places = list[Placement]()
     for placement in answered.placements:
-        is_known = any(placement.same_place(other) for other in places)
-        if not is_known and (best is not None or len(places) == _PLACES):
+        if not any(placement.same_place(other) for other in places):
+            places.append(placement)
+        if len(places) > _PLACES:
             break
-        places += [] if is_known else [placement]
         frame = look_at_frame(scan, layout, _enlarged(placement, times), FiducialOptions())
-        if frame.accepted and (best is None or likeness(frame) > likeness(best)):
-            best = frame
-        if best is not None and likeness(best) >= _PLAIN:
-            break
-    return best
+        if frame.accepted:
+            return frame
+    return None
 
 
 def _enlarged(placement: Placement, times: float) -> Placement:
