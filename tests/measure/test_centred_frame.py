@@ -10,7 +10,6 @@ import tifffile
 from brute_marks import Array, written_scan
 from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_picture, layout_of, pixel_from_camera
 
-from measure import fiducials
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
 from measure.results import FrameMeasurement
@@ -32,13 +31,13 @@ def measured(
 ) -> tuple[FrameMeasurement, bool]:
     """And whether the whole scan was searched."""
     searches: list[FrameSearch] = []
-    anywhere = fiducials._anywhere
+    anywhere = FrameSearch.anywhere
 
     def noted(search: FrameSearch, *given: Any) -> Any:
         searches.append(search)
         return anywhere(search, *given)
 
-    monkeypatch.setattr(fiducials, "_anywhere", noted)
+    monkeypatch.setattr(FrameSearch, "anywhere", noted)
     with written_scan(grey, folder) as scan:
         return measure_fiducials(scan, layout, PITCH_UM), bool(searches)
 

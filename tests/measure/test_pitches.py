@@ -18,8 +18,9 @@ from drawn_frames import (
 )
 from scipy.ndimage import gaussian_filter
 
+from measure.attempts import _pitch_to_try
 from measure.fiducial_options import FiducialOptions
-from measure.fiducials import _pitch_to_try, measure_fiducials
+from measure.fiducials import measure_fiducials
 from measure.frames.frame_measurement import measure_frame
 from measure.marks.shapes import MarkShape
 from measure.search.constellation import NARROW, Placement
