@@ -206,7 +206,7 @@ def _faint(
             counts = [as_measured, *(count(place) for count in others)]
             most = max(frames, key=lambda frame: frame.belongs.sum())
             seen.append((len(counts) * tried * min(counts), most))
-    return sorted(reversed(seen), key=_expected)
+    return sorted(seen, key=_expected)
 
 
 def _expected(seen: tuple[float, Frame]) -> float:
@@ -262,9 +262,9 @@ def named(
     search: FrameSearch, found: Sequence[Placement], frame: Frame, lines: Sequence[Line] = ()
 ) -> tuple[Pose, Placement]:
     """The pose that what is seen of the frame speaks for, and the frame's placement in it. lines: of writing."""
-    posed = [posed(found, frame.placement, pose) for pose in POSES]
-    pose = decide_pose(search.scan, search.layout, posed, frame, search.options, lines)
-    return pose, posed[POSES.index(pose.name)]
+    each = [posed(found, frame.placement, pose) for pose in POSES]
+    pose = decide_pose(search.scan, search.layout, each, frame, search.options, lines)
+    return pose, each[POSES.index(pose.name)]
 
 
 def posed(found: Sequence[Placement], best: Placement, pose: str) -> Placement:
