@@ -134,26 +134,25 @@ def test_few_of_many_scans_are_the_same_when_another_one_comes() -> None:
 
 
 class Watched:
-    """An executor that does its work when it is waited for, and counts what it holds at a time."""
+    """An executor that holds some tasks: then, and when it has got its last, it does the one that waits longest. A
+    broken task's process ends."""
 
-    def __init__(self, broken: str = "") -> None:
-        self.broken, self.held, self.most = broken, 0, 0
+    def __init__(self, total: int, holds: int = 1, broken: str = "") -> None:
+        self.left, self.holds, self.broken, self.most = total, holds, broken, 0
+        self.waiting: list[tuple[Future[Any], Callable[..., Any], Any]] = []
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **_: Any) -> "Future[Any]":
-        self.held += 1
-        self.most = max(self.most, self.held)
-        watched, future = self, Future[Any]()
-
-        class Late(Future[Any]):
-            def result(self, timeout: float | None = None) -> Any:
-                watched.held -= 1
-                return super().result(timeout)
-
-        future = Late()
-        if args[0].name == self.broken:
-            future.set_exception(BrokenProcessPool("ended abruptly"))
-        else:
-            future.set_result(fn(*pickle.loads(pickle.dumps(args))))
+        future: Future[Any] = Future()
+        self.waiting.append((future, fn, pickle.loads(pickle.dumps(args))))
+        self.most, self.left = max(self.most, len(self.waiting)), self.left - 1
+        while self.waiting and (len(self.waiting) >= self.holds or not self.left):
+            oldest, work, given = self.waiting.pop(0)
+            if given[0].name == self.broken:
+                oldest.set_exception(BrokenProcessPool("ended abruptly"))
+            else:
+                oldest.set_result(work(*given))
+            if self.left:
+                break
         return future
 
 
@@ -167,19 +166,23 @@ def test_results_come_one_by_one_and_few_tasks_are_handed_out_at_a_time(two: Pat
             asked.append(number)
             yield replace(lost, name=str(number))
 
-    watched = Watched()
+    watched = Watched(20, holds=3)
     results = measure_scans(tasks(), watched, in_flight=3)
     first = next(results)
     assert first.failure is not None
-    assert len(asked) <= 4
-    assert {first.frame.image, *(scan.frame.image for scan in results)} == {str(number) for number in range(20)}
+    assert len(asked) == 3
+    second = next(results)
+    assert len(asked) == 4
+    assert {first.frame.image, second.frame.image, *(scan.frame.image for scan in results)} == {
+        str(number) for number in range(20)
+    }
     assert watched.most == 3
 
 
 def test_a_scan_whose_process_ends_is_a_result(two: Path) -> None:
     project = read_project(two)
     tasks = scan_tasks(project, ["a", "b"])
-    results = {scan.frame.image: scan for scan in measure_scans(tasks, Watched("b"))}
+    results = {scan.frame.image: scan for scan in measure_scans(tasks, Watched(2, broken="b"))}
     assert results["a"].failure is None
     assert results["b"].failure is not None
     assert results["b"].failure.code is FailureCode.ENDED

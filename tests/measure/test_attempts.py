@@ -1,0 +1,89 @@
+"""The list of attempts to find a frame: which are made, by how many hypotheses each is judged, and what is taken."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from drawn import scan_of
+from drawn_frames import ALIKE
+
+from measure import attempts
+from measure.attempts import Attempt, Found, find_frame
+from measure.fiducial_options import FiducialOptions
+from measure.frames.frame import Frame
+from measure.probabilities import FRAMES_BY_CHANCE
+from measure.search.frame_search import FrameSearch
+from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+
+GIVEN = PitchHypothesis((0.05, 0.05), 0.04, (0.05, 0.05))
+SCAN = scan_of(np.zeros((400, 400)))
+
+
+class Stand:
+    """What an attempt finds, in a frame's stead."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.is_complete, self.measured = name, False, 0
+        self.belongs, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
+
+    def misfit(self) -> str:
+        return f"not {self.name}"
+
+
+def found_by(monkeypatch: pytest.MonkeyPatch, *expected: float | None, given: int = 1) -> tuple[Found, list[int]]:
+    """What a list of attempts comes to, each of two hypotheses and with so many frames that chance is expected to make
+    a hypothesis, and how many hypotheses each was judged by. given: how many of them believe what they find."""
+    judged: list[int] = []
+
+    def attempt(number: int, each: float | None) -> Attempt:
+        def look(_: FrameSearch, __: Sequence[PitchHypothesis], tried: int) -> Any:
+            judged.append(tried)
+            return [], [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
+
+        search = cast(FrameSearch, None)
+        return Attempt(search, [GIVEN, GIVEN], look, lambda found: found.is_taken, number < given)
+
+    monkeypatch.setattr(attempts, "_attempts", lambda *_: [attempt(*each) for each in enumerate(expected)])
+    return find_frame(SCAN, ALIKE, [[GIVEN]], True, FiducialOptions()), judged
+
+
+def name(found: Found) -> str:
+    return cast(Stand, found.frame).name if found.frame else ""
+
+
+def test_each_attempt_is_judged_by_all_hypotheses_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What would be taken by itself may be chance after so many others."""
+    found, judged = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5)
+    assert judged == [2, 4, 6]
+    assert name(found) == ""
+    assert [cast(Stand, frame).name for frame in found.unsure] == ["1", "2"]
+    assert found.misfit.startswith("not 0; under another pitch 3 of them lie as they should")
+    found, _ = found_by(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 7)
+    assert (name(found), found.is_taken) == ("2", True)
+
+
+def test_what_is_settled_is_not_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, judged = found_by(monkeypatch, np.inf, 1e-5, 1e-9)
+    assert judged == [2, 4]
+    assert name(found) == "1"
+
+
+def test_where_nothing_was_seen_the_reason_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, _ = found_by(monkeypatch, None, None)
+    assert name(found) == ""
+    assert found.misfit == "nothing in the scan looks like two or more of the camera's marks"
+
+
+@pytest.mark.parametrize(("is_given", "looks"), [(True, 5), (False, 4)])
+def test_the_attempts_in_their_order(is_given: bool, looks: int, tmp_path: Path) -> None:
+    """As given, longer one way and filling the scan, at a closer look anywhere and within the frame's edges; a small
+    scan is searched as a whole at once. Where no pitch is given, two groups of sizes stand in the place of three."""
+    hypotheses = pitch_hypotheses(SCAN, ALIKE, (50.0, 50.0) if is_given else None, FiducialOptions())
+    listed = attempts._attempts(FrameSearch(SCAN, ALIKE, FiducialOptions()), hypotheses, is_given)
+    assert len(listed) == looks
+    assert [each.is_given for each in listed] == [True, *[False] * (looks - 1)]
+    assert [each.hypotheses for each in listed[: len(hypotheses)]] == hypotheses
+    assert listed[-1].search is listed[-2].search is not listed[0].search
+    assert listed[-1].hypotheses is listed[-2].hypotheses
