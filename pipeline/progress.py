@@ -17,6 +17,10 @@ class Reporter:
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or PlainConsole(stderr=True, soft_wrap=True)
 
+    @property
+    def is_terminal(self) -> bool:
+        return self._console.is_terminal
+
     @contextmanager
     def stage(self, title: str) -> Iterator[Count]:
         """A stage: call what it yields with the thing in hand, the steps done and their total."""
@@ -45,7 +49,7 @@ class Reporter:
 
         def line(what: str, _done: int, _total: int) -> None:
             nonlocal last
-            if what != last:
+            if what and what != last:
                 self.say(f"{title} {what}")
             last = what
 

@@ -9,10 +9,14 @@ import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from pipeline.archive.store import MARK_COLUMNS, Json, Store, mark_of, places, row_of
 from pipeline.archive.verdicts import Verdict, verdict_of
+
+_AT_A_TIME = 500  # frames in a transaction
+_UNFINISHED = "digest like 'unfinished%'"  # the process that made it was ended
 
 
 @dataclass(frozen=True)
@@ -40,15 +44,17 @@ def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: I
     told = hashlib.sha256(json.dumps([dict(made_from), input_hash], sort_keys=True).encode())
     db = store.connection
     with store.writing():
-        columns = "(digest, made_from, input)"
-        unfinished = f"unfinished {input_hash}"
-        db.execute("delete from judging where digest = ?", (unfinished,))
-        values = (unfinished, json.dumps(dict(made_from)), input_hash)
-        row = db.execute(f"insert into judging {columns} values (?, ?, ?)", values).lastrowid
+        db.execute(f"delete from judging where {_UNFINISHED}")
+        values = (f"unfinished {input_hash}", json.dumps(dict(made_from)), input_hash)
+        row = db.execute("insert into judging (digest, made_from, input) values (?, ?, ?)", values).lastrowid
         assert row is not None
-        for frame in frames:
-            told.update(_write(db, row, frame, store.record(frame.result)))
-        digest = told.hexdigest()
+    left = iter(frames)
+    while some := list(islice(left, _AT_A_TIME)):  # what makes them may have to measure, and write, meanwhile
+        with store.writing():
+            for frame in some:
+                told.update(_write(db, row, frame, store.record(frame.result)))
+    digest = told.hexdigest()
+    with store.writing():
         db.execute("delete from judging where digest = ?", (digest,))
         db.execute("update judging set digest = ? where id = ?", (digest, row))
     return digest
@@ -69,7 +75,9 @@ def judging_of(store: Store, digest: str) -> Judging | None:
 
 def latest(store: Store) -> Judging | None:
     """The one that was made last."""
-    found = store.connection.execute("select digest from judging order by id desc limit 1").fetchone()
+    found = store.connection.execute(
+        f"select digest from judging where not {_UNFINISHED} order by id desc limit 1"
+    ).fetchone()
     return None if found is None else judging_of(store, found[0])
 
 

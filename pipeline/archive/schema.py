@@ -73,7 +73,7 @@ create table judged (
 ) without rowid;
 create table kept (key text primary key, value text not null);   -- what scans of a project tell all others
 create view mark_view as
-with latest as (select max(id) as id from judging),
+with latest as (select max(id) as id from judging where digest not like 'unfinished%'),
 frame as (
     select coalesce(judged_frame.name, scan.name) as image, result.id as result, own_marks, latest.id as judging,
         result.pitch_x_um / 1000.0 as px_mm, result.pitch_y_um / 1000.0 as py_mm

@@ -94,10 +94,15 @@ class Store:
 
     # --- results
 
-    def keep(self, kept: Kept, name: str | None = None) -> int:
-        """Keep a result, whole or not at all, and give its row. name: the image's, where it is one of the project."""
+    def keep(self, kept: Kept, name: str | None = None, current: bool = False) -> int:
+        """Keep a result, whole or not at all, and give its row. name: the image's, where it is one of the project;
+        current: the scan's own by today's file and options, and not only what it tells others."""
         with self.writing():
-            return self._result(kept, self._scan(kept, name))
+            scan = self._scan(kept, name)
+            result = self._result(kept, scan)
+            if current:
+                self._db.execute("update scan set result = ?, is_current = 1 where id = ?", (result, scan))
+            return result
 
     def record(self, result: int) -> Json:
         """The record of a result, as it was kept."""
@@ -117,6 +122,71 @@ class Store:
             self._db.execute(f"delete from mark where result in ({failed})")
             self._db.execute(f"update scan set result = null, is_current = 0 where result in ({failed})")
             return self._db.execute(f"delete from result where id in ({failed})").rowcount
+
+    def failures(self) -> list[str] | None:
+        """Of every scan of the project why it failed; None where one was measured."""
+        rows = self._db.execute(
+            "select verdict, detail from scan join result on result.id = scan.result where is_current "
+            f"order by verdict = '{Verdict.FAILED}', name"
+        )
+        failures = []
+        for verdict, detail in rows:
+            if verdict != Verdict.FAILED:
+                return None
+            failures.append(str(json.loads(detail)["failure"]["sentence"]))
+        return failures
+
+    # --- the content of whole files
+
+    def content_hashes(self) -> dict[str, str]:
+        """Of the scans whose content was hashed, by uri."""
+        return dict(self._db.execute("select uri, content_hash from scan where content_hash <> ''"))
+
+    def set_content_hashes(self, hashes: Mapping[str, str]) -> None:
+        with self.writing():
+            self._db.executemany(
+                "update scan set content_hash = ? where uri = ?", ((hash, uri) for uri, hash in hashes.items())
+            )
+
+    def set_copies(self, copies: Mapping[str, str]) -> None:
+        """copies: by uri the name of the image whose file it is a copy of. No other scan is one."""
+        with self.writing():
+            self._db.execute("update scan set duplicate_of = null where duplicate_of is not null")
+            self._db.executemany(
+                "update scan set duplicate_of = (select id from scan where name = ?) where uri = ?",
+                ((name, uri) for uri, name in copies.items()),
+            )
+
+    def move(self, uri: str, identity: Identity) -> None:
+        """A scan's file is elsewhere or touched, its content the same: its results have the key of what it is now."""
+        state = identity.state
+        with self.writing():
+            if uri != state.uri:  # what stood there before is another scan, whose results nobody can ask for any more
+                self._forget(state.uri)
+            self._db.execute(
+                "update scan set uri = ?, bytes = ?, mtime_ns = ?, etag = ?, identity_hash = ? where uri = ?",
+                (state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, uri),
+            )
+            results = self._db.execute(
+                "select result.id, hash, measure_revision from result join scan on scan.id = result.scan "
+                "join options on options.id = result.options join program on program.id = result.program "
+                "where uri = ?",
+                (state.uri,),
+            ).fetchall()
+            self._db.executemany(
+                "update result set fingerprint = ? where id = ?",
+                ((fingerprint(identity, told, revision), row) for row, told, revision in results),
+            )
+
+    def _forget(self, uri: str) -> None:
+        self._db.execute("delete from judging")
+        own = "select result.id from result join scan on scan.id = result.scan where uri = ?"
+        self._db.execute(
+            "update scan set duplicate_of = null where duplicate_of = (select id from scan where uri = ?)", (uri,)
+        )
+        self._db.execute(f"delete from mark where result in ({own})", (uri,))
+        self._db.execute(f"delete from result where id in ({own})", (uri,))
+        self._db.execute("delete from scan where uri = ?", (uri,))
 
     # --- what scans of a project tell the others
 

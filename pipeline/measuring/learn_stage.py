@@ -15,6 +15,7 @@ import numpy as np
 
 from measure.marks.shapes import MarkTemplate
 from measure.results import FrameMeasurement
+from measure.revision import MEASURE_REVISION
 from measure.scans.parallel import mapped
 from measure.special_marks.learned import Chip, cut, template_of
 from measure.special_marks.symmetry import with_common_origins
@@ -23,27 +24,51 @@ from pipeline.files.camera_text import camera_text
 from pipeline.files.project_file import Project
 from pipeline.files.template_table import saved_in
 from pipeline.measuring.first_pictures import digest, first_pictures
+from pipeline.measuring.memory import Json, Memory
 from pipeline.measuring.scan_task import Measure, ScanTask, scan_tasks
 from pipeline.progress import Reporter
+from pipeline.results.fingerprints import fingerprint, of_file
 from pipeline.text.atomic import write_atomically
 
 _BY = f"# Marks learned by reseau {version('reseau')}"
 
 
 def learn_marks(
-    project: Project, reporter: Reporter, measure: Measure, workers: Executor | None, folder: Path
+    project: Project, reporter: Reporter, measure: Measure, workers: Executor | None, folder: Path, memory: Memory
 ) -> Project:
     """The project with templates in the place of marks that are to be learned; the folder then holds the templates
     and a camera file that names them, as they are to stand in out/learned. Raises InputError or MeasurementError where
-    they cannot be learned. A scan that cannot be measured adds nothing to them."""
+    they cannot be learned. A scan that cannot be measured adds nothing to them. What was learned once
+    stays, whatever scans come or go, as long as its files stand in out/learned."""
     files = _file_names([camera.path for camera in project.cameras.values()], _learned_folder(project))
-    cameras = {
-        name: _learned(project, camera, folder / f"{files[camera.path]}.toml", reporter, measure, workers)
-        if camera.learned
-        else _known(project, camera)
-        for name, camera in project.cameras.items()
-    }
+    cameras = dict(project.cameras)
+    for name, camera in project.cameras.items():
+        if not camera.learned:
+            cameras[name] = _known(project, camera)
+            continue
+        place, key = folder / f"{files[camera.path]}.toml", _key(project, camera)
+        kept = _kept(project, camera, memory.told(key))
+        if kept is None:
+            kept = _learned(project, camera, place, reporter, measure, workers)
+            if place.exists():
+                memory.tell(key, {"file": place.name, "sha256": of_file(place)})
+        cameras[name] = kept
     return replace(project, cameras=cameras)
+
+
+def _key(project: Project, camera: CameraFile) -> str:
+    """Of what is learned: of which marks, and by which settings."""
+    settings = [project.pitch_um, project.pose, project.film_sigma_mm, MEASURE_REVISION]
+    return f"learned {fingerprint([camera.fiducials, camera.frame_mm, camera.clicks, settings])}"
+
+
+def _kept(project: Project, camera: CameraFile, told: Json | None) -> CameraFile | None:
+    """The camera with the marks that were learned before, where their files still stand as they were written."""
+    path = _learned_folder(project) / (told or {}).get("file", "")
+    if told is None or not path.is_file() or of_file(path) != told["sha256"]:
+        return None
+    learned = read_camera(path)
+    return _known(project, replace(camera, fiducials=learned.fiducials, learned_from=learned.learned_from))
 
 
 def _learned_folder(project: Project) -> Path:

@@ -8,7 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,8 @@ from pipeline.measuring.target_stage import measure_targets
 from pipeline.measuring.tone_stage import tone_before
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
+Made = TypeVar("Made")
+
 TASKS_A_CORE = 4  # handed out ahead: enough that no process waits, few enough that little is lost
 
 
@@ -47,45 +49,61 @@ def measure_scans(
 
     executor: None: here, one after the other. in_flight: how many tasks are handed out at a time.
     """
+    for task, result in results_of(measured_scan, tasks, executor, in_flight):
+        yield ended_scan(task, result) if isinstance(result, Exception) else result
+
+
+def results_of(
+    function: Callable[[ScanTask], Made],
+    tasks: Iterable[ScanTask],
+    executor: Submits | None = None,
+    in_flight: int | None = None,
+) -> Iterator[tuple[ScanTask, Made | Exception]]:
+    """Each task with what the function makes of it, or with why the executor has lost it. in_flight: as above."""
     if executor is None:
-        yield from map(measured_scan, tasks)
+        yield from ((task, function(task)) for task in tasks)
         return
     window = in_flight or TASKS_A_CORE * (os.cpu_count() or 1)
-    left, running = iter(tasks), dict[Future[MeasuredScan], ScanTask]()
+    left, running = iter(tasks), dict[Future[Made], ScanTask]()
     try:
         while True:
             for task in islice(left, window - len(running)):
-                running[_submitted(executor, task)] = task
+                running[_submitted(executor, function, task)] = task
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                yield _result(future, running.pop(future))
+                yield running.pop(future), _result(future)
     finally:
         for future in running:
             future.cancel()
 
 
-def _submitted(executor: Submits, task: ScanTask) -> "Future[MeasuredScan]":
+def _submitted(executor: Submits, function: Callable[[ScanTask], Made], task: ScanTask) -> "Future[Made]":
     try:
-        return executor.submit(measured_scan, task)
+        return executor.submit(function, task)
     except BrokenExecutor as error:
-        future: Future[MeasuredScan] = Future()
+        future: Future[Made] = Future()
         future.set_exception(error)
         return future
 
 
-def _result(future: "Future[MeasuredScan]", task: ScanTask) -> MeasuredScan:
-    """`measured_scan` raises nothing: what comes here is of the executor, whose process is gone or out of reach."""
+def _result(future: "Future[Made]") -> Made | Exception:
+    """What is measured raises nothing: what comes here is of the executor, whose process is gone or out of reach."""
     try:
         return future.result()
     except Exception as error:
-        told = "" if isinstance(error, BrokenExecutor) else f" ({' '.join(str(error).split())})"
-        return failed_scan(
-            task,
-            FailureCode.ENDED,
-            f"{task.scan}: the process that measured it was ended, most likely because the memory was full{told}. "
-            "Close other programs, and measure it again.",
-        )
+        return error
+
+
+def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
+    """Of a scan that its executor has lost."""
+    told = "" if isinstance(error, BrokenExecutor) else f" ({' '.join(str(error).split())})"
+    return failed_scan(
+        task,
+        FailureCode.ENDED,
+        f"{task.scan}: the process that measured it was ended, most likely because the memory was full{told}. "
+        "Close other programs, and measure it again.",
+    )
 
 
 def measured_scan(task: ScanTask) -> MeasuredScan:

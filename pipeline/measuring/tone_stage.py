@@ -9,12 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, Polygon
+from measure.revision import MEASURE_REVISION
 from measure.scans.declared_tone import declared_tone
 from measure.scans.tone import SaidOfTone, Tone, power, srgb
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
+from pipeline.measuring.memory import Memory
 from pipeline.measuring.scan_task import Measure, few_of, scan_tasks
 from pipeline.progress import Reporter
+from pipeline.results.fingerprints import fingerprint
+from pipeline.results.measured_record import said_of, said_record
 
 _SAMPLES = 4  # scans of a scanner that tell its curve to the others
 _SET = "it is set in the project"
@@ -27,29 +31,44 @@ def tone_before(setting: float | str, said: Sequence[SaidOfTone], scan: Path) ->
     return prior.told(said)[0] if said else prior
 
 
-def said_of_tones(project: Project, reporter: Reporter, measure: Measure) -> Mapping[str, tuple[SaidOfTone, ...]]:
+def said_of_tones(
+    project: Project, reporter: Reporter, measure: Measure, memory: Memory
+) -> Mapping[str, tuple[SaidOfTone, ...]]:
     """By image what others of its scanner say of the curve: some scans of each, where marks of the camera lean on it. A
-    scan that cannot be measured says nothing."""
+    scan that cannot be measured says nothing. What was said once stays, whatever scans come or go."""
     names = [name for name in project.scans if _leans_on_tone(project.camera_of(name))]
     if project.tone != "auto" or len(names) < 2:
         return {}
     kinds: dict[str, list[str]] = {}
     for name in names:
         kinds.setdefault(_kind(project, name), []).append(name)
-    samples = {kind: few_of(of_kind, _SAMPLES) for kind, of_kind in kinds.items() if len(of_kind) > 1}
+    keys = {kind: _key(project, kind, of_kind) for kind, of_kind in kinds.items() if len(of_kind) > 1}
+    before = {kind: memory.told(key) for kind, key in keys.items()}
+    samples = {kind: few_of(kinds[kind], _SAMPLES) for kind, told in before.items() if told is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
-    said = dict[str, SaidOfTone]()
+    said = {name: said_of(one) for kept in before.values() for name, one in (kept or {}).items()}
     with reporter.stage("tone curve looked for in") as tell:
         for done, scan in enumerate(measure(tasks), 1):
             tell(scan.frame.image, done, len(tasks))
             if scan.frame.tone is not None and scan.frame.tone.said is not None:
                 said[scan.frame.image] = scan.frame.tone.said
+    for kind, names_of in samples.items():
+        memory.tell(keys[kind], {name: said_record(said[name]) for name in names_of if name in said})
     told = dict[str, tuple[SaidOfTone, ...]]()
-    for kind, of_kind in samples.items():
+    for kind, kept in before.items():
+        of_kind = samples[kind] if kept is None else list(kept)
         by_others = {name: tuple(said[one] for one in of_kind if one in said and one != name) for name in of_kind}
         by_all = tuple(said[one] for one in of_kind if one in said)
         told |= {name: by_others.get(name, by_all) for name in kinds[kind]}
     return told
+
+
+def _key(project: Project, kind: str, names: Sequence[str]) -> str:
+    """Of what the scans of a scanner say: by which marks and settings they are asked."""
+    firsts = {project.camera_of(name).path: name for name in reversed(names)}
+    tasks = scan_tasks(project, sorted(firsts.values()))
+    options = sorted(task.fiducials_alone(project.tone).options_json() for task in tasks)
+    return f"tone {fingerprint([kind, options, MEASURE_REVISION])}"
 
 
 def _prior(setting: float | str, scan: Path) -> Tone:

@@ -168,7 +168,7 @@ def _frame_tone(tone: FrameTone) -> Json:
         "covariance": _numbers(believed.covariance),
         "source": believed.source,
         "is_declared": believed.is_declared,
-        "said": tone.said and _said(tone.said),
+        "said": tone.said and said_record(tone.said),
         "least": _numbers(tone.least),
         "greatest": _numbers(tone.greatest),
         "contradiction": _numbers(tone.contradiction),
@@ -178,7 +178,7 @@ def _frame_tone(tone: FrameTone) -> Json:
 def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
     mean, covariance = _some(tone["mean"]), _some(tone["covariance"])
     believed = Tone(_read_base(tone["base"]), mean, covariance, tone["source"], tone["is_declared"])
-    said = tone["said"] and _read_said(tone["said"])
+    said = tone["said"] and said_of(tone["said"])
     return FrameTone(believed, said, float(tone["least"]), float(tone["greatest"]), float(tone["contradiction"]))
 
 
@@ -197,7 +197,7 @@ def _read_base(base: Any) -> Array:
     return _some(base) if isinstance(base, list) else power(float(base))
 
 
-def _said(said: SaidOfTone) -> Json:
+def said_record(said: SaidOfTone) -> Json:
     return {
         "information": _numbers(said.information),
         "right": _numbers(said.right),
@@ -206,5 +206,5 @@ def _said(said: SaidOfTone) -> Json:
     }
 
 
-def _read_said(said: Mapping[str, Any]) -> SaidOfTone:
+def said_of(said: Mapping[str, Any]) -> SaidOfTone:
     return SaidOfTone(_some(said["information"]), _some(said["right"]), float(said["square"]), int(said["count"]))

@@ -1,0 +1,86 @@
+"""A project's scans measured into its store: only what is missing or changed, whatever happens to the rest."""
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+from measure.errors import MeasurementError
+from pipeline.archive.cluster import cluster_executor
+from pipeline.archive.judging import judge, latest
+from pipeline.archive.key import shard_of
+from pipeline.archive.moved import find_moved, hash_contents
+from pipeline.archive.store import Store
+from pipeline.archive.together import find_copies, input_of, judged_scans
+from pipeline.archive.work import Counts, Work, WorkOptions
+from pipeline.files.project_file import Project
+from pipeline.measuring.learn_stage import learn_marks
+from pipeline.measuring.measure_stage import check_measurable
+from pipeline.measuring.scan_task import scan_tasks
+from pipeline.measuring.tone_stage import said_of_tones
+from pipeline.progress import Reporter
+from pipeline.workers import worker_pool
+
+
+@dataclass(frozen=True)
+class Done:
+    """digest: of the judging of all scans; "" of a shard, which does not judge. counts: what there was to do."""
+
+    digest: str
+    counts: Counts
+
+
+def measure_archive(
+    project: Project,
+    store: Store,
+    made_from: Mapping[str, str],
+    learned_folder: Path,
+    reporter: Reporter,
+    options: WorkOptions | None = None,
+) -> Done:
+    """Measure what is missing of the project's scans, and judge all of them together, unless that is as it was.
+
+    Raises InputError for what is wrong in the user's own files, before anything is measured, and MeasurementError where
+    no scan at all could be measured; a scan that fails is a result. made_from: what a judging says that it is of;
+    learned_folder: where what is learned of marks is written.
+    """
+    options = options or WorkOptions()
+    names = check_measurable(project)
+    if options.retry:
+        store.forget_failed()
+    with _executor(project, options) as executor:
+        work = Work(project, store, executor, options.workers)
+        learned = learn_marks(project, reporter, work.measure, executor, learned_folder, store)
+        tasks = scan_tasks(learned, names, said_of_tones(learned, reporter, work.measure, store))
+        if options.moved:
+            find_moved(store, tasks, work, reporter)
+        store.set_project({work.state(task).uri: task.name for task in tasks})
+        if options.shard is not None:
+            part, parts = options.shard
+            work.complete([task for task in tasks if shard_of(task.name, parts) == part], reporter)
+            return Done("", work.counts)
+        work.complete(tasks, reporter)
+        if options.moved:
+            hash_contents(store, tasks, work, reporter)
+        _check_any(store)
+        copies = find_copies(store, tasks, work)
+        told = input_of(tasks, work, copies, made_from)
+        before = latest(store)
+        if before is not None and before.input == told:
+            return Done(before.digest, work.counts)
+        scans = judged_scans(learned, tasks, work, copies, reporter, executor)
+        return Done(judge(store, made_from, told, scans), work.counts)
+
+
+def _executor(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:
+    if options.cluster is not None:
+        return cluster_executor(options.cluster, [str(path) for path in project.scans.values()], options.workers)
+    return worker_pool(len(project.scans), options.workers)
+
+
+def _check_any(store: Store) -> None:
+    """Raises MeasurementError where no scan at all could be measured, with all that was said of them."""
+    failures = store.failures()
+    if failures is not None:
+        raise MeasurementError("\n".join(dict.fromkeys(failures)))

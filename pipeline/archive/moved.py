@@ -1,0 +1,55 @@
+"""Files that were moved, renamed or touched, and have the content that was measured: their results are theirs."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.archive.identity import Identity, content_hash, parts_hash
+from pipeline.archive.store import Store
+from pipeline.archive.work import Work
+from pipeline.measuring.scan_task import ScanTask
+from pipeline.progress import Reporter
+
+
+def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> None:
+    """Give files that the store does not know as they are the results of those whose whole content they have. Only
+    results count whose content was hashed: an earlier call with `--moved` did that."""
+    known = store.identities()
+    by_size = defaultdict[int, dict[str, str]](dict)
+    for uri, content in store.content_hashes().items():
+        by_size[known[uri].state.bytes][content] = uri
+    unknown = [
+        task
+        for task in tasks
+        if task.scan and work.state(task) != getattr(known.get(work.state(task).uri), "state", None)
+    ]
+    taken = {work.state(task).uri for task in tasks} - {work.state(task).uri for task in unknown}
+    found = 0
+    with reporter.stage("looked for in the store") as count:
+        for done, task in enumerate(unknown, 1):
+            count(task.name, done, len(unknown))
+            state = work.state(task)
+            if not by_size.get(state.bytes):
+                continue
+            content = content_hash(Path(task.scan))
+            uri = by_size[state.bytes].get(content, "")
+            if content and uri and uri not in taken:
+                store.move(uri, Identity(state, parts_hash(Path(task.scan), task.max_pixels)))
+                taken.add(state.uri)
+                del by_size[state.bytes][content]
+                found += 1
+    if unknown:
+        reporter.say(
+            f"{found} of {len(unknown)} files that are new or changed have the content of ones that are measured"
+        )
+    work.refresh()
+
+
+def hash_contents(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> None:
+    """Hash the whole files of all scans whose content is not known, so that they are known when they are moved."""
+    hashed = store.content_hashes()
+    left = {work.state(task).uri: Path(task.scan) for task in tasks if task.scan and work.state(task).uri not in hashed}
+    with reporter.stage("content hashed of") as count:
+        for done, (uri, path) in enumerate(left.items(), 1):
+            count(path.name, done, len(left))
+            store.set_content_hashes({uri: content_hash(path)})

@@ -1,0 +1,157 @@
+"""What is missing of a project's scans measured, and kept as each is done."""
+
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import lru_cache
+
+from pipeline.archive.expected_time import ExpectedTime
+from pipeline.archive.identity import FileState, Identity
+from pipeline.archive.key import fingerprint, options_hash
+from pipeline.archive.store import Kept, Store
+from pipeline.archive.witness import Witnessed, state_of, witnessed_scan
+from pipeline.files.project_file import Project
+from pipeline.measuring.measured import TASKS_A_CORE, ended_scan, results_of
+from pipeline.measuring.scan_task import ScanTask
+from pipeline.progress import Reporter
+from pipeline.results.measured_record import record_of, scan_of
+from pipeline.results.measured_scan import MeasuredScan
+
+_SAID_EVERY_S = 30.0
+_hash_of = lru_cache(maxsize=4096)(options_hash)
+
+
+@dataclass(frozen=True)
+class WorkOptions:
+    """How the work is shared. shard: (K, N), only the scans of the K-th of N parts. cluster: a scheduler's address, or
+    `local`. retry: measure again what failed. moved: keep results of files whose content is the same elsewhere.
+    workers: processes, if not one a core."""
+
+    shard: tuple[int, int] | None = None
+    cluster: str | None = None
+    retry: bool = False
+    moved: bool = False
+    workers: int | None = None
+
+
+@dataclass
+class Counts:
+    """Of the scans of a project: how many were measured now, how many of these failed, and how many were kept."""
+
+    measured: int = 0
+    failed: int = 0
+    kept: int = 0
+
+
+class Work:
+    """Scans measured as tasks ask for them: what the store holds is read there, all else measured and kept at once."""
+
+    def __init__(self, project: Project, store: Store, executor: Executor | None, workers: int | None = None) -> None:
+        """workers: how many scans are measured at a time, if not one a core."""
+        self._project, self._store, self._executor = project, store, executor
+        self._at_a_time = workers or os.cpu_count() or 1
+        self._folder = project.path.resolve().parent
+        self._identities, self._rows = store.identities(), store.fingerprints()
+        self._states: dict[str, FileState] = {}
+        self.results: dict[str, int] = {}  # by image, the row of what was asked for last
+        self.counts = Counts()
+
+    def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
+        """What each task gives, measured or kept: a `Measure`."""
+        missing = []
+        for task in tasks:
+            row = self._row(task)
+            if row is None:
+                missing.append(task)
+            else:
+                yield self._found(task, row)
+        for task, row, _ in self._measured(missing):
+            yield self._found(task, row)
+
+    def complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
+        """Measure what is missing of the scans of the project, and say how much that is. Nothing of it is held."""
+        known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
+        missing = [task for task in tasks if task.name not in known]
+        self.results |= known
+        self.counts.kept += len(known)
+        self._store.set_current(known.values())
+        if known or len(missing) > 1:
+            reporter.say(f"{len(known)} of {len(tasks)} scans are measured already; {len(missing)} to measure")
+        if missing:
+            self._complete(missing, reporter)
+
+    def read(self, name: str) -> MeasuredScan:
+        """What was asked for last of an image."""
+        return scan_of(name, self._store.record(self.results[name]), self._folder)
+
+    def keys(self) -> dict[str, str]:
+        """By image the fingerprint of what was asked for last."""
+        of_row = {row: key for key, row in self._rows.items()}
+        return {name: of_row[row] for name, row in self.results.items()}
+
+    def refresh(self) -> None:
+        """Know what the store holds now."""
+        self._identities, self._rows = self._store.identities(), self._store.fingerprints()
+
+    def state(self, task: ScanTask) -> FileState:
+        """Of the task's file, as it was when it was first asked for."""
+        if task.scan not in self._states or not task.scan:
+            self._states[task.scan] = state_of(task, self._folder)
+        return self._states[task.scan]
+
+    def _complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
+        cameras = [self._project.camera_of(task.name).path.stem for task in tasks]
+        expected = ExpectedTime(tasks, cameras, self._at_a_time)
+        said_s, failed = time.monotonic(), list[str]()
+        with reporter.stage("measured") as count:
+            for done, (task, row, kept) in enumerate(self._measured(tasks, as_scans=True), 1):
+                self.results[task.name] = row
+                self.counts.measured += 1
+                expected.is_done(task.name, kept.seconds, kept.bytes_read)
+                if kept.record["failure"]:
+                    failed.append(task.name)
+                    reporter.say(f"failed: {task.name}: {kept.record['failure']['sentence']}")
+                left = f"{done} of {len(tasks)}{f', {len(failed)} failed' if failed else ''}"
+                count(left if reporter.is_terminal or len(tasks) <= TASKS_A_CORE else "", done, len(tasks))
+                now_s = time.monotonic()
+                if done < len(tasks) and (done == self._at_a_time or now_s - said_s > _SAID_EVERY_S):
+                    said_s = now_s
+                    reporter.say(f"{left}; {expected.sentence}")
+        self.counts.failed += len(failed)
+
+    def _row(self, task: ScanTask) -> int | None:
+        """The row of its result, where its file and options are those of it."""
+        state = self.state(task)
+        known = self._identities.get(state.uri)
+        if known is None or known.state != state:
+            return None
+        return self._rows.get(fingerprint(known, _hash_of(task.options_json())))
+
+    def _found(self, task: ScanTask, row: int) -> MeasuredScan:
+        self.results[task.name] = row
+        return scan_of(task.name, self._store.record(row), self._folder)
+
+    def _measured(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, int, Kept]]:
+        """Each kept as soon as it is there. as_scans: of the project, and not only for what they tell the others."""
+        states = {task.name: self.state(task) for task in tasks}
+        for task, result in results_of(witnessed_scan, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
+            seen = result if isinstance(result, Witnessed) else Witnessed(ended_scan(task, result), "", -1)
+            kept = self._kept(task, states[task.name], seen)
+            row = self._store.keep(kept, task.name if as_scans else None, as_scans)
+            self._identities[kept.identity.state.uri], self._rows[kept.fingerprint] = kept.identity, row
+            yield task, row, kept
+
+    def _kept(self, task: ScanTask, state: FileState, seen: Witnessed) -> Kept:
+        known = self._identities.get(state.uri)
+        lost = not seen.parts_hash and known is not None and known.state == state
+        parts = known.parts_hash if lost and known is not None else seen.parts_hash
+        return Kept(
+            Identity(state, parts),
+            task.options_json(),
+            record_of(seen.scan, self._folder),
+            seen.scan.seconds,
+            seen.bytes_read,
+            self._project.camera_of(task.name).path.name,
+        )

@@ -1,0 +1,26 @@
+"""What some scans of a project tell all others, kept: it stays as it is when scans come or go, and so do the results of
+all that were measured by it."""
+
+from typing import Any, Protocol
+
+Json = dict[str, Any]
+
+
+class Memory(Protocol):
+    """Values by keys, which name all that a value depends on."""
+
+    def told(self, key: str) -> Json | None:
+        """What was told by that key; None: nothing yet."""
+
+    def tell(self, key: str, value: Json) -> None:
+        """Keep a value."""
+
+
+class Forgetful:
+    """A memory that keeps nothing."""
+
+    def told(self, key: str) -> Json | None:
+        return None
+
+    def tell(self, key: str, value: Json) -> None:
+        pass
