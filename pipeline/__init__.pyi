@@ -1,4 +1,5 @@
 from .adjusting.network import build_network as build_network
+from .archive.measurement import read_measurement as read_measurement
 from .errors import InputError as InputError
 from .files.camera_file import read_camera as read_camera
 from .files.images_file import read_images as read_images
@@ -8,4 +9,3 @@ from .results.adjustment_file import write_adjustment as write_adjustment
 from .results.adjustment_reader import read_adjustment as read_adjustment
 from .results.comparator_file import read_comparator as read_comparator
 from .results.comparator_file import write_comparator as write_comparator
-from .results.measurement_file import read_measurement as read_measurement

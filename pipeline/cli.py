@@ -4,10 +4,12 @@ Each command imports what it needs when it runs: numpy and what stands on it tak
 """
 
 import json
+import re
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +17,7 @@ import typer
 
 from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
+from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError, what_to_do
 from pipeline.exchange.convention import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
 from pipeline.files.pitch import FINEST_PITCH_UM
@@ -45,6 +48,21 @@ MaxPixels = Annotated[
 ]
 
 
+Shard = Annotated[
+    str | None, typer.Option(metavar="K/N", help="The K-th of N parts of the scans, into a store of its own.")
+]
+Cluster = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786, or `local`.")
+]
+Retry = Annotated[bool, typer.Option("--retry", help="Measure again the scans that failed.")]
+Moved = Annotated[
+    bool, typer.Option("--moved", help="Know moved or touched files by their content, which is read whole.")
+]
+Workers = Annotated[
+    int | None, typer.Option(metavar="N", min=1, max=1024, help="Processes that measure; by default one a core.")
+]
+
+
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0 done, 1 look at something, 2 wrong input, 3 a fault of ours,
     130 interrupted, as shells count it.
@@ -55,7 +73,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
     try:
         code = app(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # what typer makes of it
-            return _message("interrupted; files that were complete stay as they are", INTERRUPTED)
+            told = "interrupted; files that were complete stay as they are, and scans that were measured are kept"
+            return _message(told, INTERRUPTED)
         return code if isinstance(code, int) else DONE
     except typer.TyperException as error:
         return _message(error.format_message(), WRONG_INPUT)
@@ -63,8 +82,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _message(str(error), WRONG_INPUT)
     except BrokenExecutor:
         return _message(
-            "a process that measures was ended from outside, most likely because the memory was full; nothing was "
-            "written. Close other programs, or name one scan at a time.",
+            "a process was ended from outside, most likely because the memory was full; scans that were measured are "
+            "kept. Close other programs, or take fewer --workers, and run it again.",
             WRONG_INPUT,
         )
     except OSError as error:
@@ -129,19 +148,89 @@ def init(
 
 
 @app.command("run")
-def run_project(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
-    """The whole chain: measure, adjust, check, report."""
+def run_project(
+    project: ProjectFile,
+    shard: Shard = None,
+    cluster: Cluster = None,
+    retry: Retry = False,
+    moved: Moved = False,
+    workers: Workers = None,
+    as_json: AsJson = False,
+    max_pixels: MaxPixels = None,
+) -> int:
+    """The whole chain: measure, adjust, check, report. What is measured already stays."""
+    from pipeline.archive.work_options import WorkOptions
     from pipeline.stages import run_all
 
-    return _with_project(project, run_all, as_json, max_pixels)
+    work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
+    return _with_project(project, partial(run_all, work=work), as_json, max_pixels)
 
 
 @app.command()
-def measure(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
-    """Scans to comparator coordinates."""
+def measure(
+    project: ProjectFile,
+    shard: Shard = None,
+    cluster: Cluster = None,
+    retry: Retry = False,
+    moved: Moved = False,
+    workers: Workers = None,
+    as_json: AsJson = False,
+    max_pixels: MaxPixels = None,
+) -> int:
+    """Scans to comparator coordinates. What is measured already stays: it goes on where an earlier call stopped."""
+    from pipeline.archive.work_options import WorkOptions
     from pipeline.stages import run_measure
 
-    return _with_project(project, run_measure, as_json, max_pixels)
+    work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
+    return _with_project(project, partial(run_measure, work=work), as_json, max_pixels)
+
+
+@app.command()
+def status(
+    project: ProjectFile,
+    verdict: Annotated[
+        Verdict | None, typer.Option(metavar="V", help=f"Name the scans of one: {', '.join(Verdict)}.")
+    ] = None,
+    as_csv: Annotated[bool, typer.Option("--csv", help="A line a scan, on stdout.")] = False,
+    as_json: AsJson = False,
+) -> int:
+    """How many scans stand where, what that means, and what to do next."""
+    from pipeline.archive.status import archive_status, print_status, status_csv, status_json
+
+    every = archive_status(_read(project, None))
+    shown = every.of(verdict)
+    if as_json:
+        _echo_json(status_json(shown))
+    elif as_csv:
+        typer.echo(plain(status_csv(shown)), nl=False)
+    else:
+        print_status(shown, PlainConsole(), every=verdict is not None)
+    return DONE if every.all_good else LOOK
+
+
+@app.command()
+def merge(
+    project: ProjectFile,
+    stores: Annotated[list[Path], typer.Argument(metavar="DB...", help="Stores of shards.", show_default=False)],
+    as_json: AsJson = False,
+) -> int:
+    """Join the measurement stores of shards into that of the project."""
+    from pipeline.progress import Reporter
+    from pipeline.stages import run_merge
+
+    taken, summary = run_merge(_read(project, None), stores, Reporter())
+    for one in taken if not as_json else ():
+        typer.echo(plain(f"{one.path}: {counted(one.results, 'result')}, {one.new} of them new"))
+    return _finish(summary, as_json)
+
+
+def _shard(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise InputError(f"--shard {text!r} is not K/N, the K-th of N parts, as 3/8; K goes from 1 to N.")
+    return int(found[1]), int(found[2])
 
 
 @app.command()

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.archive.measurement import measurement_of_digest
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.publishing.made_from import CAMERA, PLACES, SCAN, SETTINGS, adjusted_from, differing, measured_from
@@ -13,7 +14,6 @@ from pipeline.report.data import Problem, ReportData
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance
 from pipeline.results.comparator_file import measurement_of, read_comparator
 from pipeline.results.fingerprints import of_file
-from pipeline.results.measurement_file import read_made_from, read_measurement
 from pipeline.text.text_file import read_json
 from pipeline.text.wording import listed
 
@@ -22,7 +22,7 @@ At = Callable[[Path], Path]
 
 
 def measured(project: Project, at: At) -> ReportData:
-    """The marks, and what measurement.json says of them where it is theirs. at: where each result stands now."""
+    """The marks, and what measurement.db says of them where it is theirs. at: where each result stands now."""
     comparator = at(project.comparator)
     data = ReportData(
         project=_title(project),
@@ -32,20 +32,21 @@ def measured(project: Project, at: At) -> ReportData:
         notes=tuple(filter(None, [outside_note(project)])),
         made_from={project.comparator.name: of_file(comparator)},
     )
-    fingerprint, path = measurement_of(comparator), at(project.measurement_path)
+    digest, path = measurement_of(comparator), project.measurement_path
     if not path.exists():
         return data
-    if of_file(path) != fingerprint:
-        if not fingerprint:
+    measurement = measurement_of_digest(path, digest)
+    if measurement is None:
+        if not digest:
             return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
         return _with_problem(
             data,
             f"{path.name} is of other marks than {project.comparator.name}: it is not shown.",
             "Run `reseau measure`.",
         )
-    scans = {scan.frame.image: scan for scan in read_measurement(path, project.output)}
-    made, now = read_made_from(path), measured_from(project) if project.scans else {}
-    data = replace(data, measurement=scans, made_from={**data.made_from, path.name: fingerprint})
+    scans = {scan.frame.image: scan for scan in measurement[1]}
+    made, now = measurement[0], measured_from(project) if project.scans else {}
+    data = replace(data, measurement=scans, made_from={**data.made_from, path.name: digest})
     if project.scans and made.get(PLACES) != now[PLACES]:
         note = f"The marks were looked for with other {PLACES} than there are now; `reseau measure` looks again."
         data = replace(data, notes=(*data.notes, note))

@@ -4,43 +4,53 @@ What only one stage needs is imported by it: adjusting takes no pictures, and me
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
+from pathlib import Path
 
 from adjust.problem.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
+from pipeline.archive.judging import drop_all_but, judging_of, rejudge
+from pipeline.archive.measurement import measured_scans, pitches, read_measurement, tell_place
+from pipeline.archive.merge import Merged, merge
+from pipeline.archive.status import archive_summary, shard_summary
+from pipeline.archive.store import Store
+from pipeline.archive.work_options import NotMeasured, WorkOptions
 from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
-from pipeline.publishing.made_from import MadeFrom, adjusted_from, measured_from
+from pipeline.publishing.made_from import adjusted_from, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
 from pipeline.report.page import write_report
 from pipeline.report_data import adjusted, measured
 from pipeline.results.adjustment_file import write_adjustment
 from pipeline.results.adjustment_reader import covariance_path
-from pipeline.results.comparator_file import ComparatorPoint, read_comparator, write_comparator
+from pipeline.results.comparator_file import ComparatorPoint, measurement_of, read_comparator, write_comparator
 from pipeline.results.fingerprints import of_file
 from pipeline.results.frames_file import for_images, write_frames
+from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.measurement_file import write_measurement
 from pipeline.summary import Summary, summarise
 from pipeline.text.atomic import write_atomically
-from pipeline.workers import worker_pool
+
+_ONE_BY_ONE = 2000  # scans: of more the summary tells totals and what needs a look, from the store
+_WRITTEN = "comparator.csv"
 
 
-def run_all(project: Project, reporter: Reporter) -> Summary:
+def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Summary:
     """Measure (where there are scans), adjust, visit the scans again, check, report. The results take the places of
-    earlier ones together, at the end; where no adjustment is possible, the marks do."""
+    earlier ones together, at the end; where no adjustment is possible, the marks do. Of a shard nothing is adjusted."""
+    if work is not None and work.shard is not None:
+        return run_measure(project, reporter, work)
     check_transformation(project)
     with unpublished(project) as new:
-        made_from = measured_from(project)
-        scans = _measured_marks(project, made_from, new, reporter) if project.scans else ()
+        scans = _measured_marks(project, new, reporter, work) if project.scans else ()
         try:
-            adjustment = _adjusted_marks(project, scans, made_from, new, reporter)
+            adjustment = _adjusted_marks(project, scans, new, reporter)
             if adjustment is None:
                 for path in (project.adjustment_path, covariance_path(project.adjustment_path), project.check_path):
                     new.remove(path)  # of an earlier run
@@ -51,21 +61,35 @@ def run_all(project: Project, reporter: Reporter) -> Summary:
         except WriteError:
             raise
         except Exception:
-            new.publish()  # hours of measuring are not lost for a wrong point number
+            _publish(project, new)  # hours of measuring are not lost for a wrong point number
             raise
-        new.publish()
+        _publish(project, new)
         _fill_images(project, scans)
         return summary
 
 
-def run_measure(project: Project, reporter: Reporter) -> Summary:
-    """Scans to comparator.csv."""
+def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Summary:
+    """Scans to comparator.csv. Of a shard to its store alone: `reseau merge` joins these."""
+    if work is not None and work.shard is not None:
+        return _measured_shard(project, reporter, work, work.shard)
     with unpublished(project) as new:
-        scans = _measured_marks(project, measured_from(project), new, reporter)
-        data = measured(project, new.at)
-        new.publish()
-    _fill_images(project, scans)
-    return summarise(data, {"comparator coordinates": project.comparator, "measurement": project.measurement_path})
+        digest = _measure(project, new, reporter, work)
+        data = measured(project, new.at) if len(project.scans) <= _ONE_BY_ONE else None
+        _publish(project, new)
+    if project.images_path is not None:
+        _fill_images(project, measured_scans(project.measurement_path, digest))
+    files = {"comparator coordinates": project.comparator, "measurement": project.measurement_path}
+    return summarise(data, files) if data is not None else archive_summary(project, files)
+
+
+def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
+    """The stores of shards into that of the project; and, where they hold all its scans, the marks of all together."""
+    with Store(project.measurement_path) as store:
+        taken = merge(store, stores)
+    try:
+        return taken, run_measure(project, reporter, WorkOptions(only_kept=True))
+    except NotMeasured:
+        return taken, archive_summary(project, {"measurement": project.measurement_path})
 
 
 def run_adjust(project: Project, reporter: Reporter) -> Summary:
@@ -108,19 +132,37 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
         return summary
 
 
-def _measured_marks(
-    project: Project, made_from: MadeFrom, new: Unpublished, reporter: Reporter
-) -> tuple[MeasuredScan, ...]:
-    from pipeline.measuring.measure_stage import measure_project
+def _measured_shard(project: Project, reporter: Reporter, work: WorkOptions, shard: tuple[int, int]) -> Summary:
+    from pipeline.archive.measure_archive import measure_archive
 
-    with worker_pool(len(project.scans)) as workers:
-        scans = measure_project(project, reporter, new.place(project.output / "learned"), workers)
-    _write_marks(project, scans, made_from, new)
-    return scans
+    path = project.shard_path(*shard)
+    with unpublished(project) as new, Store(path) as store:
+        measure_archive(project, store, {}, new.place(project.output / "learned"), reporter, work)
+    return shard_summary(project, path, shard)
+
+
+def _measured_marks(
+    project: Project, new: Unpublished, reporter: Reporter, work: WorkOptions | None
+) -> tuple[MeasuredScan, ...]:
+    return read_measurement(project.measurement_path, _measure(project, new, reporter, work))
+
+
+def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkOptions | None) -> str:
+    """Measure what is missing, write the marks of all scans, and give the digest of their judging."""
+    from pipeline.archive.measure_archive import measure_archive
+
+    with Store(project.measurement_path) as store:
+        tell_place(store, project.path.parent)
+        done = measure_archive(
+            project, store, measured_from(project), new.place(project.output / "learned"), reporter, work
+        )
+        if store.told(_WRITTEN) != _written(project, done.digest):
+            _write_marks(project, store, done.digest, new)
+        return done.digest
 
 
 def _adjusted_marks(
-    project: Project, scans: Sequence[MeasuredScan], made_from: MadeFrom, new: Unpublished, reporter: Reporter
+    project: Project, scans: Sequence[MeasuredScan], new: Unpublished, reporter: Reporter
 ) -> Adjustment | None:
     """The adjustment, after a second visit to the scans where that found more; None where nothing is to be adjusted."""
     marks = _given_marks(project, new)
@@ -132,7 +174,7 @@ def _adjusted_marks(
     again = measure_again(project, scans, adjustment, reporter)
     if again is None:
         return adjustment
-    _write_marks(project, again, made_from, new)
+    _write_again(project, again, new)
     return adjust_marks(project, _given_marks(project, new))
 
 
@@ -146,17 +188,41 @@ def _given_marks(project: Project, new: Unpublished) -> tuple[ComparatorPoint, .
     return read_comparator(path)
 
 
-def _write_marks(project: Project, scans: Sequence[MeasuredScan], made_from: MadeFrom, new: Unpublished) -> None:
-    measurement = new.place(project.measurement_path)
-    write_measurement(measurement, scans, project.output, made_from)
-    pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
-    write_comparator(new.place(project.comparator), [scan.frame for scan in scans], pitch_um, of_file(measurement))
-    written = write_frames(new.place(project.frames_path), scans)
-    if not written:
+def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublished) -> None:
+    """What a second visit found, in the place of what was judged before it."""
+    folder = project.path.resolve().parent
+    with Store(project.measurement_path) as store:
+        before = judging_of(store, measurement_of(new.at(project.comparator)))
+        assert before is not None
+        digest = rejudge(store, before, {scan.frame.image: record_of(scan, folder) for scan in scans})
+        _write_marks(project, store, digest, new)
+
+
+def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) -> None:
+    frames = (scan.frame for scan in measured_scans(store.path, digest))
+    write_comparator(new.place(project.comparator), frames, pitches(store, digest), digest)
+    if not write_frames(new.place(project.frames_path), measured_scans(store.path, digest)):
         new.remove(project.frames_path)
 
 
-def _fill_images(project: Project, scans: Sequence[MeasuredScan]) -> None:
+def _publish(project: Project, new: Unpublished) -> None:
+    """Every result to its place; then nobody names the judgings any more that were before."""
+    new.publish()
+    if not (project.scans and project.measurement_path.exists() and project.comparator.exists()):
+        return
+    digest = measurement_of(project.comparator)
+    with Store(project.measurement_path) as store:
+        if judging_of(store, digest) is not None:
+            drop_all_but(store, digest)
+            store.tell(_WRITTEN, _written(project, digest))
+
+
+def _written(project: Project, digest: str) -> dict[str, str]:
+    """Which marks stand in which file: where both are as they were, neither is written again."""
+    return {"digest": digest, "file": of_file(project.comparator) if project.comparator.exists() else ""}
+
+
+def _fill_images(project: Project, scans: Iterable[MeasuredScan]) -> None:
     """What was read on the film, where the user's own list has empty columns for it."""
     if project.images_path is not None:
         fill_images(project.images_path, for_images(scans, WRITTEN))

@@ -73,6 +73,14 @@ def judging_of(store: Store, digest: str) -> Judging | None:
     return None if found is None else Judging(found[0], found[1], json.loads(found[2]), found[3])
 
 
+def rejudge(store: Store, before: Judging, records: Mapping[str, Json]) -> str:
+    """Keep another judging of the same results, after a look that a later `measure` does not take; give its digest."""
+    query = "select name, result from judged_frame where judging = ? order by name"
+    rows = store.connection.execute(query, (before.row,)).fetchall()
+    frames = [JudgedScan(name, result, records[name]) for name, result in rows]
+    return judge(store, before.made_from, f"looked again {before.input}", frames)
+
+
 def latest(store: Store) -> Judging | None:
     """The one that was made last."""
     found = store.connection.execute(

@@ -13,7 +13,8 @@ from pipeline.archive.key import shard_of
 from pipeline.archive.moved import find_moved, hash_contents
 from pipeline.archive.store import Store
 from pipeline.archive.together import find_copies, input_of, judged_scans
-from pipeline.archive.work import Counts, Work, WorkOptions
+from pipeline.archive.work import Counts, Work
+from pipeline.archive.work_options import WorkOptions
 from pipeline.files.project_file import Project
 from pipeline.measuring.learn_stage import learn_marks
 from pipeline.measuring.measure_stage import check_measurable
@@ -50,7 +51,7 @@ def measure_archive(
     if options.retry:
         store.forget_failed()
     with _executor(project, options) as executor:
-        work = Work(project, store, executor, options.workers)
+        work = Work(project, store, executor, options)
         learned = learn_marks(project, reporter, work.measure, executor, learned_folder, store)
         tasks = scan_tasks(learned, names, said_of_tones(learned, reporter, work.measure, store))
         if options.moved:

@@ -1,11 +1,12 @@
 """What was measured of a project, and judged, as others read it from out/measurement.db."""
 
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from pipeline.archive.judging import judged_records, judging_of, latest
-from pipeline.archive.store import Json, Store
+from pipeline.archive.store import Store
 from pipeline.errors import InputError
 from pipeline.results.measured_record import scan_of
 from pipeline.results.measured_scan import MeasuredScan
@@ -18,18 +19,25 @@ def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
 
     Raises InputError where there is no such store, or nothing in it is judged.
     """
-    return tuple(_scans(path, digest))
+    return tuple(measured_scans(path, digest))
 
 
-def measurement_json(path: Path, digest: str) -> Json | None:
-    """The same as JSON: `made_from`, and by image the record of its scan; None where that judging is not there."""
-    if not path.exists():
-        return None
+def measurement_of_digest(path: Path, digest: str) -> tuple[Mapping[str, str], tuple[MeasuredScan, ...]] | None:
+    """What a judging was made from, and its scans; None where the store has not that one."""
     with Store(path) as store:
         judging = judging_of(store, digest)
-        if judging is None:
-            return None
-        return {"made_from": dict(judging.made_from), "images": dict(judged_records(store, judging))}
+    return None if judging is None else (judging.made_from, read_measurement(path, digest))
+
+
+def pitches(store: Store, digest: str) -> dict[str, tuple[float, float]]:
+    """By image what a pixel measures, um; NaN of scans of which nobody knows."""
+    rows = store.connection.execute(
+        "select judged_frame.name, pitch_x_um, pitch_y_um from judged_frame join result on result.id = result "
+        "join judging on judging.id = judging where judging.digest = ?",
+        (digest,),
+    )
+    unknown = (math.nan, math.nan)
+    return {name: unknown if across is None else (across, down) for name, across, down in rows}
 
 
 def tell_place(store: Store, project_folder: Path) -> None:
@@ -39,7 +47,8 @@ def tell_place(store: Store, project_folder: Path) -> None:
         store.tell(_PLACE, {"path": told})
 
 
-def _scans(path: Path, digest: str) -> Iterator[MeasuredScan]:
+def measured_scans(path: Path, digest: str = "") -> Iterator[MeasuredScan]:
+    """The same one after the other."""
     if not path.exists():
         raise InputError(f"{path}: there is no such file. Run `reseau measure` first.")
     with Store(path) as store:

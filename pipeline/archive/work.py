@@ -12,6 +12,7 @@ from pipeline.archive.identity import FileState, Identity
 from pipeline.archive.key import fingerprint, options_hash
 from pipeline.archive.store import Kept, Store
 from pipeline.archive.witness import Witnessed, state_of, witnessed_scan
+from pipeline.archive.work_options import NotMeasured, WorkOptions
 from pipeline.files.project_file import Project
 from pipeline.measuring.measured import TASKS_A_CORE, ended_scan, results_of
 from pipeline.measuring.scan_task import ScanTask
@@ -21,19 +22,6 @@ from pipeline.results.measured_scan import MeasuredScan
 
 _SAID_EVERY_S = 30.0
 _hash_of = lru_cache(maxsize=4096)(options_hash)
-
-
-@dataclass(frozen=True)
-class WorkOptions:
-    """How the work is shared. shard: (K, N), only the scans of the K-th of N parts. cluster: a scheduler's address, or
-    `local`. retry: measure again what failed. moved: keep results of files whose content is the same elsewhere.
-    workers: processes, if not one a core."""
-
-    shard: tuple[int, int] | None = None
-    cluster: str | None = None
-    retry: bool = False
-    moved: bool = False
-    workers: int | None = None
 
 
 @dataclass
@@ -48,10 +36,13 @@ class Counts:
 class Work:
     """Scans measured as tasks ask for them: what the store holds is read there, all else measured and kept at once."""
 
-    def __init__(self, project: Project, store: Store, executor: Executor | None, workers: int | None = None) -> None:
-        """workers: how many scans are measured at a time, if not one a core."""
+    def __init__(
+        self, project: Project, store: Store, executor: Executor | None, options: WorkOptions | None = None
+    ) -> None:
+        options = options or WorkOptions()
         self._project, self._store, self._executor = project, store, executor
-        self._at_a_time = workers or os.cpu_count() or 1
+        self._at_a_time = options.workers or os.cpu_count() or 1
+        self._only_kept = options.only_kept
         self._folder = project.path.resolve().parent
         self._identities, self._rows = store.identities(), store.fingerprints()
         self._states: dict[str, FileState] = {}
@@ -135,6 +126,8 @@ class Work:
 
     def _measured(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, int, Kept]]:
         """Each kept as soon as it is there. as_scans: of the project, and not only for what they tell the others."""
+        if tasks and self._only_kept:
+            raise NotMeasured
         states = {task.name: self.state(task) for task in tasks}
         for task, result in results_of(witnessed_scan, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
             seen = result if isinstance(result, Witnessed) else Witnessed(ended_scan(task, result), "", -1)

@@ -94,7 +94,11 @@ class Project:
 
     @property
     def measurement_path(self) -> Path:
-        return self.output / "measurement.json"
+        return self.output / "measurement.db"
+
+    def shard_path(self, part: int, parts: int) -> Path:
+        """The store of one of several parts of the scans."""
+        return self.output / f"measurement.{part}-of-{parts}.db"
 
     @property
     def frames_path(self) -> Path:

@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
+from pipeline.archive.identity import file_state
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.fingerprints import fingerprint, of_scan
+from pipeline.results.fingerprints import fingerprint
 
 MadeFrom = dict[str, str]
 
@@ -40,6 +41,7 @@ _ORIGIN = {"path", "source"}
 def measured_from(project: Project) -> MadeFrom:
     """Of a measurement: every scan, what is sought in it, and what tells where to look. The last changes no mark that
     was measured, but which are found, and what they are named."""
+    folder = project.path.parent
     coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
     places = [
         coordinates,
@@ -53,7 +55,7 @@ def measured_from(project: Project) -> MadeFrom:
         PLACES: fingerprint(places),
         **{f"{CAMERA}{camera.name}": fingerprint(_sought(camera)) for camera in project.cameras.values()},
         **{
-            f"{SCAN}{image}": fingerprint([of_scan(path), project.camera_of(image).name])
+            f"{SCAN}{image}": fingerprint([file_state(path, folder), project.camera_of(image).name])
             for image, path in project.scans.items()
         },
     }

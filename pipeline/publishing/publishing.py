@@ -19,6 +19,7 @@ _HEAD = 4096
 _JSON = rb'\s*\{\s*("reseau"|"verdict": "[a-z ]+",\s*"reason"|"chosen": (null|\{\s*"transformation"))'
 _HEADS = {
     ".json": _JSON,
+    ".db": rb"SQLite format 3\0",
     ".npz": rb"PK\x03\x04.{26}(fingerprint|names)\.npy",
     ".csv": rb"# written about the frames, reseau",
     ".html": rb"<!DOCTYPE html>.*<title>.*: calibration report</title>",

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.status import Status
+from pipeline.archive.measurement import read_measurement
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.measurement_file import read_measurement
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

@@ -12,6 +12,7 @@ import numpy as np
 
 from measure.errors import MeasurementError
 from measure.scans.scan import open_scan
+from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
@@ -22,7 +23,6 @@ from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile, interpola
 from pipeline.resampling.source import source_of
 from pipeline.results.adjustment_reader import read_adjustment
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.measurement_file import read_measurement
 from pipeline.text.atomic import check_writable
 from pipeline.workers import worker_pool
 
@@ -82,8 +82,6 @@ def resample(
     of the same scan in the same way is kept. Raises InputError where nothing was measured, or for a lens that nobody
     has adjusted.
     """
-    if not project.measurement_path.exists():
-        raise InputError(f"{project.measurement_path}: there is no such file. Run `reseau measure` first.")
     check_writable(folder)
     tasks, results = resample_tasks(project, folder, pitch_um, with_lens, BEST if not fast else FAST)
     with reporter.stage("resampled") as count, worker_pool(max(len(tasks), 1)) as workers:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -46,15 +46,16 @@ class ComparatorPoint:
 
 
 def write_comparator(
-    path: Path, frames: Sequence[FrameMeasurement], pitch_um: Mapping[str, tuple[float, float]], measurement: str = ""
+    path: Path, frames: Iterable[FrameMeasurement], pitch_um: Mapping[str, tuple[float, float]], measurement: str = ""
 ) -> None:
     """Write every mark of every frame. Raises InputError where the file cannot be written.
 
-    pitch_um: by image, NaN of a scan that could not be measured. measurement: the fingerprint of the
-    measurement.json that holds the same marks.
+    pitch_um: by image, NaN of a scan that could not be measured. frames: a sequence is
+    sorted by name; what is no sequence has that order. measurement: the digest of the judging in measurement.db that
+    has the same marks.
     """
     lines = _head(pitch_um, measurement)
-    for frame in sorted(frames, key=lambda frame: frame.image):
+    for frame in sorted(frames, key=lambda frame: frame.image) if isinstance(frames, Sequence) else frames:
         lines += [_line(frame.image, mark, pitch_um[frame.image]) for mark in frame.marks]
     write_atomically(path, "\n".join(lines) + "\n")
 

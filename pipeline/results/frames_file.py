@@ -1,6 +1,6 @@
 """frames.csv: what is written about each frame, line by line, with the fields that are understood."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,7 +18,7 @@ HEAD = """# written about the frames, reseau {version}: as far as it was read. p
 """
 
 
-def write_frames(path: Path, scans: Sequence[MeasuredScan]) -> bool:
+def write_frames(path: Path, scans: Iterable[MeasuredScan]) -> bool:
     """Write frames.csv, and say so, where anything was read. Raises InputError where it cannot be written."""
     rows = [csv_line(row) for scan in scans for row in _rows(scan.frame)]
     if rows:
@@ -26,7 +26,7 @@ def write_frames(path: Path, scans: Sequence[MeasuredScan]) -> bool:
     return bool(rows)
 
 
-def for_images(scans: Sequence[MeasuredScan], names: Sequence[str]) -> Mapping[str, Mapping[str, str]]:
+def for_images(scans: Iterable[MeasuredScan], names: Sequence[str]) -> Mapping[str, Mapping[str, str]]:
     """By image the fields of these names."""
     return {scan.frame.image: said(scan.frame.writing or (), names) for scan in scans}
 
