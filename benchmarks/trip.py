@@ -60,9 +60,9 @@ class Followed:
 def followed() -> Followed:
     cv2.setNumThreads(1)  # what other threads call is not followed
     from drawn_project import write_project
+    from pipeline.measuring.measure_stage import measure_project
 
     from pipeline.files.project_file import read_project
-    from pipeline.measuring.measure_stage import measure_project
     from pipeline.progress import Reporter
     from pipeline.results.comparator_file import write_comparator
 

@@ -137,7 +137,7 @@ def _measured_shard(project: Project, reporter: Reporter, work: WorkOptions, sha
 
     path = project.shard_path(*shard)
     with unpublished(project) as new, Store(path) as store:
-        measure_archive(project, store, {}, new.place(project.output / "learned"), reporter, work)
+        measure_archive(project, store, dict, new.place(project.output / "learned"), reporter, work)
     return shard_summary(project, path, shard)
 
 
@@ -154,7 +154,7 @@ def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkO
     with Store(project.measurement_path) as store:
         tell_place(store, project.path.parent)
         done = measure_archive(
-            project, store, measured_from(project), new.place(project.output / "learned"), reporter, work
+            project, store, lambda: measured_from(project), new.place(project.output / "learned"), reporter, work
         )
         if store.told(_WRITTEN) != _written(project, done.digest):
             _write_marks(project, store, done.digest, new)

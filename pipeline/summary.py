@@ -28,7 +28,7 @@ FRAME_ROWS = 50  # of frames at most in a table in the terminal: the report has 
 
 @dataclass(frozen=True)
 class Summary:
-    """The end of a command. poses: of the scans, each with its evidence, as measurement.json has them. files: what was
+    """The end of a command. poses: of the scans, each with its evidence, as measurement.db has them. files: what was
     written, by a word for it. forms: of the fiducials of cameras of which nothing else was adjusted."""
 
     verdict: Verdict

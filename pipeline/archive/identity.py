@@ -12,6 +12,7 @@ from tifffile import TiffFile
 from measure.errors import MeasurementError
 from measure.scans.broken import DECODING_ERRORS
 from measure.scans.scan import Scan, open_scan
+from pipeline.results.fingerprints import of_scan
 
 _HEAD_BYTES = 1 << 16
 _MIDDLE_PX = 256
@@ -58,12 +59,13 @@ def uri_of(path: Path, folder: Path) -> str:
 
 
 def parts_hash(path: Path, max_pixels: int | None = None) -> str:
-    """SHA-256 (hexadecimal) of the first 64 KiB, of the tables of tile offsets and byte counts, and of the 256 x 256 px
-    in the middle. Head and tables alone would not do: uncompressed scans of one scanner share them.
+    """SHA-256 (hexadecimal) of the first 64 KiB, of the tables of tile offsets and byte counts, of the 256 x 256 px in
+    the middle, and of pieces spread over the file. Head and tables alone would not do: uncompressed scans of one
+    scanner share them.
 
     A file that cannot be opened as a scan has a hash of its first bytes; "" where not even these can be read.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(of_scan(path).encode())
     try:
         with path.open("rb") as file:
             digest.update(file.read(_HEAD_BYTES))

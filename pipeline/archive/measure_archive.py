@@ -1,6 +1,6 @@
 """A project's scans measured into its store: only what is missing or changed, whatever happens to the rest."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -17,7 +17,8 @@ from pipeline.archive.work import Counts, Work
 from pipeline.archive.work_options import WorkOptions
 from pipeline.files.project_file import Project
 from pipeline.measuring.learn_stage import learn_marks
-from pipeline.measuring.measure_stage import check_measurable
+from pipeline.measuring.measurable import check_measurable
+from pipeline.measuring.roll import with_known_lines
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.measuring.tone_stage import said_of_tones
 from pipeline.progress import Reporter
@@ -35,7 +36,7 @@ class Done:
 def measure_archive(
     project: Project,
     store: Store,
-    made_from: Mapping[str, str],
+    made_from: Callable[[], Mapping[str, str]],
     learned_folder: Path,
     reporter: Reporter,
     options: WorkOptions | None = None,
@@ -43,8 +44,8 @@ def measure_archive(
     """Measure what is missing of the project's scans, and judge all of them together, unless that is as it was.
 
     Raises InputError for what is wrong in the user's own files, before anything is measured, and MeasurementError where
-    no scan at all could be measured; a scan that fails is a result. made_from: what a judging says that it is of;
-    learned_folder: where what is learned of marks is written.
+    no scan at all could be measured; a scan that fails is a result. made_from: what a judging says that it is
+    of, asked when all is measured; learned_folder: where what is learned of marks is written.
     """
     options = options or WorkOptions()
     names = check_measurable(project)
@@ -54,6 +55,7 @@ def measure_archive(
         work = Work(project, store, executor, options)
         learned = learn_marks(project, reporter, work.measure, executor, learned_folder, store)
         tasks = scan_tasks(learned, names, said_of_tones(learned, reporter, work.measure, store))
+        tasks, _ = with_known_lines(tasks, work.measure, reporter)
         if options.moved:
             find_moved(store, tasks, work, reporter)
         store.set_project({work.state(task).uri: task.name for task in tasks})
@@ -66,12 +68,13 @@ def measure_archive(
             hash_contents(store, tasks, work, reporter)
         _check_any(store)
         copies = find_copies(store, tasks, work)
-        told = input_of(tasks, work, copies, made_from)
+        made = made_from()
+        told = input_of(tasks, work, copies, made)
         before = latest(store)
         if before is not None and before.input == told:
             return Done(before.digest, work.counts)
         scans = judged_scans(learned, tasks, work, copies, reporter, executor)
-        return Done(judge(store, made_from, told, scans), work.counts)
+        return Done(judge(store, made, told, scans), work.counts)
 
 
 def _executor(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:

@@ -17,6 +17,7 @@ from pipeline.archive.store import Store
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.files.project_file import Project
 from pipeline.report.data import Problem
+from pipeline.report.verdict import Level
 from pipeline.report.verdict import Verdict as ProjectVerdict
 from pipeline.summary import Summary
 
@@ -171,7 +172,7 @@ def _summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
     problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
     if more:
         problems.append(Problem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
-    level = "good" if status.all_good else "look"
+    level: Level = "good" if status.all_good else "look"
     return Summary(ProjectVerdict(level, sentence, tuple(problems), ()), {}, {}, None, None, files)
 
 

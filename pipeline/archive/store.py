@@ -277,6 +277,14 @@ class Store:
         return int(self._db.execute(f"select id from program where {where}", told).fetchone()[0])
 
 
+def known_identities(path: Path) -> dict[str, Identity]:
+    """`Store.identities` of a store; nothing where there is none."""
+    if not path.exists():
+        return {}
+    with Store(path) as store:
+        return store.identities()
+
+
 def places(count: int) -> str:
     return ", ".join("?" * count)
 

@@ -59,5 +59,11 @@ def verdict_of(record: Mapping[str, Any]) -> Verdict:
         return Verdict.POOR
     pose = record["pose"]
     needs_look = record["problems"] or (pose and not pose["decided"])
-    of_marks = max((_OF_MARK[Status(mark["status"])] for mark in marks), key=list(Verdict).index)
+    of_marks = max((_of_mark(mark) for mark in marks), key=list(Verdict).index)
     return Verdict.LOOK if needs_look else of_marks
+
+
+def _of_mark(mark: Mapping[str, Any]) -> Verdict:
+    """A target that was not seen costs the others nothing; a fiducial is in every frame of its camera."""
+    status = Status(mark["status"])
+    return Verdict.GOOD if status is Status.PREDICTED and mark["kind"] != "fiducial" else _OF_MARK[status]

@@ -14,7 +14,7 @@ from pipeline.archive.store import Kept, Store
 from pipeline.archive.witness import Witnessed, state_of, witnessed_scan
 from pipeline.archive.work_options import NotMeasured, WorkOptions
 from pipeline.files.project_file import Project
-from pipeline.measuring.measured import TASKS_A_CORE, ended_scan, results_of
+from pipeline.measuring.measured import TASKS_A_CORE, ended_scan, reads_writing, results_of
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 from pipeline.results.measured_record import record_of, scan_of
@@ -118,7 +118,7 @@ class Work:
         known = self._identities.get(state.uri)
         if known is None or known.state != state:
             return None
-        return self._rows.get(fingerprint(known, _hash_of(task.options_json())))
+        return self._rows.get(fingerprint(known, _hash_of(_options_json(task))))
 
     def _found(self, task: ScanTask, row: int) -> MeasuredScan:
         self.results[task.name] = row
@@ -142,9 +142,14 @@ class Work:
         parts = known.parts_hash if lost and known is not None else seen.parts_hash
         return Kept(
             Identity(state, parts),
-            task.options_json(),
+            _options_json(task),
             record_of(seen.scan, self._folder),
             seen.scan.seconds,
             seen.bytes_read,
             self._project.camera_of(task.name).path.name,
         )
+
+
+def _options_json(task: ScanTask) -> str:
+    """All that a result depends on beside the scan: also whether there is something that reads writing."""
+    return task.options_json() if not reads_writing(task.options) else task.options_json()[:-1] + ',"reads":true}'

@@ -72,7 +72,8 @@ def results_of(
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                yield running.pop(future), _result(future)
+                task, result = running.pop(future), _result(future)
+                yield task, result
     finally:
         for future in running:
             future.cancel()
@@ -184,6 +185,12 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
     if options.known_pose is not None and measured.pose is not None:
         measured = replace(measured, pose=options.known_pose)
     return replace(measured, marks=_with_sizes(measured, layout, scan, pitch))
+
+
+def reads_writing(options: ScanOptions) -> bool:
+    """Whether anything would be read: what the result depends on beside scan and options, for what reads is an
+    extra."""
+    return options.fiducials.writing != "none" and networks() is not None
 
 
 def _missed_reading(options: ScanOptions, frame: FrameMeasurement) -> tuple[str, ...]:

@@ -14,13 +14,3 @@ class Memory(Protocol):
 
     def tell(self, key: str, value: Json) -> None:
         """Keep a value."""
-
-
-class Forgetful:
-    """A memory that keeps nothing."""
-
-    def told(self, key: str) -> Json | None:
-        return None
-
-    def tell(self, key: str, value: Json) -> None:
-        pass

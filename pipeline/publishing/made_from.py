@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
-from pipeline.archive.identity import file_state
+from pipeline.archive.identity import Identity, file_state, parts_hash
+from pipeline.archive.store import known_identities
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import ComparatorPoint
@@ -41,7 +43,7 @@ _ORIGIN = {"path", "source"}
 def measured_from(project: Project) -> MadeFrom:
     """Of a measurement: every scan, what is sought in it, and what tells where to look. The last changes no mark that
     was measured, but which are found, and what they are named."""
-    folder = project.path.parent
+    known = known_identities(project.measurement_path)
     coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
     places = [
         coordinates,
@@ -55,7 +57,7 @@ def measured_from(project: Project) -> MadeFrom:
         PLACES: fingerprint(places),
         **{f"{CAMERA}{camera.name}": fingerprint(_sought(camera)) for camera in project.cameras.values()},
         **{
-            f"{SCAN}{image}": fingerprint([file_state(path, folder), project.camera_of(image).name])
+            f"{SCAN}{image}": fingerprint([*_parts(path, project, known), project.camera_of(image).name])
             for image, path in project.scans.items()
         },
     }
@@ -75,6 +77,15 @@ def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFro
         DISTANCES: fingerprint({fingerprint(given.distance) for given in project.given_distances}),
         SETTINGS: fingerprint(_settings(project)),
     }
+
+
+def _parts(path: Path, project: Project, known: Mapping[str, Identity]) -> tuple[int, str]:
+    """Of a scan's file its size and what its telling parts hold: read only where it is not as the store knows it. A
+    file that was touched, or stands elsewhere, is the same."""
+    state = file_state(path, project.path.resolve().parent)
+    found = known.get(state.uri)
+    is_known = found is not None and found.state == state
+    return state.bytes, found.parts_hash if found is not None and is_known else parts_hash(path, project.max_pixels)
 
 
 def differing(made: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -1,18 +1,16 @@
 """What tests of the pipeline share: three frames of the demonstration, rendered and run once for all, and work without
 processes."""
 
-import pickle
 import shutil
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from collections.abc import Iterator
 from contextlib import nullcontext
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import cv2
 import pytest
 from demonstration import FRAMES
+from in_process import Here
 
 from pipeline.cli import run
 from pipeline.rendered.scene_file import render_project
@@ -56,20 +54,7 @@ def project(finished: tuple[Path, int], tmp_path: Path) -> Path:
     return folder
 
 
-class Here(Executor):
-    """Does its work at once in this process, pickled on its way there and back as if there were another one."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        work = pickle.loads(pickle.dumps((fn, args, kwargs)))
-        try:
-            future.set_result(pickle.loads(pickle.dumps(work[0](*work[1], **work[2]))))
-        except Exception as error:
-            future.set_exception(pickle.loads(pickle.dumps(error)))
-        return future
-
-
 @pytest.fixture
 def in_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small scans are measured sooner than a new process has loaded its modules. The demonstration starts them."""
-    monkeypatch.setattr("pipeline.stages.worker_pool", lambda _: nullcontext(Here()))
+    monkeypatch.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: nullcontext(Here()))

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from kept_scans import content
+
 END_S = 5.0  # within which every process is to be gone
 LONGEST_S = 300.0
 Whom = Literal["parent", "worker"]
@@ -35,7 +37,8 @@ def state(folder: Path) -> State:
     """The results in a project's folder; what begins with a point has not taken its place."""
     files = [folder / "comparator.csv", *sorted((folder / "out").rglob("*"))]
     names = {str(file.relative_to(folder)): file for file in files if file.is_file()}
-    return {name: file.read_bytes() for name, file in names.items() if "/." not in name}
+    left = {name: file for name, file in names.items() if "/." not in name and not name.endswith(("-wal", "-shm"))}
+    return {name: told for name, file in left.items() if (told := content(file))}
 
 
 def started(folder: Path, command: str) -> subprocess.Popen[bytes]:

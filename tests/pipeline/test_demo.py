@@ -20,7 +20,7 @@ in_its_group = pytest.mark.xdist_group("demonstration")  # one run of it serves 
 
 def assert_measured_right_and_calibrated_within_its_sigmas(folder: Path, frames: int) -> None:
     out = folder / "out"
-    comparison = compare_with_truth(folder / "truth.json", out / "measurement.json", out / "adjustment.json")
+    comparison = compare_with_truth(folder / "truth.json", out / "measurement.db", out / "adjustment.json")
     assert len(comparison.frames) == frames
     for frame in comparison.frames:
         assert frame.wrong == ()

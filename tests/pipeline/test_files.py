@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from kept_scans import keep_scans
 
 from measure.covariance import Cause, Covariance
 from measure.film import SCATTER_MM
@@ -16,6 +17,7 @@ from measure.marks.shapes import MarkShape, MarkTemplate, Polygon
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
+from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.camera_text import camera_text
@@ -31,7 +33,6 @@ from pipeline.results.comparator_file import (
     write_comparator,
 )
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.measurement_file import read_measurement, write_measurement
 from pipeline.text.atomic import atomic_path, check_writable, write_atomically
 from pipeline.text.image_names import image_name
 from pipeline.text.tables import read_toml
@@ -263,8 +264,8 @@ def test_a_measurement_is_read_back_with_its_reasons_and_the_causes_of_its_covar
     bent = Reason("the film is bent.", Code.BENT_FRAME)
     frame = FrameMeasurement("a", (mark,), problems=(bent,))
     scan = MeasuredScan(str(tmp_path / "a.tif"), 300, 400, (20.0, 20.0), frame)
-    write_measurement(tmp_path / "measurement.json", [scan])
-    (frame,) = (one.frame for one in read_measurement(tmp_path / "measurement.json"))
+    keep_scans(tmp_path / "out" / "measurement.db", [scan])
+    (frame,) = (one.frame for one in read_measurement(tmp_path / "out" / "measurement.db"))
     (back,) = frame.marks
     assert (back.reason, back.reason.codes) == (weak, weak.codes)
     assert [(each, each.codes) for each in frame.problems] == [(bent, bent.codes)]

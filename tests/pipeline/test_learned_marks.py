@@ -22,6 +22,7 @@ from pipeline.files.project_file import Project, read_project
 from pipeline.measuring import learn_stage
 from pipeline.measuring.learn_stage import learn_marks
 from pipeline.measuring.measured import measure_scans
+from pipeline.measuring.memory import Json
 from pipeline.measuring.scan_task import scan_tasks
 from pipeline.progress import Reporter
 from synthetic_images import areas, scene
@@ -93,9 +94,19 @@ def clicks(folder: Path) -> str:
     return f'[clicks]\nscan = "f1.tif"\n[clicks.px]\n{lines}'
 
 
+class Forgetful:
+    """A memory that keeps nothing."""
+
+    def told(self, key: str) -> Json | None:
+        return None
+
+    def tell(self, key: str, value: Json) -> None:
+        pass
+
+
 def learned(project: Project) -> Project:
     reporter = Reporter(Console(quiet=True))
-    return learn_marks(project, reporter, measure_scans, None, project.output / "learned")
+    return learn_marks(project, reporter, measure_scans, None, project.output / "learned", Forgetful())
 
 
 def measured(project: Project, *scans: str) -> list[FrameMeasurement]:

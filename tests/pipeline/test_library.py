@@ -150,7 +150,7 @@ def test_images_may_name_a_camera_of_the_library(tmp_path: Path) -> None:
 def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
     """All drawn marks within a tenth of a pixel of the truth; those that are not drawn are passed over."""
     assert run(["measure", str(frame)]) == 0
-    measured = frame.parent / "out" / "measurement.json"
+    measured = frame.parent / "out" / "measurement.db"
     (compared,) = compare_with_truth(frame.parent / "truth.json", measured).frames
     assert compared.observed["fiducial"] == 4
     assert compared.wrong == ()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kept_scans import keep_scans
 from test_command_line import replaced, results, rewritten_scans
 
 from adjust.errors import AdjustmentError
@@ -18,14 +19,14 @@ from adjust.problem.network import Prior
 from measure.errors import MeasurementError
 from measure.status import Status
 from pipeline import stages
+from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.publishing.made_from import measured_from
 from pipeline.report_data import adjusted
 from pipeline.results.comparator_file import read_comparator, write_comparator
-from pipeline.results.fingerprints import fingerprint, of_file, of_scan
+from pipeline.results.fingerprints import fingerprint, of_scan
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.measurement_file import read_measurement, write_measurement
 from pipeline.summary import summarise
 
 SAID = pytest.CaptureFixture[str]
@@ -52,24 +53,17 @@ def said(told: dict[str, Any]) -> str:
 def measured_as(folder: Path, scans: tuple[MeasuredScan, ...]) -> None:
     """The files that `reseau measure` would leave if it had measured this."""
     project = read_project(folder / "project.toml")
-    write_measurement(project.measurement_path, scans, made_from=measured_from(project))
+    digest = keep_scans(project.measurement_path, scans, measured_from(project))
     frames, pitch_um = [scan.frame for scan in scans], {scan.frame.image: scan.pitch_um for scan in scans}
-    write_comparator(project.comparator, frames, pitch_um, of_file(project.measurement_path))
+    write_comparator(project.comparator, frames, pitch_um, digest)
 
 
 def one_scan_more(folder: Path) -> MeasuredScan:
     """A fourth scan of the project, and what measuring it gives."""
     (folder / "scans" / "frame4.tif").write_bytes((folder / "scans" / "frame1.tif").read_bytes() + b"\0")
     rewritten_scans(folder, "scans/frame*.tif")
-    first = read_measurement(folder / "out" / "measurement.json")[0]
+    first = read_measurement(folder / "out" / "measurement.db")[0]
     return replace(first, scan=str(folder / "scans" / "frame4.tif"), frame=replace(first.frame, image="frame4"))
-
-
-@pytest.fixture
-def measured_before(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What measuring gives is known, and given at once."""
-    scans = read_measurement(project / "out" / "measurement.json")
-    monkeypatch.setattr("pipeline.measuring.measure_stage.measure_project", lambda *_: scans)
 
 
 def test_a_finished_project_is_current(finished: tuple[Path, int]) -> None:
@@ -83,7 +77,7 @@ def test_a_finished_project_is_current(finished: tuple[Path, int]) -> None:
 
 def test_an_adjustment_of_one_scan_less_is_not_shown(project: Path, capsys: SAID) -> None:
     more = one_scan_more(project)
-    measured_as(project, (*read_measurement(project / "out" / "measurement.json"), more))
+    measured_as(project, (*read_measurement(project / "out" / "measurement.db"), more))
     code, told = summary(project, capsys, "report")
     assert code == 1
     assert told["sentence"].startswith("Measured: ")
@@ -142,8 +136,9 @@ def old_covariance(folder: Path) -> None:
 
 
 def old_measurement(folder: Path) -> None:
-    scans = read_measurement(folder / "out" / "measurement.json")
-    write_measurement(folder / "out" / "measurement.json", scans[:2])
+    scans = read_measurement(folder / "out" / "measurement.db")
+    (folder / "out" / "measurement.db").unlink()
+    keep_scans(folder / "out" / "measurement.db", scans[:2])
 
 
 def of_an_earlier_version(folder: Path) -> None:
@@ -182,7 +177,7 @@ def moved_point(folder: Path) -> None:
         (old_check, "check.json is of another adjustment: it is not shown.", {"adjustment"}),
         (old_covariance, "adjustment.npz belongs to another adjustment.json: both are not shown.", set()),
         (of_an_earlier_version, "adjustment.json is of what it does not say: it is not shown.", set()),
-        (old_measurement, "measurement.json is of other marks than comparator.csv", {"adjustment", "check"}),
+        (old_measurement, "measurement.db is of other marks than comparator.csv", {"adjustment", "check"}),
     ],
 )  # fmt: skip
 def test_what_was_made_from_something_else_is_said_and_not_shown(
@@ -221,7 +216,6 @@ def fails_with(error: BaseException) -> Callable[..., Any]:
     return fail
 
 
-@pytest.mark.usefixtures("measured_before")
 def test_an_end_after_measuring_leaves_all_as_it_was(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = results(project)
     monkeypatch.setattr(stages, "adjust_marks", fails_with(KeyboardInterrupt()))
@@ -229,12 +223,10 @@ def test_an_end_after_measuring_leaves_all_as_it_was(project: Path, monkeypatch:
     assert results(project) == before
 
 
-@pytest.mark.usefixtures("measured_before")
 def test_marks_that_cannot_be_adjusted_are_kept_and_the_earlier_adjustment_is_not_shown(
     project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    more = (*read_measurement(project / "out" / "measurement.json"), one_scan_more(project))
-    monkeypatch.setattr("pipeline.measuring.measure_stage.measure_project", lambda *_: more)
+    one_scan_more(project)
     monkeypatch.setattr(stages, "adjust_marks", fails_with(AdjustmentError("a wrong point number")))
     assert run(["run", str(project / "project.toml")]) == 2
     assert "frame4" in {point.image for point in read_comparator(project / "comparator.csv")}
@@ -244,7 +236,6 @@ def test_marks_that_cannot_be_adjusted_are_kept_and_the_earlier_adjustment_is_no
     assert "it is not shown" in said(told)
 
 
-@pytest.mark.usefixtures("measured_before")
 def test_a_scan_that_vanishes_before_the_second_visit_keeps_what_the_first_gave(
     project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
 ) -> None:

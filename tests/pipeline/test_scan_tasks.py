@@ -17,6 +17,7 @@ import pytest
 from drawn_project import CAMERA, PROJECT, write_project
 
 from measure.status import Status
+from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.measuring import measured
@@ -24,7 +25,6 @@ from pipeline.measuring.measured import measure_scans, measured_scan
 from pipeline.measuring.scan_task import ScanTask, few_of, scan_tasks
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_scan import FailureCode, MeasuredScan
-from pipeline.results.measurement_file import read_measurement
 
 Changed = Callable[[str, str], tuple[str, str]]  # of project.toml and camera.toml
 SAID = pytest.CaptureFixture[str]
@@ -256,7 +256,7 @@ def test_damaged_and_missing_scans_cost_the_others_nothing(tmp_path: Path, capsy
         ("e", Status.ABSENT),
     }
     assert (four.parent / "out" / "report.html").exists()
-    scans = {scan.frame.image: scan for scan in read_measurement(four.parent / "out" / "measurement.json")}
+    scans = {scan.frame.image: scan for scan in read_measurement(four.parent / "out" / "measurement.db")}
     assert {name: scan.failure and str(scan.failure.code) for name, scan in scans.items()} == {
         "a": None, "b": None, "c": None, "d": "unreadable", "e": "missing", "f": "unreadable", "g": "missing",
     }  # fmt: skip

@@ -1,12 +1,12 @@
 """What is written on the frames, through the files: frames.csv, images.csv, the camera's file, a roll's poses."""
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from kept_scans import keep_scans
 from rich.console import Console
 
 from measure.covariance import Cause, Covariance
@@ -19,6 +19,7 @@ from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
 from measure.writing import networks as networks_module
 from measure.writing.line import Line, Reading
+from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.camera_file import parse_camera, read_camera
@@ -34,7 +35,6 @@ from pipeline.rendered.scene_file import render_project
 from pipeline.report.writing import written
 from pipeline.results.frames_file import for_images, write_frames
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.measurement_file import read_measurement, write_measurement
 from pipeline.text.tables import Table
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
@@ -88,9 +88,9 @@ def test_two_scans_that_say_the_same_frame_are_told() -> None:
 
 
 def test_what_was_read_is_kept_in_the_measurement(tmp_path: Path) -> None:
-    path = tmp_path / "measurement.json"
+    path = tmp_path / "out" / "measurement.db"
     before = scan("a", [line("RUN 7", "90m", "left")], Pose("90", False, ("because",), roll="one question"))
-    write_measurement(path, [before, scan("b", None)])
+    keep_scans(path, [before, scan("b", None)])
     kept, unread = read_measurement(path)
     assert kept.frame.writing == before.frame.writing
     assert kept.frame.pose == before.frame.pose
@@ -367,16 +367,17 @@ def test_a_rendered_frame_is_read_and_its_pose_decided(tmp_path: Path, monkeypat
     )
     (tmp_path / "p" / "images.csv").write_text("image,run,date\na,,\n", encoding="utf-8")
     run(["measure", str(project)])
-    frame = json.loads((tmp_path / "p" / "out" / "measurement.json").read_text(encoding="utf-8"))["images"]["a"]
-    assert frame["pose"]["name"] == "90m"
-    assert frame["pose"]["decided"]
+    (scan,) = read_measurement(tmp_path / "p" / "out" / "measurement.db")
+    assert scan.frame.pose is not None
+    assert (scan.frame.pose.name, scan.frame.pose.decided) == ("90m", True)
     assert "a,run," in (tmp_path / "p" / "out" / "frames.csv").read_text(encoding="utf-8")
     assert (tmp_path / "p" / "images.csv").read_text(encoding="utf-8") == "image,run,date\na,7,1968-05-16\n"
     monkeypatch.setattr("pipeline.measuring.measured.networks", lambda: None)
     monkeypatch.setattr("measure.fiducials.networks", lambda: None)
     run(["measure", str(project)])
-    frame = json.loads((tmp_path / "p" / "out" / "measurement.json").read_text(encoding="utf-8"))["images"]["a"]
-    assert not frame["pose"]["decided"]
-    assert any("pip install --no-deps rapidocr-onnxruntime" in note for note in frame["notes"])
+    (scan,) = read_measurement(tmp_path / "p" / "out" / "measurement.db")
+    assert scan.frame.pose is not None
+    assert not scan.frame.pose.decided
+    assert any("pip install --no-deps rapidocr-onnxruntime" in note for note in scan.notes)
     assert networks_module.PACKAGE == "rapidocr_onnxruntime"
     assert not (tmp_path / "p" / "out" / "frames.csv").exists()

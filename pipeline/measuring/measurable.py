@@ -1,5 +1,4 @@
-"""Scans to marks, in three steps: each scan by itself, the scans of each camera, those of the project."""
-
+"""What of a project can be measured at all: known before anything is."""
 
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project

@@ -1,0 +1,348 @@
+"""A project's scans are measured once: what changed is measured again, and nothing else."""
+
+import json
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from drawn_project import CAMERA, write_project
+from in_process import Here
+
+from pipeline.archive.status import archive_status
+from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
+from pipeline.archive.witness import Witnessed, witnessed_scan
+from pipeline.cli import run
+from pipeline.files.project_file import read_project
+from pipeline.measuring.scan_task import ScanTask
+
+SAID = pytest.CaptureFixture[str]
+pytestmark = pytest.mark.usefixtures("in_one_process")
+
+measured: list[str] = []  # the images that were measured, in their order
+
+
+def counted_scan(task: ScanTask) -> Witnessed:
+    measured.append(task.name)
+    return witnessed_scan(task)
+
+
+@pytest.fixture(autouse=True)
+def counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured.clear()
+    monkeypatch.setattr("pipeline.archive.work.witnessed_scan", counted_scan)
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of three scans, not measured yet."""
+    return write_project(tmp_path_factory.mktemp("three"), ["a", "b", "c"]).parent
+
+
+@pytest.fixture(scope="module")
+def done(three: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, measured."""
+    folder = tmp_path_factory.mktemp("done") / "p"
+    shutil.copytree(three, folder)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: nullcontext(Here()))
+        assert measure(folder) == 0
+    return folder
+
+
+@pytest.fixture
+def folder(done: Path, tmp_path: Path) -> Path:
+    """The same, in a folder of its own, as old as it was."""
+    shutil.copytree(done, tmp_path / "p")
+    return tmp_path / "p"
+
+
+def measure(folder: Path, *options: str) -> int:
+    return run(["measure", str(folder / "project.toml"), *options])
+
+
+def marks(folder: Path) -> bytes:
+    return (folder / "comparator.csv").read_bytes()
+
+
+def verdicts(folder: Path) -> dict[str, str]:
+    return {scan.image: str(scan.verdict) for scan in archive_status(read_project(folder / "project.toml")).scans}
+
+
+def rewritten(folder: Path, name: str, old: str, new: str) -> None:
+    path = folder / name
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def one_pixel(folder: Path) -> None:
+    pixels = tifffile.imread(folder / "b.tif")
+    pixels[5, 5] ^= 1
+    tifffile.imwrite(folder / "b.tif", pixels)
+
+
+def one_more(folder: Path) -> None:
+    pixels = tifffile.imread(folder / "b.tif")
+    tifffile.imwrite(folder / "d.tif", pixels + 1)
+
+
+CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "nothing": (lambda p: None, ""),
+    "touched": (lambda p: os.utime(p / "b.tif", ns=(1, 1)), "b"),
+    "one pixel changed": (one_pixel, "b"),
+    "renamed": (lambda p: (p / "b.tif").rename(p / "e.tif"), "e"),
+    "one more": (one_more, "d"),
+    "one less": (lambda p: (p / "b.tif").unlink(), ""),
+    "excluded": (lambda p: rewritten(p, "project.toml", "[measure]", 'exclude = ["b.tif"]\n[measure]'), ""),
+    "an option": (lambda p: rewritten(p, "project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"'), "abc"),
+    "a mark drawn otherwise": (lambda p: rewritten(p, "camera.toml", "line_mm = 0.1\n", "line_mm = 0.11\n"), "abc"),
+    "an option of the adjustment": (
+        lambda p: rewritten(p, "project.toml", "[measure]", "[adjust]\nrobust = true\n[measure]"), ""),
+    "the camera's name": (lambda p: rewritten(p, "camera.toml", 'name = "K"', 'name = "L"'), ""),
+    "the marks' file deleted": (lambda p: (p / "comparator.csv").unlink(), ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> None:
+    act, again = CHANGES[change]
+    act(folder)
+    assert measure(folder) in (0, 1)
+    assert "".join(sorted(measured)) == again
+    after = marks(folder)
+    measured.clear()
+    assert measure(folder) in (0, 1)
+    assert not measured
+    assert marks(folder) == after
+
+
+def test_what_was_measured_with_other_options_comes_back_without_measuring(folder: Path) -> None:
+    before = marks(folder)
+    rewritten(folder, "project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"')
+    measure(folder)
+    assert len(measured) == 3
+    rewritten(folder, "project.toml", 'pose = "0"\ntone = "linear"', 'pose = "0"')
+    measure(folder)
+    assert len(measured) == 3
+    assert marks(folder) == before
+
+
+def test_a_new_revision_of_measuring_measures_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.archive.key.fingerprint.__defaults__", (-1,))
+    measure(folder)
+    assert sorted(measured) == ["a", "b", "c"]
+
+
+def test_a_project_that_is_moved_as_a_whole_keeps_its_results(folder: Path, tmp_path: Path) -> None:
+    before = marks(folder)
+    folder.rename(tmp_path / "elsewhere")
+    assert measure(tmp_path / "elsewhere") == 0
+    assert not measured
+    assert marks(tmp_path / "elsewhere") == before
+
+
+def test_moved_and_touched_files_are_known_by_their_content_where_that_is_asked(folder: Path) -> None:
+    measure(folder, "--moved")  # hashes whole files
+    assert not measured
+    os.utime(folder / "a.tif", ns=(1, 1))
+    (folder / "b.tif").rename(folder / "e.tif")
+    one_pixel_of_c = tifffile.imread(folder / "c.tif")
+    one_pixel_of_c[3, 3] ^= 1
+    tifffile.imwrite(folder / "c.tif", one_pixel_of_c)
+    measure(folder, "--moved")
+    assert measured == ["c"]
+    assert set(verdicts(folder)) == {"a", "c", "e"}
+    measure(folder)
+    assert measured == ["c"]
+
+
+def spoil(folder: Path) -> None:
+    """Beside one good scan: a broken, a truncated, a foreign and a black one, and one that nobody may read."""
+    data = (folder / "b.tif").read_bytes()
+    (folder / "b.tif").write_bytes(data[: len(data) // 2])
+    (folder / "c.tif").write_bytes(b"II*\0 and nothing that is right")
+    (folder / "foreign.tif").write_text("a letter", encoding="utf-8")
+    black = np.zeros_like(tifffile.imread(folder / "a.tif"))
+    tifffile.imwrite(folder / "black.tif", black)
+
+
+def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, capsys: SAID) -> None:
+    good = [line for line in marks(folder).decode().splitlines() if line.startswith("a,")]
+    spoil(folder)
+    assert measure(folder) == 1
+    assert verdicts(folder) == {
+        "a": "good", "b": "failed", "c": "failed", "black": "poor", "foreign": "failed",
+    }  # fmt: skip
+    rows = marks(folder).decode().splitlines()
+    assert [row for row in rows if row.startswith("a,")] == good
+    assert sum(",absent," in row and "the scan could not be measured" in row for row in rows) == 3 * 4
+    measured.clear()
+    capsys.readouterr()
+    assert measure(folder) == 1  # and no second time
+    assert not measured
+    assert measure(folder, "--retry") == 1
+    assert sorted(measured) == ["b", "c", "foreign"]
+    assert run(["status", str(folder / "project.toml"), "--verdict", "failed"]) == 1
+    out, err = capsys.readouterr()
+    assert "foreign" in out
+    assert "Mend or replace" in out.replace("\n", " ")
+    assert "Traceback" not in err
+
+
+def test_copies_count_once(folder: Path) -> None:
+    shutil.copyfile(folder / "a.tif", folder / "z.tif")
+    near = tifffile.imread(folder / "a.tif")
+    near[2, 2] ^= 1
+    tifffile.imwrite(folder / "y.tif", near)
+    assert measure(folder) == 1
+    rows = [line.split(",") for line in marks(folder).decode().splitlines() if line.startswith(("y,", "z,"))]
+    assert {(row[0], row[10]) for row in rows} == {("y", "measured"), ("z", "rejected")}
+    assert all("copy of that of a" in row[11] for row in rows if row[0] == "z")
+    assert verdicts(folder)["z"] in ("look", "poor")
+
+
+class Interrupts:
+    """An executor that is interrupted after so many tasks."""
+
+    def __init__(self, after: int) -> None:
+        self.left = after
+
+    def __enter__(self) -> "Interrupts":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.left -= 1
+        if self.left < 0:
+            raise KeyboardInterrupt
+        future.set_result(fn(*args))
+        return future
+
+
+def test_an_interrupt_keeps_what_is_done(
+    three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: SAID
+) -> None:
+    shutil.copytree(three, tmp_path / "p")
+    monkeypatch.setattr("pipeline.archive.work.TASKS_A_CORE", 1)
+    monkeypatch.setattr("pipeline.archive.work.os.cpu_count", lambda: 1)
+    with monkeypatch.context() as patched:
+        patched.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: Interrupts(2))
+        assert measure(tmp_path / "p") == 130
+    assert "scans that were measured are kept" in capsys.readouterr().err
+    assert not (tmp_path / "p" / "comparator.csv").exists()
+    assert sorted(verdicts(tmp_path / "p").values()) == ["good", "good", "waiting"]
+    measured.clear()
+    assert measure(tmp_path / "p") == 0
+    assert len(measured) == 1
+    assert "2 of 3 scans are measured already; 1 to measure" in capsys.readouterr().err
+
+
+def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tmp_path: Path, capsys: SAID) -> None:
+    parts = tmp_path / "parts"
+    shutil.copytree(three, parts)
+    project = parts / "project.toml"
+    assert measure(parts, "--shard", "1/5") == 0
+    assert not (parts / "comparator.csv").exists()
+    store = parts / "out" / "measurement.{}-of-5.db"
+    assert run(["merge", str(project), str(store).format(1)]) == 1  # the others are waiting
+    assert "waiting" in capsys.readouterr().out
+    assert measure(parts, "--shard", "2/5") == 0
+    assert sorted(measured) == ["a", "b", "c"]
+    assert run(["merge", str(project), *(str(store).format(k) for k in (1, 2))]) == 0
+    assert len(measured) == 3
+    assert marks(parts) == marks(folder)
+    assert measure(parts) == 0
+    assert len(measured) == 3
+
+
+@pytest.mark.parametrize("shard", ["3", "0/2", "3/2", "a/b", "1/2/3"])
+def test_a_shard_that_is_none_is_refused(folder: Path, shard: str, capsys: SAID) -> None:
+    assert measure(folder, "--shard", shard) == 2
+    assert "is not K/N" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_gives_the_same_marks(folder: Path, three: Path, tmp_path: Path) -> None:
+    shutil.copytree(three, tmp_path / "cluster")
+    assert measure(tmp_path / "cluster", "--cluster", "local", "--workers", "2") == 0
+    assert not measured
+    assert marks(tmp_path / "cluster") == marks(folder)
+
+
+def test_status_tells_what_changed_outside(folder: Path, capsys: SAID) -> None:
+    project = str(folder / "project.toml")
+    assert run(["status", project]) == 0
+    one_more(folder)
+    os.utime(folder / "a.tif", ns=(1, 1))
+    (folder / "c.tif").unlink()
+    assert verdicts(folder) == {"a": "old", "b": "good", "d": "waiting"}
+    capsys.readouterr()
+    assert run(["status", project, "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert {name: one["verdict"] for name, one in told["images"].items()} == {"a": "old", "d": "waiting"}
+    assert told["verdicts"]["good"]["scans"] == 1
+    assert run(["status", project, "--csv", "--verdict", "waiting"]) == 1
+    assert capsys.readouterr().out.splitlines()[1].startswith("d,waiting,")
+    assert run(["status", project, "--verdict", "dreadful"]) == 2
+
+
+def test_the_page_of_archives_has_the_table_of_verdicts() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "archives.md").read_text(encoding="utf-8")
+    assert all(f"| `{verdict}` | {MEANING[verdict]} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)
+
+
+def test_other_programs_read_the_marks(folder: Path) -> None:
+    with sqlite3.connect(folder / "out" / "measurement.db") as db:
+        rows = db.execute("select image, point, x_mm, y_mm, status from mark_view").fetchall()
+    lines = [line.split(",") for line in marks(folder).decode().splitlines() if line.startswith(("a,", "b,", "c,"))]
+    assert [(row[0], row[1], f"{row[2]:.7f}", f"{row[3]:.7f}", row[4]) for row in rows] == [
+        (line[0], line[1], line[3], line[4], line[10]) for line in lines
+    ]
+
+
+LEARNED = (
+    CAMERA.replace('mark = "m"', 'mark = "l"').split("[mark.m]")[0] + '[mark.l]\nkind = "learned"\nsize_mm = 2.0\n'
+)
+
+
+def test_learned_marks_stay_when_a_scan_comes(three: Path, tmp_path: Path) -> None:
+    shutil.copytree(three, tmp_path / "p")
+    (tmp_path / "p" / "camera.toml").write_text(LEARNED, encoding="utf-8")
+    assert measure(tmp_path / "p") in (0, 1)
+    measured.clear()
+    before = marks(tmp_path / "p")
+    assert measure(tmp_path / "p") in (0, 1)
+    assert not measured
+    assert marks(tmp_path / "p") == before
+    one_more(tmp_path / "p")
+    assert measure(tmp_path / "p") in (0, 1)
+    assert measured == ["d"]
+
+
+TIPS = 'kind = "polygon"\nvertices_mm = [[0, 0], [0.8, -1.0], [0.8, 1.0]]\n'  # leans on the tone curve
+
+
+def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(three: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "p"
+    shutil.copytree(three, folder)
+    camera = CAMERA.split("[mark.m]")[0] + f"[mark.m]\n{TIPS}"
+    (folder / "camera.toml").write_text(camera, encoding="utf-8")
+    measure(folder)
+    measured.clear()
+    measure(folder)
+    assert not measured
+    one_more(folder)
+    (folder / "a.tif").unlink()
+    measure(folder)
+    assert measured == ["d"]
