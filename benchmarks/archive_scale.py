@@ -1,6 +1,6 @@
 """Fifty thousand scans through the archive: memory, the store's share of a scan's time, status, and nothing to do.
 
-    python -m benchmarks.archive_scale [SCANS]
+    python benchmarks/archive_scale.py [SCANS]
 
 Stand-ins for the measuring of a scan, so that only the rest is timed; two processes. Each command runs in a process of
 its own, whose largest memory and CPU time are printed.
@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.archive_stand_ins import use, write_project
+from archive_stand_ins import use, write_project
 
 _COMMANDS = {
     "measure": ["measure"],
@@ -42,7 +42,7 @@ def main(scans: int) -> None:
 
 def _row(title: str, arguments: list[str], scans: int) -> None:
     start = time.monotonic()
-    own = [sys.executable, "-m", "benchmarks.archive_scale", "--command", *arguments]
+    own = [sys.executable, __file__, "--command", *arguments]
     ended = subprocess.run(own, capture_output=True, text=True, check=False)
     clock_s = time.monotonic() - start
     told = ended.stderr.strip().splitlines()[-1].split() if ended.stderr.strip() else []

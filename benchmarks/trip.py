@@ -7,6 +7,7 @@ which every way of looking is tried, and follows every call.
 
 import sys
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
@@ -60,8 +61,10 @@ class Followed:
 def followed() -> Followed:
     cv2.setNumThreads(1)  # what other threads call is not followed
     from drawn_project import write_project
-    from pipeline.measuring.measure_stage import measure_project
 
+    from pipeline.archive import measure_archive
+    from pipeline.archive.measurement import read_measurement
+    from pipeline.archive.store import Store
     from pipeline.files.project_file import read_project
     from pipeline.progress import Reporter
     from pipeline.results.comparator_file import write_comparator
@@ -72,9 +75,12 @@ def followed() -> Followed:
         tifffile.imwrite(path.with_name("grain.tif"), grain.astype(np.uint16))
         project = read_project(path)
         calls = Followed()
+        vars(measure_archive)["worker_pool"] = lambda *_: nullcontext()  # nor what other processes do
         sys.setprofile(calls)
         try:
-            scans = measure_project(project, Reporter(), Path(place) / "learned")
+            with Store(project.measurement_path) as store:
+                measure_archive.measure_archive(project, store, dict, Path(place) / "learned", Reporter())
+            scans = read_measurement(project.measurement_path)
             pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
             write_comparator(project.comparator, [scan.frame for scan in scans], pitch_um)
         finally:

@@ -48,6 +48,7 @@ class Code(StrEnum):
     NO_BOARD = "no-board"
     PLATE = "plate"
     FEW_TIES = "few-ties"
+    COPY = "copy"
 
 
 MEANING = {
@@ -88,6 +89,7 @@ MEANING = {
     Code.NO_BOARD: "The board, or a part of its markers, was not found.",
     Code.PLATE: "The plate in the picture contradicts the camera.",
     Code.FEW_TIES: "Fewer natural points were found than wanted.",
+    Code.COPY: "The scan's file is a copy of another one, whose marks count.",
 }
 
 

@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement
 from measure.status import Status
 from pipeline.archive.identity import content_hash
@@ -115,10 +116,11 @@ def _judged(scan: MeasuredScan, work: Work, project: Project) -> JudgedScan:
 
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:
     """A scan of which none of the marks counts, for they count in another one."""
-    told = f"its file is a copy of that of {original}, which counts"
+    told = Reason(f"its file is a copy of that of {original}, which counts", Code.COPY)
     marks = [
         replace(mark, status=Status.REJECTED, reason=told) if mark.status.is_observation else mark
         for mark in scan.frame.marks
     ]
-    problem = f"its file is byte for byte that of {original}: its marks count once. Name one of both in `exclude`."
+    sentence = f"its file is byte for byte that of {original}: its marks count once. Name one of both in `exclude`."
+    problem = Reason(sentence, Code.COPY)
     return replace(scan, frame=replace(scan.frame, marks=tuple(marks), problems=(*scan.frame.problems, problem)))

@@ -14,7 +14,8 @@ from pipeline.archive.store import Kept, Store
 from pipeline.archive.witness import Witnessed, state_of, witnessed_scan
 from pipeline.archive.work_options import NotMeasured, WorkOptions
 from pipeline.files.project_file import Project
-from pipeline.measuring.measured import TASKS_A_CORE, ended_scan, reads_writing, results_of
+from pipeline.measuring.handed_out import TASKS_A_CORE, results_of
+from pipeline.measuring.measured import ended_scan, reads_writing
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 from pipeline.results.measured_record import record_of, scan_of

@@ -1,14 +1,11 @@
 """The first step of measuring: each scan by itself, its fiducials and then the targets that they make predictable."""
 
-import os
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from collections.abc import Iterable, Iterator
+from concurrent.futures import BrokenExecutor
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -25,21 +22,11 @@ from measure.status import Status
 from measure.writing.networks import MISSING, networks
 from pipeline.errors import InputError, what_to_do
 from pipeline.measuring.camera_model import misplaced_principal_point
+from pipeline.measuring.handed_out import Submits, results_of
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.measuring.target_stage import measure_targets
 from pipeline.measuring.tone_stage import tone_before
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
-
-Made = TypeVar("Made")
-
-TASKS_A_CORE = 4  # handed out ahead: enough that no process waits, few enough that little is lost
-
-
-class Submits(Protocol):
-    """What shares work out: an executor of `concurrent.futures`, or one like it."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> "Future[Any]":
-        """Have `fn` called with these, some time."""
 
 
 def measure_scans(
@@ -51,49 +38,6 @@ def measure_scans(
     """
     for task, result in results_of(measured_scan, tasks, executor, in_flight):
         yield ended_scan(task, result) if isinstance(result, Exception) else result
-
-
-def results_of(
-    function: Callable[[ScanTask], Made],
-    tasks: Iterable[ScanTask],
-    executor: Submits | None = None,
-    in_flight: int | None = None,
-) -> Iterator[tuple[ScanTask, Made | Exception]]:
-    """Each task with what the function makes of it, or with why the executor has lost it. in_flight: as above."""
-    if executor is None:
-        yield from ((task, function(task)) for task in tasks)
-        return
-    window = in_flight or TASKS_A_CORE * (os.cpu_count() or 1)
-    left, running = iter(tasks), dict[Future[Made], ScanTask]()
-    try:
-        while True:
-            for task in islice(left, window - len(running)):
-                running[_submitted(executor, function, task)] = task
-            if not running:
-                return
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                task, result = running.pop(future), _result(future)
-                yield task, result
-    finally:
-        for future in running:
-            future.cancel()
-
-
-def _submitted(executor: Submits, function: Callable[[ScanTask], Made], task: ScanTask) -> "Future[Made]":
-    try:
-        return executor.submit(function, task)
-    except BrokenExecutor as error:
-        future: Future[Made] = Future()
-        future.set_exception(error)
-        return future
-
-
-def _result(future: "Future[Made]") -> Made | Exception:
-    """What is measured raises nothing: what comes here is of the executor, whose process is gone or out of reach."""
-    try:
-        return future.result()
-    except Exception as error:
-        return error
 
 
 def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:

@@ -45,7 +45,7 @@ class Problem:
 class ReportData:
     """Everything a report can show.
 
-    comparator: the rows of comparator.csv. measurement: the scans of measurement.json by image. adjustment, check: the
+    comparator: the rows of comparator.csv. measurement: the scans of measurement.db by image. adjustment, check: the
     contents of adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed
     frame by camera name. thumbnail: from image, point and kind (a fiducial and a target may share a name) to the mark's
     picture. problems, notes: what the caller has to say beyond the files. made_from: their fingerprints by name. unit:
