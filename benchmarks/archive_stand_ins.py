@@ -41,7 +41,10 @@ def write_project(folder: Path, scans: int, a_folder: int = 1000) -> Path:
 
 
 def stand_in(task: ScanTask) -> Witnessed:
-    """Measured in the time that RESEAU_STAND_IN_S says, 0 by default."""
+    """Measured in the time that RESEAU_STAND_IN_S says, 0 by default; RESEAU_STAND_IN_LOG: where its begin is told."""
+    if told := os.environ.get("RESEAU_STAND_IN_LOG"):
+        with Path(told).open("a", encoding="utf-8") as file:
+            file.write(f"{task.name}\n")
     time.sleep(float(os.environ.get("RESEAU_STAND_IN_S", "0")))
     digest = hashlib.sha256(Path(task.scan).read_bytes()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))

@@ -1,0 +1,94 @@
+"""What is measured again after what change: six small drawn frames, counted by the store's results.
+
+python benchmarks/archive_changes.py
+"""
+
+import os
+import shutil
+import sqlite3
+import sys
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import tifffile
+
+from pipeline.cli import run
+
+ROOT = Path(__file__).parents[1]
+sys.path += [str(ROOT / "tests" / "pipeline"), str(ROOT / "tests" / "measure")]
+NAMES = [f"f{number}" for number in range(1, 7)]
+
+
+def rewritten(name: str, old: str, new: str) -> Callable[[Path], None]:
+    def act(folder: Path) -> None:
+        text = (folder / name).read_text(encoding="utf-8")
+        assert old in text
+        (folder / name).write_text(text.replace(old, new), encoding="utf-8")
+
+    return act
+
+
+def pixel(folder: Path, name: str = "f2.tif", out: str = "f2.tif") -> None:
+    pixels = tifffile.imread(folder / name)
+    pixels[3, 3] ^= 1
+    tifffile.imwrite(folder / out, pixels)
+
+
+def moved(folder: Path) -> None:
+    (folder / "box").mkdir()
+    (folder / "f2.tif").rename(folder / "box" / "f2.tif")
+    rewritten("project.toml", 'scans = ["*.tif"]', 'scans = ["**/*.tif"]')(folder)
+
+
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "nothing": lambda folder: None,
+    "one file touched": lambda folder: os.utime(folder / "f2.tif", ns=(1, 1)),
+    "one file moved to another folder": moved,
+    "one file renamed": lambda folder: (folder / "f2.tif").rename(folder / "g.tif"),
+    "one pixel of one file changed": pixel,
+    "one setting of [measure]": rewritten("project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"'),
+    "one mark drawn otherwise": rewritten("camera.toml", "line_mm = 0.1\n", "line_mm = 0.11\n"),
+    "a setting of [adjust]": rewritten("project.toml", "[measure]", "[adjust]\nrobust = true\n[measure]"),
+    "one scan more": lambda folder: pixel(folder, "f2.tif", "g.tif"),
+    "one scan less": lambda folder: (folder / "f2.tif").unlink(),
+    "one scan in exclude": rewritten("project.toml", "[measure]", 'exclude = ["f2.tif"]\n[measure]'),
+}
+
+
+def main() -> None:
+    from drawn_project import write_project
+
+    print(f"{len(NAMES)} scans measured; then...\n")
+    print(f"{'change':<36}{'measured again':>15}{'and once more':>15}")
+    with TemporaryDirectory() as place:
+        first = write_project(Path(place) / "first", NAMES).parent
+        measured(first)
+        for title, change in CHANGES.items():
+            folder = Path(place) / "changed"
+            shutil.copytree(first, folder)
+            change(folder)
+            print(f"{title:<36}{measured(folder):>15}{measured(folder):>15}", flush=True)
+            shutil.rmtree(folder)
+
+
+def measured(folder: Path) -> int:
+    """How many results a call of `reseau measure` adds."""
+    before = results(folder)
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        assert run(["measure", str(folder / "project.toml")]) in (0, 1)
+    return results(folder) - before
+
+
+def results(folder: Path) -> int:
+    path = folder / "out" / "measurement.db"
+    if not path.exists():
+        return 0
+    with sqlite3.connect(path) as db:
+        return int(db.execute("select count(*) from result").fetchone()[0])
+
+
+if __name__ == "__main__":
+    main()

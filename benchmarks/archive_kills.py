@@ -1,0 +1,107 @@
+"""Kills -9 of the parent and of workers at random moments of a run of 200 stand-in scans: each time it goes on.
+
+    python benchmarks/archive_kills.py [KILLS] [SEED]
+
+At the end the store is held against that of an undisturbed run, all but times, and scans that were begun more than once
+are counted.
+"""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from archive_stand_ins import use, write_project
+
+from pipeline.archive.judging import judged_records, latest
+from pipeline.archive.store import Store
+
+_SCANS, _SCAN_S, _WORKERS = 200, 0.2, 2
+
+
+def main(kills: int, seed: int) -> None:
+    rng = random.Random(seed)
+    with TemporaryDirectory() as place:
+        calm, wild = Path(place) / "calm", Path(place) / "wild"
+        calm.mkdir()
+        write_project(calm, _SCANS)
+        shutil.copytree(calm, wild)
+        started(calm).wait()
+        total: Counter[str] = Counter()
+        print(f"seed {seed}, {_SCANS} scans of {_SCAN_S} s, {_WORKERS} workers")
+        while total["parent"] + total["worker"] < kills:
+            shutil.rmtree(wild / "out", ignore_errors=True)
+            (wild / "starts").write_text("", encoding="utf-8")
+            done = measured_to_its_end(wild, rng)
+            starts = Counter((wild / "starts").read_text(encoding="utf-8").split())
+            total += done
+            again, in_hand = starts.total() - len(starts), _WORKERS * done["parent"] + done["worker"]
+            print(f"kills of the parent {done['parent']}, of workers {done['worker']}:", end=" ")
+            print(f"store equal {content(wild) == content(calm)}, marks equal {marks(wild) == marks(calm)};", end=" ")
+            print(f"begun more than once {again}, in hand when killed at most {in_hand}", flush=True)
+        print(f"in all {dict(total)}")
+
+
+def measured_to_its_end(folder: Path, rng: random.Random) -> Counter[str]:
+    """Begun again after each kill of the parent, until it ends by itself; how many of whom were killed."""
+    done: Counter[str] = Counter()
+    while True:
+        process = started(folder)
+        while process.poll() is None:
+            after = time.monotonic() + rng.uniform(1.0, 12.0)
+            while time.monotonic() < after and process.poll() is None:
+                time.sleep(0.02)
+            whom = rng.choice(("parent", "worker"))
+            victims = [process.pid] if whom == "parent" else workers(process.pid)
+            if process.poll() is None and victims:
+                os.kill(rng.choice(victims), signal.SIGKILL)
+                done[whom] += 1
+                if whom == "parent":
+                    process.wait()
+        if process.returncode in (0, 1):
+            return done
+
+
+def started(folder: Path) -> "subprocess.Popen[bytes]":
+    own = [sys.executable, __file__, "--measure", str(folder / "project.toml")]
+    environment = os.environ | {"RESEAU_STAND_IN_S": str(_SCAN_S), "RESEAU_STAND_IN_LOG": str(folder / "starts")}
+    return subprocess.Popen(own, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def workers(parent: int) -> list[int]:
+    """Its processes that measure."""
+    children = Path(f"/proc/{parent}/task/{parent}/children")
+    threads = Path(f"/proc/{parent}/task").glob("*/children") if children.exists() else ()
+    pids = [int(pid) for file in threads for pid in file.read_text(encoding="ascii").split()]
+    return [pid for pid in pids if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def content(folder: Path) -> list[str]:
+    with Store(folder / "out" / "measurement.db") as store:
+        judging = latest(store)
+        assert judging is not None
+        keys = sorted(store.fingerprints())
+        return [*keys, *(f"{name} {record}" for name, record in judged_records(store, judging))]
+
+
+def marks(folder: Path) -> bytes:
+    return (folder / "comparator.csv").read_bytes()
+
+
+def measure(project: str) -> int:
+    from pipeline.cli import run
+
+    use()
+    return run(["measure", project, "--workers", str(_WORKERS)])
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--measure"]:
+        sys.exit(measure(sys.argv[2]))
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 50, int(sys.argv[2]) if len(sys.argv) > 2 else 1)
