@@ -25,7 +25,7 @@ from pipeline.files.images_file import read_images
 from pipeline.files.points_file import read_points
 from pipeline.files.project_file import Project, read_project
 from pipeline.files.template_table import saved_in
-from pipeline.measuring.measure_stage import check_measurable
+from pipeline.measuring.measurable import check_measurable
 from pipeline.results.comparator_file import (
     comparator_from_pixel,
     pixel_from_comparator,
