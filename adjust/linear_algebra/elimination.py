@@ -25,8 +25,10 @@ from adjust.linear_algebra.normal_equations import Groups, border_square, spread
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-REFLECTED = 1e9  # rows times columns squared in the shared unknowns up to which these rows are factorised themselves
-SAFE = 1e-6  # reciprocal condition of the shared triangle down to which their normal equations will do
+CHEAP = 1e8  # rows times columns squared in the shared unknowns up to which these rows are always reflected
+REFLECTED = 1e9  # the same, up to which they are wherever their normal equations would cost digits
+SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal equations will do beyond that
+TEN_DIGITS = 1e-3  # the same up to that: variances keep them
 
 
 @dataclass(frozen=True)
@@ -58,10 +60,11 @@ def eliminate(
 
     Blocks of many more rows than columns are squared, which is quickest, where all triangles turn out so well
     conditioned (STEADY) that it does not matter. Otherwise they are factorised by reflections, and so are the rows that
-    are left in the shared unknowns. Where that would take too long, and `sums` tell how, their normal equations are
-    summed up and factorised (Cholesky). That squares the condition: of variances the relative error is at most some
-    1e-16 times the squared condition, 1e-4 where the condition is 1e6; where it is worse, reflections take their time.
-    Not sharp: singular values below 1e-6 need not be told from that.
+    are left in the shared unknowns. Where that would take long, and `sums` tell how, their normal equations are summed
+    up and factorised (Cholesky). That squares the condition: of variances the relative error is at most some 1e-16
+    times the squared condition, 1e-10 where the condition is 1e3; where it is worse, reflections take their time, but
+    for rows of which they would take too much: there 1e6 will do. Not sharp: singular values below 1e-6 need not be
+    told from that.
 
     fronts: of the shared unknowns, which stand in their order; a single one if they are not told.
     """
@@ -82,10 +85,13 @@ def eliminate(
         factor = by_squares(normals, scale, priors, fronts)
         if factor is not None:
             return factor
-    if sums is not None and reflections_cost(fronts, heights) > REFLECTED:
+    cost = reflections_cost(fronts, heights)
+    if sums is not None and cost > (CHEAP if sharp else REFLECTED):
         lift = 0.0 if sharp else SAFE**2
         factor = _by_normal_equations(blocks, sums, scale, priors, fronts, lift)
-        if factor is not None and (not sharp or factor.triangle.reciprocal_condition > SAFE):
+        if factor is not None and (
+            not sharp or factor.triangle.reciprocal_condition > (SAFE if cost > REFLECTED else TEN_DIGITS)
+        ):
             return factor
     factors = []
     rests = []

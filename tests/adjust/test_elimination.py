@@ -195,6 +195,7 @@ def test_normal_equations_give_what_reflections_give(count: int, monkeypatch: py
     numbering, at = linearised(count)
     by_reflections = factorise(numbering, at)
     monkeypatch.setattr(elimination, "REFLECTED", 0.0)
+    monkeypatch.setattr(elimination, "CHEAP", 0.0)
     reflected = []
     monkeypatch.setattr(elimination, "_eliminate_blocks", lambda *_: reflected.append(True))
     factor = factorise(numbering, at)
@@ -204,6 +205,18 @@ def test_normal_equations_give_what_reflections_give(count: int, monkeypatch: py
     expected = whole(by_reflections) / np.outer(sigmas, sigmas)
     np.testing.assert_allclose(whole(factor) / np.outer(sigmas, sigmas), expected, atol=1e-8)
     assert factor.length() == pytest.approx(by_reflections.length(), rel=1e-10)
+
+
+def test_what_is_cheap_to_reflect_is_squared_only_where_that_costs_no_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    numbering, at = linearised(18)
+    exact = factorise(numbering, at).variances()
+    monkeypatch.setattr(elimination, "CHEAP", 0.0)
+    monkeypatch.setattr(elimination, "TEN_DIGITS", 1e-6)
+    squared = factorise(numbering, at).variances()
+    assert not np.array_equal(squared, exact)
+    np.testing.assert_allclose(squared, exact, rtol=1e-6)
+    monkeypatch.setattr(elimination, "TEN_DIGITS", 1.0)  # as if the condition were worse
+    np.testing.assert_array_equal(factorise(numbering, at).variances(), exact)
 
 
 def test_roots_of_cofactors_are_local_where_many_unknowns_are_shared(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,6 +234,7 @@ def test_what_is_badly_conditioned_is_reflected(monkeypatch: pytest.MonkeyPatch)
     numbering, at = linearised(18, np.inf)
     expected = factorise(numbering, at)
     monkeypatch.setattr(elimination, "REFLECTED", 0.0)
+    monkeypatch.setattr(elimination, "CHEAP", 0.0)
     np.testing.assert_array_equal(factorise(numbering, at).triangle.toarray(), expected.triangle.toarray())
     rough = factorise(numbering, at, camera_priors=False)
     assert np.linalg.svd(rough.triangle.toarray())[1][-7:] == pytest.approx(np.full(7, 1e-6), rel=0.01)
@@ -229,6 +243,7 @@ def test_what_is_badly_conditioned_is_reflected(monkeypatch: pytest.MonkeyPatch)
 def test_large_networks_are_adjusted_alike_whatever_the_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """By normal equations: the same bits again, and the same to rounding from observations in another order."""
     monkeypatch.setattr(elimination, "REFLECTED", 0.0)
+    monkeypatch.setattr(elimination, "CHEAP", 0.0)
     monkeypatch.setattr(triangle, "WIDE", 0)
     rng = np.random.default_rng(12)
     network, start = simulated(rng, points=field_points(rng, 18), point_sigma=0.05, free={"k3": np.inf})
