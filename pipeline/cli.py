@@ -129,7 +129,7 @@ def demo(
 @app.command()
 def init(
     scans: Annotated[
-        list[Path], typer.Argument(metavar="FOLDER_OR_URL...", help="Folders with scans, or scans.", show_default=False)
+        list[Path], typer.Argument(metavar="FOLDER...", help="Folders with scans, or scans.", show_default=False)
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where project.toml and images.csv go.")] = Path(),
     max_pixels: MaxPixels = None,

@@ -2,6 +2,7 @@
 
 import glob
 import os
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -136,6 +137,8 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
         if path.exists():
             raise InputError(f"{path} is there already, and init writes over nothing. Give another folder by --out.")
     for path in given:
+        if re.match(r"\w+:/", path.as_posix()) and not path.exists():
+            raise InputError(f"{path} is an address, and scans are read from folders only. Mount or copy them.")
         if not path.exists():
             raise InputError(f"there is no {path} (looked for {path.absolute()}). Give folders with scans, or scans.")
     with reporter.stage("looked at") as count:

@@ -199,6 +199,11 @@ def test_of_each_kind_in_each_folder_three_are_tried(box: Path, monkeypatch: pyt
     assert unread == {box / "1952/0004.tif": "cannot be decoded"}
 
 
+def test_an_address_is_told_to_be_none_of_a_folder(tmp_path: Path, capsys: SAID) -> None:
+    assert run(["init", "s3://prints/1952/", "--out", str(tmp_path)]) == 2
+    assert "is an address, and scans are read from folders only" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("given", "said"), [("nowhere", "there is no"), ("empty", "no scan there, nor below"), ("only", "none can be read")]
 )
