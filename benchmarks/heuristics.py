@@ -1,6 +1,6 @@
 """What each heuristic brings: the same pictures measured with it, and with it switched off.
 
-PYTHONPATH=tests/measure python benchmarks/heuristics.py [--only NAME] [--count 24]
+OPENBLAS_NUM_THREADS=1 PYTHONPATH=tests/measure python benchmarks/heuristics.py [--only NAME] [--count 24]
 
 Each row is one heuristic: the figure that it is there for, with it and without. The last rows compare a method of
 scikit-image with what is used in its place, on the same pictures.
