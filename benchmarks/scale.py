@@ -2,6 +2,7 @@
 
 python benchmarks/scale.py                      the whole table
 python benchmarks/scale.py known reseau 200     one measurement: task, program, views
+python benchmarks/scale.py known start 200      approximations; "nothing": without a principal distance, and adjusted
 python benchmarks/scale.py unknown ceres 200 20000
 
 A single measurement is of as many threads as OPENBLAS_NUM_THREADS says.
@@ -151,6 +152,17 @@ def start(scene: Scene) -> Figures:
     return {"seconds": seconds, "mib": _peak_mib(), "vpv": adjust(scene.network, found).vpv}
 
 
+def nothing(scene: Scene) -> Figures:
+    """Approximations and adjustment where nothing is given but the points, not even a principal distance."""
+    cameras = tuple(
+        replace(camera, principal_distance_mm=None, x0_mm=None, y0_mm=None) for camera in scene.network.cameras
+    )
+    network = replace(scene.network, cameras=cameras)
+    found, seconds = _timed(lambda: approximate(network))
+    result, more = _timed(lambda: adjust(network, found))
+    return {"seconds": seconds, "adjustment_seconds": more, "mib": _peak_mib(), "vpv": result.vpv}
+
+
 def opencv(scene: Scene) -> Figures:
     """OpenCV's calibration with its standard deviations, from the same principal distance."""
     cv2.setNumThreads(1)
@@ -275,6 +287,7 @@ def ceres(scene: Scene) -> Figures:
 PROGRAMS: dict[tuple[str, str], Callable[..., Figures]] = {
     ("known", "reseau"): lambda views: reseau(known(views)),
     ("known", "start"): lambda views: start(known(views)),
+    ("known", "nothing"): lambda views: nothing(known(views)),
     ("known", "opencv"): lambda views: opencv(known(views)),
     ("unknown", "reseau"): lambda images, points: reseau(unknown(images, points)),
     ("unknown", "scipy"): lambda images, points: scipy(unknown(images, points)),
