@@ -1,10 +1,12 @@
 """comparator.csv: comparator coordinates of every mark, also of those that were not found."""
 
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from typing import get_args
 
@@ -15,7 +17,7 @@ from adjust.problem.network import ObservationKind
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
-from pipeline.text.atomic import write_atomically
+from pipeline.text.atomic import atomic_path
 from pipeline.text.csv_table import Row, csv_line, read_csv
 from pipeline.text.image_names import image_name
 from pipeline.text.text_file import read_bytes
@@ -54,10 +56,12 @@ def write_comparator(
     sorted by name; what is no sequence has that order. measurement: the digest of the judging in measurement.db that
     has the same marks.
     """
-    lines = _head(pitch_um, measurement)
-    for frame in sorted(frames, key=lambda frame: frame.image) if isinstance(frames, Sequence) else frames:
-        lines += [_line(frame.image, mark, pitch_um[frame.image]) for mark in frame.marks]
-    write_atomically(path, "\n".join(lines) + "\n")
+    ordered = sorted(frames, key=lambda frame: frame.image) if isinstance(frames, Sequence) else frames
+    rows = (_line(frame.image, mark, pitch_um[frame.image]) for frame in ordered for mark in frame.marks)
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in chain(_head(pitch_um, measurement), rows))  # an archive's are many
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def points_text(points: Sequence[ComparatorPoint], pitch_um: Mapping[str, tuple[float, float]]) -> str:
