@@ -26,6 +26,7 @@ class Cause(StrEnum):
     SECOND_METHOD = "second method"
     GIVEN_PLACES = "given places"
     OTHER_FRAMES = "other frames"
+    CLICK = "click"
 
 
 MEANING = {
@@ -41,6 +42,7 @@ MEANING = {
     Cause.SECOND_METHOD: "Its edges put it elsewhere.",
     Cause.GIVEN_PLACES: "It contradicts the given places.",
     Cause.OTHER_FRAMES: "It contradicts the camera's other frames.",
+    Cause.CLICK: "A person pointed at it, and nothing could be matched there.",
 }
 
 

@@ -14,6 +14,18 @@ from measure.writing.line import KnownLine
 Reads = Literal["none", "pose", "all"]
 
 
+CLICK_SIGMA_PX = 0.5  # of a place at which a person points, in a picture that is enlarged for it
+
+
+@dataclass(frozen=True)
+class Click:
+    """A mark where a person sees it, in the scan's pixels."""
+
+    point: str
+    col_px: float
+    row_px: float
+
+
 @dataclass(frozen=True)
 class FiducialOptions:
     """How fiducial marks are measured.
@@ -25,7 +37,8 @@ class FiducialOptions:
     where the others put it. film_sigma_mm: scatter of marks by film and scanner. match: of the fit at full resolution;
     a polygon is matched with the rotation and scale of the frame. writing: what is written about the frame is read in
     "none", where nothing else decides the "pose", or in "all". known_lines: of the same roll; where one of them is read
-    at its place, the pose asks for no more. Raises ValueError, naming the option, for a value that is none.
+    at its place, the pose asks for no more. clicks: where a person sees marks: they are matched from there, and three
+    or more say where the frame is. Raises ValueError, naming the option, for a value that is none.
     """
 
     pose: str = "auto"
@@ -39,6 +52,7 @@ class FiducialOptions:
     match: MatchOptions = field(default_factory=lambda: MatchOptions(linear_sigma=0.05))
     writing: Reads = "none"
     known_lines: tuple[KnownLine, ...] = ()
+    clicks: tuple[Click, ...] = ()
 
     def __post_init__(self) -> None:
         if self.pose != "auto" and self.pose not in POSES:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from measure.attempts import best_of, find_frame, named, posed
 from measure.fiducial_options import FiducialOptions
 from measure.frames.chance import doubt
+from measure.frames.clicked_frame import clicked_frame, is_shown, with_clicks
 from measure.frames.fiducial_rows import absent_frame, lost_frame, present_frame
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import measure_frame
@@ -52,6 +53,19 @@ def measure_fiducials(
     layout = at_border(layout)
     if scan.is_lost:
         return lost_frame(scan, layout)
+    if is_shown(layout, options):
+        frame, pose = clicked_frame(scan, layout, pitch_um, options)
+        lines = _read(scan, layout, frame) if options.writing == "all" else None
+        return with_clicks(
+            replace(present_frame(scan, layout, frame, pose, pitch_um, (), NO_REASON), writing=lines), options.clicks
+        )
+    return with_clicks(_searched(scan, layout, pitch_um, options), options.clicks)
+
+
+def _searched(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> FrameMeasurement:
+    """The same where nobody shows where the frame is."""
     hypotheses = pitch_hypotheses(scan, layout, pitch_um, options)
     result = find_frame(scan, layout, hypotheses, pitch_um is not None, options)
     search, frame = result.search, result.frame

@@ -49,6 +49,8 @@ class Code(StrEnum):
     PLATE = "plate"
     FEW_TIES = "few-ties"
     COPY = "copy"
+    CLICKED = "clicked"
+    DECIDED = "decided"
 
 
 MEANING = {
@@ -90,6 +92,8 @@ MEANING = {
     Code.PLATE: "The plate in the picture contradicts the camera.",
     Code.FEW_TIES: "Fewer natural points were found than wanted.",
     Code.COPY: "The scan's file is a copy of another one, whose marks count.",
+    Code.CLICKED: "A person pointed at it, and nothing could be matched there.",
+    Code.DECIDED: "A person decided so.",
 }
 
 

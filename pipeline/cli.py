@@ -415,6 +415,23 @@ def report(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels 
 
 
 @app.command()
+def review(
+    project: ProjectFile,
+    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Of this machine; 0 takes any.")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
+    who: Annotated[str | None, typer.Option(metavar="NAME", help="Who decides; by default who is logged in.")] = None,
+    max_pixels: MaxPixels = None,
+) -> int:
+    """A page on this machine to go through what needs a look; decisions stand in decisions.jsonl."""
+    try:
+        from pipeline.review.server import serve
+    except ModuleNotFoundError as error:
+        raise InputError(f"review needs {error.name}. Install it with: pip install reseau[review]") from None
+    serve(_read(project, max_pixels), port, who, not no_browser, typer.echo)
+    return DONE
+
+
+@app.command()
 def render(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="The scene file.", show_default=False)],
     out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the project goes.", show_default=False)],

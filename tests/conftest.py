@@ -1,10 +1,13 @@
-"""What all tests share: the last line of a run says what was left out for want of data."""
+"""What all tests share: the last lines of a run say what was left out for want of data, or of a browser."""
 
+import browser
 import pytest
 from real_data import DATA, REASON
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    left_out = [each for each in terminalreporter.stats.get("skipped", []) if REASON in str(each.longrepr)]
-    if left_out:
-        terminalreporter.write_line(f"LEFT OUT: {len(left_out)} tests that need real data in {DATA}", yellow=True)
+    skipped = [str(each.longrepr) for each in terminalreporter.stats.get("skipped", [])]
+    for reason, need in ((REASON, f"real data in {DATA}"), (browser.REASON, "a browser: install chromium")):
+        count = sum(reason in each for each in skipped)
+        if count:
+            terminalreporter.write_line(f"LEFT OUT: {count} tests that need {need}", yellow=True)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause
-from measure.fiducial_options import FiducialOptions
+from measure.fiducial_options import CLICK_SIGMA_PX, FiducialOptions
 from measure.fitting.matching import Match
 from measure.frames.channels import best_weights
 from measure.frames.first_look import strongest
@@ -35,6 +35,7 @@ MANY = 6  # marks that agree and tell where a faint one must be
 _CLEAR_RESPONSE = 0.25  # correlation of marks before they are fitted, where likenesses are CLEAR_LIKENESS
 _CHANNEL_TRIALS = 6  # marks that the channels are chosen from
 _REDUCED_PX = 1.5  # of the reduced scan: how well a placement predicts
+CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # about a click: its sigma three times, and as much for who points less well
 
 
 def first_search_px(
@@ -75,6 +76,7 @@ class FrameSighter:
         self.certain: Mask = np.zeros(len(layout.marks), dtype=bool)
         self.weights: tuple[float, ...] | None = None
         gate_px = options.gate_mm / float(self.pitch.mean())
+        self.clicked = {click.point: np.array([click.col_px, click.row_px]) for click in options.clicks}
         self.first_search_px = first_search_px(placement, layout, options)
         self.near_px = first_search_px(placement, layout, options, NARROW)
         # Where the frame is hardly known to be there, texture must not feign a mark of it so far off.
@@ -150,7 +152,8 @@ class FrameSighter:
             return
         index = np.flatnonzero(found)
         up, sigma = self._up_mm(index), self._sigma_mm(index)
-        out = outliers(self.camera[index], up, sigma, self.turn, self.options.gate_mm) & ~self.certain[index]
+        told = self.certain | [mark.id in self.clicked for mark in self.layout.marks]
+        out = outliers(self.camera[index], up, sigma, self.turn, self.options.gate_mm) & ~told[index]
         self.belongs[index[out]] = False
         fit = fit_frame(self.camera[index[~out]], up[~out], sigma[~out], self.turn)
         self.pixel_from_camera = np.diag([1.0, -1.0]) @ fit.up_from_camera / self.pitch[:, None]
@@ -225,9 +228,12 @@ class FrameSighter:
         return sighting
 
     def expected(self, index: int, search_px: float) -> MarkPrediction:
-        """A mark where the frame puts it now."""
-        mark = self.layout.marks[index].mark
-        start = np.column_stack([self.pixel_from_camera[:, :2], self._predicted_px()[index]])
+        """A mark where the frame puts it now, or where a person sees it: then no farther off than that one points."""
+        mark, click = self.layout.marks[index].mark, self.clicked.get(self.layout.marks[index].id)
+        if click is not None:
+            search_px = min(search_px, CLICK_REACH_PX)
+        place = self._predicted_px()[index] if click is None else click
+        start = np.column_stack([self.pixel_from_camera[:, :2], place])
         sign = sign_of(mark, self.placement.polarity)
         return MarkPrediction(mark, start, search_px, sign, self.weights, self.placement.surroundings)
 

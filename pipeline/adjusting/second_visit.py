@@ -90,9 +90,12 @@ def _visit(
 
 
 def _is_missed(mark: MarkMeasurement | None, settings: TargetSettings) -> bool:
-    """A coded target that was rejected has another one's ring at its place, and stays rejected."""
+    """A coded target that was rejected has another one's ring at its place, and stays rejected; and so does what a
+    person decided."""
     if mark is None:
         return True
+    if Code.DECIDED in mark.reason.codes:
+        return False
     return not mark.status.is_observation and not (settings.code is not None and mark.status is Status.REJECTED)
 
 

@@ -111,7 +111,7 @@ def _with_same_frames(scans: Iterator[CheckedScan], names: Sequence[str], work: 
 
 def _judged(scan: MeasuredScan, work: Work, project: Project) -> JudgedScan:
     name = scan.frame.image
-    return JudgedScan(name, work.results[name], record_of(scan, project.path.resolve().parent))
+    return JudgedScan(name, work.results[name], record_of(work.decided(scan), project.path.resolve().parent))
 
 
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:

@@ -2,17 +2,20 @@
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
+from pipeline.archive.decided import after_checks, before_checks, by_image, decided
 from pipeline.archive.expected_time import ExpectedTime
-from pipeline.archive.identity import FileState, Identity
+from pipeline.archive.identity import FileState, Identity, parts_hash
 from pipeline.archive.key import fingerprint, options_hash
 from pipeline.archive.store import Kept, Store
 from pipeline.archive.witness import Witnessed, state_of, witnessed_scan
 from pipeline.archive.work_options import NotMeasured, WorkOptions
+from pipeline.files.decisions_file import About, Decision
 from pipeline.files.project_file import Project
 from pipeline.measuring.handed_out import TASKS_A_CORE, results_of
 from pipeline.measuring.measured import ended_scan, reads_writing
@@ -47,13 +50,15 @@ class Work:
         self._folder = project.path.resolve().parent
         self._identities, self._rows = store.identities(), store.fingerprints()
         self._states: dict[str, FileState] = {}
+        self._decisions = by_image(project.decisions)
+        self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, of what was asked for last
         self.results: dict[str, int] = {}  # by image, the row of what was asked for last
         self.counts = Counts()
 
     def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
-        """What each task gives, measured or kept: a `Measure`."""
+        """What each task gives, measured or kept, without the marks that are none by decision: a `Measure`."""
         missing = []
-        for task in tasks:
+        for task in map(self._decided, tasks):
             row = self._row(task)
             if row is None:
                 missing.append(task)
@@ -64,6 +69,7 @@ class Work:
 
     def complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
         """Measure what is missing of the scans of the project, and say how much that is. Nothing of it is held."""
+        tasks = [self._decided(task) for task in tasks]
         known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
         missing = [task for task in tasks if task.name not in known]
         self.results |= known
@@ -75,8 +81,13 @@ class Work:
             self._complete(missing, reporter)
 
     def read(self, name: str) -> MeasuredScan:
-        """What was asked for last of an image."""
-        return scan_of(name, self._store.record(self.results[name]), self._folder)
+        """What was asked for last of an image, without the marks that are none by decision."""
+        scan = scan_of(name, self._store.record(self.results[name]), self._folder)
+        return before_checks(scan, self._counting.get(name, {}))
+
+    def decided(self, scan: MeasuredScan) -> MeasuredScan:
+        """A scan that was checked, as decisions have it."""
+        return after_checks(scan, self._counting.get(scan.frame.image, {}))
 
     def keys(self) -> dict[str, str]:
         """By image the fingerprint of what was asked for last."""
@@ -113,6 +124,20 @@ class Work:
                     reporter.say(f"{left}; {expected.sentence}")
         self.counts.failed += len(failed)
 
+    def _decided(self, task: ScanTask) -> ScanTask:
+        """The task as decisions about its scan have it."""
+        decisions = self._decisions.get(task.name)
+        if decisions is None:
+            return task
+        state = self.state(task)
+        known = self._identities.get(state.uri)
+        if known is None or known.state != state:
+            known = Identity(state, parts_hash(Path(task.scan), task.max_pixels))
+        identity = known
+        now = decided(task, decisions, lambda one: fingerprint(identity, _hash_of(_options_json(one))))
+        self._counting[task.name] = now.counting
+        return now.task
+
     def _row(self, task: ScanTask) -> int | None:
         """The row of its result, where its file and options are those of it."""
         state = self.state(task)
@@ -123,7 +148,7 @@ class Work:
 
     def _found(self, task: ScanTask, row: int) -> MeasuredScan:
         self.results[task.name] = row
-        return scan_of(task.name, self._store.record(row), self._folder)
+        return self.read(task.name)
 
     def _measured(self, tasks: Sequence[ScanTask], as_scans: bool = False) -> Iterator[tuple[ScanTask, int, Kept]]:
         """Each kept as soon as it is there. as_scans: of the project, and not only for what they tell the others."""

@@ -15,6 +15,8 @@ from measure.scans.scan import Scan, open_scan
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.files.decisions_file import FILE as DECISIONS
+from pipeline.files.decisions_file import Decision, read_decisions
 from pipeline.files.distances_file import GivenDistance, read_distances
 from pipeline.files.images_file import GivenImages, read_images
 from pipeline.files.library import camera_path
@@ -40,6 +42,7 @@ class Project:
     left_out: the images that `exclude` leaves out.
     tone: the curve of the scans: auto, one of TONES, or the power of the grey value that light grows as.
     unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
+    decisions: that a person made about marks and poses, the oldest first.
     crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
     writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
     """
@@ -64,6 +67,7 @@ class Project:
     images_path: Path | None = None
     left_out: frozenset[str] = frozenset()
     crs: str = ""
+    decisions: tuple[Decision, ...] = ()
 
     def open_scan(self, name: str) -> Scan:
         """The scan of an image. Raises MeasurementError where it cannot be read."""
@@ -79,6 +83,10 @@ class Project:
     def film_sigma_mm(self) -> float:
         """What film and scanner scatter a mark by, as the project says it, or else as it is believed of any film."""
         return self.adjust.film_sigma_um / 1000.0 or SCATTER_MM
+
+    @property
+    def decisions_path(self) -> Path:
+        return self.path.parent / DECISIONS
 
     @property
     def adjustment_path(self) -> Path:
@@ -202,6 +210,7 @@ def read_project(path: Path) -> Project:
         given_distances=read_distances(named["distances"]) if "distances" in named else (),
         images_path=named.get("images"),
     )
+    project = replace(project, decisions=read_decisions(project.decisions_path))
     if not project.scans and not project.comparator.exists():
         raise InputError(
             f"{path}: there are no scans and no comparator coordinates. Give scans = [...] to measure, or comparator = "

@@ -17,6 +17,7 @@ MadeFrom = dict[str, str]
 # The names of the parts are words of messages: "is of other ... than there are now".
 CAMERAS, SETTINGS, SCAN, CAMERA = "cameras", "settings", "scan ", "camera "
 MARKS, POINTS, IMAGES, DISTANCES = "marks", "points", "images", "distances"
+DECISIONS = "decisions"
 PLACES = "points, orientations or lenses"
 
 # Of a project; all else of it is a setting, and so is what may be added.
@@ -30,6 +31,7 @@ _FILES = {
     "given_images",
     "given_distances",
     "images_path",
+    "decisions",
 }
 _NO_MATTER = {"max_pixels", "crs"}
 # Of a camera: what tells where its targets are, but not what its marks are.
@@ -55,6 +57,7 @@ def measured_from(project: Project) -> MadeFrom:
     return {
         SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
         PLACES: fingerprint(places),
+        **({DECISIONS: fingerprint(project.decisions)} if project.decisions else {}),
         **{f"{CAMERA}{camera.name}": fingerprint(_sought(camera)) for camera in project.cameras.values()},
         **{
             f"{SCAN}{image}": fingerprint([*_parts(path, project, known), project.camera_of(image).name])

@@ -1,0 +1,210 @@
+"""What of the store a person looks at: one frame of the latest judging with its result, as JSON for the page."""
+
+import json
+import sqlite3
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.covariance import MEANING
+from measure.marks.shapes import FrameCorner, LayoutMark
+from measure.results import MarkMeasurement
+from pipeline.archive.judging import Judging, latest
+from pipeline.archive.store import MARK_COLUMNS, Store, mark_of
+from pipeline.files.camera_file import CameraFile
+from pipeline.results.measured_record import scan_of
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.review.outlines import outlines_px
+
+Json = dict[str, Any]
+Array = NDArray[np.float64]
+
+_OTHERS = 6  # frames beside which a mark is shown
+_LEAST_PX = 40  # of a window, so that the surroundings can be seen
+_REACH_SIZES = 2.5  # of a window, in the mark's own size
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """A frame. verdict: of the judging; fingerprint: of its result; camera: with its marks as they were sought."""
+
+    scan: MeasuredScan
+    verdict: str
+    fingerprint: str
+    camera: CameraFile
+
+    @cached_property
+    def drawn(self) -> Mapping[str, LayoutMark]:
+        """The marks of the camera that have a drawing or a picture, by name."""
+        return {mark.id: mark for mark in self.camera.layout().marks} if self.camera.drawn else {}
+
+    def mark(self, point: str, kind: str) -> MarkMeasurement:
+        """Raises KeyError where the frame has no such mark."""
+        found = next((one for one in self.scan.frame.marks if (one.point, one.kind) == (point, kind)), None)
+        if found is None:
+            raise KeyError(point)
+        return found
+
+    def predicted_px(self, point: str, kind: str) -> Array | None:
+        """Where the frame puts a fiducial."""
+        matrix, drawn = self.scan.frame.pixel_from_camera, self.drawn.get(point)
+        if matrix is None or drawn is None or kind != "fiducial":
+            return None
+        return np.asarray(matrix @ (*drawn.xy_mm, 1.0))
+
+    def place_px(self, point: str, kind: str) -> Array:
+        """Where to look: at the mark, where it should be, or in the middle of the scan."""
+        mark, predicted = self.mark(point, kind), self.predicted_px(point, kind)
+        if mark.center_px is not None:
+            return mark.center_px
+        return predicted if predicted is not None else np.array([self.scan.width_px / 2, self.scan.height_px / 2])
+
+    def pixel_from_mark(self, point: str, kind: str) -> Array | None:
+        """(2, 3), as the frame turns and scales a fiducial, at its place."""
+        matrix, drawn = self.scan.frame.pixel_from_camera, self.drawn.get(point)
+        if matrix is None or drawn is None or kind != "fiducial" or isinstance(drawn.mark, FrameCorner):
+            return None
+        return np.column_stack([matrix[:, :2], self.place_px(point, kind)])
+
+    def window_px(self, point: str, kind: str) -> int:
+        """Half the width of the window about a mark."""
+        size = self.mark(point, kind).quality.get("size_px", 0.0)
+        return int(max(_LEAST_PX, np.ceil(_REACH_SIZES * size / 2)))
+
+    def mark_json(self, point: str, kind: str) -> Json:
+        """All that the page shows of a mark."""
+        mark = self.mark(point, kind)
+        drawn, linear = self.drawn.get(point), self.pixel_from_mark(point, kind)
+        return {
+            **_row_json(mark),
+            "image": self.scan.frame.image,
+            "camera": self.camera.name,
+            "verdict": self.verdict,
+            "fingerprint": self.fingerprint,
+            "place": _pair(self.place_px(point, kind)),
+            "predicted": _pair(self.predicted_px(point, kind)),
+            "second": _second(mark),
+            "half": self.window_px(point, kind),
+            "covariance": None if mark.covariance_px2 is None else mark.covariance_px2.tolist(),
+            "causes": _causes(mark),
+            "quality": {name: value for name, value in mark.quality.items() if np.isfinite(value)},
+            "outlines": [] if drawn is None or linear is None else outlines_px(drawn.mark, linear),
+            "has_residual": linear is not None and mark.quality.get("blur_px", 0.0) > 0,
+            "can_accept": mark.covariance is not None and mark.center_px is not None,
+            "size": [self.scan.width_px, self.scan.height_px],
+        }
+
+    def frame_json(self) -> Json:
+        """All that the page shows of a frame."""
+        frame, pose = self.scan.frame, self.scan.frame.pose
+        marks = [
+            {**_row_json(mark), "place": _pair(self._known_place(mark))} for mark in frame.marks if mark.kind != "tie"
+        ]
+        return {
+            "image": frame.image,
+            "camera": self.camera.name,
+            "verdict": self.verdict,
+            "fingerprint": self.fingerprint,
+            "size": [self.scan.width_px, self.scan.height_px],
+            "pitch_um": [value for value in self.scan.pitch_um if np.isfinite(value)],
+            "problems": [str(problem) for problem in frame.problems],
+            "notes": list(self.scan.notes),
+            "pose": None
+            if pose is None
+            else {"name": pose.name, "decided": pose.decided, "evidence": list(pose.evidence), "roll": pose.roll},
+            "marks": marks,
+            "fiducials": list(self.drawn),
+        }
+
+    def _known_place(self, mark: MarkMeasurement) -> Array | None:
+        return mark.center_px if mark.center_px is not None else self.predicted_px(mark.point, mark.kind)
+
+
+class Looking:
+    """Frames of the latest judging of a store, which somebody else may be writing meanwhile."""
+
+    def __init__(self, store: Path, folder: Path, camera_of: Any) -> None:
+        """folder: that paths of scans are relative to. camera_of: the camera of an image."""
+        self._store, self._folder, self._camera_of = store, folder, camera_of
+
+    def judging(self) -> Judging | None:
+        with Store(self._store) as store:
+            return latest(store)
+
+    def at(self, image: str) -> LookedAt:
+        """Raises KeyError where no such image is judged."""
+        with Store(self._store) as store:
+            row = store.connection.execute(_ONE, (image,)).fetchone()
+            if row is None:
+                raise KeyError(image)
+            judging, result, own_marks, detail, uri, verdict, key = row
+            record = store.record(result)
+            if own_marks:
+                record["marks"] = _own_marks(store.connection, judging, result)
+        record.update(json.loads(detail) if detail else {})
+        scan = scan_of(image, {**record, "scan": uri}, self._folder)
+        return LookedAt(scan, verdict, key, self._camera_of(image))
+
+    def others(self, image: str, point: str, kind: str) -> Sequence[str]:
+        """Frames beside which the mark is shown: of the same camera, where it was measured."""
+        with Store(self._store) as store:
+            rows = store.connection.execute(_BESIDE, (image, image, point, kind, _OTHERS)).fetchall()
+        return [name for (name,) in rows]
+
+
+_ONE = """
+select f.judging, f.result, f.own_marks, f.detail, s.uri, f.verdict, r.fingerprint
+from judged_frame f join scan s on s.id = f.scan join result r on r.id = f.result
+where f.name = ? and f.judging = (select max(id) from judging)
+"""
+
+_BESIDE = """
+with own as (
+    select s.camera, s.id from judged_frame f join scan s on s.id = f.scan
+    where f.name = ? and f.judging = (select max(id) from judging)
+)
+select f.name from own join scan s on s.camera = own.camera join judged_frame f on f.scan = s.id
+join mark m on m.result = f.result
+where f.judging = (select max(id) from judging) and f.name <> ? and m.point = ? and m.kind = ? and m.status = 'measured'
+order by abs(s.id - own.id) limit ?
+"""
+
+
+def _own_marks(db: sqlite3.Connection, judging: int, result: int) -> list[Json]:
+    query = f"select {MARK_COLUMNS} from judged where judging = ? and result = ? order by number"
+    return [mark_of(row) for row in db.execute(query, (judging, result))]
+
+
+def _row_json(mark: MarkMeasurement) -> Json:
+    return {
+        "point": mark.point,
+        "kind": mark.kind,
+        "status": str(mark.status),
+        "reason": str(mark.reason),
+        "code": mark.reason.code,
+        "center": _pair(mark.center_px),
+    }
+
+
+def _pair(place: Array | None) -> list[float] | None:
+    return None if place is None else [round(float(value), 4) for value in place]
+
+
+def _second(mark: MarkMeasurement) -> list[float] | None:
+    """Where the second method puts the mark."""
+    if mark.center_px is None or "second_method_col_px" not in mark.quality:
+        return None
+    offset = (mark.quality["second_method_col_px"], mark.quality["second_method_row_px"])
+    return _pair(mark.center_px + offset)
+
+
+def _causes(mark: MarkMeasurement) -> list[Json]:
+    """What its sigma consists of, the largest part first."""
+    parts = mark.covariance.parts.items() if mark.covariance else ()
+    told = [(str(c), MEANING[c], float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
+    return [{"cause": c, "meaning": m, "sigma_px": s} for c, m, s in sorted(told, key=lambda one: -one[2])]

@@ -1,0 +1,144 @@
+"""Pictures of scans for the page: windows at the file's own pixels, what a fit leaves of them, whole frames reduced."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.errors import MeasurementError
+from measure.marks.rendering import picture
+from measure.marks.shapes import Mark
+from measure.scans.scan import Scan, open_scan
+
+Array = NDArray[np.float64]
+
+_OPEN = 4  # scans that are kept open
+_KEPT_MB = 64  # of pictures, so that one that was shown is there at once
+_WINDOW_PX = 480  # a larger window is reduced to about this many pixels
+_FRAME_PX = 1400  # of the longer side of a whole scan
+_POSE_PX = 180
+_NOTHING = 128  # grey: beyond the scan
+_ROUNDS, _OUTLYING = 6, 5.0  # of a fit, and times the median residual: three and a half standard deviations
+_SHARE = 0.1  # per cent of pixels that may be too dark or too light to be told apart
+
+
+class Pictures:
+    """Windows of scans as PNG. Several threads may ask; the scans asked for last are kept open."""
+
+    def __init__(self, max_pixels: int | None = None) -> None:
+        self._max_pixels = max_pixels
+        self._open: OrderedDict[str, Scan] = OrderedDict()
+        self._kept: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
+        self._lock, self._reading = threading.Lock(), threading.Lock()
+
+    def close(self) -> None:
+        with self._reading:
+            while self._open:
+                self._open.popitem()[1].close()
+
+    def window(self, scan: str, col0: int, row0: int, size: int) -> bytes:
+        """A square window; one of many pixels is reduced. Raises MeasurementError where the file cannot be read."""
+        return self._png(("window", scan, col0, row0, size), lambda: _window(self._scan(scan), col0, row0, size))
+
+    def residual(self, scan: str, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> bytes:
+        """What is left of the picture about a mark when the mark as it was fitted, and a sloping ground, are taken
+        out."""
+        key = ("residual", scan, hash(mark), *pixel_from_mark.ravel(), blur_px, half)
+        return self._png(key, lambda: _residual(self._scan(scan), mark, pixel_from_mark, blur_px, half))
+
+    def frame(self, scan: str) -> bytes:
+        """The whole scan, reduced."""
+        return self._png(("frame", scan), lambda: stretched(self._reduced(scan, _FRAME_PX)))
+
+    def posed(self, scan: str, pose: str) -> bytes:
+        """The whole scan as it would have to be seen if it lay in that pose: upright, and not mirrored."""
+        return self._png(("pose", scan, pose), lambda: upright(stretched(self._reduced(scan, _POSE_PX)), pose))
+
+    def _reduced(self, name: str, side_px: int) -> Array:
+        scan = self._scan(name)
+        factor = max(1, -(-max(scan.width_px, scan.height_px) // _FRAME_PX))  # one for both: it is kept
+        grey = np.asarray(scan.reduced(factor), dtype=np.float64)
+        smaller = side_px / max(grey.shape)
+        return (
+            grey
+            if smaller >= 1
+            else np.asarray(cv2.resize(grey, None, fx=smaller, fy=smaller, interpolation=cv2.INTER_AREA))
+        )
+
+    def _png(self, key: tuple[object, ...], make: Callable[[], NDArray[np.uint8]]) -> bytes:
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        with self._reading:
+            _, data = cv2.imencode(".png", make(), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        png = data.tobytes()
+        with self._lock:
+            self._kept[key] = png
+            while sum(map(len, self._kept.values())) > _KEPT_MB * 1_000_000:
+                self._kept.popitem(last=False)
+        return png
+
+    def _scan(self, name: str) -> Scan:
+        """Called while `_reading` is held."""
+        if name not in self._open:
+            self._open[name] = open_scan(Path(name), self._max_pixels)
+            while len(self._open) > _OPEN:
+                self._open.popitem(last=False)[1].close()
+        self._open.move_to_end(name)
+        return self._open[name]
+
+
+def stretched(grey: Array) -> NDArray[np.uint8]:
+    """8 bit, from the darkest to the lightest but for a few."""
+    low, high = np.percentile(grey, [_SHARE, 100.0 - _SHARE])
+    return np.asarray(np.rint(np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0), dtype=np.uint8)
+
+
+def upright(grey: NDArray[np.uint8], pose: str) -> NDArray[np.uint8]:
+    """A scan of that pose turned back, and mirrored back."""
+    turned = np.rot90(grey, -int(pose.removesuffix("m")) // 90)
+    return np.ascontiguousarray(turned[:, ::-1] if pose.endswith("m") else turned)
+
+
+def _window(scan: Scan, col0: int, row0: int, size: int) -> NDArray[np.uint8]:
+    if col0 >= scan.width_px or row0 >= scan.height_px or col0 + size <= 0 or row0 + size <= 0:
+        raise MeasurementError("the window is outside of the scan")
+    step = max(1, size // _WINDOW_PX)
+    grey = scan.window(col0, row0, size, size) if step == 1 else _reduced_window(scan, col0, row0, size, step)
+    if step > 1:
+        return stretched(np.asarray(grey, dtype=np.float64))
+    inside = scan.inside(col0, row0, size, size)
+    shown = stretched(np.asarray(grey, dtype=np.float64))
+    shown[~inside] = _NOTHING
+    return shown
+
+
+def _reduced_window(scan: Scan, col0: int, row0: int, size: int, step: int) -> Array:
+    """Bounded in memory: rows of the window at a time."""
+    side = size // step
+    rows = [scan.window(col0, row0 + step * k, side * step, step) for k in range(side)]
+    return np.stack([row.reshape(step, side, step).mean(axis=(0, 2)) for row in rows])
+
+
+def _residual(scan: Scan, mark: Mark, pixel_from_mark: Array, blur_px: float, half: int) -> NDArray[np.uint8]:
+    center = pixel_from_mark[:, 2]
+    col0, row0 = (round(float(value)) - half for value in center)
+    width = 2 * half + 1
+    grey = np.asarray(scan.window(col0, row0, width, width), dtype=np.float64)
+    local = np.column_stack([pixel_from_mark[:, :2], center - (col0, row0)])
+    model = np.asarray(picture(mark, local, width, width, blur_px), dtype=np.float64)
+    rows, cols = np.mgrid[-1 : 1 : width * 1j, -1 : 1 : width * 1j]
+    design = np.stack([model, np.ones_like(model), rows, cols], axis=-1).reshape(-1, 4)
+    left, told = grey.ravel(), np.ones(grey.size, dtype=bool)
+    for _ in range(_ROUNDS):  # what is damaged is to be seen, and not to spoil the rest
+        values, *_ = np.linalg.lstsq(design[told], grey.ravel()[told], rcond=None)
+        left = grey.ravel() - design @ values
+        told = np.abs(left) <= _OUTLYING * np.median(np.abs(left))
+    shown = left.reshape(grey.shape)
+    reach = max(np.percentile(np.abs(shown), 99.5), 1e-12)
+    return np.asarray(np.rint(np.clip(shown / reach, -1.0, 1.0) * 127.0 + 128.0), dtype=np.uint8)

@@ -1,0 +1,157 @@
+"""What of a project needs a person's eye, from the store: the worst first, each question once.
+
+A pose comes first, for all names of its frame hang on it, and once where it is the same question for the frames of a
+roll; then frames in which nothing was found; then marks, those of frames with few others before those with many, for
+there a decision changes more.
+"""
+
+import json
+import sqlite3
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from measure.reason import Code
+from measure.status import Status
+from pipeline.archive.verdicts import Verdict
+from pipeline.files.decisions_file import About
+
+
+class Question(StrEnum):
+    """What is asked, in the order in which it is."""
+
+    POSE = "pose"
+    FRAME = "frame"
+    MARK = "mark"
+
+
+_WORST = (Status.REJECTED, Status.WEAK, Status.PREDICTED, Status.ABSENT)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A question. images: of a pose all frames that it is the same for, else one. fingerprints: of the results that
+    are looked at, in the order of the images. marks: how many were found in the frame. point, kind, status: of a mark.
+    """
+
+    question: Question
+    images: tuple[str, ...]
+    fingerprints: tuple[str, ...]
+    camera: str
+    verdict: str
+    marks: int
+    reason: str
+    code: str = ""
+    point: str = ""
+    kind: str = ""
+    status: str = ""
+
+    @property
+    def key(self) -> str:
+        """By which a page asks for it."""
+        return json.dumps([self.question, self.images[0], self.point, self.kind], ensure_ascii=False)
+
+    @property
+    def abouts(self) -> tuple[About, ...]:
+        """What decisions that answer it are about; of a frame without marks no single one does."""
+        return tuple((image, self.point, self.kind) for image in self.images)
+
+    @property
+    def folder(self) -> str:
+        return self.images[0].rpartition("/")[0]
+
+
+def queue_of(db: sqlite3.Connection, judging: int) -> tuple[Entry, ...]:
+    """Every question of a judging, the worst first."""
+    frames = {frame.result: frame for frame in _frames(db, judging)}
+    marks = sorted(_marks(db, judging, frames), key=_badness)
+    bare = [
+        Entry(Question.FRAME, (f.image,), (f.key,), f.camera, f.verdict, 0, f.problem or "no mark was found in it")
+        for f in sorted(frames.values(), key=lambda frame: frame.image)
+        if f.marks == 0
+    ]
+    return (*_poses(list(frames.values())), *bare, *marks)
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    image: str
+    result: int
+    key: str
+    camera: str
+    verdict: str
+    marks: int
+    is_decided: bool
+    evidence: str
+    roll: str
+    problem: str
+
+
+_FRAMES = """
+select f.name, f.result, r.fingerprint, coalesce(s.camera, ''), f.verdict, f.own_marks,
+    coalesce(json_extract(f.detail, '$.pose'), json_extract(r.detail, '$.pose')),
+    coalesce(json_extract(f.detail, '$.problems[0]'), json_extract(r.detail, '$.problems[0]'), '')
+from judged_frame f join result r on r.id = f.result join scan s on s.id = f.scan
+where f.judging = ? and f.verdict <> 'failed' and s.duplicate_of is null
+"""
+
+_MARKS = """
+select f.result, m.point, m.kind, m.status, m.reason_code, m.reason
+from judged_frame f join {table} m on m.result = f.result {of_judging}
+where f.judging = :judging and {own} f.own_marks and m.status <> 'measured'
+    and m.reason_code not like '{decided}%' and m.reason_code not like '{clicked}%'
+order by f.result, m.number
+"""
+
+_FOUND = """
+select f.result, count(*) from judged_frame f join {table} m on m.result = f.result {of_judging}
+where f.judging = :judging and {own} f.own_marks and m.status in ('measured', 'weak') group by f.result
+"""
+_ANSWERED = {"decided": Code.DECIDED, "clicked": Code.CLICKED}
+_OWN = {"table": "judged", "of_judging": "and m.judging = f.judging", "own": "", **_ANSWERED}
+_AS_MEASURED = {"table": "mark", "of_judging": "", "own": "not", **_ANSWERED}
+
+
+def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
+    found = dict[int, int]()
+    for source in (_OWN, _AS_MEASURED):
+        found |= dict(db.execute(_FOUND.format(**source), {"judging": judging}).fetchall())
+    for image, result, key, camera, verdict, _, pose_json, problem in db.execute(_FRAMES, (judging,)):
+        pose = json.loads(pose_json) if pose_json else None
+        is_decided = pose is None or bool(pose["decided"])
+        evidence = "" if pose is None else " ".join(pose["evidence"])
+        roll = "" if pose is None else pose["roll"]
+        yield _Frame(image, result, key, camera, verdict, found.get(result, 0), is_decided, evidence, roll, problem)
+
+
+def _poses(frames: Sequence[_Frame]) -> Iterator[Entry]:
+    """One for each roll's question, and for each frame that is asked about by itself: those first that concern many."""
+    groups = defaultdict[tuple[str, str], list[_Frame]](list)
+    for frame in sorted(frames, key=lambda frame: frame.image):
+        if not frame.is_decided and frame.marks:
+            groups[frame.camera, frame.roll or frame.image].append(frame)
+    for group in sorted(groups.values(), key=lambda group: (-len(group), group[0].image)):
+        first = group[0]
+        images, keys = tuple(frame.image for frame in group), tuple(frame.key for frame in group)
+        reason = first.roll or first.evidence
+        yield Entry(Question.POSE, images, keys, first.camera, first.verdict, first.marks, reason)
+
+
+def _marks(db: sqlite3.Connection, judging: int, frames: dict[int, _Frame]) -> Iterator[Entry]:
+    for source in (_OWN, _AS_MEASURED):
+        for result, point, kind, status, code, reason in db.execute(_MARKS.format(**source), {"judging": judging}):
+            frame = frames.get(result)
+            if frame is not None and frame.marks:
+                where = ((frame.image,), (frame.key,), frame.camera, frame.verdict, frame.marks)
+                yield Entry(Question.MARK, *where, reason, code, point, kind, status)
+
+
+def _badness(entry: Entry) -> tuple[int, bool, int, str]:
+    is_target = entry.kind != "fiducial"  # of which there are many, and of which few change anything
+    return (entry.marks if not is_target else 0, is_target, _WORST.index(Status(entry.status)), entry.images[0])
+
+
+def verdicts() -> list[str]:
+    """Those by which a queue can be filtered."""
+    return [str(verdict) for verdict in Verdict]

@@ -1,0 +1,71 @@
+"""A review of a small project, served by a process of its own, as a user starts it."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from brute_marks import Array
+from drawn_frames import ALIKE, CORNERS, NOISE_DN, frame_picture, pixel_from_camera
+from drawn_project import CAMERA, PROJECT
+
+GOOD, BARE, SCRATCHED, TURNED = "good", "<img src=x onerror=alert(1)>", "scratched", "turned"
+FAR_TURN_RAD = 0.35  # of TURNED: no search looks for a frame that is laid so
+
+
+def write_faults(folder: Path) -> Path:
+    """Four frames: one without fault; of one mark 3 is not there; of one it is scratched; one lies askew."""
+    folder.mkdir(parents=True)
+    (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
+    for seed, name in enumerate((GOOD, BARE, SCRATCHED, TURNED), 1):
+        grey = frame_picture(ALIKE, matrix_of(name), seed)
+        col, row = np.rint(mark_px(name, "3")).astype(int)
+        if name == BARE:
+            noise = np.random.default_rng(seed).normal(0, NOISE_DN, (81, 81))
+            grey[row - 40 : row + 41, col - 40 : col + 41] = 3000 + noise
+        if name == SCRATCHED:
+            grey[row - 30 : row + 31, col + 1 : col + 9] = 14000
+        tifffile.imwrite(folder / f"{name}.tif", np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
+    (folder / "project.toml").write_text(PROJECT, encoding="utf-8")
+    return folder / "project.toml"
+
+
+def matrix_of(name: str) -> Array:
+    """Camera mm to pixels, as the frame was drawn."""
+    return pixel_from_camera("0", FAR_TURN_RAD if name == TURNED else 0.004)
+
+
+def mark_px(name: str, point: str) -> Array:
+    """Where a mark was drawn."""
+    return np.asarray(matrix_of(name) @ (*CORNERS[int(point) - 1], 1.0))
+
+
+@dataclass(frozen=True)
+class Served:
+    """address: with its token."""
+
+    address: str
+    process: subprocess.Popen[str]
+
+    @property
+    def origin(self) -> str:
+        return self.address.split("/?")[0]
+
+
+@contextmanager
+def served(project: Path, port: int = 0) -> Iterator[Served]:
+    """`reseau review`, until the block ends."""
+    start = "from pipeline.main import main; main()"
+    command = [sys.executable, "-c", start, "review", str(project), "--no-browser", "--who", "ann"]
+    with subprocess.Popen([*command, "--port", str(port)], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            address = process.stdout.readline().strip()
+            assert address.startswith("http://127.0.0.1:"), address
+            yield Served(address, process)
+        finally:
+            process.kill()

@@ -1,0 +1,166 @@
+"""decisions.jsonl: what counts of it, what it changes, and what is said of a file that is not as it should be."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from measure.covariance import Cause, Covariance
+from measure.fiducial_options import Click, FiducialOptions
+from measure.reason import Code, Reason
+from measure.results import FrameMeasurement, MarkMeasurement
+from measure.status import Status
+from pipeline.archive.decided import after_checks, before_checks, decided
+from pipeline.errors import InputError
+from pipeline.files.camera_file import CameraFile
+from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
+from pipeline.measuring.scan_task import ScanOptions, ScanTask
+from pipeline.results.measured_scan import MeasuredScan
+
+TASK = ScanTask("a", "a.tif", ScanOptions(cast(CameraFile, SimpleNamespace()), None, FiducialOptions()))
+
+
+def key_of(task: ScanTask) -> str:
+    """A stand-in for the fingerprint: what of the options decisions change."""
+    fiducials = task.options.fiducials
+    return f"{fiducials.pose} {[(click.point, click.col_px) for click in fiducials.clicks]}"
+
+
+def mark_decision(choice: Choice, point: str = "1", **rest: Any) -> Decision:
+    return Decision("a", choice, point, "fiducial", **rest)
+
+
+def place(point: str, col_px: float, **rest: Any) -> Decision:
+    return mark_decision(Choice.PLACE, point, col_px=col_px, row_px=2.0, **rest)
+
+
+def test_what_is_appended_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "decisions.jsonl"
+    told = [
+        Decision("box/a", Choice.ACCEPT, "1", "fiducial", note="é <b>", who="ann", when="2026-01-01T10:00:00+00:00"),
+        place("2", 1.5, fingerprint="f", window=(1.0, 2.0, 81.0, 81.0)),
+        Decision("a", Choice.POSE, pose="90m"),
+        Decision("a", Choice.UNDO),
+    ]
+    append_decisions(path, told[:1])
+    append_decisions(path, told[1:])
+    assert read_decisions(path) == tuple(told)
+
+
+def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(tmp_path: Path) -> None:
+    path = tmp_path / "decisions.jsonl"
+    append_decisions(path, [mark_decision(Choice.ACCEPT)])
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"image": "a", "deci')
+    assert read_decisions(path) == (mark_decision(Choice.ACCEPT),)
+    append_decisions(path, [mark_decision(Choice.REJECT)])
+    assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
+    path.write_bytes(whole.rstrip(b"\n"))  # as an editor leaves it
+    append_decisions(path, [mark_decision(Choice.REJECT)])
+    assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('{"image": "a", "decision": "acept", "point": "1"}', "line 2, decision.*Did you mean 'accept'"),
+        ('{"image": "a", "decision": "accept"}', "line 2, point: is missing"),
+        ('{"decision": "accept", "point": "1"}', "line 2, image: is missing"),
+        ('{"image": "a", "decision": "place", "point": "1", "col_px": 1}', "row_px: must be a number of pixels"),
+        ('{"image": "a", "decision": "place", "point": "1", "col_px": true, "row_px": 1}', "col_px: must be a number"),
+        ('{"image": "a", "decision": "pose", "pose": "91"}', "pose: must be one of"),
+        ('{"image": "a", "decision": "pose", "pose": "90", "point": "1"}', "a pose is of the whole scan"),
+        ('{"image": "a", "decision": "accept", "point": "1", "when": "now"}', "when: must be a time"),
+        ('{"image": "a", "decision": "accept", "point": "1", "kind": "fid"}', "kind: must be one of"),
+        ('["a"]', "line 2: must be a JSON object"),
+        ("{", "line 2: is no JSON"),
+    ],
+)
+def test_a_wrong_line_is_named(line: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "decisions.jsonl"
+    path.write_text(f'{{"image": "a", "decision": "accept", "point": "1"}}\n{line}\n')
+    with pytest.raises(InputError, match=words):
+        read_decisions(path)
+
+
+def test_the_last_line_counts_and_undo_takes_back_the_one_before() -> None:
+    accept, reject, undo = (mark_decision(choice) for choice in (Choice.ACCEPT, Choice.REJECT, Choice.UNDO))
+    about = accept.about
+    assert standing([accept, reject])[about] is reject
+    assert standing([accept, reject, undo])[about] is accept
+    assert standing([accept, undo, undo, reject])[about] is reject
+    assert standing([accept, undo]) == {}
+
+
+def test_decisions_of_another_result_do_not_count() -> None:
+    old = mark_decision(Choice.ACCEPT, fingerprint="another file")
+    own = mark_decision(Choice.REJECT, "2", fingerprint=key_of(TASK))
+    assert list(decided(TASK, [old, own], key_of).counting.values()) == [own]
+
+
+def test_decisions_count_for_what_follows_from_those_before_them() -> None:
+    """Accepted, then another mark placed, then, on what was measured from that, one more rejected."""
+    accept = mark_decision(Choice.ACCEPT, "1", fingerprint=key_of(TASK))
+    placed = place("2", 7.0, fingerprint=key_of(TASK))
+    now = decided(TASK, [accept, placed], key_of)
+    assert now.task.options.fiducials.clicks == (Click("2", 7.0, 2.0),)
+    reject = mark_decision(Choice.REJECT, "3", fingerprint=key_of(now.task))
+    assert set(decided(TASK, [accept, placed, reject], key_of).counting.values()) == {accept, placed, reject}
+
+
+def test_what_was_decided_about_marks_does_not_count_in_another_pose() -> None:
+    placed = place("2", 7.0, fingerprint=key_of(TASK))
+    pose = Decision("a", Choice.POSE, pose="90", fingerprint=key_of(TASK))
+    late = mark_decision(Choice.ACCEPT, "3", fingerprint=key_of(TASK))  # on a page that was not measured anew yet
+    now = decided(TASK, [pose, late], key_of)
+    assert now.task.options.fiducials.pose == "90"
+    assert list(now.counting.values()) == [pose]
+    other = replace(pose, pose="180")  # somebody thinks again, on that page
+    assert decided(TASK, [pose, other], key_of).task.options.fiducials.pose == "180"
+    undone = Decision("a", Choice.UNDO, fingerprint="whatever is shown")
+    assert decided(TASK, [placed, pose, undone], key_of).task.options.fiducials.pose == "auto"
+
+
+def scan_of(*marks: MarkMeasurement) -> MeasuredScan:
+    return MeasuredScan("a.tif", 100, 100, (20.0, 20.0), FrameMeasurement("a", marks))
+
+
+def weak(point: str, kind: Any = "fiducial") -> MarkMeasurement:
+    covariance = Covariance({Cause.NOISE: 0.01 * np.eye(2)})
+    return MarkMeasurement(
+        point, kind, np.array([5.0, 6.0]), covariance, Status.WEAK, Reason("a scratch", Code.COVERED)
+    )
+
+
+def test_a_mark_becomes_what_was_decided_and_says_by_whom() -> None:
+    choices = {"1": Choice.ACCEPT, "2": Choice.REJECT, "3": Choice.ABSENT}
+    counting = {one.about: one for point, choice in choices.items() if (one := mark_decision(choice, point, who="ann"))}
+    scan = scan_of(*(weak(point) for point in "1234"))
+    before, after = before_checks(scan, counting), after_checks(scan, counting)
+    statuses = [Status.WEAK, Status.REJECTED, Status.ABSENT, Status.WEAK]
+    assert [mark.status for mark in before.frame.marks] == statuses
+    assert [mark.status for mark in after.frame.marks] == [Status.MEASURED, *statuses[1:]]
+    assert "accepted by ann: a scratch" in after.frame.marks[0].reason
+    assert [mark.reason.code for mark in after.frame.marks] == ["decided covered", "decided", "decided", "covered"]
+    assert after.frame.marks[2].center_px is None
+    assert after.notes == ("Decisions stand behind it: 3 of ann.",)
+    assert after_checks(scan, {}) == scan
+
+
+def test_a_mark_that_was_not_measured_cannot_be_accepted() -> None:
+    bare = MarkMeasurement(
+        "1", "fiducial", np.array([5.0, 6.0]), None, Status.PREDICTED, Reason("not seen", Code.NOT_FOUND)
+    )
+    one = mark_decision(Choice.ACCEPT)
+    assert after_checks(scan_of(bare), {one.about: one}).frame.marks[0].status is Status.PREDICTED
+
+
+def test_a_target_that_is_placed_counts_as_well_as_one_points() -> None:
+    one = Decision("a", Choice.PLACE, "1", "target", col_px=50.0, row_px=60.0)
+    (mark,) = after_checks(scan_of(weak("1", "target")), {one.about: one}).frame.marks
+    assert mark.status is Status.WEAK
+    assert mark.center_px is not None
+    np.testing.assert_array_equal(mark.center_px, (50.0, 60.0))

@@ -1,0 +1,332 @@
+"""The review page: who may ask, and a person's whole session in a real browser, whose decisions lead to the right marks
+and to no others."""
+
+import csv
+import http.client
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, urlsplit
+
+import numpy as np
+import pytest
+from browser import browser_page, needs_browser
+from brute_marks import Array
+from playwright.sync_api import Page, Position, expect
+from review_server import BARE, GOOD, SCRATCHED, TURNED, Served, mark_px, served, write_faults
+
+from pipeline.cli import run
+
+pytestmark = pytest.mark.xdist_group("review")
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project's folder, measured once."""
+    project = write_faults(tmp_path_factory.mktemp("review") / "faults")
+    assert run(["measure", str(project)]) == 1
+    return project.parent
+
+
+@pytest.fixture(scope="module")
+def server(measured: Path) -> Iterator[Served]:
+    with served(measured / "project.toml") as one:
+        yield one
+
+
+@pytest.fixture
+def page(server: Served, measured: Path) -> Iterator[Page]:
+    """The page, nothing being decided yet."""
+    (measured / "decisions.jsonl").unlink(missing_ok=True)
+    with browser_page() as one:
+        one.goto(server.address)
+        expect(one.locator("#left")).to_contain_text("3 left: 1 frame, 2 marks")
+        yield one
+
+
+# --- who may ask
+
+
+def asked(
+    server: Served, path: str, headers: Mapping[str, str] | None = None, method: str = "GET", body: str = ""
+) -> tuple[int, Mapping[str, str], str]:
+    """Status, headers and text of an answer. A Host of None is the server's own."""
+    where = urlsplit(server.address)
+    connection = http.client.HTTPConnection(where.hostname or "", where.port)
+    try:
+        connection.request(method, path, body or None, dict(headers or {}))
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read().decode(errors="replace")
+    finally:
+        connection.close()
+
+
+def cookie_of(server: Served) -> str:
+    status, headers, _ = asked(server, f"/?{urlsplit(server.address).query}")
+    assert (status, headers["location"]) == (303, "/")
+    cookie = headers["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert "samesite=strict" in cookie.lower()
+    return cookie.split(";")[0]
+
+
+def test_only_who_has_the_address_is_answered(server: Served) -> None:
+    for path in ("/", "/?token=guessed", "/api/queue", "/static/review.js", "/api/frame.png?image=good"):
+        assert asked(server, path)[0] == 403
+    cookie = {"Cookie": cookie_of(server)}
+    status, headers, text = asked(server, "/api/queue", cookie)
+    assert status == 200
+    assert json.loads(text)["total"] == 3
+    assert "default-src 'none'" in headers["content-security-policy"]
+    assert "unsafe" not in headers["content-security-policy"]
+    assert headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "0.0.0.0:1"])
+def test_another_host_name_is_refused(host: str, server: Served) -> None:
+    assert asked(server, "/api/queue", {"Cookie": cookie_of(server), "Host": host})[0] == 403
+
+
+@pytest.mark.parametrize("origin", [None, "http://evil.example", "null", "https://127.0.0.1"])
+def test_only_the_page_itself_may_decide(origin: str | None, server: Served, measured: Path) -> None:
+    decision = {"image": GOOD, "point": "1", "kind": "fiducial", "decision": "accept"}
+    headers = {"Cookie": cookie_of(server)} | ({} if origin is None else {"Origin": origin})
+    assert asked(server, "/api/decide", headers, "POST", json.dumps({"decisions": [decision]}))[0] == 403
+    assert not (measured / "decisions.jsonl").exists()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../server.py",
+        "/static/%2e%2e/server.py",
+        "/static//etc/passwd",
+        f"/api/frame.png?image={quote('../faults/good')}",
+        f"/api/frame.png?image={quote('/etc/passwd')}",
+        "/api/mark?image=good&point=9&kind=fiducial",
+        "/api/pose.png?image=good&pose=45",
+    ],
+)
+def test_images_and_marks_are_names_and_never_paths(path: str, server: Served) -> None:
+    assert asked(server, path, {"Cookie": cookie_of(server)})[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("decision", "words"),
+    [
+        ({"image": "../good", "point": "1", "kind": "fiducial", "decision": "accept"}, "no image or mark '../good'"),
+        ({"image": GOOD, "point": "9", "kind": "fiducial", "decision": "accept"}, "no image or mark '9'"),
+        ({"image": BARE, "point": "3", "kind": "fiducial", "decision": "accept"}, "nothing was measured"),
+        ({"image": GOOD, "point": "1", "kind": "fiducial", "decision": "keep"}, "no decision"),
+        ({"image": GOOD, "decision": "accept"}, "needs its name"),
+        ({"image": GOOD, "point": "1", "kind": "fiducial", "decision": "place"}, "col_px"),
+        ({"image": GOOD, "decision": "pose", "pose": "45"}, "no pose"),
+        ("accept", "object"),
+    ],
+)
+def test_what_cannot_be_decided_is_refused_and_nothing_is_written(
+    decision: object, words: str, server: Served, measured: Path
+) -> None:
+    right = {"image": GOOD, "point": "1", "kind": "fiducial", "decision": "absent"}
+    headers = {"Cookie": cookie_of(server), "Origin": server.origin}
+    status, _, text = asked(server, "/api/decide", headers, "POST", json.dumps({"decisions": [right, decision]}))
+    assert status == 400
+    assert words in text
+    assert not (measured / "decisions.jsonl").exists()
+
+
+# --- a person's session
+
+
+@needs_browser
+def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measured: Path) -> None:
+    rows = comparator(measured)
+    place_frame_by_keys(page)
+    expect(page.locator("#left")).to_contain_text("2 left: 2 marks")
+    for done in range(2):
+        expect(page.locator("#mark-view")).to_be_visible()
+        name = page.locator("#title").inner_text()
+        page.keyboard.press("n" if name.startswith(BARE) else "a")
+        expect(page.locator("#left")).not_to_contain_text(f"{2 - done} left")
+        if done == 0:
+            expect(page.locator("#title")).not_to_have_text(name)
+    expect(page.locator("#left")).to_have_text("Nothing is left. Run reseau measure.")
+    told = decisions(measured)
+    assert {(one["image"], one.get("point"), one["decision"]) for one in told} == {
+        (BARE, "3", "absent"),
+        (SCRATCHED, "3", "accept"),
+        *((TURNED, point, "place") for point in "123"),
+    }
+    assert all(one["who"] == "ann" and one["fingerprint"] and one["when"] for one in told)
+    check_measured_again(measured, rows)
+
+
+@needs_browser
+def test_a_session_by_mouse_alone_leads_to_the_same(page: Page, measured: Path) -> None:
+    rows = comparator(measured)
+    whole = page.locator("#whole")
+    for point in "123":
+        page.get_by_role("radio", name=point).click()
+        click_in_frame(page, point)
+        expect(page.locator("#near")).to_be_focused()
+        page.locator("#near").click(position=middle(page, "#near"))
+    page.get_by_role("button", name="Measure").click()
+    expect(page.locator("#trial")).to_contain_text("4 measured; pose 0.")
+    page.get_by_role("button", name="Keep the clicks").click()
+    expect(whole).to_be_hidden()
+    for done in range(2):
+        name = page.locator("#title").inner_text()
+        page.get_by_role("button", name="Not there" if name.startswith(BARE) else "Accept").click()
+        expect(page.locator("#left")).not_to_contain_text(f"{2 - done} left")
+        if done == 0:
+            expect(page.locator("#title")).not_to_have_text(name)
+    expect(page.locator("#left")).to_have_text("Nothing is left. Run reseau measure.")
+    check_measured_again(measured, rows)
+
+
+@needs_browser
+def test_a_click_in_a_marks_picture_places_it(page: Page, measured: Path) -> None:
+    open_entry(page, BARE)
+    canvas = page.locator("#mark")
+    where = middle(page, "#mark")
+    canvas.click(position={"x": where["x"] + 56, "y": where["y"]})  # a tenth of the picture's width
+    expect(page.locator("#left")).to_contain_text("2 left")
+    (one,) = decisions(measured)
+    assert (one["decision"], one["image"], one["point"]) == ("place", BARE, "3")
+    off_px = np.array([one["col_px"], one["row_px"]]) - mark_px(BARE, "3")
+    assert off_px == pytest.approx((0.1 * one["window"][2], 0.0), abs=1.0)
+
+
+@needs_browser
+def test_undo_takes_back_the_last_decision(page: Page, measured: Path) -> None:
+    open_entry(page, SCRATCHED)
+    page.keyboard.press("r")
+    expect(page.locator("#left")).to_contain_text("2 left")
+    open_entry(page, SCRATCHED)
+    expect(page.locator("#decided")).to_contain_text("Decided: reject by ann")
+    page.keyboard.press("u")
+    expect(page.locator("#left")).to_contain_text("3 left")
+    assert [one["decision"] for one in decisions(measured)] == ["reject", "undo"]
+
+
+@needs_browser
+def test_two_windows_see_one_anothers_decisions(page: Page, server: Served, measured: Path) -> None:
+    other = page.context.new_page()
+    other.goto(server.origin)  # the cookie is the browser's
+    expect(other.locator("#left")).to_contain_text("3 left")
+    open_entry(other, SCRATCHED)
+    other.keyboard.press("a")
+    expect(other.locator("#left")).to_contain_text("2 left")
+    expect(page.locator("#left")).to_contain_text("2 left")
+    open_entry(page, SCRATCHED)
+    expect(page.locator("#decided")).to_contain_text("accept by ann")
+    page.keyboard.press("r")  # the last one counts
+    expect(other.locator("#queue")).to_contain_text("reject, ann")
+    assert [one["decision"] for one in decisions(measured)] == ["accept", "reject"]
+
+
+@needs_browser
+def test_names_are_shown_as_text(page: Page) -> None:
+    open_entry(page, BARE)
+    expect(page.locator("#title")).to_contain_text(BARE)
+    assert page.locator("main img, nav img").count() == 0
+
+
+@needs_browser
+def test_a_server_that_was_killed_goes_on_where_it_stopped(measured: Path) -> None:
+    (measured / "decisions.jsonl").unlink(missing_ok=True)
+    with browser_page() as page:
+        with served(measured / "project.toml") as first:
+            page.goto(first.address)
+            open_entry(page, SCRATCHED)
+            page.keyboard.press("a")
+            expect(page.locator("#left")).to_contain_text("2 left")
+            first.process.kill()
+            first.process.wait()
+            page.keyboard.press("j")
+            page.keyboard.press("n")
+            expect(page.locator("#told")).to_contain_text("The server does not answer")
+        with served(measured / "project.toml") as second:
+            page.goto(second.address)
+            expect(page.locator("#left")).to_contain_text("2 left")
+
+
+# --- what a person does, and what comes of it
+
+
+def open_entry(page: Page, image: str) -> None:
+    page.locator("#queue button", has_text=image).first.click()
+    expect(page.locator("#title")).to_contain_text(image)
+    expect(page.locator("#mark-view")).to_be_visible()
+
+
+def place_frame_by_keys(page: Page) -> None:
+    """The cursor goes from the middle of the scan to near a mark, then exactly to it, three times."""
+    expect(page.locator("#whole")).to_be_focused()
+    for number in "123":
+        page.keyboard.press(number)
+        steer(page, "whole", mark_px(TURNED, number))
+        page.keyboard.press("Enter")
+        expect(page.locator("#near")).to_be_focused()
+        steer(page, "near", mark_px(TURNED, number))
+        page.keyboard.press("Enter")
+    page.keyboard.press("m")
+    expect(page.locator("#trial")).to_contain_text("4 measured; pose 0.")
+    page.keyboard.press("Enter")
+
+
+def steer(page: Page, view: str, place_px: Array) -> None:
+    """Arrow keys until the cursor, which the page tells, is there."""
+    for axis, (less, more) in enumerate((("ArrowLeft", "ArrowRight"), ("ArrowUp", "ArrowDown"))):
+        for _ in range(400):
+            at = json.loads(page.locator(f"#{view}").get_attribute("data-cursor") or "null")
+            left = 1.0 if at is None else place_px[axis] - at[axis]
+            if at is not None and abs(left) < 0.6:
+                break
+            page.keyboard.press(more if left > 0 else less)
+
+
+def click_in_frame(page: Page, point: str) -> None:
+    box = page.locator("#whole").bounding_box()
+    assert box is not None
+    share = mark_px(TURNED, point) / 400.0
+    page.locator("#whole").click(position={"x": box["width"] * share[0], "y": box["height"] * share[1]})
+
+
+def middle(page: Page, selector: str) -> Position:
+    box = page.locator(selector).bounding_box()
+    assert box is not None
+    return {"x": box["width"] / 2, "y": box["height"] / 2}
+
+
+def check_measured_again(folder: Path, before: Mapping[tuple[str, str], Mapping[str, str]]) -> None:
+    """Measured with the decisions: the rows that they are about changed, and no others."""
+    copy = folder.parent / "again"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(folder, copy)
+    run(["measure", str(copy / "project.toml")])
+    after = comparator(copy)
+    assert {key for key in before if before[key] != after[key]} == {
+        (BARE, "3"),
+        (SCRATCHED, "3"),
+        *((TURNED, point) for point in "1234"),
+    }
+    assert after[BARE, "3"]["status"] == "absent"
+    assert after[SCRATCHED, "3"]["status"] == "measured"
+    for point in "1234":
+        row = after[TURNED, point]
+        assert row["status"] == "measured", row
+        place = np.array([float(row["col_px"]), float(row["row_px"])])
+        np.testing.assert_allclose(place, mark_px(TURNED, point), atol=0.1)
+
+
+def decisions(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "decisions.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+def comparator(folder: Path) -> Mapping[tuple[str, str], Mapping[str, str]]:
+    lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
+    return {(row["image"], row["point"]): row for row in rows}
