@@ -407,10 +407,33 @@ def _numbers(text: str) -> list[float]:
 
 
 @app.command()
-def report(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
-    """What the earlier stages found, in report.html."""
-    from pipeline.stages import run_report
+def report(
+    project: ProjectFile,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="After --frames: more images.", show_default=False)
+    ] = None,
+    frames: Annotated[
+        list[str] | None,
+        typer.Option("--frames", metavar="NAME", help="Only pages of these images, in out/frames, with all marks."),
+    ] = None,
+    as_json: AsJson = False,
+    max_pixels: MaxPixels = None,
+) -> int:
+    """What the earlier stages found, in report.html; or all of some images, each in a page of its own."""
+    from pipeline.stages import run_frame_pages, run_report
 
+    if frames:
+        from pipeline.progress import Reporter
+
+        images = list(dict.fromkeys([*frames, *(names or ())]))
+        pages = run_frame_pages(_read(project, max_pixels), images, Reporter())
+        if as_json:
+            _echo_json({"frames": {image: str(path) for image, path in pages.items()}})
+        for image, path in pages.items() if not as_json else ():
+            typer.echo(plain(f"{image}: {path}"))
+        return DONE
+    if names:
+        raise InputError("images are named after --frames: reseau report PROJECT.toml --frames NAME...")
     return _with_project(project, run_report, as_json, max_pixels)
 
 

@@ -1,19 +1,22 @@
 """What the stages left, as far as it is of what there is now: what was made from something else is named, not shown."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.measurement import measurement_of_digest
+from pipeline.archive.measurement import made_from_of, measured_scans
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
+from pipeline.many_frames import MOST_FRAMES, reduced
 from pipeline.publishing.made_from import CAMERA, PLACES, SCAN, SETTINGS, adjusted_from, differing, measured_from
 from pipeline.publishing.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance
 from pipeline.results.comparator_file import measurement_of, read_comparator
 from pipeline.results.fingerprints import of_file
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.spelling import did_you_mean
 from pipeline.text.text_file import read_json
 from pipeline.text.wording import listed
 
@@ -21,8 +24,11 @@ Json = dict[str, Any]
 At = Callable[[Path], Path]
 
 
-def measured(project: Project, at: At) -> ReportData:
-    """The marks, and what measurement.db says of them where it is theirs. at: where each result stands now."""
+def measured(project: Project, at: At, most_frames: int | None = None) -> ReportData:
+    """The marks, and what measurement.db says of them where it is theirs. at: where each result stands now.
+
+    most_frames: of more than these the scans are not read; `scans_of` gives them one by one.
+    """
     comparator = at(project.comparator)
     data = ReportData(
         project=_title(project),
@@ -35,8 +41,8 @@ def measured(project: Project, at: At) -> ReportData:
     digest, path = measurement_of(comparator), project.measurement_path
     if not path.exists():
         return data
-    measurement = measurement_of_digest(path, digest)
-    if measurement is None:
+    made = made_from_of(path, digest)
+    if made is None:
         if not digest:
             return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
         return _with_problem(
@@ -44,8 +50,9 @@ def measured(project: Project, at: At) -> ReportData:
             f"{path.name} is of other marks than {project.comparator.name}: it is not shown.",
             "Run `reseau measure`.",
         )
-    scans = {scan.frame.image: scan for scan in measurement[1]}
-    made, now = measurement[0], measured_from(project) if project.scans else {}
+    many = most_frames is not None and frames_of(data) > most_frames
+    scans = {} if many else {scan.frame.image: scan for scan in measured_scans(path, digest)}
+    now = measured_from(project) if project.scans else {}
     data = replace(data, measurement=scans, made_from={**data.made_from, path.name: digest})
     if project.scans and made.get(PLACES) != now[PLACES]:
         note = f"The marks were looked for with other {PLACES} than there are now; `reseau measure` looks again."
@@ -53,9 +60,39 @@ def measured(project: Project, at: At) -> ReportData:
     return replace(data, problems=(*data.problems, *(_unlike(made, now) if project.scans else ())))
 
 
-def adjusted(project: Project, at: At) -> ReportData:
+def frames_of(data: ReportData) -> int:
+    """How many images have marks."""
+    return len({row.image for row in data.comparator})
+
+
+def scans_of(data: ReportData, project: Project) -> Iterator[MeasuredScan]:
+    """The scans of data that have not been read, one after the other; none where the store is of other marks."""
+    digest = data.made_from.get(project.measurement_path.name)
+    return iter(()) if digest is None else measured_scans(project.measurement_path, digest)
+
+
+def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> ReportData:
+    """All that a report shows: of more frames than these, totals and those that need a look."""
+    data = adjusted(project, at, most_frames)
+    if frames_of(data) <= most_frames:
+        return data
+    return reduced(data, scans_of(data, project), lambda image: project.camera_of(image).name)
+
+
+def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
+    """All that is known of some images. Raises InputError for one that there is not."""
+    data = adjusted(project, at, 0)
+    known = {row.image for row in data.comparator}
+    for image in images:
+        if image not in known:
+            raise InputError(f"{project.comparator}: has no image {image!r}.{did_you_mean(image, known)}")
+    scans = {scan.frame.image: scan for scan in scans_of(data, project) if scan.frame.image in images}
+    return replace(data, comparator=[row for row in data.comparator if row.image in images], measurement=scans)
+
+
+def adjusted(project: Project, at: At, most_frames: int | None = None) -> ReportData:
     """The same with the adjustment, where it is of these marks, and its check, where it is of that adjustment."""
-    data, path = measured(project, at), at(project.adjustment_path)
+    data, path = measured(project, at, most_frames), at(project.adjustment_path)
     if not path.exists():
         return data
     adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), of_file(path)

@@ -24,9 +24,8 @@ from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.publishing.made_from import adjusted_from, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
-from pipeline.report.data import ReportData
-from pipeline.report.page import write_report
-from pipeline.report_data import adjusted, measured
+from pipeline.report.page import write_frame_page, write_report
+from pipeline.report_data import adjusted, frame_data, measured, report_data
 from pipeline.results.adjustment_file import write_adjustment
 from pipeline.results.adjustment_reader import covariance_path
 from pipeline.results.comparator_file import ComparatorPoint, measurement_of, read_comparator, write_comparator
@@ -57,7 +56,7 @@ def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = Non
             else:
                 _write_adjustment(project, adjustment, new)
                 _write_check(project, adjustment, new)
-            summary = _reported(project, adjusted(project, new.at), new)
+            summary = _reported(project, new)
         except WriteError:
             raise
         except Exception:
@@ -127,9 +126,26 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
         _given_marks(project, new)
         with reporter.stage("reporting") as count:
             count(project.report_path.name, 0, 1)
-            summary = _reported(project, adjusted(project, new.at), new)
+            summary = _reported(project, new)
         new.publish()
         return summary
+
+
+def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter) -> dict[str, Path]:
+    """Everything about some images, each in a page of its own; where these stand, by image. Raises InputError for an
+    image that there is not."""
+    from pipeline.thumbnails import Thumbnails
+
+    with unpublished(project) as new, reporter.stage("reporting") as count:
+        _given_marks(project, new)
+        data = frame_data(project, new.at, frozenset(images))
+        pages = {image: project.frame_page_path(image) for image in images}
+        with Thumbnails((data.measurement or {}).values(), project.max_pixels) as pictures:
+            for done, (image, path) in enumerate(pages.items()):
+                count(image, done, len(pages))
+                write_frame_page(replace(data, thumbnail=pictures.of), image, new.place(path))
+        new.publish()
+        return pages
 
 
 def _measured_shard(project: Project, reporter: Reporter, work: WorkOptions, shard: tuple[int, int]) -> Summary:
@@ -242,9 +258,10 @@ def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> 
     write_atomically(new.place(project.check_path), text)
 
 
-def _reported(project: Project, data: ReportData, new: Unpublished) -> Summary:
+def _reported(project: Project, new: Unpublished) -> Summary:
     from pipeline.thumbnails import Thumbnails
 
+    data = report_data(project, new.at)
     scans = data.measurement.values() if data.measurement else ()
     with Thumbnails(scans, project.max_pixels) as pictures:
         write_report(replace(data, thumbnail=pictures.of), new.place(project.report_path))

@@ -57,9 +57,11 @@ class Summary:
 def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     """Judge the data as the report does, and add where everything stands."""
     frames: dict[str, dict[str, int]] = {}
-    for mark in data.comparator:
+    for mark in data.comparator if not data.totals else ():
         counts = frames.setdefault(mark.image, {str(status): 0 for status in Status})
         counts[mark.status] += 1
+    if data.totals:
+        frames = {name: {str(s): counts.get(s, 0) for s in Status} for name, counts in data.totals.marks.items()}
     poses = {name: pose_record(scan.frame.pose) for name, scan in current_scans(data).items() if scan.frame.pose}
     return Summary(judge(data), frames, poses, data.adjustment, data.check, files, _forms(data))
 

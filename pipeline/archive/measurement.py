@@ -22,11 +22,11 @@ def read_measurement(path: Path, digest: str = "") -> tuple[MeasuredScan, ...]:
     return tuple(measured_scans(path, digest))
 
 
-def measurement_of_digest(path: Path, digest: str) -> tuple[Mapping[str, str], tuple[MeasuredScan, ...]] | None:
-    """What a judging was made from, and its scans; None where the store has not that one."""
+def made_from_of(path: Path, digest: str) -> Mapping[str, str] | None:
+    """What a judging was made from; None where the store has not that one."""
     with Store(path) as store:
         judging = judging_of(store, digest)
-    return None if judging is None else (judging.made_from, read_measurement(path, digest))
+    return None if judging is None else judging.made_from
 
 
 def pitches(store: Store, digest: str) -> dict[str, tuple[float, float]]:

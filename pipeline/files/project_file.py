@@ -116,6 +116,13 @@ class Project:
     def report_path(self) -> Path:
         return self.output / "report.html"
 
+    def frame_page_path(self, image: str) -> Path:
+        """The page of one image, in folders as its name has them. Raises InputError for a name that is no path."""
+        parts = image.split("/")
+        if any(part in ("", ".", "..") for part in parts) or "\\" in image or ":" in image:
+            raise InputError(f"image {image!r}: its name cannot be that of a file, so it has no page. Rename its scan.")
+        return self.output.joinpath("frames", *parts[:-1], f"{parts[-1]}.html")
+
     @property
     def results(self) -> tuple[Path, ...]:
         """What the program may write: an earlier result at most may stand there."""

@@ -22,7 +22,7 @@ _HEADS = {
     ".db": rb"SQLite format 3\0",
     ".npz": rb"PK\x03\x04.{26}(fingerprint|names)\.npy",
     ".csv": rb"# written about the frames, reseau",
-    ".html": rb"<!DOCTYPE html>.*<title>.*: calibration report</title>",
+    ".html": rb"<!DOCTYPE html>.*<title>.*: (calibration|film|frame) report</title>",
     ".toml": rb"# Marks learned by reseau",
     ".tif": rb"(II|MM).*reseau",
 }

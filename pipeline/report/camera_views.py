@@ -18,6 +18,7 @@ from pipeline.results.adjustment_reader import Covariance
 
 PLOT_PX = 560.0
 LONGEST_VECTOR_PX = 60.0
+MOST_VECTORS = 10_000  # in the picture of all frames
 CURVE_TABLE_ROWS = 6
 FINE_UM = 0.05  # standard deviation of a form below which tenths of a micrometre do not show it
 
@@ -226,6 +227,7 @@ def _vectors(rows: list[Json], frame_mm: tuple[float, float] | None) -> Markup |
     if not rows:
         return None
     scale = vectors.vector_scale(rows, LONGEST_VECTOR_PX)
+    rows = rows[:: -(-len(rows) // MOST_VECTORS)]  # evenly over the frames
     return vectors.all_images_plot(rows, vectors.plane(rows, frame_mm, PLOT_PX), scale)
 
 

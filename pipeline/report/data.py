@@ -42,6 +42,25 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class FrameTotals:
+    """What a report says of more frames than it shows one by one.
+
+    needs_look: how many of them need a look. marks: their number by image and status; of_targets: of those that are no
+    fiducials, by kind and status. verdicts: number of frames by camera and kind of file, and then by verdict. problems:
+    what the frames have to say. places_px, sigmas_um: of all marks observed, by axis; as `fractions.places_px` has
+    them, and along x and y of the comparator.
+    """
+
+    needs_look: int
+    marks: Mapping[str, Mapping[str, int]]
+    of_targets: Mapping[tuple[str, str], int]
+    verdicts: Mapping[tuple[str, str], Mapping[str, int]]
+    problems: tuple[Problem, ...]
+    places_px: Mapping[str, NDArray[np.float64]]
+    sigmas_um: Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
 class ReportData:
     """Everything a report can show.
 
@@ -49,7 +68,8 @@ class ReportData:
     contents of adjustment.json and check.json; covariance: adjustment.npz. frame_mm: width and height of the exposed
     frame by camera name. thumbnail: from image, point and kind (a fiducial and a target may share a name) to the mark's
     picture. problems, notes: what the caller has to say beyond the files. made_from: their fingerprints by name. unit:
-    of the object coordinates.
+    of the object coordinates. totals: of all frames where they are many; comparator and measurement are then of those
+    that are shown.
     """
 
     project: str
@@ -64,3 +84,4 @@ class ReportData:
     notes: tuple[str, ...] = ()
     made_from: Mapping[str, str] = field(default_factory=dict)
     unit: str = "m"
+    totals: FrameTotals | None = None

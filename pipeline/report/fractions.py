@@ -1,9 +1,10 @@
 """Fractional parts of measured pixel positions: marks prefer no place within a pixel, biased methods do."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtrik, chdtrc
 
 from pipeline.report.marks import Frame
@@ -36,16 +37,22 @@ class FractionTest:
         return self.probability is not None and self.probability < LEAST_PROBABILITY and self.bias_px > LEAST_BIAS_PX
 
 
-def places_px(shots: list[Frame]) -> dict[str, Array]:
+def places_px(shots: Iterable[Frame]) -> dict[str, Array]:
     """Columns and rows (n,) of all marks observed, each place along its axis once: a mark that recurs there in frame
     after frame, and the line of a lattice that lies along the pixels, share one fractional part."""
-    centers = [
-        mark.center_px
-        for frame in shots
-        for mark in frame.marks
-        if mark.status.is_observation and mark.center_px is not None
-    ]
-    columns, rows = np.array(centers, dtype=np.float64).reshape(-1, 2).T
+    return places_apart([center for frame in shots for center in centers_px(frame)])
+
+
+def centers_px(frame: Frame) -> Iterator[Array]:
+    """Centres (2,) of the marks of a frame that are observations."""
+    for mark in frame.marks:
+        if mark.status.is_observation and mark.center_px is not None:
+            yield mark.center_px
+
+
+def places_apart(centers: ArrayLike) -> dict[str, Array]:
+    """The same of centres (n, 2)."""
+    columns, rows = np.asarray(centers, dtype=np.float64).reshape(-1, 2).T
     return {"column": _apart(columns), "row": _apart(rows)}
 
 

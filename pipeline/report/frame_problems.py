@@ -1,11 +1,11 @@
 """What of the frames' measurement needs a look, before any adjustment."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TypeVar
 
 from pipeline.report.data import Problem
-from pipeline.report.fractions import fraction_test, places_px
+from pipeline.report.fractions import Array, fraction_test
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed
 from pipeline.text.wording import LISTED, counted, listed
@@ -18,6 +18,17 @@ _ONE_ANSWER = (
 )
 
 Sentence = TypeVar("Sentence", Problem, str)
+
+
+def problems_of(frame: Frame, with_pose: bool) -> Iterator[Problem]:
+    """What one frame has to say. with_pose: also of a pose that nothing decides."""
+    yield from _assumed(frame) if with_pose else ()
+    yield from _problems_of(frame)
+
+
+def without_numbers(sentence: str) -> str:
+    """The same of sentences that differ by their numbers alone."""
+    return _NUMBER.sub("#", sentence)
 
 
 def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
@@ -81,7 +92,7 @@ def _reasons(lost: list[Mark]) -> str:
     first."""
     alike: dict[str, list[Mark]] = {}
     for mark in lost:
-        alike.setdefault(f"{mark.status}: {_NUMBER.sub('#', mark.reason)}", []).append(mark)
+        alike.setdefault(f"{mark.status}: {without_numbers(mark.reason)}", []).append(mark)
     return "; ".join(_told(marks) for marks in list(alike.values())[:LISTED])
 
 
@@ -91,8 +102,9 @@ def _told(marks: list[Mark]) -> str:
     return f"{names} {first.status}{like}: {first.reason.rstrip('.')}"
 
 
-def pixel_locking(shots: list[Frame]) -> Iterator[Problem]:
-    for axis, positions in places_px(shots).items():
+def pixel_locking(places_px: Mapping[str, Array]) -> Iterator[Problem]:
+    """places_px: of the marks by axis, as `fractions.places_px` has them."""
+    for axis, positions in places_px.items():
         test = fraction_test(positions)
         if test.is_locked:
             yield Problem(

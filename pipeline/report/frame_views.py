@@ -55,13 +55,13 @@ class FrameView:
     is_open: bool
 
 
-def frame_views(data: ReportData, shots: list[Frame]) -> list[FrameView]:
-    """All frames, drawn to the same scales."""
-    shown = thumbnails.shown_marks(shots)
+def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) -> list[FrameView]:
+    """All frames, drawn to the same scales. every_mark: picture them all, however many."""
+    shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else thumbnails.shown_marks(shots)
     px_per_um, most_px = thumbnail_scale(shots), thumbnails.stored_px(shown)
     by_image = residuals_by_image(data)
     suspect = suspect_rows(data.adjustment) if data.adjustment else []
-    plots = _plots(data, by_image, suspect)
+    plots = _plots(data, by_image, suspect, [frame.image for frame in shots if frame.image in by_image])
     views = []
     for frame in shots:
         stored: Json = data.adjustment["images"].get(frame.image, {}) if data.adjustment else {}
@@ -105,15 +105,19 @@ def camera_of(data: ReportData, image: str) -> str:
     return str(data.adjustment["images"][image].get("camera", next(iter(data.adjustment["cameras"]))))
 
 
-def _plots(data: ReportData, by_image: dict[str, list[Json]], suspect: list[Json]) -> dict[str, Markup]:
+def _plots(
+    data: ReportData, by_image: dict[str, list[Json]], suspect: list[Json], images: list[str]
+) -> dict[str, Markup]:
     rows = [row for residuals in by_image.values() for row in residuals]
     if not rows:
         return {}
     scale = vectors.vector_scale(rows, LONGEST_VECTOR_PX)
-    frame_mm = {image: data.frame_mm.get(camera_of(data, image)) for image in by_image}
+    frame_mm = {image: data.frame_mm.get(camera_of(data, image)) for image in images}
     return {
-        image: vectors.image_plot(image, residuals, vectors.plane(residuals, frame_mm[image], PLOT_PX), scale, suspect)
-        for image, residuals in by_image.items()
+        image: vectors.image_plot(
+            image, by_image[image], vectors.plane(by_image[image], frame_mm[image], PLOT_PX), scale, suspect
+        )
+        for image in images
     }
 
 

@@ -72,7 +72,7 @@ def frames(data: ReportData) -> list[Frame]:
     marks: dict[str, dict[tuple[bool, str], Mark]] = defaultdict(dict)
     for mark in _marks(data, scans):
         marks[mark.image][mark.is_fiducial, mark.point] = mark
-    names = {*scans, *marks, *(data.adjustment["images"] if data.adjustment else {})}
+    names = {*scans, *marks, *(data.adjustment["images"] if data.adjustment and not data.totals else {})}
     return [
         Frame(name, tuple(sorted(marks[name].values(), key=_order)), scans.get(name))
         for name in sorted(names, key=natural)

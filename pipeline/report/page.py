@@ -1,7 +1,7 @@
 """report.html: one file, no network, readable without scripts and on paper."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -14,13 +14,14 @@ from measure import reason, status
 from pipeline.report.camera_views import camera_views
 from pipeline.report.charts import fraction_plot
 from pipeline.report.data import Json, ReportData
-from pipeline.report.fractions import LEAST_MARKS, FractionTest, fraction_test, places_px
+from pipeline.report.fractions import LEAST_MARKS, Array, FractionTest, fraction_test, places_px
 from pipeline.report.frame_views import frame_views, thumbnail_scale
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.parameters import spoken_name
 from pipeline.report.scanner_views import scanner_views
 from pipeline.report.svg import round_step
+from pipeline.report.totals import totals_view
 from pipeline.report.verdict import critical_w, judge, sigma0_bounds
 from pipeline.text.atomic import write_atomically
 
@@ -30,6 +31,19 @@ LIST_LIMIT = 200  # rows of a long table
 def write_report(data: ReportData, path: Path) -> None:
     """Write the report. Raises InputError where the file cannot be written; an earlier one then stays as it was."""
     write_atomically(path, render_report(data))
+
+
+def write_frame_page(data: ReportData, image: str, path: Path) -> None:
+    """Write the page of one image, with all its marks. Raises InputError where the file cannot be written."""
+    write_atomically(path, render_frame_page(data, image))
+
+
+def render_frame_page(data: ReportData, image: str) -> str:
+    """All that data has of one image, as HTML."""
+    shots = [frame for frame in frames(data) if frame.image == image]
+    context = _common(data) | _of_frames(data, shots, every_mark=True)
+    up = "../" * (image.count("/") + 1)
+    return _environment().get_template("frame.html.j2").render({**context, "image": image, "up": up})
 
 
 def render_report(data: ReportData) -> str:
@@ -57,33 +71,47 @@ def _context(data: ReportData) -> dict[str, Any]:
     adjustment = data.adjustment
     cameras = camera_views(data)
     calibrated = any(camera.calibrated for camera in cameras)
+    places = data.totals.places_px if data.totals else places_px(shots)
     return {
-        "project": data.project,
+        **_common(data),
+        **_of_frames(data, shots),
         "title": "Calibration report" if calibrated or not adjustment else "Film report",
         "calibrated": calibrated,
+        "verdict": judge(data),
+        "check": data.check,
+        "totals": totals_view(data) if data.totals else None,
+        "spoken": lambda name: spoken_name(name, adjustment["cameras"] if adjustment else ()),
+        "measured": bool(data.measurement),
+        "cameras": cameras,
+        "scanners": scanner_views(data),
+        "fractions": list(_fractions(places)),
+        "least_marks": LEAST_MARKS,
+        "sigma0_bounds": sigma0_bounds(adjustment["redundancy"]) if adjustment and adjustment["redundancy"] else None,
+        "points": _points(adjustment) if adjustment else [],
+        "list_limit": LIST_LIMIT,
+    }
+
+
+def _common(data: ReportData) -> dict[str, Any]:
+    return {
+        "project": data.project,
         "version": version("reseau"),
         "made_from": ", ".join(f"{name} {fingerprint}" for name, fingerprint in data.made_from.items()) or "memory",
         "unit": data.unit,
-        "verdict": judge(data),
-        "adjustment": adjustment,
-        "check": data.check,
-        "frames": frame_views(data, shots),
-        "spoken": lambda name: spoken_name(name, adjustment["cameras"] if adjustment else ()),
-        "points_word": _points_word(shots),
-        "measured": bool(data.measurement),
+        "adjustment": data.adjustment,
+        "critical_w": critical_w(2 * len(data.adjustment["residuals"])) if data.adjustment else 0.0,
         "has_pictures": data.thumbnail is not None,
-        "cameras": cameras,
-        "scanners": scanner_views(data),
-        "fractions": list(_fractions(shots)),
-        "least_marks": LEAST_MARKS,
         "meaning": status.MEANING,
         "codes": reason.MEANING,
+    }
+
+
+def _of_frames(data: ReportData, shots: list[Frame], every_mark: bool = False) -> dict[str, Any]:
+    return {
+        "frames": frame_views(data, shots, every_mark),
+        "points_word": _points_word(shots),
         "reasons": Counter(code for frame in shots for mark in frame.marks for code in mark.codes).most_common(),
         "arrow_bar": _arrow_bar(shots),
-        "sigma0_bounds": sigma0_bounds(adjustment["redundancy"]) if adjustment and adjustment["redundancy"] else None,
-        "critical_w": critical_w(2 * len(adjustment["residuals"])) if adjustment else 0.0,
-        "points": _points(adjustment) if adjustment else [],
-        "list_limit": LIST_LIMIT,
     }
 
 
@@ -95,9 +123,9 @@ def _points_word(shots: list[Frame]) -> str:
     return "targets and tie points" if "target" in kinds else "tie points"
 
 
-def _fractions(shots: list[Frame]) -> Iterator[tuple[str, FractionTest, Markup]]:
+def _fractions(places: Mapping[str, Array]) -> Iterator[tuple[str, FractionTest, Markup]]:
     """By axis: the test of the fractional parts and its drawing; nothing where no pixel positions are known."""
-    for axis, positions in places_px(shots).items():
+    for axis, positions in places.items():
         if len(positions):
             test = fraction_test(positions)
             yield axis, test, fraction_plot(axis, test)

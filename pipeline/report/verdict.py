@@ -9,6 +9,7 @@ from scipy.special import chdtri, ndtri
 
 from measure.status import Status
 from pipeline.report.data import Json, Problem, ReportData
+from pipeline.report.fractions import places_px
 from pipeline.report.frame_problems import assumed_poses, frame_problems, pixel_locking, said_by
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
@@ -194,7 +195,7 @@ def _is_solved(data: ReportData) -> bool:
     return data.adjustment is not None and not any(_no_solution(data.adjustment))
 
 
-def _is_film_alone(data: ReportData) -> bool:
+def is_film_alone(data: ReportData) -> bool:
     """Whether fiducial marks are all there was to adjust."""
     return data.adjustment is not None and not any(map(camera_is_calibrated, data.adjustment["cameras"].values()))
 
@@ -210,7 +211,10 @@ def _of_solution(look: Callable[[Json], Iterator[Problem]], checked: bool = Fals
 
 
 def _of_frames(data: ReportData, shots: list[Frame]) -> Iterator[Problem]:
-    if not _is_film_alone(data):
+    if data.totals:
+        yield from data.totals.problems
+        return
+    if not is_film_alone(data):
         yield from assumed_poses(shots)
     yield from frame_problems(shots)
 
@@ -220,7 +224,7 @@ NEEDS_A_LOOK: dict[str, Look] = {
     "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
     "made from": lambda data, _: data.problems,
     "frames": _of_frames,
-    "pixel locking": lambda _, shots: pixel_locking(shots),
+    "pixel locking": lambda data, shots: pixel_locking(data.totals.places_px if data.totals else places_px(shots)),
     "warnings": lambda data, _: map(Problem, data.adjustment["warnings"] if data.adjustment else ()),
     "σ₀": _of_solution(_too_large, checked=True),
     "redundancy": _of_solution(_unchecked),
@@ -242,13 +246,13 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
     elif not data.check:
         yield "There is no check against OpenCV yet: run `reseau check`."
-    elif data.check["verdict"] == "not possible" and not _is_film_alone(data):
+    elif data.check["verdict"] == "not possible" and not is_film_alone(data):
         yield f"OpenCV cannot check this calibration. {data.check['reason']}"
     if data.adjustment:
         yield from _weight_notes(data.adjustment)
         if _is_solved(data) and data.adjustment["redundancy"] > 0:
             yield from _too_small(data.adjustment)
-    if _is_film_alone(data):
+    if is_film_alone(data):
         for problem in assumed_poses(shots):
             yield f"{problem.what} {problem.next_step}"
         yield (
@@ -258,7 +262,11 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield f"{listed(images)}: {note}"
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
         for kind, *words in (("target", "target"), ("tie", "sight of a tie point", "sights of tie points")):
-            number = sum(mark.status is status and mark.kind == kind for frame in shots for mark in frame.marks)
+            number = (
+                data.totals.of_targets.get((kind, status), 0)
+                if data.totals
+                else sum(mark.status is status and mark.kind == kind for frame in shots for mark in frame.marks)
+            )
             if number:
                 yield f"{counted(number, *words)} {status} (their reasons stand with the marks)."
 
@@ -283,7 +291,7 @@ def _weight_notes(adjustment: Json) -> Iterator[str]:
 
 def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int) -> str:
     marks = _observed(data, shots)
-    found = f"{counted(marks, 'mark')} in {counted(len(shots), 'frame')}"
+    found = f"{counted(marks, 'mark')} in {counted(len(data.totals.marks if data.totals else shots), 'frame')}"
     ending = f", but {counted(problems, 'thing needs', 'things need')} a look." if level == "look" else "."
     if not marks:
         return "No mark was measured."
@@ -305,5 +313,7 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
 
 def _observed(data: ReportData, shots: list[Frame]) -> int:
     """How many marks are observations; those of the adjustment where the comparator file is not at hand."""
+    if data.totals:
+        return sum(count[status] for count in data.totals.marks.values() for status in (Status.MEASURED, Status.WEAK))
     marks = sum(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
     return marks or (len(data.adjustment["residuals"]) if data.adjustment else 0)

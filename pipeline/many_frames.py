@@ -1,0 +1,157 @@
+"""What a report shows of more frames than it can show one by one: totals of all, and those that need a look."""
+
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipeline.archive.verdicts import Verdict, verdict_of
+from pipeline.report.data import FrameTotals, Problem, ReportData
+from pipeline.report.fractions import centers_px, places_apart
+from pipeline.report.frame_problems import problems_of, without_numbers
+from pipeline.report.frame_views import residuals_by_image
+from pipeline.report.marks import Frame, frames
+from pipeline.report.verdict import is_film_alone, suspect_rows
+from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.measured_record import pose_record
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.text.wording import counted, listed
+
+MOST_FRAMES = 200  # that a report shows with their marks
+_MOST_PROBLEMS = 50  # different ones that it lists
+_WORST_FIRST = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK, Verdict.GOOD)
+
+
+@dataclass
+class _Totals:
+    """Of the frames so far, for `FrameTotals`."""
+
+    marks: dict[str, Counter[str]] = field(default_factory=dict)
+    of_targets: Counter[tuple[str, str]] = field(default_factory=Counter)
+    verdicts: dict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    said: dict[tuple[str, str], tuple[Problem, list[str]]] = field(default_factory=dict)
+    centers_px: "array[float]" = field(default_factory=lambda: array("d"))
+    sigmas_um: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def add(self, frame: Frame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[Problem]) -> None:
+        self.verdicts[kind][verdict] += 1
+        self.marks[frame.image] = Counter(str(mark.status) for mark in frame.marks)
+        self.of_targets.update((mark.kind, mark.status) for mark in frame.marks if not mark.is_fiducial)
+        for problem in problems:
+            alike = without_numbers(problem.what), problem.next_step
+            self.said.setdefault(alike, (problem, []))[1].append(frame.image)
+        for center in centers_px(frame):
+            self.centers_px.extend(center.tolist())
+        for mark in frame.marks:
+            if mark.status.is_observation and mark.sigma_um is not None:
+                self.sigmas_um.extend(mark.sigma_um.tolist())
+
+    def result(self, needs_look: int) -> FrameTotals:
+        x_um, y_um = np.array(self.sigmas_um).reshape(-1, 2).T
+        return FrameTotals(
+            needs_look=needs_look,
+            marks=self.marks,
+            of_targets=self.of_targets,
+            verdicts=dict(sorted(self.verdicts.items())),
+            problems=tuple(_listed(self.said)),
+            places_px=places_apart(np.array(self.centers_px)),
+            sigmas_um={"x": x_um, "y": y_um},
+        )
+
+
+def reduced(data: ReportData, scans: Iterable[MeasuredScan], camera_of: Callable[[str], str]) -> ReportData:
+    """The data with the totals of all frames, and of single frames only the worst of those that need a look.
+
+    scans: of the images of data.comparator, read once, one after the other.
+    """
+    totals, worst, needs_look = _Totals(), _Worst(), 0
+    with_pose = not is_film_alone(data)
+    suspect = {row["image"] for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
+    for one in _one_by_one(data, scans):
+        (frame,) = frames(one)
+        verdict, problems = _verdict(frame, with_pose), list(problems_of(frame, with_pose))
+        kind = camera_of(frame.image), frame.scan.scan.rpartition(".")[2].lower() if frame.scan else "given"
+        totals.add(frame, kind, verdict, problems)
+        if problems or verdict is not Verdict.GOOD or frame.image in suspect:
+            needs_look += 1
+            worst.add(
+                (_WORST_FIRST.index(verdict), -max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)), one
+            )
+    shown = worst.shown()
+    return replace(
+        data,
+        comparator=[row for one in shown for row in one.comparator],
+        measurement={name: scan for one in shown for name, scan in (one.measurement or {}).items()},
+        totals=totals.result(needs_look),
+    )
+
+
+class _Worst:
+    """The first of all that were added, by their keys; never many more are kept."""
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[tuple[float, ...], int, ReportData]] = []
+        self._count = 0
+
+    def add(self, key: tuple[float, ...], one: ReportData) -> None:
+        self._kept.append((key, self._count, one))
+        self._count += 1
+        if len(self._kept) > 2 * MOST_FRAMES:
+            self._kept = sorted(self._kept, key=lambda each: each[:2])[:MOST_FRAMES]
+
+    def shown(self) -> list[ReportData]:
+        return [one for *_, one in sorted(self._kept, key=lambda each: each[:2])[:MOST_FRAMES]]
+
+
+def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[ReportData]:
+    """Of every frame by itself: its rows, its scan, its residuals."""
+    rows: dict[str, list[ComparatorPoint]] = defaultdict(list)
+    for row in data.comparator:
+        rows[row.image].append(row)
+    residuals = residuals_by_image(data)
+    seen = set[str]()
+
+    def of(image: str, scan: MeasuredScan | None) -> ReportData:
+        own = {"images": {image: {}}, "residuals": residuals.get(image, [])} if data.adjustment else None
+        return replace(
+            data, comparator=rows.get(image, []), measurement={image: scan} if scan else {}, adjustment=own, totals=None
+        )
+
+    for scan in scans:
+        if scan.frame.image in rows or not scan.frame.marks:  # others were taken out of the comparator file
+            seen.add(scan.frame.image)
+            yield of(scan.frame.image, scan)
+    others = data.adjustment["images"] if data.adjustment else ()
+    for image in sorted({*rows, *others} - seen):
+        yield of(image, None)
+
+
+def _verdict(frame: Frame, with_pose: bool) -> Verdict:
+    """As `reseau status` has it, of the marks as the comparator file has them now."""
+    measured = frame.scan.frame if frame.scan else None
+    return verdict_of(
+        {
+            "failure": frame.scan.failure if frame.scan else None,
+            "marks": [{"kind": mark.kind, "status": mark.status} for mark in frame.marks],
+            "pixel_from_camera": measured.pixel_from_camera if measured else (),
+            "pose": pose_record(measured.pose) if measured and measured.pose and with_pose else None,
+            "problems": measured.problems if measured else (),
+        }
+    )
+
+
+def _listed(said: dict[tuple[str, str], tuple[Problem, list[str]]]) -> Iterator[Problem]:
+    """What most frames say first."""
+    ordered = sorted(said.values(), key=lambda each: -len(each[1]))
+    for problem, images in ordered[:_MOST_PROBLEMS]:
+        of_first = " (The numbers are those of the first.)" if len(images) > 1 and _has_numbers(problem) else ""
+        yield Problem(f"{listed(images)}: {problem.what}{of_first}", problem.next_step)
+    rest = sum(len(images) for _, images in ordered[_MOST_PROBLEMS:])
+    if rest:
+        yield Problem(f"{counted(rest, 'more problem')} of frames, all different.", "`reseau status --csv` has them.")
+
+
+def _has_numbers(problem: Problem) -> bool:
+    return without_numbers(problem.what) != problem.what

@@ -1,0 +1,169 @@
+"""The report on thousands of frames: small, its numbers those that were made up, and a page of any frame."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from measure.covariance import Cause, Covariance
+from measure.reason import Code, Reason
+from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.status import Status
+from pipeline.cli import run
+from pipeline.many_frames import MOST_FRAMES, reduced
+from pipeline.report import ReportData, judge, render_report
+from pipeline.report.page import render_frame_page
+from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
+
+FRAMES, MARKS = 3000, 8
+BAD, FAILED = range(0, FRAMES, 10), range(5, FRAMES, 100)
+KNOWN = Covariance({Cause.NOISE: np.eye(2) * 4e-4})
+SIGMA_UM = (3.0, 4.0)
+
+
+def image(number: int) -> str:
+    return f"box<b>{number % 3}/{number:04d}"
+
+
+def scan(number: int) -> MeasuredScan:
+    """Every tenth has lost a fiducial, every hundredth could not be read."""
+    rng = np.random.default_rng(number)
+    marks = []
+    for i in range(MARKS):
+        is_lost = number in FAILED or (number in BAD and i == 0)
+        status = Status.ABSENT if is_lost else Status.MEASURED
+        place = None if is_lost else rng.uniform(0, 12000, 2)
+        why = Reason("it is faint", Code.COVERED) if is_lost else Reason()
+        marks.append(MarkMeasurement(f"m{i}", "fiducial", place, None if is_lost else KNOWN, status, why))
+    if number in FAILED:
+        failure = Failure(FailureCode.UNREADABLE, f"scan {number} is damaged")
+        frame = FrameMeasurement(image(number), tuple(marks), problems=(failure.sentence,))
+        return MeasuredScan.failed(f"{image(number)}.tif", frame, failure)
+    frame = FrameMeasurement(image(number), tuple(marks), Pose("0", True, ("set.",)), np.eye(2, 3))
+    ending = "jpg" if number % 2 else "tif"
+    return MeasuredScan(f"{image(number)}.{ending}", 12000, 12000, (20.0, 20.0), frame)
+
+
+def rows(scans: list[MeasuredScan]) -> Iterator[ComparatorPoint]:
+    for each in scans:
+        for mark in each.frame.marks:
+            is_known = mark.center_px is not None
+            xy, sigma = (np.zeros(2), 1e-3 * np.array(SIGMA_UM)) if is_known else (None, None)
+            yield ComparatorPoint(each.frame.image, mark.point, "fiducial", xy, sigma, 0.0, mark.status, "")
+
+
+@pytest.fixture(scope="module")
+def many() -> ReportData:
+    scans = [scan(number) for number in range(FRAMES)]
+    return reduced(ReportData("Many", list(rows(scans))), iter(scans), lambda name: f"camera {name[6]}")
+
+
+@pytest.fixture(scope="module")
+def page(many: ReportData) -> str:
+    return render_report(many)
+
+
+def test_a_report_on_thousands_of_frames_is_small(page: str) -> None:
+    assert len(page.encode()) < 2_000_000
+    assert page.count("<details id=") == MOST_FRAMES
+
+
+def test_its_counts_are_those_of_the_frames(many: ReportData, page: str) -> None:
+    assert many.totals is not None
+    assert many.totals.needs_look == len(BAD) + len(FAILED)
+    good = FRAMES - len(BAD) - len(FAILED)
+    counts = sum(map(Counter, many.totals.verdicts.values()), Counter[str]())
+    assert counts == {"good": good, "look": len(BAD), "failed": len(FAILED)}
+    assert {camera for camera, _ in many.totals.verdicts} == {"camera 0", "camera 1", "camera 2"}
+    assert {kind for _, kind in many.totals.verdicts} == {"tif", "jpg"}
+    observed = FRAMES * MARKS - len(BAD) - MARKS * len(FAILED)
+    assert judge(many).sentence.startswith(f"Measured: {observed} marks in {FRAMES} frames, but ")
+    assert {axis: np.unique(sigmas).round(9).tolist() for axis, sigmas in many.totals.sigmas_um.items()} == {
+        "x": [SIGMA_UM[0]], "y": [SIGMA_UM[1]],
+    }  # fmt: skip
+    assert f"{observed} marks, rms 3.00 µm" in page
+
+
+def test_the_worst_frames_are_shown_and_alike_problems_said_once(many: ReportData, page: str) -> None:
+    shown = set(many.measurement or {})
+    assert {image(number) for number in FAILED} <= shown
+    assert shown <= {image(number) for number in (*BAD, *FAILED)}
+    told = [problem.what for problem in judge(many).problems]
+    assert len(told) == 2
+    assert f"and {len(BAD) - 8} more: 1 fiducial mark not measured, 7 measured" in told[0]
+    assert f"and {len(FAILED) - 8} more: scan 5 is damaged" in told[1]
+
+
+def test_what_users_named_is_escaped(page: str) -> None:
+    assert "box&lt;b&gt;" in page
+    assert "<b>0/" not in page
+
+
+def test_nothing_is_read_twice_or_kept(many: ReportData) -> None:
+    assert len(many.measurement or {}) == MOST_FRAMES
+    assert len(many.comparator) == MOST_FRAMES * MARKS
+
+
+def test_good_frames_alone_need_no_look() -> None:
+    scans = [scan(number) for number in range(1, 400) if number not in BAD and number not in FAILED]
+    data = reduced(ReportData("Good", list(rows(scans))), iter(scans), lambda _: "k")
+    assert judge(data).level == "good"
+    assert "No frame needs a look." in render_report(data)
+
+
+def test_the_page_of_a_frame_has_all_its_marks() -> None:
+    one = scan(0)
+    targets = tuple(MarkMeasurement(f"t{i}", "target", np.ones(2), KNOWN, Status.MEASURED) for i in range(700))
+    frame = FrameMeasurement(one.frame.image, (*one.frame.marks, *targets), one.frame.pose, np.eye(2, 3))
+    whole = MeasuredScan(one.scan, 12000, 12000, (20.0, 20.0), frame)
+    html = render_frame_page(ReportData("Many", [], {frame.image: whole}), frame.image)
+    assert set(re.findall(r"<b>([mt]\d+)</b>", html)) == {mark.point for mark in frame.marks}
+    assert 'href="../../report.html"' in html
+    assert "<b>0/" not in html
+
+
+def given(folder: Path, images: int) -> Path:
+    """A project of coordinates that somebody has measured."""
+    marks = {"1": (-100, -100), "2": (100, -100), "3": (100, 100), "4": (-100, 100)}
+    fiducials = [f'[[fiducial]]\nid = "{id}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0' for id, (x, y) in marks.items()]
+    (folder / "camera.toml").write_text("\n".join(['name = "K"', *fiducials]), encoding="utf-8")
+    (folder / "project.toml").write_text('camera = "camera.toml"\n', encoding="utf-8")
+    lines = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
+    rng = np.random.default_rng(3)
+    for number in range(images):
+        for id, xy in marks.items():
+            x, y = xy + rng.normal(0, 0.003, 2)
+            lines.append(f"roll/{number:03d},{id},fiducial,{x:.5f},{y:.5f},0.003,0.003")
+    (folder / "comparator.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder / "project.toml"
+
+
+def test_pages_are_made_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = given(tmp_path, MOST_FRAMES + 5)
+    assert run(["adjust", str(project)]) in (0, 1)
+    for _ in range(2):  # what was written may be written over
+        assert run(["report", str(project)]) in (0, 1)
+        assert run(["report", str(project), "--frames", "roll/007", "roll/008"]) == 0
+    assert sorted(file.name for file in (tmp_path / "out" / "frames" / "roll").iterdir()) == ["007.html", "008.html"]
+    page = (tmp_path / "out" / "frames" / "roll" / "007.html").read_text(encoding="utf-8")
+    assert set(re.findall(r"<b>(\d)</b> fiducial", page)) == {"1", "2", "3", "4"}
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"Of {MOST_FRAMES + 5} frames" in report
+    assert "Histogram of the residual in x" in report
+    capsys.readouterr()
+    assert run(["report", str(project), "--frames", "roll/7"]) == 2
+    assert "has no image 'roll/7'" in capsys.readouterr().err
+    assert run(["report", str(project), "roll/007"]) == 2
+
+
+def test_few_frames_are_shown_one_by_one(tmp_path: Path) -> None:
+    project = given(tmp_path, 3)
+    assert run(["adjust", str(project)]) in (0, 1)
+    assert run(["report", str(project)]) in (0, 1)
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert 'id="totals"' not in report
+    assert report.count("<details id=") == 3
