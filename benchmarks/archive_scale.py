@@ -42,14 +42,19 @@ def main(scans: int) -> None:
 
 def _row(title: str, arguments: list[str], scans: int) -> None:
     start = time.monotonic()
+    cpu_s, peak_mb = told_of(arguments)
+    clock_s = time.monotonic() - start
+    print(f"{title:<28}{clock_s:9.1f}{cpu_s:9.1f}{1e3 * cpu_s / scans:11.2f}{peak_mb:12.0f}", flush=True)
+
+
+def told_of(arguments: list[str]) -> tuple[float, float]:
+    """CPU seconds, and MB at most, of one command in a process of its own."""
     own = [sys.executable, __file__, "--command", *arguments]
     ended = subprocess.run(own, capture_output=True, text=True, check=False)
-    clock_s = time.monotonic() - start
     told = ended.stderr.strip().splitlines()[-1].split() if ended.stderr.strip() else []
     if ended.returncode not in (0, 1) or len(told) != 3:
-        raise SystemExit(f"{title} ended with {ended.returncode}:\n{ended.stderr[-3000:]}")
-    cpu_s, peak_mb = float(told[1]), float(told[2])
-    print(f"{title:<28}{clock_s:9.1f}{cpu_s:9.1f}{1e3 * cpu_s / scans:11.2f}{peak_mb:12.0f}", flush=True)
+        raise SystemExit(f"{' '.join(arguments)} ended with {ended.returncode}:\n{ended.stderr[-3000:]}")
+    return float(told[1]), float(told[2])
 
 
 def command(arguments: list[str]) -> int:

@@ -21,7 +21,7 @@ from pipeline.text.wording import counted, listed
 
 MOST_FRAMES = 200  # that a report shows with their marks
 _MOST_PROBLEMS = 50  # different ones that it lists
-_WORST_FIRST = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK, Verdict.GOOD)
+_BEST_FIRST = (Verdict.GOOD, Verdict.LOOK, Verdict.POOR, Verdict.FAILED)
 
 
 @dataclass
@@ -54,7 +54,7 @@ class _Totals:
             needs_look=needs_look,
             marks=self.marks,
             of_targets=self.of_targets,
-            verdicts=dict(sorted(self.verdicts.items())),
+            verdicts={kind: {v: counts[v] for v in _BEST_FIRST} for kind, counts in sorted(self.verdicts.items())},
             problems=tuple(_listed(self.said)),
             places_px=places_apart(np.array(self.centers_px)),
             sigmas_um={"x": x_um, "y": y_um},
@@ -77,7 +77,7 @@ def reduced(data: ReportData, scans: Iterable[MeasuredScan], camera_of: Callable
         if problems or verdict is not Verdict.GOOD or frame.image in suspect:
             needs_look += 1
             worst.add(
-                (_WORST_FIRST.index(verdict), -max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)), one
+                (-_BEST_FIRST.index(verdict), -max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)), one
             )
     shown = worst.shown()
     return replace(

@@ -80,7 +80,7 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
                 writing=written(frame.scan),
                 orientation=_quantities(stored.get("exterior", {})),
                 transformation=_quantities(stored.get("transformation", {})),
-                is_open=len(shots) <= OPEN_FRAMES or _lost_fiducial(frame),
+                is_open=len(shots) <= OPEN_FRAMES or (data.totals is None and _lost_fiducial(frame)),
             )
         )
     return views

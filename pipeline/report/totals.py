@@ -35,8 +35,9 @@ def totals_view(data: ReportData) -> TotalsView:
     """Of data that has totals."""
     assert data.totals is not None
     counts = data.totals.verdicts
-    verdicts = tuple(dict.fromkeys(verdict for each in counts.values() for verdict in sorted(each)))
-    rows = tuple((*kind, tuple(each.get(verdict, 0) for verdict in verdicts)) for kind, each in counts.items())
+    named = dict.fromkeys(verdict for each in counts.values() for verdict in each)
+    verdicts = tuple(verdict for verdict in named if any(each[verdict] for each in counts.values()))
+    rows = tuple((*kind, tuple(each[verdict] for verdict in verdicts)) for kind, each in counts.items())
     residuals = data.adjustment["residuals"] if data.adjustment else ()
     v_um = {axis: np.array([row[f"v{axis}_um"] for row in residuals], dtype=float) for axis in "xy"}
     return TotalsView(
@@ -46,7 +47,7 @@ def totals_view(data: ReportData) -> TotalsView:
         verdicts=verdicts,
         rows=rows[:ROWS],
         left_out=max(len(rows) - ROWS, 0),
-        all=tuple(sum(each.get(verdict, 0) for each in counts.values()) for verdict in verdicts),
+        all=tuple(sum(each[verdict] for each in counts.values()) for verdict in verdicts),
         histograms=(*_histograms("residual", v_um), *_histograms("σ", data.totals.sigmas_um)),
     )
 

@@ -237,7 +237,7 @@ NEEDS_A_LOOK: dict[str, Look] = {
 def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     """What is worth knowing and needs no action."""
     yield from data.notes
-    if not data.comparator and not data.measurement:
+    if not data.comparator and not data.measurement and not data.totals:
         yield "No measurement was handed to this report."
     if not data.adjustment:
         if _observed(data, shots):

@@ -55,6 +55,7 @@ def test_film_transformations_without_an_object(tmp_path: Path, capsys: pytest.C
     assert not any(
         word in report for word in ("OpenCV</h2>", "Calibration report", "Distortion</h2>", "Parameters</h2>")
     )
+    assert run(["report", str(project)]) == 0  # and it may be written over
     result = result_of(project)
     assert result["converged"]
     assert (result["unknowns"], result["redundancy"]) == (18, 8)

@@ -3,10 +3,12 @@
 import re
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from kept_scans import keep_scans
 
 from measure.covariance import Cause, Covariance
 from measure.reason import Code, Reason
@@ -16,7 +18,7 @@ from pipeline.cli import run
 from pipeline.many_frames import MOST_FRAMES, reduced
 from pipeline.report import ReportData, judge, render_report
 from pipeline.report.page import render_frame_page
-from pipeline.results.comparator_file import ComparatorPoint
+from pipeline.results.comparator_file import ComparatorPoint, write_comparator
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
 FRAMES, MARKS = 3000, 8
@@ -41,7 +43,7 @@ def scan(number: int) -> MeasuredScan:
         marks.append(MarkMeasurement(f"m{i}", "fiducial", place, None if is_lost else KNOWN, status, why))
     if number in FAILED:
         failure = Failure(FailureCode.UNREADABLE, f"scan {number} is damaged")
-        frame = FrameMeasurement(image(number), tuple(marks), problems=(failure.sentence,))
+        frame = FrameMeasurement(image(number), tuple(marks), problems=(Reason(failure.sentence, Code.FAILED_SCAN),))
         return MeasuredScan.failed(f"{image(number)}.tif", frame, failure)
     frame = FrameMeasurement(image(number), tuple(marks), Pose("0", True, ("set.",)), np.eye(2, 3))
     ending = "jpg" if number % 2 else "tif"
@@ -53,7 +55,7 @@ def rows(scans: list[MeasuredScan]) -> Iterator[ComparatorPoint]:
         for mark in each.frame.marks:
             is_known = mark.center_px is not None
             xy, sigma = (np.zeros(2), 1e-3 * np.array(SIGMA_UM)) if is_known else (None, None)
-            yield ComparatorPoint(each.frame.image, mark.point, "fiducial", xy, sigma, 0.0, mark.status, "")
+            yield ComparatorPoint(each.frame.image, mark.point, "fiducial", xy, sigma, 0.0, mark.status, mark.reason)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +105,7 @@ def test_what_users_named_is_escaped(page: str) -> None:
     assert "<b>0/" not in page
 
 
-def test_nothing_is_read_twice_or_kept(many: ReportData) -> None:
+def test_only_what_is_shown_is_kept(many: ReportData) -> None:
     assert len(many.measurement or {}) == MOST_FRAMES
     assert len(many.comparator) == MOST_FRAMES * MARKS
 
@@ -167,3 +169,25 @@ def test_few_frames_are_shown_one_by_one(tmp_path: Path) -> None:
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert 'id="totals"' not in report
     assert report.count("<details id=") == 3
+
+
+def test_scans_come_from_the_store_one_after_the_other(tmp_path: Path) -> None:
+    project, scans = given(tmp_path, 1), []
+    project.write_text('camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = 20.0\n', encoding="utf-8")
+    (tmp_path / "scans").mkdir()
+    for number in range(MOST_FRAMES + 11):
+        file = tmp_path / "scans" / f"{number:04d}.tif"
+        file.write_bytes(f"scan {number}".encode())
+        one = scan(number)
+        scans.append(replace(one, scan=str(file), frame=replace(one.frame, image=file.stem)))
+    digest = keep_scans(tmp_path / "out" / "measurement.db", scans)
+    pitches = {each.frame.image: each.pitch_um for each in scans}
+    write_comparator(tmp_path / "comparator.csv", [each.frame for each in scans], pitches, digest)
+    assert run(["report", str(project), "--frames", "0001", "0010"]) == 0
+    assert "12000 × 12000 px" in (tmp_path / "out" / "frames" / "0010.html").read_text(encoding="utf-8")
+    assert run(["report", str(project)]) == 1
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    bad, lost = (sum(number < len(scans) for number in each) for each in (BAD, FAILED))
+    assert f"Of {len(scans)} frames {bad + lost} need a look. They are shown below." in report
+    assert report.count("<details id=") == bad + lost
+    assert "scan 5 is damaged" in report
