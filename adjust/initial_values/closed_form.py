@@ -81,6 +81,8 @@ def principal_distance_together(fields: Sequence[KnownField]) -> tuple[float, fl
         rotations, shifts, c, sigma = refined_distance(*poses, *fields_mm, start, sigma_mm)
     except np.linalg.LinAlgError:  # points behind the camera, for gross errors
         return None
+    if not np.isfinite(sigma):
+        return None
     found = batch.oriented(rotations, shifts, np.full(len(some), c))
     return (c, sigma) if found.agree(batch.sigma_mm / c, _typical(found.sigma)).all() else None
 

@@ -47,7 +47,8 @@ def refined_poses(
 def refined_distance(
     rotations: Array, shifts: Array, points: Array, xy_mm: Array, weights: Array, distance_mm: float, sigma_mm: float
 ) -> tuple[Array, Array, float, float]:
-    """Poses together with the principal distance in mm of all images, and the standard deviation of its logarithm.
+    """Poses together with the principal distance in mm of all images, and the standard deviation of its logarithm,
+    infinite where the points do not determine it.
 
     points (k, n, 3), image coordinates xy_mm (k, n, 2) of standard deviation sigma_mm at least. Gauss-Newton steps from
     nearby, with the poses eliminated. A radial distortion of the third degree, about 0, is estimated besides and
@@ -72,7 +73,8 @@ def refined_distance(
     tangents = (xy_mm - bend * by_bend_mm) / c
     squares = float((weights * squared_residuals(rotations, shifts, points, tangents)).sum())
     variance = max(squares / max(2.0 * float(weights.sum()) - 6 * len(points) - 2, 1.0), noise**2)
-    return rotations, shifts, c, float(np.sqrt(variance * np.linalg.inv(reduced)[0, 0]))
+    cofactor = float(np.linalg.inv(reduced)[0, 0])
+    return rotations, shifts, c, float(np.sqrt(variance * cofactor)) if cofactor > 0 else np.inf
 
 
 def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: Array) -> Array:

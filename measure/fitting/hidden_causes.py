@@ -10,6 +10,8 @@ tones then are lighter or darker between the same ends, and where all edges face
 next to nothing else.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,6 +44,20 @@ def covariance_of_landscape(light: Array, beside: Mask, moved: Array) -> Array:
     covariance = products(moved, correlated(moved, landscape))
     sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)  # far lags are chance, and may leave less than nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Landscape:
+    """Where a mark shows one. light, beside: as `covariance_of_landscape` takes them; share (height, width): of it in
+    the light of the mark's window."""
+
+    light: Array
+    beside: Mask
+    share: Array
+
+    def covariance(self, by_grey: Array) -> Array:
+        """(n, n) of figures whose derivatives by the grey values are by_grey (n, height, width)."""
+        return covariance_of_landscape(self.light, self.beside, by_grey * self.share)
 
 
 def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_change: float) -> Array:

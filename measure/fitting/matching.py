@@ -19,7 +19,7 @@ from measure.fitting.border_search import is_overwhelming, likely_border
 from measure.fitting.bordered_model import BorderedModel
 from measure.fitting.clipping import Sides, clear_of_ends
 from measure.fitting.generators import is_round
-from measure.fitting.hidden_causes import covariance_of_changed_tone, covariance_of_landscape
+from measure.fitting.hidden_causes import Landscape, covariance_of_changed_tone
 from measure.fitting.linear_fit import LinearFit
 from measure.fitting.own_shape import OwnShape, own_shape
 from measure.fitting.picture_fit import EDGE_BLURS, PictureFit
@@ -360,7 +360,7 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))
         place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))
-    place = place.plus(Cause.LANDSCAPE, _by_landscape(by_grey[:2], model, about))
+    place = place.plus(Cause.LANDSCAPE, _landscape(model, about).covariance(by_grey[:2]))
     linear = LinearFit(model.residuals, used, model.design, by_grey, noise, model.steadiness)
     freedom = model.options.freedom
     tells_shape = freedom == "similarity" and not is_round(model.mark)
@@ -375,9 +375,8 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     )
 
 
-def _by_landscape(by_grey: Array, model: PictureModel, about: _Surroundings) -> Array:
-    """(n, n) of figures whose derivatives by the grey values are by_grey (n, height, width)."""
-    return covariance_of_landscape(about.grey, about.frame, by_grey * model.design[-GREY])
+def _landscape(model: PictureModel, about: _Surroundings) -> Landscape:
+    return Landscape(about.grey, about.frame, model.design[-GREY])
 
 
 def _tone(fit: PictureFit, linear: LinearFit, about: _Surroundings) -> ToldTone | None:
@@ -390,11 +389,8 @@ def _tone(fit: PictureFit, linear: LinearFit, about: _Surroundings) -> ToldTone 
         return untold_tone(linear, model.light, model.detail, coding.tone, coding.full_scale_dn)
     drawn, linear = model.drawn, replace(linear, noise=linear.noise.at_least(fit.floor_dn**2))
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
-
-    def by_landscape(by_grey: Array) -> Array:
-        return _by_landscape(by_grey, model, about)
-
-    return told_tone(linear, drawn, model.grey, clear, coding.tone, coding.full_scale_dn, by_landscape)
+    landscape = _landscape(model, about)
+    return told_tone(linear, drawn, model.grey, clear, coding.tone, coding.full_scale_dn, landscape)
 
 
 def _blur_sigma(model: PictureModel, covariance: Array) -> float:

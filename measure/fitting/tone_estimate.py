@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.fitting.hidden_causes import Landscape
 from measure.fitting.linear_fit import LinearFit
 from measure.fitting.picture_model import GREY
 from measure.noise.pixel_sums import combined, products
@@ -29,12 +30,11 @@ def told_tone(
     clear: Mask,
     tone: Tone,
     full_scale_dn: float,
-    by_landscape: Callable[[Array], Array],
+    landscape: Landscape,
 ) -> ToldTone:
     """Beside the unknowns of a linearised fit. drawn, grey (height, width): the light that it draws, and that it was
     fitted to; clear, alike: where that is not near an end of the scanner's range, which changes what noise does.
-    by_landscape: what a landscape in the mark adds to the covariance (n, n) of figures whose derivatives by the grey
-    values are (n, height, width).
+    landscape: in the mark.
 
     With the departures d the residuals are r + H d - D x. The score H'r of what D leaves of H grows with d by N and has
     the covariance S that the noise gives it: N' S^-1 N is the information, also where the noise is not white. H is
@@ -47,7 +47,7 @@ def told_tone(
     left = _beside(fit, changes * clear)
     normal = products(left, changes)
     score = -products(left, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
-    covariance = fit.covariance(left) + by_landscape(left)
+    covariance = fit.covariance(left) + landscape.covariance(left)
     covariance += _LEAST_VARIANCE * max(float(np.trace(covariance)), 1e-30) * np.eye(len(covariance))
     said = SaidOfTone.by_score(normal, score + normal @ tone.mean, covariance)
     return _told(fit, said, tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
