@@ -13,5 +13,9 @@ class MissingError(MeasurementError):
     """There is no such file."""
 
 
+class UnreachableError(MeasurementError):
+    """A store or a server did not give it: what is there is not known, and may be whole."""
+
+
 class TooLargeError(MeasurementError):
     """The file claims more pixels than are read, unless the user allows them."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
 from measure.results import MarkMeasurement
+from measure.scans.addresses import scan_path
 from measure.scans.scan import Scan, open_scan
 from pipeline.report.data import Thumbnail
 from pipeline.results.measured_scan import MeasuredScan
@@ -43,7 +44,7 @@ class Thumbnails:
         if mark is None or mark.center_px is None:
             return None
         try:
-            return _cut(self._scan(Path(self._scans[image].scan)), mark.center_px, _half_px(mark))
+            return _cut(self._scan(scan_path(self._scans[image].scan)), mark.center_px, _half_px(mark))
         except MeasurementError:
             return None
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tifffile import TiffFile, TiffPage
 
+from measure.scans.addresses import tiff_file
 from measure.scans.broken import DECODING_ERRORS
 from measure.scans.quantisation import jpeg_headers
 from measure.scans.tone import Tone, power, sampled, srgb
@@ -30,7 +31,7 @@ def declared_tone(path: Path) -> Tone | None:
         with path.open("rb") as opened:
             start = opened.read(16)
         if start[:2] in (b"II", b"MM"):
-            with TiffFile(path) as file:
+            with tiff_file(path) as file:
                 return _of_page(file.pages.first.aspage())
         if start.startswith(_PNG_START):
             return _of_png(path)

@@ -1,7 +1,7 @@
 """JPEG and PNG files: decoded whole, for neither can be read by parts."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from measure.scans.jpeg_stream import decoded, picture_size
 from measure.scans.quantisation import jpeg_headers, rounding_step_dn
 from measure.scans.radiometry import Radiometry, Samples
 from measure.scans.resolution import JFIF_UNIT, NO_TAGS, PNG_UNIT, Pitch, pitch_from_density
-from measure.scans.segments import LostPart, Segments
+from measure.scans.segments import LostPart, Place, Segments
 from measure.scans.size_limit import check_size
 from measure.scans.tiff_scan import orientation_notes, tag_pitch
 
@@ -64,7 +64,10 @@ class WholePicture:
             self.lost = (LostPart(0, 0, self.width_px, self.height_px, damage),)
             self._samples = np.full_like(samples, self.full_scale_dn // 2)
 
-    def read(self, row: int, column: int) -> Samples:
+    def fetched(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+        return {}
+
+    def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """All of it."""
         return self._samples
 

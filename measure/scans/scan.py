@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError, MissingError
+from measure.scans.addresses import Address, scan_path
 from measure.scans.earlier_compression import earlier_step_dn
 from measure.scans.parallel import side_by_side
 from measure.scans.picture_scan import open_picture
@@ -303,18 +304,23 @@ def _steps_of(factor: int) -> tuple[int, ...]:
     return (factor,) if factor > 1 else ()
 
 
-def open_scan(path: Path, max_pixels: int | None = None) -> Scan:
-    """Open a TIFF, BigTIFF, JPEG or PNG file, told apart by its first bytes and not by its name.
+def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
+    """Open a TIFF, BigTIFF, JPEG or PNG file, told apart by its first bytes and not by its name; path: of a file, or
+    an address as `Address` has it.
 
     max_pixels: how many a scan may have; None: as many as `size_limit` says.
-    Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture.
+    Raises MeasurementError, with what to do, for a file that is missing, empty, truncated or no such picture,
+    UnreachableError for an address that does not answer.
     """
-    path = Path(path)
+    path = scan_path(path)
     start = first_bytes(path)
     if start[:4] in TIFF_STARTS:
         segments, pitch, notes = open_tiff(path, max_pixels)
     else:
         segments, pitch, notes = open_picture(path, start, max_pixels)
+    is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
+    if isinstance(path, Address) and is_one:
+        notes = *notes, "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
     return Scan(path, segments, pitch, notes)
 
 

@@ -1,6 +1,7 @@
 """The segments of a scan decoded last, for all threads that read it."""
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from threading import Lock
@@ -53,12 +54,15 @@ class SegmentCache:
             samples[row : row + part.shape[0], col : col + part.shape[1]] = part
 
         others: list[tuple[tuple[int, int], _Segment]] = []
-        for key in product(rows, cols):
-            segment = self._segment(key)
+        wanted = {key: self._segment(key) for key in product(rows, cols)}
+        stored = self._segments.fetched(
+            [key for key, segment in wanted.items() if segment.samples is None and not segment.lock.locked()]
+        )
+        for key, segment in wanted.items():
             if segment.samples is None and segment.lock.locked():
                 others.append((key, segment))
             else:
-                take(*key, self._decoded(key, segment))
+                take(*key, self._decoded(key, segment, stored.get(key, ())))
         for key, segment in others:
             take(*key, self._decoded(key, segment))
 
@@ -69,12 +73,12 @@ class SegmentCache:
             self._kept.move_to_end(key)
         return segment
 
-    def _decoded(self, key: tuple[int, int], segment: _Segment) -> Samples:
+    def _decoded(self, key: tuple[int, int], segment: _Segment, stored: Sequence[bytes] = ()) -> Samples:
         """Decoded here unless another thread has begun to."""
         with segment.lock:
             samples = segment.samples
             if samples is None:
-                samples = segment.samples = self._segments.read(*key)
+                samples = segment.samples = self._segments.read(*key, stored)
                 self._make_room(samples.nbytes)
         return samples
 

@@ -1,10 +1,12 @@
 """What a scan file is to those who read windows: a grid of segments."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from measure.scans.radiometry import Samples
+
+Place = tuple[int, int]  # row and column in a grid of segments
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,12 @@ class Segments(Protocol):
     @property
     def lost(self) -> Sequence[LostPart]: ...
 
-    def read(self, row: int, column: int) -> Samples:
-        """Segment (row, column) of the grid: (height, width, channels), values that grow with light."""
+    def fetched(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+        """What the file has stored of segments (row, column), where asking for all together is quicker than for one
+        after the other; else nothing."""
+
+    def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
+        """Segment (row, column) of the grid: (height, width, channels), values that grow with light. stored: as
+        `fetched` gives it."""
 
     def close(self) -> None: ...

@@ -8,6 +8,7 @@ import numpy as np
 from tifffile import TiffFile, TiffPage
 
 from measure.errors import MeasurementError
+from measure.scans.addresses import tiff_file
 from measure.scans.broken import DECODING_ERRORS, broken, unsupported
 from measure.scans.quantisation import rounding_step_dn
 from measure.scans.radiometry import Radiometry
@@ -35,7 +36,7 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> tuple[Segments, Pitc
     """
     try:
         taken = check_directories(path)
-        file = TiffFile(path)
+        file = tiff_file(path)
     except (BadDirectory, *DECODING_ERRORS) as error:
         raise broken(path, str(error)) from error
     try:

@@ -1,6 +1,6 @@
 """The tiles and strips of a TIFF page, each decoded on its own: what is damaged in one costs none of the others."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from mmap import ACCESS_READ, ALLOCATIONGRANULARITY, mmap
 from pathlib import Path
 from threading import Lock
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from tifffile import TIFF, TiffFile, TiffPage
 from tifffile.tifffile import jpeg_decode_colorspace
 
+from measure.scans.addresses import Address
 from measure.scans.broken import DECODING_ERRORS, broken, unsupported
 from measure.scans.jpeg_stream import decoded
 from measure.scans.radiometry import Radiometry, Samples
-from measure.scans.segments import LostPart
+from measure.scans.segments import LostPart, Place
 
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)
 _PLAIN = 1
@@ -30,6 +31,7 @@ class TiffSegments:
     ) -> None:
         self._file, self._page, self._path, self._radiometry = file, page, path, radiometry
         self._reading = Lock()
+        self._address = path if isinstance(path, Address) else None
         self.rounding_step_dn = rounding_step_dn
         self.channels, self.full_scale_dn = radiometry.channels, radiometry.full_scale_dn
         self.sample_bytes = radiometry.sample_bytes
@@ -67,14 +69,29 @@ class TiffSegments:
         """The tiles and strips that could not be decoded."""
         return tuple(self._lost.values())
 
-    def read(self, row: int, column: int) -> Samples:
+    def fetched(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
+        """Of an address, by one request for all; a local file is read as each segment is decoded."""
+        if self._address is None or not places:
+            return {}
+        indices = [self._indices(*place) for place in places]
+        counts, offsets = self._page.databytecounts, self._page.dataoffsets
+        extents = [(offsets[index], offsets[index] + counts[index]) for own in indices for index in own]
+        parts = iter(self._address.ranges(extents))
+        return {place: [next(parts) for _ in own] for place, own in zip(places, indices, strict=True)}
+
+    def _indices(self, row: int, column: int) -> list[int]:
+        """Of a segment's tiles or strips, one for each plane."""
+        rows, columns = self._grid
+        return [row * columns + column + plane * rows * columns for plane in range(self._planes)]
+
+    def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         """Segment (row, column): the planes of a file that keeps them apart are put together."""
         height = min(self.segment_height_px, self.height_px - row * self.segment_height_px)
         width = min(self.segment_width_px, self.width_px - column * self.segment_width_px)
-        index = row * self._grid[1] + column
-        plane_step = self._grid[0] * self._grid[1]
+        indices = self._indices(row, column)
+        given: Sequence[bytes | None] = stored or [None] * len(indices)
         try:
-            planes = [self._decoded(index + plane * plane_step, height, width) for plane in range(self._planes)]
+            planes = [self._decoded(*own, height, width) for own in zip(indices, given, strict=True)]
             samples = planes[0] if len(planes) == 1 else np.concatenate(planes, axis=-1)
             if samples.shape[0] < height or samples.shape[1] < width:
                 raise ValueError("it is cut short")
@@ -83,18 +100,19 @@ class TiffSegments:
         except DECODING_ERRORS as error:
             place = column * self.segment_width_px, row * self.segment_height_px
             part = "tile" if self._page.is_tiled else "strip"
-            self._lost[row, column] = LostPart(*place, width, height, f"{part} {index}: {error}")
+            self._lost[row, column] = LostPart(*place, width, height, f"{part} {indices[0]}: {error}")
             dtype = np.uint8 if self.sample_bytes == 1 else np.uint16
             return np.full((height, width, self.channels), self.full_scale_dn // 2, dtype)
         return self._radiometry.apply(samples[:height, :width])
 
-    def _decoded(self, index: int, height_px: int, width_px: int) -> NDArray[np.generic]:
+    def _decoded(self, index: int, given: bytes | None, height_px: int, width_px: int) -> NDArray[np.generic]:
         """(height, width, samples) of the stored numbers, height_px by width_px or more of them; a tile that was left
-        out of the file is all zeros. Raises one of DECODING_ERRORS."""
+        out of the file is all zeros. given: what is stored of it, None where it is still to be read. Raises one of
+        DECODING_ERRORS."""
         page = self._page
         if not page.databytecounts[index]:
             return np.zeros((height_px, self.segment_width_px, self._samples), page.dtype)
-        data = self._stored(index)
+        data = self._stored(index) if given is None else given
         if page.compression in JPEG_COMPRESSIONS:
             return self._of_jpeg(bytes(data), height_px, width_px)
         if page.compression == _PLAIN or page.compression in _INTO_MEMORY:
@@ -166,6 +184,8 @@ class TiffSegments:
         """A tile or strip as the file has it: mapped where it is so large that a copy would take long, for a mapping
         takes longer than the copy of a small one."""
         offset, size = self._page.dataoffsets[index], self._page.databytecounts[index]
+        if self._address is not None:
+            return self._address.ranges([(offset, offset + size)])[0]
         if size > _MAPPED_BYTES:
             before = offset % ALLOCATIONGRANULARITY
             length = before + size
@@ -189,7 +209,7 @@ class RawRows(TiffSegments):
         super().__init__(file, page, path, radiometry, rounding_step_dn)
         self.segment_height_px, self.segment_width_px = 1, self.width_px
 
-    def read(self, row: int, column: int) -> Samples:
+    def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
         samples = np.empty((1, self.width_px, self.channels), np.uint8 if self.sample_bytes == 1 else np.uint16)
         self.fill(samples, row, 0)
         return samples
@@ -203,12 +223,16 @@ class RawRows(TiffSegments):
     def _fill(self, samples: Samples, row0: int, col0: int) -> None:
         height, width, _ = samples.shape
         start = int(self._page.dataoffsets[0]) + row0 * self._row_bytes
+        shape = (height, self.width_px, self._page.samplesperpixel)
+        if self._address is not None:
+            (data,) = self._address.ranges([(start, start + height * self._row_bytes)])
+            samples[:] = self._radiometry.apply(np.ndarray(shape, self._stored_dtype, data)[:, col0 : col0 + width])
+            return
         before = start % ALLOCATIONGRANULARITY
         size = before + height * self._row_bytes
         try:
             # Of the rows only the pages with these columns are read, and none of them is held afterwards.
             with mmap(self._file.filehandle.fileno(), size, access=ACCESS_READ, offset=start - before) as mapped:
-                shape = (height, self.width_px, self._page.samplesperpixel)
                 rows = np.ndarray(shape, self._stored_dtype, mapped, before)
                 samples[:] = self._radiometry.apply(rows[:, col0 : col0 + width])
                 del rows

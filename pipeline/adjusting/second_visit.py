@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from measure.checks.lost_pixels import without_lost
 from measure.errors import MeasurementError
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
+from measure.scans.addresses import scan_path
 from measure.scans.scan import open_scan
 from measure.status import Status
 from pipeline.files.project_file import Project
@@ -78,7 +78,7 @@ def _visit(
     ]
     if not missed:
         return scan
-    with open_scan(Path(scan.scan), max_pixels) as opened:
+    with open_scan(scan_path(scan.scan), max_pixels) as opened:
         grey = opened if settings.code is None else opened.green()
         marks = without_lost(opened, measure_single_targets(grey, missed, settings))
     found = {mark.point: mark for mark in marks if mark.status.is_observation}

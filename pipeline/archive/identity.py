@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tifffile import TiffFile
 
-from measure.errors import MeasurementError
+from measure.errors import MeasurementError, MissingError, UnreachableError
+from measure.scans.addresses import Address, tiff_file
 from measure.scans.broken import DECODING_ERRORS
 from measure.scans.scan import Scan, open_scan
 from pipeline.results.fingerprints import of_scan
@@ -42,16 +42,21 @@ class Identity:
 
 
 def file_state(path: Path, folder: Path) -> FileState:
-    """The state of a local file. folder: that of the project, which may be moved as a whole."""
+    """The state of a file or an object; one that does not answer is as one that is not there. folder: that of the
+    project, which may be moved as a whole."""
     try:
         stat = path.stat()
-    except OSError:
+        if isinstance(path, Address):
+            return FileState(str(path), stat.st_size, etag=path.etag)
+    except (OSError, MissingError, UnreachableError):
         return FileState(uri_of(path, folder), -1)
     return FileState(uri_of(path, folder), stat.st_size, stat.st_mtime_ns)
 
 
 def uri_of(path: Path, folder: Path) -> str:
-    """Relative to the folder, where that is possible, with `/`."""
+    """Relative to the folder, where that is possible, with `/`; an address as it is."""
+    if isinstance(path, Address):
+        return str(path)
     try:
         return Path(os.path.relpath(os.path.abspath(path), os.path.abspath(folder))).as_posix()
     except ValueError:  # on another drive
@@ -63,13 +68,16 @@ def parts_hash(path: Path, max_pixels: int | None = None) -> str:
     the middle, and of pieces spread over the file. Head and tables alone would not do: uncompressed scans of one
     scanner share them.
 
-    A file that cannot be opened as a scan has a hash of its first bytes; "" where not even these can be read.
+    A file that cannot be opened as a scan has a hash of its first bytes; "" where not even these can be read. Of an
+    object, what its store calls its content stands for all this: nothing of it is read.
     """
-    digest = hashlib.sha256(of_scan(path).encode())
     try:
+        if isinstance(path, Address) and path.etag:
+            return hashlib.sha256(f"{path.etag} {path.stat().st_size}".encode()).hexdigest()
+        digest = hashlib.sha256(of_scan(path).encode())
         with path.open("rb") as file:
             digest.update(file.read(_HEAD_BYTES))
-    except OSError:
+    except (OSError, MissingError, UnreachableError):
         return ""
     try:
         with open_scan(path, max_pixels) as scan:
@@ -88,7 +96,7 @@ def content_hash(path: Path) -> str:
         with path.open("rb") as file:
             while piece := file.read(_PIECE_BYTES):
                 digest.update(piece)
-    except OSError:
+    except (OSError, MissingError, UnreachableError):
         return ""
     return digest.hexdigest()
 
@@ -97,7 +105,7 @@ def _tables(path: Path) -> bytes:
     """Where the tiles or strips of all its pictures stand in a TIFF file; empty for other files, which have none."""
     if not _is_tiff(path):
         return b""
-    with TiffFile(path) as file:
+    with tiff_file(path) as file:
         pages = [page.aspage() for page in file.pages]
         tables = [np.array([*page.dataoffsets, *page.databytecounts], dtype="<u8") for page in pages]
     return b"".join(table.tobytes() for table in tables)

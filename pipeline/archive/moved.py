@@ -2,8 +2,8 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from pathlib import Path
 
+from measure.scans.addresses import scan_path
 from pipeline.archive.identity import Identity, content_hash, parts_hash
 from pipeline.archive.store import Store
 from pipeline.archive.work import Work
@@ -31,10 +31,10 @@ def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Re
             state = work.state(task)
             if not by_size.get(state.bytes):
                 continue
-            content = content_hash(Path(task.scan))
+            content = content_hash(scan_path(task.scan))
             uri = by_size[state.bytes].get(content, "")
             if content and uri and uri not in taken:
-                store.move(uri, Identity(state, parts_hash(Path(task.scan), task.max_pixels)))
+                store.move(uri, Identity(state, parts_hash(scan_path(task.scan), task.max_pixels)))
                 taken.add(state.uri)
                 del by_size[state.bytes][content]
                 found += 1
@@ -48,7 +48,9 @@ def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Re
 def hash_contents(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> None:
     """Hash the whole files of all scans whose content is not known, so that they are known when they are moved."""
     hashed = store.content_hashes()
-    left = {work.state(task).uri: Path(task.scan) for task in tasks if task.scan and work.state(task).uri not in hashed}
+    left = {
+        work.state(task).uri: scan_path(task.scan) for task in tasks if task.scan and work.state(task).uri not in hashed
+    }
     with reporter.stage("content hashed of") as count:
         for done, (uri, path) in enumerate(left.items(), 1):
             count(path.name, done, len(left))

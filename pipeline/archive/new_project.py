@@ -138,7 +138,9 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
             raise InputError(f"{path} is there already, and init writes over nothing. Give another folder by --out.")
     for path in given:
         if re.match(r"\w+:/", path.as_posix()) and not path.exists():
-            raise InputError(f"{path} is an address, and scans are read from folders only. Mount or copy them.")
+            raise InputError(
+                f"{path} is an address, and init looks into folders only. Name its scans in a project.toml of your own."
+            )
         if not path.exists():
             raise InputError(f"there is no {path} (looked for {path.absolute()}). Give folders with scans, or scans.")
     with reporter.stage("looked at") as count:

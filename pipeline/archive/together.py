@@ -6,10 +6,10 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from pathlib import Path
 
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement
+from measure.scans.addresses import scan_path
 from measure.status import Status
 from pipeline.archive.identity import content_hash
 from pipeline.archive.judging import JudgedScan
@@ -65,7 +65,7 @@ def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str
     for group in groups.values():
         originals.clear()
         for task in sorted(group, key=lambda task: task.name) if len(group) > 1 else ():
-            content = hashes.get(work.state(task).uri) or content_hash(Path(task.scan))
+            content = hashes.get(work.state(task).uri) or content_hash(scan_path(task.scan))
             hashes[work.state(task).uri] = content
             if content and originals.setdefault(content, task.name) != task.name:
                 copies[task.name] = originals[content]

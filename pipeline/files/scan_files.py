@@ -1,10 +1,13 @@
-"""The scans that a project names: files, and patterns of files at any depth; what their images are called."""
+"""The scans that a project names: files and addresses, and patterns of them at any depth; what their images are
+called."""
 
 import glob
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from measure.errors import MeasurementError
+from measure.scans.addresses import found_addresses, is_address
 from pipeline.text.image_names import names_below
 from pipeline.text.tables import Table
 
@@ -23,7 +26,12 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
     folder = table.file.parent
     found = dict[Path, None]()
     for pattern in patterns:
-        own = _found(pattern, folder)
+        try:
+            own = _found(pattern, folder)
+        except MeasurementError as error:
+            raise table.error("scans", str(error)) from error
+        if not own and is_address(pattern):
+            raise table.error("scans", f"{pattern!r} finds no object. Check the bucket, the folder and the ending.")
         if not own:
             raise table.error("scans", _nothing_found(pattern, folder / pattern))
         found |= dict.fromkeys(own)
@@ -48,6 +56,8 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
 def _found(pattern: str, folder: Path) -> list[Path]:
     """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
     that lead nowhere: a scan that is named is opened or refused. `**` is any number of folders."""
+    if is_address(pattern):
+        return found_addresses(pattern)
     if (folder / pattern).is_file():
         return [folder / pattern]
     names = glob.glob(pattern, root_dir=folder, recursive=True)

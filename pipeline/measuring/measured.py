@@ -11,7 +11,7 @@ import numpy as np
 
 from measure.checks.lost_pixels import with_damage
 from measure.checks.pitch_check import pitch_problem
-from measure.errors import MeasurementError, MissingError, TooLargeError
+from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
 from measure.fiducials import measure_fiducials
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
@@ -81,6 +81,8 @@ def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
             return FailureCode.TOO_LARGE, told
         case MissingError():
             return FailureCode.MISSING, told
+        case UnreachableError():
+            return FailureCode.UNREACHABLE, told
         case MeasurementError():
             return FailureCode.UNREADABLE, told
         case InputError():

@@ -4,7 +4,6 @@ import re
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.ties import measure_ties
 from measure.reason import Code, Reason
+from measure.scans.addresses import scan_path
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.tie_table import TieSettings
@@ -76,5 +76,5 @@ def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
         middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
         pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
         frame_mm = None
-    path, marks = Path(scan.scan), np.array(taken).reshape(-1, 3)
+    path, marks = scan_path(scan.scan), np.array(taken).reshape(-1, 3)
     return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels)

@@ -10,6 +10,7 @@ from adjust.problem.network import Distortion, Exterior, Prior
 from measure.errors import MissingError
 from measure.fiducial_options import FiducialOptions
 from measure.results import Pose
+from measure.scans.addresses import scan_path
 from measure.scans.scan import Scan, open_scan
 from measure.scans.tone import SaidOfTone
 from measure.writing.line import KnownLine
@@ -73,7 +74,7 @@ class ScanTask:
         """The scan. Raises MeasurementError where it cannot be read."""
         if not self.scan:
             raise MissingError(_NO_SCAN)
-        return open_scan(Path(self.scan), self.max_pixels)
+        return open_scan(scan_path(self.scan), self.max_pixels)
 
     def posed(self, pose: str) -> "ScanTask":
         """The same scan in a pose that is known, nothing read in it."""

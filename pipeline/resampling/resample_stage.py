@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from measure.errors import MeasurementError
+from measure.scans.addresses import scan_path
 from measure.scans.scan import open_scan
+from pipeline.archive.identity import file_state
 from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
@@ -54,8 +56,8 @@ class ResampleTask:
         if chain.lens is not None:
             numbers += [*chain.lens.interior, *chain.lens.parameters]
             words += [chain.lens.distortion.family, chain.lens.distortion.decentering, chain.lens.distortion.r0_mm]
-        file = self.scan.stat()
-        words += [file.st_size, file.st_mtime_ns, [float(number).hex() for number in numbers]]
+        file = file_state(self.scan, Path())
+        words += [file.bytes, file.mtime_ns, file.etag, [float(number).hex() for number in numbers]]
         return hashlib.sha256(json.dumps(words).encode()).hexdigest()
 
 
@@ -111,7 +113,7 @@ def resample_tasks(
             ResampleTask(
                 image=image,
                 camera=project.camera_of(image).name,
-                scan=Path(measured.scan),
+                scan=scan_path(measured.scan),
                 chain=chain,
                 pose=measured.frame.pose.name if measured.frame.pose else "0",
                 pitch_mm=pitch_mm,

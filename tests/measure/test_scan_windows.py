@@ -61,7 +61,10 @@ def test_a_window_decodes_only_its_tiles_and_a_whole_pass_each_tile_once(tmp_pat
             sample_bytes, rounding_step_dn = segments.sample_bytes, segments.rounding_step_dn
             lost = segments.lost
 
-            def read(self, row: int, column: int) -> Any:
+            def fetched(self, places: Any) -> Any:
+                return {}
+
+            def read(self, row: int, column: int, stored: Any = ()) -> Any:
                 reads.append((row, column))
                 return original(row, column)
 
@@ -141,10 +144,10 @@ def test_a_search_by_blocks_decodes_each_segment_once(
     monkeypatch.setattr("measure.single_targets.block_search.ROW_BYTES", 100)
     tifffile.imwrite(tmp_path / "s.tif", picture(), photometric="minisblack", compression="lzw", **layout)
     with open_scan(tmp_path / "s.tif") as scan:
-        reads: list[tuple[int, ...]] = []
+        reads: list[tuple[Any, ...]] = []
         original = scan._segments.read
 
-        def read(*key: int) -> Any:
+        def read(*key: Any) -> Any:
             reads.append(key)
             return original(*key)
 

@@ -201,7 +201,7 @@ def test_of_each_kind_in_each_folder_three_are_tried(box: Path, monkeypatch: pyt
 
 def test_an_address_is_told_to_be_none_of_a_folder(tmp_path: Path, capsys: SAID) -> None:
     assert run(["init", "s3://prints/1952/", "--out", str(tmp_path)]) == 2
-    assert "is an address, and scans are read from folders only" in capsys.readouterr().err
+    assert "is an address, and init looks into folders only" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

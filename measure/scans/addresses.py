@@ -1,0 +1,291 @@
+"""Scans that are no local files, but objects in a store or files of a server, read by ranges of their bytes."""
+
+import os
+import stat
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from io import BufferedIOBase
+from pathlib import Path, PosixPath
+from threading import Lock
+from typing import Any, TypeVar
+
+from tifffile import TiffFile
+
+from measure.errors import MeasurementError, MissingError, UnreachableError
+
+Made = TypeVar("Made")
+Extent = tuple[int, int]  # first byte, and the byte after the last
+
+_EXTRAS = {"s3": "s3", "http": "http", "https": "http"}  # of reseau, by the scheme of an address
+_BLOCK_BYTES = 1 << 16  # of heads, tags and tables, fetched at a time
+_MOST_BLOCKS = 256  # of an object, held
+_KEPT_OBJECTS = 8  # whose blocks are held
+_WAITS_S = (0.1, 0.5, 2.0)  # before an address is asked again
+_TIMEOUT_S = 30.0  # without a byte
+_CHECKSUMS = ("ETag", "Content-MD5", "Digest", "Last-Modified")  # of which servers give at least one, mostly
+
+
+class Address(PosixPath):
+    """`s3://bucket/key`, `https://host/path` or `http://host/path`: a path whose file stands elsewhere.
+
+    Its methods raise MissingError where nothing is there, UnreachableError where that cannot be told or read after some
+    tries, and MeasurementError where the extra of reseau that reaches it is not installed.
+    """
+
+    def __str__(self) -> str:
+        return super().__str__().replace(":/", "://", 1)
+
+    def __fspath__(self) -> str:
+        return str(self)
+
+    def __reduce__(self) -> tuple[type["Address"], tuple[str]]:
+        return Address, (str(self),)
+
+    @property
+    def etag(self) -> str:
+        """What the store calls this content of it; "" where it says nothing. Asked for anew."""
+        return _asked(self).etag
+
+    def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
+        """Its size, asked for anew; nothing else of it is known."""
+        return os.stat_result((stat.S_IFREG, 0, 0, 0, 0, 0, _asked(self).size, 0, 0, 0))
+
+    def exists(self, *, follow_symlinks: bool = True) -> bool:
+        try:
+            _asked(self)
+        except MissingError:
+            return False
+        return True
+
+    def is_file(self, *, follow_symlinks: bool = True) -> bool:
+        return self.exists()
+
+    def is_dir(self, *, follow_symlinks: bool = True) -> bool:
+        return False
+
+    def absolute(self) -> "Address":
+        return self
+
+    def resolve(self, strict: bool = False) -> "Address":
+        return self
+
+    def open(self, *args: Any, **kwargs: Any) -> Any:  # whose modes are those of files
+        """As a file opened with "rb", for reading bytes: of heads, tags and tables, for what is read is held."""
+        return _Opened(self)
+
+    def read_bytes(self) -> bytes:
+        """All of it, by one request."""
+        (data,) = self.ranges([(0, _known(self).size)])
+        return data
+
+    def ranges(self, extents: Sequence[Extent]) -> list[bytes]:
+        """The bytes of several places, asked for together."""
+        system = _file_system(self)
+        starts, ends = [first for first, _ in extents], [after for _, after in extents]
+        parts = _persistently(self, lambda: _whole(self, system.cat_ranges, starts, ends))
+        _count(len(parts), sum(map(len, parts)))
+        return parts
+
+
+@dataclass
+class Traffic:
+    """What this process has asked stores and servers for: ranges, and their bytes."""
+
+    ranges: int = 0
+    bytes: int = 0
+
+
+TRAFFIC = Traffic()
+_counting = Lock()
+
+
+def scan_path(text: str | Path) -> Path:
+    """The file or the address that a text names."""
+    if isinstance(text, Path):
+        return text
+    return Address(text) if is_address(text) else Path(text)
+
+
+def is_address(text: str) -> bool:
+    scheme, colon, _ = text.partition("://")
+    return bool(colon) and scheme.lower() in _EXTRAS
+
+
+def found_addresses(pattern: str) -> list[Path]:
+    """The one address, or the objects that a pattern finds, `**` being any number of folders. Servers list no files:
+    each address on one is named. Raises as `Address` does."""
+    address = Address(pattern)
+    system = _file_system(address)
+    if _scheme(address) != "s3" or not any(sign in pattern for sign in "*?["):
+        return [address]
+    names = _persistently(address, lambda: list(system.glob(pattern)))
+    return [Address(f"s3://{name}") for name in sorted(names)]
+
+
+def tiff_file(path: Path) -> TiffFile:
+    """A TIFF file opened, wherever it is. Raises one of DECODING_ERRORS, or as `Address` does."""
+    return TiffFile(path.open("rb") if isinstance(path, Address) else path)
+
+
+@dataclass
+class _Object:
+    """What is known of an object: its size, what the store calls its content, and blocks of it by their numbers."""
+
+    size: int
+    etag: str
+    blocks: dict[int, bytes] = field(default_factory=dict)
+
+
+_objects: OrderedDict[str, _Object] = OrderedDict()
+_holding = Lock()
+
+
+class _Opened(BufferedIOBase):
+    """An address as a file that is read by blocks."""
+
+    def __init__(self, address: Address) -> None:
+        self.name, self._address, self._object, self._place = str(address), address, _known(address), 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._place
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._place = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._object.size}[whence]
+        return self._place
+
+    def read(self, size: int | None = -1) -> bytes:
+        end = self._object.size if size is None or size < 0 else min(self._place + size, self._object.size)
+        if end <= self._place:
+            return b""
+        numbers = range(self._place // _BLOCK_BYTES, (end - 1) // _BLOCK_BYTES + 1)
+        first = numbers[0] * _BLOCK_BYTES
+        data = b"".join(self._blocks(numbers))[self._place - first : end - first]
+        self._place = end
+        return data
+
+    def _blocks(self, numbers: range) -> list[bytes]:
+        held = self._object.blocks
+        blocks = {number: held.get(number) for number in numbers}
+        missing = [number for number, block in blocks.items() if block is None]
+        if missing:
+            first, after = missing[0] * _BLOCK_BYTES, min((missing[-1] + 1) * _BLOCK_BYTES, self._object.size)
+            (data,) = self._address.ranges([(first, after)])
+            for number in range(missing[0], missing[-1] + 1):
+                blocks[number] = data[number * _BLOCK_BYTES - first :][:_BLOCK_BYTES]
+            if len(held) + len(numbers) > _MOST_BLOCKS:  # as where a whole file is hashed
+                held.clear()
+            held.update((number, blocks[number] or b"") for number in numbers)
+        return [blocks[number] or b"" for number in numbers]
+
+
+def _known(address: Address) -> _Object:
+    """As it was when its size was last asked for."""
+    with _holding:
+        known = _objects.get(str(address))
+    return _asked(address) if known is None else known
+
+
+def _asked(address: Address) -> _Object:
+    """Asked for anew; blocks of the same content are kept."""
+    system = _file_system(address)
+    info = _persistently(address, lambda: _info(system, str(address)))
+    size, etag = info.get("size"), next((str(info[key]) for key in _CHECKSUMS if info.get(key)), "")
+    if size is None:
+        raise UnreachableError(f"{address}: its server does not say how large it is. Download it, and name the file.")
+    with _holding:
+        known = _objects.get(str(address))
+        if known is None or (known.size, known.etag) != (size, etag):
+            known = _objects[str(address)] = _Object(int(size), etag)
+        _objects.move_to_end(str(address))
+        while len(_objects) > _KEPT_OBJECTS:
+            _objects.popitem(last=False)
+    return known
+
+
+def _info(system: Any, address: str) -> Mapping[str, Any]:
+    """fsspec takes whatever a server refuses for a file that is not there, and names the refusal as the cause."""
+    try:
+        info: Mapping[str, Any] = system.info(address)
+    except FileNotFoundError as error:
+        cause = error.__cause__
+        if isinstance(cause, Exception) and not isinstance(cause, FileNotFoundError) and _status(cause) != 404:
+            raise cause from None
+        raise
+    return info
+
+
+def _whole(address: Address, cat_ranges: Any, starts: list[int], ends: list[int]) -> list[bytes]:
+    parts: list[bytes] = cat_ranges([str(address)] * len(starts), starts, ends, on_error="raise")
+    for part, start, end in zip(parts, starts, ends, strict=True):
+        if len(part) > end - start:
+            raise UnreachableError(
+                f"{address}: its server gives no parts of files (no ranges of bytes). Download it, and name the file."
+            )
+        if len(part) < end - start:
+            raise ConnectionError(f"{len(part)} bytes came in place of {end - start}")
+    return parts
+
+
+def _persistently(address: Address, ask: Callable[[], Made]) -> Made:
+    """What is asked for, after some tries: also of what is forbidden, as a busy store says now and then."""
+    for wait_s in (*_WAITS_S, None):
+        try:
+            return ask()
+        except MeasurementError:
+            raise
+        except FileNotFoundError:
+            raise MissingError(f"there is no {address}: check its name, and that its store or server has it") from None
+        except Exception as error:  # each of fsspec's libraries has its own
+            if wait_s is None:
+                raise UnreachableError(f"{address}: {_told(error)}. Tried {len(_WAITS_S) + 1} times.") from error
+            time.sleep(wait_s)
+    raise AssertionError
+
+
+def _told(error: Exception) -> str:
+    if isinstance(error, PermissionError) or _status(error) in (401, 403):
+        return "its store or server forbids to read it (403): check your credentials and its permissions"
+    if isinstance(error, TimeoutError):
+        return f"its store or server did not answer within {_TIMEOUT_S:g} s"
+    return f"it cannot be reached ({type(error).__name__}: {error})"
+
+
+def _status(error: Exception) -> int | None:
+    """The answer of a server, as aiohttp has it."""
+    return getattr(error, "status", None)
+
+
+def _scheme(address: Address) -> str:
+    return str(address).partition("://")[0].lower()
+
+
+def _file_system(address: Address) -> Any:
+    """fsspec's, which keeps one for each scheme."""
+    scheme = _scheme(address)
+    try:
+        fsspec = import_module("fsspec")
+        if scheme == "s3":
+            config = {"read_timeout": _TIMEOUT_S, "connect_timeout": _TIMEOUT_S}
+            return fsspec.filesystem("s3", config_kwargs=config, default_cache_type="none")
+        timeout = import_module("aiohttp").ClientTimeout(sock_connect=_TIMEOUT_S, sock_read=_TIMEOUT_S)
+        return fsspec.filesystem(scheme, client_kwargs={"timeout": timeout}, use_listings_cache=False)
+    except ImportError:
+        extra = _EXTRAS[scheme]
+        raise MeasurementError(
+            f"{address}: addresses that begin with {scheme}:// need the extra {extra!r}: pip install 'reseau[{extra}]'"
+        ) from None
+
+
+def _count(ranges: int, size: int) -> None:
+    with _counting:
+        TRAFFIC.ranges += ranges
+        TRAFFIC.bytes += size

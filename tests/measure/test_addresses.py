@@ -1,0 +1,159 @@
+"""Scans in object stores and on servers give what local files give, by few requests and bytes; what does not answer is
+told as such, and never as damage."""
+
+import pickle
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from range_server import RangeServer, range_server
+
+from measure.errors import MeasurementError, MissingError, UnreachableError
+from measure.scans import addresses
+from measure.scans.addresses import Address, scan_path
+from measure.scans.declared_tone import declared_tone
+from measure.scans.scan import open_scan
+
+SIDE_PX, TILE_PX = 2304, 128
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "tiles": {"tile": (TILE_PX, TILE_PX), "compression": "zlib"},
+    "rows": {},
+    "strips": {"rowsperstrip": 16, "compression": "lzw"},
+    "planes": {"tile": (TILE_PX, TILE_PX), "planarconfig": "separate", "photometric": "rgb"},
+}
+PLACES = [(200 + 1850 * (number % 2), 230 + 480 * (number // 2), 40, 40) for number in range(8)]
+
+
+def noise(channels: tuple[int, ...] = ()) -> Any:
+    return np.random.default_rng(1).integers(0, 256, (*channels, SIDE_PX, SIDE_PX), np.uint8)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(addresses, "_WAITS_S", (0.01, 0.01))
+    monkeypatch.setattr(addresses, "_TIMEOUT_S", 0.3)
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[RangeServer]:
+    with range_server(tmp_path) as server:
+        yield server
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_windows_are_those_of_the_local_file(tmp_path: Path, server: RangeServer, layout: str) -> None:
+    picture = noise((3,) if layout == "planes" else ())
+    tifffile.imwrite(tmp_path / "s.tif", picture, **LAYOUTS[layout])
+    with open_scan(tmp_path / "s.tif") as local, open_scan(f"{server.url}/s.tif") as remote:
+        for place in (*PLACES, (-20, -20, 50, 50), (SIDE_PX - 30, SIDE_PX - 30, 60, 60)):
+            np.testing.assert_array_equal(remote.samples(*place), local.samples(*place))
+        assert remote.name == "s"
+        assert remote.notes == local.notes
+        assert (remote.pitch_um, remote.is_lossy, remote.damage) == (local.pitch_um, local.is_lossy, "")
+
+
+def test_eight_windows_take_few_requests_and_bytes(tmp_path: Path, server: RangeServer) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
+    with open_scan(f"{server.url}/s.tif") as scan:
+        declared_tone(scan.path)
+        opening, head_bytes = server.gets, server.sent_bytes
+        for place in PLACES:
+            scan.samples(*place)
+    assert opening <= 3
+    assert head_bytes <= 3 * (1 << 16)
+    assert server.gets - opening <= 8 * 4
+    assert server.sent_bytes - head_bytes <= 8 * 4 * 1.01 * TILE_PX**2
+
+
+def test_tiles_of_a_window_are_asked_for_together(
+    tmp_path: Path, server: RangeServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
+    asked: list[int] = []
+    ranges = Address.ranges
+
+    def counting(address: Address, extents: Any) -> Any:
+        asked.append(len(extents))
+        return ranges(address, extents)
+
+    with open_scan(f"{server.url}/s.tif") as scan:
+        monkeypatch.setattr(Address, "ranges", counting)
+        scan.samples(100, 100, 200, 200)
+    assert asked == [9]
+
+
+def test_a_picture_in_one_piece_is_fetched_whole_and_says_so(tmp_path: Path, server: RangeServer) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", noise(), compression="zlib", rowsperstrip=SIDE_PX)
+    with open_scan(f"{server.url}/s.tif") as scan:
+        scan.samples(10, 10, 20, 20)
+        assert "fetched whole" in " ".join(scan.notes)
+    with open_scan(tmp_path / "s.tif") as scan:
+        assert not scan.notes
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("failures", [[403], [503, 500], [1.0]])
+def test_what_fails_in_the_middle_is_asked_for_again(
+    tmp_path: Path, server: RangeServer, failures: list[int | float]
+) -> None:
+    picture = noise()
+    tifffile.imwrite(tmp_path / "s.tif", picture, **LAYOUTS["tiles"])
+    with open_scan(f"{server.url}/s.tif") as scan:
+        server.failures = list(failures)
+        np.testing.assert_array_equal(scan.samples(300, 400, 20, 30)[..., 0], picture[400:430, 300:320])
+        assert not scan.damage
+    assert not server.failures
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(
+    ("failure", "told"), [(403, "forbids to read it .403.*credentials"), (500, "cannot be reached"), (1.0, "0.3 s")]
+)
+def test_what_goes_on_failing_is_told_and_is_no_damage(
+    tmp_path: Path, server: RangeServer, failure: float, told: str
+) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
+    with open_scan(f"{server.url}/s.tif") as scan:
+        server.failures = [failure] * 3
+        with pytest.raises(UnreachableError, match=rf"/s\.tif: .*{told}.*Tried 3 times"):
+            scan.samples(300, 400, 20, 30)
+        assert not scan.damage
+
+
+@pytest.mark.usefixtures("quick")
+def test_missing_forbidden_and_silent_addresses(tmp_path: Path, server: RangeServer) -> None:
+    with pytest.raises(MissingError, match=r"there is no http.*nowhere\.tif"):
+        open_scan(f"{server.url}/nowhere.tif")
+    with pytest.raises(UnreachableError, match="forbids"):
+        open_scan(f"{server.url}/closed/s.tif")
+    with pytest.raises(UnreachableError, match="cannot be reached"):
+        open_scan("http://127.0.0.1:9/s.tif")
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_server_without_ranges_is_told(tmp_path: Path, server: RangeServer) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", noise(), **LAYOUTS["tiles"])
+    server.by_ranges = False
+    with pytest.raises(UnreachableError, match="no parts of files"):
+        open_scan(f"{server.url}/s.tif")
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(MeasurementError, match=r"pip install 'reseau\[s3\]'"):
+        open_scan("s3://prints/1.tif")
+    with pytest.raises(MeasurementError, match=r"pip install 'reseau\[http\]'"):
+        open_scan("https://example.org/1.tif")
+
+
+def test_an_address_stays_one_through_a_pickle() -> None:
+    address = scan_path("s3://prints/1952/0001.tif")
+    again = pickle.loads(pickle.dumps(address))
+    assert isinstance(again, Address)
+    assert str(again) == "s3://prints/1952/0001.tif"
+    assert (again.stem, again.suffix) == ("0001", ".tif")
+    assert not isinstance(scan_path("prints/0001.tif"), Address)

@@ -1,0 +1,117 @@
+"""A project of scans in an object store or on a server gives the rows of the same scans on the disk."""
+
+import sqlite3
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drawn_project import PROJECT, write_project
+from moto.server import ThreadedMotoServer
+from range_server import range_server
+
+from measure.scans import addresses
+from pipeline.archive.identity import file_state, parts_hash
+from pipeline.cli import run
+from pipeline.errors import InputError
+from pipeline.files.project_file import read_project
+
+pytestmark = pytest.mark.usefixtures("in_one_process")
+
+
+@pytest.fixture(scope="module")
+def store() -> Iterator[Any]:
+    """A client of a store that runs here, with an empty bucket `prints`."""
+    boto3, fsspec = import_module("boto3"), import_module("fsspec")
+    server = ThreadedMotoServer(port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        patch.setenv("AWS_ACCESS_KEY_ID", "test")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        fsspec.get_filesystem_class("s3").clear_instance_cache()
+        client = boto3.client("s3")
+        client.create_bucket(Bucket="prints")
+        yield client
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("local")
+    write_project(folder, ["a", "b"])
+    return folder
+
+
+def of_scans(folder: Path, scans: str) -> Path:
+    write_project(folder, [], PROJECT.replace('"*.tif"', scans))
+    return folder
+
+
+def measured(folder: Path, *options: str) -> int:
+    return run(["measure", str(folder / "project.toml"), *options])
+
+
+def rows(folder: Path) -> list[str]:
+    lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if not line.startswith("#")]
+
+
+def test_a_bucket_and_a_server_give_the_rows_of_the_disk(
+    store: Any, local: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert measured(local) == 0
+    for name in ("a", "b"):
+        store.upload_file(str(local / f"{name}.tif"), "prints", f"1952/{name}.tif")
+    bucket = of_scans(tmp_path / "bucket", '"s3://prints/1952/*.tif"')
+    assert measured(bucket) == 0
+    assert rows(bucket) == rows(local)
+    with range_server(local) as server:
+        named = of_scans(tmp_path / "named", f'"{server.url}/a.tif", "{server.url}/b.tif"')
+        assert measured(named) == 0
+    assert rows(named) == rows(local)
+    capsys.readouterr()
+    assert measured(bucket) == 0
+    assert "2 of 2 scans are measured already; 0 to measure" in capsys.readouterr().err
+
+
+def test_names_are_those_below_the_common_folder_and_contents_tell_copies(
+    store: Any, local: Path, tmp_path: Path
+) -> None:
+    for key, name in (("box/1/a.tif", "a"), ("box/2/a.tif", "b"), ("box/2/copy.tif", "b"), ("box/2/a.txt", "a")):
+        store.upload_file(str(local / f"{name}.tif"), "prints", key)
+    scans = read_project(of_scans(tmp_path, '"s3://prints/box/**/*.tif"') / "project.toml").scans
+    assert {name: str(path) for name, path in scans.items()} == {
+        "1/a": "s3://prints/box/1/a.tif",
+        "2/a": "s3://prints/box/2/a.tif",
+        "2/copy": "s3://prints/box/2/copy.tif",
+    }
+    states = {name: file_state(path, tmp_path) for name, path in scans.items()}
+    assert states["2/a"].uri == "s3://prints/box/2/a.tif"
+    assert states["2/a"].bytes == (local / "b.tif").stat().st_size
+    assert states["2/a"].etag
+    hashes = {name: parts_hash(path) for name, path in scans.items()}
+    assert hashes["2/a"] == hashes["2/copy"] != hashes["1/a"]
+
+
+def test_a_bucket_without_scans_and_one_that_is_not_there(store: Any, tmp_path: Path) -> None:
+    for pattern in ("s3://prints/nowhere/*.tif", "s3://no-such-bucket/*.tif"):
+        with pytest.raises(InputError, match=r"scans.*finds no object.*Check the bucket|there is no s3://no-such"):
+            read_project(of_scans(tmp_path, f'"{pattern}"') / "project.toml")
+
+
+def test_an_address_that_does_not_answer_costs_the_others_nothing(
+    local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(addresses, "_WAITS_S", (0.01,))
+    with range_server(local) as server:
+        folder = of_scans(tmp_path, f'"{server.url}/a.tif", "{server.url}/closed/b.tif"')
+        assert measured(folder, "--workers", "1") == 1
+    with sqlite3.connect(folder / "out" / "measurement.db") as db:
+        query = "select scan.name, detail ->> '$.failure.code' from result join scan on scan.id = result.scan"
+        codes = dict(db.execute(query))
+    assert codes == {"a": None, "closed/b": "unreachable"}
+    assert "forbids to read it (403)" in capsys.readouterr().err
