@@ -3,7 +3,6 @@
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -86,7 +85,7 @@ class Pictures:
     def _scan(self, name: str) -> Scan:
         """Called while `_reading` is held."""
         if name not in self._open:
-            self._open[name] = open_scan(Path(name), self._max_pixels)
+            self._open[name] = open_scan(name, self._max_pixels)
             while len(self._open) > _OPEN:
                 self._open.popitem(last=False)[1].close()
         self._open.move_to_end(name)
