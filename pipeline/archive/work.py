@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
+from measure.scans.addresses import scan_path
 from pipeline.archive.decided import after_checks, before_checks, by_image, decided
 from pipeline.archive.expected_time import ExpectedTime
 from pipeline.archive.identity import FileState, Identity, parts_hash
@@ -132,7 +132,7 @@ class Work:
         state = self.state(task)
         known = self._identities.get(state.uri)
         if known is None or known.state != state:
-            known = Identity(state, parts_hash(Path(task.scan), task.max_pixels))
+            known = Identity(state, parts_hash(scan_path(task.scan), task.max_pixels))
         identity = known
         now = decided(task, decisions, lambda one: fingerprint(identity, _hash_of(_options_json(one))))
         self._counting[task.name] = now.counting
