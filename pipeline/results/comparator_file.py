@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
+from sys import intern
 from typing import get_args
 
 import numpy as np
@@ -18,7 +19,7 @@ from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.text.atomic import atomic_path
-from pipeline.text.csv_table import Row, csv_line, read_csv
+from pipeline.text.csv_table import Row, csv_line, csv_rows
 from pipeline.text.image_names import image_name
 from pipeline.text.text_file import read_bytes
 
@@ -32,7 +33,7 @@ _HEAD = 4096
 _PITCH = re.compile(r'^"?# pitch of (.+): ([0-9.e+-]+) um across, ([0-9.e+-]+) um down"?$', re.MULTILINE)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)  # archives have many
 class ComparatorPoint:
     """A mark in an image. xy_mm (2,) and sigma_mm (2,), None where it has none; rho: correlation of x and y."""
 
@@ -133,7 +134,7 @@ def pitches_of(path: Path) -> dict[str, tuple[float, float]]:
 def read_comparator(path: Path) -> tuple[ComparatorPoint, ...]:
     """Read comparator.csv. Raises InputError naming the line: a duplicated mark, an unknown kind, no number."""
     points: dict[tuple[str, str, str], ComparatorPoint] = {}
-    for row in read_csv(path, COLUMNS[:5], COLUMNS[5:]):
+    for row in csv_rows(path, COLUMNS[:5], COLUMNS[5:]):
         point = _point(row)
         key = (point.image, point.point, "fiducial" if point.kind == "fiducial" else "object")
         if key in points:
@@ -165,8 +166,8 @@ def _point(row: Row) -> ComparatorPoint:
     if not math.fabs(rho) < 1.0:
         raise row.error("rho", f"is a correlation and must lie between -1 and 1, not {rho:g}.")
     return ComparatorPoint(
-        image=image_name(row.name("image")),
-        point=row.name("point"),
+        image=intern(image_name(row.name("image"))),
+        point=intern(row.name("point")),
         kind=_KINDS[kind],
         xy_mm=xy,
         sigma_mm=None if sx is None or sy is None else np.array([sx, sy]),

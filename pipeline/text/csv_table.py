@@ -88,24 +88,33 @@ def _quoted(cell: str) -> str:
 
 def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
     """The rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, a line cut short."""
+    return tuple(csv_rows(path, required, optional))
+
+
+def csv_rows(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[Row]:
+    """The same one after the other, for files of very many rows."""
     try:
         data = read_bytes(path)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file. Looked for {path.resolve()}.") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a CSV file is needed here. Name one.") from None
-    return parse_csv(data, path, required, optional)
+    yield from _rows(data, path, required, optional)
 
 
 def parse_csv(data: bytes, path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> tuple[Row, ...]:
     """The same of the file's content. path: for messages."""
-    lines = list(_content_lines(data, path))
-    if not lines:
+    return tuple(_rows(data, path, required, optional))
+
+
+def _rows(data: bytes, path: Path, required: Sequence[str], optional: Sequence[str]) -> Iterator[Row]:
+    lines = _content_lines(data, path)
+    first = next(lines, None)
+    if first is None:
         raise InputError(f"{path}: is empty; its first line must name the columns: {','.join(required)}.")
-    header = _cells(path, *lines[0])
-    _check_header(path, lines[0][0], header, required, optional)
-    rows = []
-    for number, text in lines[1:]:
+    header = _cells(path, *first)
+    _check_header(path, first[0], header, required, optional)
+    for number, text in lines:
         cells = _cells(path, number, text)
         if len(cells) > len(header) and any(cells[len(header) :]):
             raise InputError(
@@ -117,8 +126,7 @@ def parse_csv(data: bytes, path: Path, required: Sequence[str], optional: Sequen
                 f"{path}, line {number}: is cut short: it has {len(cells)} of the {len(header)} values that the header "
                 "names. Complete it; a value that is not given is left blank between its commas."
             )
-        rows.append(Row(path, number, dict(zip(header, cells, strict=False))))
-    return tuple(rows)
+        yield Row(path, number, dict(zip(header, cells, strict=False)))
 
 
 def _cells(path: Path, line: int, text: str) -> list[str]:
