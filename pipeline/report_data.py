@@ -65,10 +65,11 @@ def frames_of(data: ReportData) -> int:
     return len({row.image for row in data.comparator})
 
 
-def scans_of(data: ReportData, project: Project) -> Iterator[MeasuredScan]:
-    """The scans of data that have not been read, one after the other; none where the store is of other marks."""
+def scans_of(data: ReportData, project: Project, images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
+    """The scans of data that have not been read, or those of some images, one after the other; none where the store is
+    of other marks."""
     digest = data.made_from.get(project.measurement_path.name)
-    return iter(()) if digest is None else measured_scans(project.measurement_path, digest)
+    return iter(()) if digest is None else measured_scans(project.measurement_path, digest, images)
 
 
 def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> ReportData:
@@ -86,7 +87,7 @@ def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     for image in images:
         if image not in known:
             raise InputError(f"{project.comparator}: has no image {image!r}.{did_you_mean(image, known)}")
-    scans = {scan.frame.image: scan for scan in scans_of(data, project) if scan.frame.image in images}
+    scans = {scan.frame.image: scan for scan in scans_of(data, project, images)}
     return replace(data, comparator=[row for row in data.comparator if row.image in images], measurement=scans)
 
 

@@ -7,7 +7,7 @@ process is ended. The one before is dropped when the files that name this one ar
 import hashlib
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -89,8 +89,9 @@ def latest(store: Store) -> Judging | None:
     return None if found is None else judging_of(store, found[0])
 
 
-def judged_records(store: Store, judging: Judging) -> Iterator[tuple[str, Json]]:
-    """Name and record of every frame, by name: where its file is now, and as all scans together show it."""
+def judged_records(store: Store, judging: Judging, images: Collection[str] | None = None) -> Iterator[tuple[str, Json]]:
+    """Name and record of every frame, by name: where its file is now, and as all scans together show it. images: of
+    these alone."""
     db = store.connection
     frames = db.execute(
         "select judged_frame.name, judged_frame.result, own_marks, judged_frame.detail, uri from judged_frame "
@@ -98,6 +99,8 @@ def judged_records(store: Store, judging: Judging) -> Iterator[tuple[str, Json]]
         (judging.row,),
     )
     for name, result, own_marks, detail, uri in frames:
+        if images is not None and name not in images:
+            continue
         record = store.record(result)
         if own_marks:
             query = f"select {MARK_COLUMNS} from judged where judging = ? and result = ? order by number"

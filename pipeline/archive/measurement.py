@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from pipeline.archive.judging import judged_records, judging_of, latest
@@ -47,8 +47,8 @@ def tell_place(store: Store, project_folder: Path) -> None:
         store.tell(_PLACE, {"path": told})
 
 
-def measured_scans(path: Path, digest: str = "") -> Iterator[MeasuredScan]:
-    """The same one after the other."""
+def measured_scans(path: Path, digest: str = "", images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
+    """The same one after the other. images: of these alone."""
     if not path.exists():
         raise InputError(f"{path}: there is no such file. Run `reseau measure` first.")
     with Store(path) as store:
@@ -56,5 +56,5 @@ def measured_scans(path: Path, digest: str = "") -> Iterator[MeasuredScan]:
         if judging is None:
             raise InputError(f"{path}: its scans are not judged yet. Run `reseau measure`, which goes on with them.")
         folder = path.parent / (store.told(_PLACE) or {"path": ".."})["path"]
-        for name, record in judged_records(store, judging):
+        for name, record in judged_records(store, judging, images):
             yield scan_of(name, record, folder)

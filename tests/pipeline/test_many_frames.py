@@ -16,7 +16,7 @@ from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
 from pipeline.cli import run
 from pipeline.many_frames import MOST_FRAMES, reduced
-from pipeline.report import ReportData, judge, render_report
+from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.page import render_frame_page
 from pipeline.results.comparator_file import ComparatorPoint, write_comparator
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
@@ -108,6 +108,13 @@ def test_what_users_named_is_escaped(page: str) -> None:
 def test_only_what_is_shown_is_kept(many: ReportData) -> None:
     assert len(many.measurement or {}) == MOST_FRAMES
     assert len(many.comparator) == MOST_FRAMES * MARKS
+
+
+def test_pictures_of_all_that_is_shown_leave_it_small(many: ReportData) -> None:
+    grey = np.random.default_rng(1).normal(2e4, 3e3, (81, 81))  # noise, which no format makes small
+    page = render_report(replace(many, thumbnail=lambda *_: Thumbnail(grey, (0.0, 0.0))))
+    assert page.count("data:image/png") == MOST_FRAMES * MARKS
+    assert len(page.encode()) < 10_000_000
 
 
 def test_good_frames_alone_need_no_look() -> None:
