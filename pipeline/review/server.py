@@ -173,7 +173,7 @@ class _Answers:
         if not isinstance(given, list) or not given:
             raise InputError("decisions are missing.")
         self._session.decide([_decision(one) for one in given])
-        return {"decided": len(given)}
+        return self.queue(query, None)
 
     def measure(self, query: "_Query", body: Any) -> Any:
         if not isinstance(body, dict):

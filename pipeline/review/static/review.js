@@ -8,7 +8,7 @@ const COLOURS = { measured: "--measured", second: "--second", predicted: "--pred
 
 const state = {
   entries: [], start: 0, at: -1, page: null, mark: null, frame: null, poses: [], clicks: new Map(), named: "", trial: null,
-  overlay: true, generation: 0,
+  overlay: true, generation: 0, ahead: new Map(), // ahead: what is fetched of the next marks, by key
 };
 
 // --- asking the server
@@ -29,9 +29,9 @@ function tell(message) {
 }
 
 async function guarded(work) {
+  tell("");
   try {
     await work();
-    tell("");
   } catch (error) {
     tell(error instanceof TypeError ? `The server does not answer: ${error.message}` : error.message);
   }
@@ -170,8 +170,11 @@ const values = () => {
 };
 
 async function refresh(keep = true) {
+  take(await json("/api/queue", { ...values(), start: state.start }), keep);
+}
+
+function take(page, keep = true) {
   const key = state.entries[state.at]?.key;
-  const page = await json("/api/queue", { ...values(), start: state.start });
   const changed = JSON.stringify(page) !== JSON.stringify(state.page);
   state.page = page;
   state.entries = page.entries;
@@ -232,7 +235,6 @@ async function open(index) {
     if (entry.question === "mark") await openMark(entry, state.generation);
     if (entry.question === "pose") await openPose(entry, state.generation);
     if (entry.question === "frame") await openFrame(entry, state.generation);
-    prefetch(index);
   });
 }
 
@@ -244,18 +246,20 @@ function showAnswer(entry) {
 }
 
 function prefetch(index) {
-  for (const entry of state.entries.slice(index + 1, index + 3)) {
-    if (entry.question === "mark") warm(entry).catch(() => {});
-  }
+  const ahead = state.entries.slice(index + 1, index + 4).filter((entry) => entry.question === "mark");
+  const kept = ahead.map((entry) => [entry.key, state.ahead.get(entry.key) ?? fetched(entry)]);
+  state.ahead = new Map(kept);
 }
 
-async function warm(entry) {
+// A mark and its picture, as they are shown first.
+async function fetched(entry) {
   const mark = await markOf(entry);
   const view = new View({ width: by("mark").width, height: by("mark").height }, null);
   view.zoom = zoomOf(mark, by("mark").width);
   view.center = mark.place;
   view.draw = () => {};
   await view.load(mark.image);
+  return { mark, view };
 }
 
 async function step(by_) {
@@ -285,8 +289,8 @@ async function nextLeft() {
 
 async function decide(decisions, advance = true) {
   await guarded(async () => {
-    await json("/api/decide", {}, { decisions });
-    await refresh();
+    state.ahead.delete(state.entries[state.at]?.key); // what was decided about it is another now
+    take(await json("/api/decide", { ...values(), start: state.start }, { decisions }));
     if (advance) await nextLeft();
     else await open(state.at);
   });
@@ -332,21 +336,21 @@ const markOf = (entry) => json("/api/mark", { image: entry.images[0], point: ent
 const zoomOf = (mark, width) => Math.max(1, width / (2 * mark.half));
 
 async function openMark(entry, generation) {
-  const mark = await markOf(entry);
+  const { mark, view } = await (state.ahead.get(entry.key)?.catch(() => null) ?? fetched(entry)) ?? (await fetched(entry));
   if (generation !== state.generation) return;
   state.mark = mark;
   for (const id of ["mark-view", "facts-view"]) by(id).hidden = false;
   by("accept").disabled = !mark.can_accept;
   by("reject").disabled = !mark.can_accept;
-  views.mark.zoom = zoomOf(mark, by("mark").width);
-  views.mark.center = mark.place;
+  Object.assign(views.mark, { zoom: view.zoom, center: view.center, picture: view.picture, wanted: view.wanted });
   views.mark.marks = (pen) => drawMark(views.mark, pen, mark);
   views.surroundings.zoom = views.mark.zoom / 8;
   views.surroundings.center = mark.place;
   views.surroundings.marks = (pen) => views.surroundings.cross(pen, mark.place, colour("measured"), 6, 16);
-  await views.mark.load(mark.image);
+  views.mark.draw();
   by("mark").focus({ preventScroll: true });
   showFacts(mark);
+  prefetch(state.at);
   await Promise.all([views.surroundings.load(mark.image), showResidual(mark, generation), showOthers(mark, generation)]);
 }
 
