@@ -1,10 +1,10 @@
 """Patches of a disk's shape in a picture: blobs by their Laplacian at several scales, then by the outline at half of
 their height."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from math import sqrt
 from typing import Literal
 
 import cv2
@@ -18,9 +18,8 @@ from measure.single_targets.joined import joined
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-_PEAK_OF_DISK = (
-    2 / np.e
-)  # of the scale-normalised Laplacian of a disk, in units of its contrast, at sigma = r / sqrt(2)
+# Of the scale-normalised Laplacian of a disk, in units of its contrast, at sigma = r / sqrt(2).
+_PEAK_OF_DISK = 2 / math.e
 _RESPONSE_SIGMAS = 5.0  # above the picture's own texture at that scale
 _TEXTURE_PX = 1024  # side, px of the scan: a smaller picture may be full of disks, which are no texture or noise
 _CELL_PX = 1536  # of the scan, side of what has one texture and one noise, about
@@ -66,7 +65,7 @@ class Candidate:
     def radius_px(self) -> float:
         """Of the circle of the same area."""
         (a, b), (c, d) = self.pixel_from_disk.tolist()
-        return sqrt(abs(a * d - b * c))
+        return math.sqrt(abs(a * d - b * c))
 
 
 @dataclass(frozen=True, eq=False)
