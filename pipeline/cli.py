@@ -448,8 +448,8 @@ def review(
     """A page on this machine to go through what needs a look; decisions stand in decisions.jsonl."""
     try:
         from pipeline.review.server import serve
-    except ModuleNotFoundError as error:
-        raise InputError(f"review needs {error.name}. Install it with: pip install reseau[review]") from None
+    except ModuleNotFoundError:
+        raise InputError("review needs starlette and uvicorn. Install them: pip install 'reseau[review]'.") from None
     serve(_read(project, max_pixels), port, who, not no_browser, typer.echo)
     return DONE
 

@@ -9,7 +9,16 @@ from pipeline.archive.measurement import made_from_of, measured_scans
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.many_frames import MOST_FRAMES, reduced
-from pipeline.publishing.made_from import CAMERA, PLACES, SCAN, SETTINGS, adjusted_from, differing, measured_from
+from pipeline.publishing.made_from import (
+    CAMERA,
+    DECISIONS,
+    PLACES,
+    SCAN,
+    SETTINGS,
+    adjusted_from,
+    differing,
+    measured_from,
+)
 from pipeline.publishing.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance
@@ -131,6 +140,11 @@ def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem
     for what, names in kinds.items():
         if names:
             yield Problem(f"{what}: {listed(names)}.", "Run `reseau measure`; what is shown is of the earlier scans.")
+    if DECISIONS in others:
+        yield Problem(
+            "Decisions were made, or taken back, since the marks were judged.",
+            "Run `reseau measure`, which takes them in; what is shown is without them.",
+        )
     changed = ["project" if name == SETTINGS else name for name in others if name in made and name in now]
     changed = [name for name in changed if name == "project" or name.startswith(CAMERA)]
     if changed:

@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from drawn_project import write_project
 
 from measure.covariance import Cause, Covariance
 from measure.fiducial_options import Click, FiducialOptions
@@ -14,6 +15,7 @@ from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
 from pipeline.archive.decided import after_checks, before_checks, decided
+from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
@@ -164,3 +166,25 @@ def test_a_target_that_is_placed_counts_as_well_as_one_points() -> None:
     assert mark.status is Status.WEAK
     assert mark.center_px is not None
     np.testing.assert_array_equal(mark.center_px, (50.0, 60.0))
+
+
+@pytest.mark.usefixtures("in_one_process")
+def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = write_project(tmp_path / "p", ["a", "b"])
+    assert run(["measure", str(project)]) == 0
+    before = project.with_name("comparator.csv").read_text(encoding="utf-8")
+    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.REJECT, who="ann")])
+    capsys.readouterr()
+    assert run(["report", str(project)]) == 1
+    assert "Decisions were made" in capsys.readouterr().out
+    run(["measure", str(project)])
+    said = capsys.readouterr()
+    assert "0 to measure" in said.err  # a mark that is no mark is judged, and not measured, anew
+    assert "Decisions were made" not in said.out
+    assert "rejected by ann" in project.with_name("comparator.csv").read_text(encoding="utf-8")
+    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.UNDO)])
+    assert run(["measure", str(project)]) == 0
+    rows = [line for line in project.with_name("comparator.csv").read_text().splitlines() if line[0] != "#"]
+    assert rows == [line for line in before.splitlines() if line[0] != "#"]
