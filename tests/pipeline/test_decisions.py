@@ -183,6 +183,7 @@ def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
     said = capsys.readouterr()
     assert "0 to measure" in said.err  # a mark that is no mark is judged, and not measured, anew
     assert "Decisions were made" not in said.out
+    assert "Decisions stand behind it: 1 of ann" in " ".join(said.out.split())
     assert "rejected by ann" in project.with_name("comparator.csv").read_text(encoding="utf-8")
     append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.UNDO)])
     assert run(["measure", str(project)]) == 0
