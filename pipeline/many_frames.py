@@ -21,7 +21,7 @@ from pipeline.text.wording import counted, listed
 
 MOST_FRAMES = 200  # that a report shows with their marks
 _MOST_PROBLEMS = 50  # different ones that it lists
-_BEST_FIRST = (Verdict.GOOD, Verdict.LOOK, Verdict.POOR, Verdict.FAILED)
+_BEST_FIRST = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR, Verdict.FAILED)
 
 
 @dataclass
@@ -74,7 +74,7 @@ def reduced(data: ReportData, scans: Iterable[MeasuredScan], camera_of: Callable
         verdict, problems = _verdict(frame, with_pose), list(problems_of(frame, with_pose))
         kind = camera_of(frame.image), frame.scan.scan.rpartition(".")[2].lower() if frame.scan else "given"
         totals.add(frame, kind, verdict, problems)
-        if problems or verdict is not Verdict.GOOD or frame.image in suspect:
+        if problems or verdict.needs_look or frame.image in suspect:
             needs_look += 1
             worst.add(
                 (-_BEST_FIRST.index(verdict), -max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)), one
@@ -134,10 +134,13 @@ def _verdict(frame: Frame, with_pose: bool) -> Verdict:
     return verdict_of(
         {
             "failure": frame.scan.failure if frame.scan else None,
-            "marks": [{"kind": mark.kind, "status": mark.status} for mark in frame.marks],
+            "marks": [
+                {"kind": mark.kind, "status": mark.status, "reason_code": " ".join(mark.codes)} for mark in frame.marks
+            ],
             "pixel_from_camera": measured.pixel_from_camera if measured else (),
             "pose": pose_record(measured.pose) if measured and measured.pose and with_pose else None,
             "problems": measured.problems if measured else (),
+            "decided_by": frame.scan.decided_by if frame.scan else {},
         }
     )
 

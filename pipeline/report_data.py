@@ -22,7 +22,7 @@ from pipeline.publishing.made_from import (
 from pipeline.publishing.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance
-from pipeline.results.comparator_file import measurement_of, read_comparator
+from pipeline.results.comparator_file import decisions_of, decisions_told, measurement_of, read_comparator
 from pipeline.results.fingerprints import of_file
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.spelling import did_you_mean
@@ -44,7 +44,7 @@ def measured(project: Project, at: At, most_frames: int | None = None) -> Report
         comparator=read_comparator(comparator),
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
-        notes=tuple(filter(None, [outside_note(project)])),
+        notes=tuple(filter(None, [outside_note(project), decisions_told(decisions_of(comparator))])),
         made_from={project.comparator.name: of_file(comparator)},
     )
     digest, path = measurement_of(comparator), project.measurement_path

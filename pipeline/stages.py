@@ -13,7 +13,7 @@ from adjust.problem.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.archive.judging import drop_all_but, judging_of, rejudge
-from pipeline.archive.measurement import measured_scans, pitches, read_measurement, tell_place
+from pipeline.archive.measurement import decisions_by, measured_scans, pitches, read_measurement, tell_place
 from pipeline.archive.merge import Merged, merge
 from pipeline.archive.status import archive_summary, shard_summary
 from pipeline.archive.store import Store
@@ -216,7 +216,7 @@ def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublish
 
 def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) -> None:
     frames = (scan.frame for scan in measured_scans(store.path, digest))
-    write_comparator(new.place(project.comparator), frames, pitches(store, digest), digest)
+    write_comparator(new.place(project.comparator), frames, pitches(store, digest), digest, decisions_by(store, digest))
     if not write_frames(new.place(project.frames_path), measured_scans(store.path, digest)):
         new.remove(project.frames_path)
 

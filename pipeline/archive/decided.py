@@ -65,13 +65,9 @@ def before_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> Mea
 
 
 def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
-    """The scan as decisions have it, whatever the checks say, and a note of who made them."""
-    if not counting:
-        return scan
-    changed = _changed(scan, counting)
+    """The scan as decisions have it, whatever the checks say, and who made how many of them."""
     people = Counter(one.who or "somebody" for one in counting.values())
-    told = ", ".join(f"{count} of {who}" for who, count in sorted(people.items()))
-    return replace(changed, notes=(*changed.notes, f"Decisions stand behind it: {told}."))
+    return replace(_changed(scan, counting), decided_by=dict(sorted(people.items())))
 
 
 def _with(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:

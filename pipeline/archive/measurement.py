@@ -1,13 +1,16 @@
 """What was measured of a project, and judged, as others read it from out/measurement.db."""
 
+import json
 import math
 import os
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from pipeline.archive.judging import judged_records, judging_of, latest
 from pipeline.archive.store import Store
 from pipeline.errors import InputError
+from pipeline.results.comparator_file import DecidedBy
 from pipeline.results.measured_record import scan_of
 from pipeline.results.measured_scan import MeasuredScan
 
@@ -38,6 +41,19 @@ def pitches(store: Store, digest: str) -> dict[str, tuple[float, float]]:
     )
     unknown = (math.nan, math.nan)
     return {name: unknown if across is None else (across, down) for name, across, down in rows}
+
+
+def decisions_by(store: Store, digest: str) -> dict[DecidedBy, int]:
+    """How many decisions of whom stand behind a judging, by camera."""
+    counts = Counter[DecidedBy]()
+    rows = store.connection.execute(
+        "select camera, judged_frame.detail ->> '$.decided_by' as told from judged_frame join scan on scan.id = scan "
+        "join judging on judging.id = judging where judging.digest = ? and told is not null",
+        (digest,),
+    )
+    for camera, told in rows:
+        counts.update({(camera, who): count for who, count in json.loads(told).items()})
+    return dict(sorted(counts.items()))
 
 
 def tell_place(store: Store, project_folder: Path) -> None:

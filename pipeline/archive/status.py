@@ -53,7 +53,7 @@ class ArchiveStatus:
 
     @property
     def all_good(self) -> bool:
-        return all(scan.verdict is Verdict.GOOD for scan in self.scans)
+        return not any(scan.verdict.needs_look for scan in self.scans)
 
     def of(self, verdict: Verdict | None) -> "ArchiveStatus":
         """The scans of one verdict; None: all."""
@@ -93,7 +93,7 @@ select scan.uri, scan.bytes, scan.mtime_ns, scan.etag, scan.is_current, original
     result.detail ->> '$.failure.code',
     case when coalesce(judged_frame.verdict, result.verdict) in ('look', 'poor') then coalesce(
         (select point || ': ' || reason from judged where judged.judging = latest.id and judged.result = result.id
-         and reason <> '' order by number limit 1),
+         and reason <> '' and reason_code not like 'decided%' order by number limit 1),
         (select point || ': ' || reason from mark where mark.result = result.id
          and reason <> '' order by number limit 1)
     ) end,
@@ -105,7 +105,7 @@ left join latest left join judged_frame on judged_frame.judging = latest.id and 
 
 
 def status_json(status: ArchiveStatus) -> dict[str, Any]:
-    """For programs: the totals, and every scan that is not good."""
+    """For programs: the totals, and every scan that needs a look."""
     return {
         "scans": len(status.scans),
         "verdicts": {
@@ -121,7 +121,7 @@ def status_json(status: ArchiveStatus) -> dict[str, Any]:
                 "camera": scan.camera,
             }
             for scan in status.scans
-            if scan.verdict is not Verdict.GOOD
+            if scan.verdict.needs_look
         },
     }
 

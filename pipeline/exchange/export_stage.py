@@ -4,7 +4,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
@@ -13,6 +13,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.block import Block, read_block
 from pipeline.exchange.convention import FORMATS, Convention, ExportOptions, Written
 from pipeline.files.project_file import Project
+from pipeline.results.comparator_file import decisions_of, decisions_told
 from pipeline.text.atomic import write_atomically, writing
 
 README = "README.txt"
@@ -44,6 +45,8 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
     write: Callable[[Block, ExportOptions], Written] = module.write
     convention: Convention = module.CONVENTION
     written = write(block, options)
+    decided = decisions_told(decisions_of(project.comparator))
+    written = replace(written, notes=(*written.notes, decided)) if decided else written
     told = readme(format, convention, written)
     publish(folder, {**written.files, README: told})
     return Exported(folder, tuple(written.files), written, told)

@@ -70,8 +70,8 @@ def _problems_of(frame: Frame) -> Iterator[Problem]:
     pose = measured.pose if measured else None
     said = pose.evidence if pose and not pose.decided else ()
     yield from (Problem(problem) for problem in (measured.problems if measured else ()) if problem not in said)
-    lost = [mark for mark in frame.marks if mark.is_fiducial and not mark.status.is_observation]
-    found = sum(mark.is_fiducial for mark in frame.marks) - len(lost)
+    lost = [mark for mark in frame.marks if mark.is_fiducial and mark.is_open]
+    found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
     if lost and (found or pose):  # a frame that was not found at all has said so
         yield Problem(
             f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured ({_reasons(lost)}).",

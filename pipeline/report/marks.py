@@ -49,6 +49,11 @@ class Mark:
         return self.reason.codes
 
     @property
+    def is_open(self) -> bool:
+        """Whether it is no observation, and nobody has decided that it is none."""
+        return not self.status.is_observation and Code.DECIDED not in self.codes
+
+    @property
     def w(self) -> float | None:
         """The standardised residual; None where nothing checks the mark."""
         return self.residual["w"] if self.residual else None

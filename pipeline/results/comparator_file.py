@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 from sys import intern
+from types import MappingProxyType
 from typing import get_args
 
 import numpy as np
@@ -29,6 +30,9 @@ COLUMNS = (
 _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 Array = NDArray[np.float64]
 
+DecidedBy = tuple[str, str]  # camera, and who
+_NOBODY: Mapping[DecidedBy, int] = MappingProxyType({})
+_DECISIONS = re.compile(r'^"?# (\d+) decisions of (.+), camera (.+?)"?$', re.MULTILINE)
 _HEAD = 4096
 _PITCH = re.compile(r'^"?# pitch of (.+): ([0-9.e+-]+) um across, ([0-9.e+-]+) um down"?$', re.MULTILINE)
 
@@ -49,18 +53,24 @@ class ComparatorPoint:
 
 
 def write_comparator(
-    path: Path, frames: Iterable[FrameMeasurement], pitch_um: Mapping[str, tuple[float, float]], measurement: str = ""
+    path: Path,
+    frames: Iterable[FrameMeasurement],
+    pitch_um: Mapping[str, tuple[float, float]],
+    measurement: str = "",
+    decided: Mapping[DecidedBy, int] | None = None,
 ) -> None:
     """Write every mark of every frame. Raises InputError where the file cannot be written.
 
     pitch_um: by image, NaN of a scan that could not be measured. frames: a sequence is
     sorted by name; what is no sequence has that order. measurement: the digest of the judging in measurement.db that
-    has the same marks.
+    has the same marks. decided: how many decisions of whom stand behind the marks of a camera.
     """
     ordered = sorted(frames, key=lambda frame: frame.image) if isinstance(frames, Sequence) else frames
     rows = (_line(frame.image, mark, pitch_um[frame.image]) for frame in ordered for mark in frame.marks)
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(f"{line}\n" for line in chain(_head(pitch_um, measurement), rows))  # an archive's are many
+        file.writelines(
+            f"{line}\n" for line in chain(_head(pitch_um, measurement, decided or {}), rows)
+        )  # an archive's are many
         file.flush()
         os.fsync(file.fileno())
 
@@ -80,17 +90,24 @@ def _point_line(point: ComparatorPoint, pitch_um: tuple[float, float] | None) ->
     return csv_line([point.image, point.point, point.kind, *cells, str(point.status), point.reason])
 
 
-def _head(pitch_um: Mapping[str, tuple[float, float]], measurement: str = "") -> list[str]:
+def _head(
+    pitch_um: Mapping[str, tuple[float, float]], measurement: str = "", decided: Mapping[DecidedBy, int] = _NOBODY
+) -> list[str]:
     known_pitches = [(image, pitch) for image, pitch in sorted(pitch_um.items()) if math.isfinite(pitch[0])]
     return [
         f"# comparator coordinates, reseau {version('reseau')}",
         *([f"# measurement {measurement}"] if measurement else []),
+        *(f"# {count} decisions of {_line_of(who)}, camera {_line_of(by)}" for (by, who), count in decided.items()),
         "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas",
         "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)",
         *(f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down" for image, (x, y) in known_pitches),
         "# status: only measured and weak are observations",
         ",".join(COLUMNS),
     ]
+
+
+def _line_of(name: str) -> str:
+    return " ".join(name.split())
 
 
 def comparator_from_pixel(center_px: Array, pitch_um: tuple[float, float]) -> Array:
@@ -123,6 +140,25 @@ def measurement_of(path: Path) -> str:
     with path.open("rb") as file:
         found = re.search(rb"^\W*# measurement ([0-9a-f]{64})\b", file.read(_HEAD), re.MULTILINE)
     return found[1].decode() if found else ""
+
+
+def decisions_of(path: Path) -> dict[DecidedBy, int]:
+    """How many decisions of whom stand behind the marks of each camera, as the lines above the table tell it."""
+    with path.open("rb") as file:
+        head = takewhile(lambda line: line.lstrip(b'"\xef\xbb\xbf').startswith(b"#"), file)
+        text = b"".join(line for line in head if b" decisions of " in line).decode("utf-8", "replace")
+    return {(camera, who): int(count) for count, who, camera in _DECISIONS.findall(text)}
+
+
+def decisions_told(decided: Mapping[DecidedBy, int]) -> str:
+    """That in a sentence; "" where there are none."""
+    cameras = sorted({camera for camera, _ in decided})
+    parts = [
+        ", ".join(f"{count} of {who}" for (own, who), count in sorted(decided.items()) if own == camera)
+        for camera in cameras
+    ]
+    named = parts if len(parts) == 1 else [f"{camera}: {part}" for camera, part in zip(cameras, parts, strict=True)]
+    return f"Decisions stand behind these marks: {'; '.join(named)}." if named else ""
 
 
 def pitches_of(path: Path) -> dict[str, tuple[float, float]]:

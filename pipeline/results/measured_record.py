@@ -43,6 +43,7 @@ def record_of(measured: MeasuredScan, folder: Path) -> Json:
         "problems": list(frame.problems),
         "problem_codes": [problem.code for problem in frame.problems],
         "notes": list(measured.notes),
+        **({"decided_by": dict(measured.decided_by)} if measured.decided_by else {}),
         "marks": [_mark(mark) for mark in frame.marks],
     }
 
@@ -63,7 +64,8 @@ def scan_of(image: str, record: Mapping[str, Any], folder: Path) -> MeasuredScan
     failure = record["failure"] and Failure(FailureCode(record["failure"]["code"]), record["failure"]["sentence"])
     scan = record["scan"] if _is_address(record["scan"]) else str(folder / record["scan"])
     size = (int(record["width_px"]), int(record["height_px"]))
-    return MeasuredScan(scan, *size, (float(across), float(down)), frame, tuple(record["notes"]), failure)
+    pitch_um, notes = (float(across), float(down)), tuple(record["notes"])
+    return MeasuredScan(scan, *size, pitch_um, frame, notes, failure, decided_by=record.get("decided_by", {}))
 
 
 def _is_address(scan: str) -> bool:

@@ -1,6 +1,7 @@
 """What one scan gave: the value that measuring hands on, and that files keep."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -47,7 +48,7 @@ class MeasuredScan:
     scan: the path or the address of its file. pitch_um: what a pixel measures, across and down. notes: what is worth
     knowing of the file, and needs no action. failure: why nothing was measured; then every mark of the frame is absent,
     size and pitch are not known (0 and NaN), and the sentence is the frame's problem. seconds: that measuring took; no
-    part of what was measured, and of no record.
+    part of what was measured, and of no record. decided_by: how many decisions of whom stand behind it.
     """
 
     scan: str
@@ -58,6 +59,7 @@ class MeasuredScan:
     notes: tuple[str, ...] = ()
     failure: Failure | None = None
     seconds: float = field(default=0.0, compare=False)
+    decided_by: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def failed(cls, scan: str, frame: FrameMeasurement, failure: Failure) -> "MeasuredScan":

@@ -1,5 +1,6 @@
 """decisions.jsonl: what counts of it, what it changes, and what is said of a file that is not as it should be."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
+from pipeline.results.comparator_file import decisions_of, decisions_told, read_comparator, write_comparator
 from pipeline.results.measured_scan import MeasuredScan
 
 TASK = ScanTask("a", "a.tif", ScanOptions(cast(CameraFile, SimpleNamespace()), None, FiducialOptions()))
@@ -148,7 +150,7 @@ def test_a_mark_becomes_what_was_decided_and_says_by_whom() -> None:
     assert "accepted by ann: a scratch" in after.frame.marks[0].reason
     assert [mark.reason.code for mark in after.frame.marks] == ["decided covered", "decided", "decided", "covered"]
     assert after.frame.marks[2].center_px is None
-    assert after.notes == ("Decisions stand behind it: 3 of ann.",)
+    assert after.decided_by == {"ann": 3}
     assert after_checks(scan, {}) == scan
 
 
@@ -183,9 +185,45 @@ def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
     said = capsys.readouterr()
     assert "0 to measure" in said.err  # a mark that is no mark is judged, and not measured, anew
     assert "Decisions were made" not in said.out
-    assert "Decisions stand behind it: 1 of ann" in " ".join(said.out.split())
+    assert "Decisions stand behind these marks: 1 of ann" in " ".join(said.out.split())
     assert "rejected by ann" in project.with_name("comparator.csv").read_text(encoding="utf-8")
     append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.UNDO)])
     assert run(["measure", str(project)]) == 0
     rows = [line for line in project.with_name("comparator.csv").read_text().splitlines() if line[0] != "#"]
     assert rows == [line for line in before.splitlines() if line[0] != "#"]
+
+
+@pytest.mark.usefixtures("in_one_process")
+def test_what_is_decided_is_not_open_and_every_command_says_who_decided(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A mark that no scan shows needs a look, until a person says that it is not there."""
+    project = write_project(tmp_path / "p", ["a"])
+    with project.with_name("camera.toml").open("a") as camera:
+        camera.write('[[fiducial]]\nid = "5"\nxy_mm = [7.0, 0.0]\nsigma_mm = 0.01\nmark = "m"\n')
+    assert run(["measure", str(project)]) == 1
+    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.ABSENT, "5", who="ann lee")])
+    assert run(["measure", str(project)]) == 0
+    capsys.readouterr()
+    assert run(["status", str(project), "--json"]) == 0
+    verdicts = json.loads(capsys.readouterr().out)["verdicts"]
+    assert (verdicts["decided"]["scans"], verdicts["good"]["scans"], verdicts["look"]["scans"]) == (1, 0, 0)
+    told = "Decisions stand behind these marks: 1 of ann lee."
+    for command in ("adjust", "report", "check"):
+        run([command, str(project)])
+        assert told in " ".join(capsys.readouterr().out.split()), command
+    assert told in project.parent.joinpath("out", "report.html").read_text(encoding="utf-8")
+    assert run(["export", str(project), "csv", str(tmp_path / "csv")]) == 0
+    assert told in (tmp_path / "csv" / "README.txt").read_text(encoding="utf-8")
+
+
+def test_whose_decisions_stand_behind_a_file_is_read_from_its_head(tmp_path: Path) -> None:
+    decided = {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line\nend"): 3}
+    path = tmp_path / "comparator.csv"
+    write_comparator(path, [FrameMeasurement("f", (weak("1"),))], {"f": (20.0, 20.0)}, decided=decided)
+    read = decisions_of(path)
+    assert read == {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line end"): 3}
+    said = "a.toml: 2 of ann, the second; b.toml: 1 of bob, 3 of line end"
+    assert decisions_told(read) == f"Decisions stand behind these marks: {said}."
+    assert decisions_told({}) == ""
+    assert len(read_comparator(path)) == 1

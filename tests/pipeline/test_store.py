@@ -231,6 +231,12 @@ def test_verdicts_of_scans() -> None:
         mark["status"] = "rejected"
     assert verdict_of(few) == Verdict.POOR
     assert verdict_of(failed()) == Verdict.FAILED
+    answered = record()
+    answered["marks"][0] |= {"status": "rejected", "reason_code": "decided"}
+    assert verdict_of({**answered, "decided_by": {"ann": 1}}) == Verdict.DECIDED
+    assert verdict_of({**answered, "decided_by": {"ann": 1}, "problems": ["bent"]}) == Verdict.LOOK
+    assert verdict_of({**record(), "decided_by": {"ann": 1}}) == Verdict.DECIDED
+    assert verdict_of({**record(status="weak"), "decided_by": {"ann": 1}}) == Verdict.LOOK
     assert set(MEANING) == set(NEXT_STEP) == set(Verdict)
 
 
