@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,10 +31,10 @@ def validate(network: Network) -> None:
     _check_antennas(network)
     _check_duplicate_observations(network)
     _check_values(network.observations)
-    fiducial, count = network.observations.is_fiducial, len(network.images)
-    targets, fiducials = (np.bincount(network.image_numbers[of], minlength=count) for of in (~fiducial, fiducial))
-    for image, *shown in zip(network.images, targets.tolist(), fiducials.tolist(), strict=True):
-        _check_image(image, *shown)
+    _check_parts(network)
+    targets, fiducials = _shown(network)
+    for frame, image in {image.frame: image for image in network.images}.items():
+        _check_image(replace(image, name=frame), targets[frame], fiducials[frame])
 
 
 def _check_not_empty(network: Network) -> None:
@@ -232,6 +233,39 @@ def _check_values(observations: Observations) -> None:
             raise AdjustmentError(
                 f"{observations.kind[row]} {observations.point[row]} in image {observations.image[row]} {what}."
             )
+
+
+def _check_parts(network: Network) -> None:
+    """The scans of one frame are of one camera and know one orientation, and joins are common to two of them."""
+    first: dict[str, Image] = {}
+    for image in network.images:
+        other = first.setdefault(image.frame, image)
+        exteriors = [each.exterior for each in (image, other)]
+        same = exteriors[0] is exteriors[1] or (
+            None not in exteriors and all(str(vars(each)) == str(vars(exteriors[0])) for each in exteriors)
+        )
+        alike = image.camera == other.camera and image.transformation == other.transformation and same
+        if not alike or bool(image.part_of) != bool(other.part_of):
+            raise AdjustmentError(
+                f"frame {image.frame}: its scans {other.name} and {image.name} differ in camera, transformation or "
+                "given orientation. Parts of one frame have the same."
+            )
+    for (frame, point), rows in sorted(network.joins.items()):
+        if len(rows) < 2:
+            raise AdjustmentError(
+                f"join {point} is observed in one scan of frame {frame} only, and joins nothing. Leave it out, or "
+                "measure it in another part of the frame."
+            )
+
+
+def _shown(network: Network) -> tuple[Counter[str], Counter[str]]:
+    """How many object points, and how many fiducials, every frame shows, those in several of its parts once."""
+    observations = network.observations
+    frame = [network.images[i].frame for i in network.image_numbers]
+    marks = set(zip(frame, observations.kind, observations.point, strict=True))
+    of_kind = [Counter(frame for frame, kind, _ in marks if (kind == "fiducial") == told) for told in (False, True)]
+    joins = Counter(frame for frame, kind, _ in marks if kind == "join")
+    return of_kind[0] - joins, of_kind[1]
 
 
 def _check_image(image: Image, targets: int, fiducials: int) -> None:

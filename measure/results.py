@@ -15,7 +15,7 @@ from measure.scans.told_tone import FrameTone
 from measure.status import Status
 from measure.writing.line import Line
 
-Kind = Literal["fiducial", "target", "tie"]
+Kind = Literal["fiducial", "target", "tie", "join"]
 Array = NDArray[np.float64]
 
 

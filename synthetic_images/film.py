@@ -88,21 +88,23 @@ class FrameGeometry:
 def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
     """The geometry of one frame: the film's own transformation, then mirror, turn and place on the scanner's bed."""
     image, film = scene.images[index], scene.images[index].film
-    width_px, height_px = _scan_size(scene, image)
+    whole_px, height_px = _scan_size(scene, image)
+    first_px, end_px = (round(share * whole_px) for share in image.part)
     pitch_mm = np.asarray(scene.scanner.pitch_um) / 1000
-    center = np.array([width_px - 1, -(height_px - 1)]) / 2 * pitch_mm
+    center = np.array([(whole_px - 1) / 2 - first_px, -(height_px - 1) / 2]) * pitch_mm
     mirror = np.diag([-1.0, 1.0]) if image.pose.endswith("m") else np.eye(2)
     bed_from_film = turn(image.turn_rad) @ _quarter_turn(image.pose) @ mirror
     film_from_camera = turn(film.rotation_rad) @ np.array([[film.scale[0], film.shear_rad], [0.0, film.scale[1]]])
     shift = bed_from_film @ np.asarray(film.shift_mm) + center + np.asarray(image.offset_mm)
-    generator = np.random.default_rng([scene.seed, index, 1])
+    frames = [each.frame for each in scene.images]  # the film deforms once, however many scans there are of it
+    generator = np.random.default_rng([scene.seed, frames.index(image.frame), 1])
     directions = generator.uniform(0, 2 * np.pi, WAVES)
     waves = 2 * np.pi / (generator.uniform(0.6, 1.6, WAVES) * max(scene.camera.frame_mm))
     rms_mm = scene.film.deformation_um / 1000
     return FrameGeometry(
         scene=scene,
         image=image,
-        width_px=width_px,
+        width_px=end_px - first_px,
         height_px=height_px,
         comparator_from_camera=np.column_stack([bed_from_film @ film_from_camera, shift]),
         # A sine's mean square is 1/2, and the waves' squares add up.

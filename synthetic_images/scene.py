@@ -220,7 +220,8 @@ class SceneImage:
     exterior: X0, Y0, Z0 in object units, omega, phi, kappa in rad. pose: as in `measure.results.Pose`; turn_rad: the
     small turn beside it; offset_mm: of the frame's centre from the scan's centre. covered: fiducials under a piece of
     tape; neighbour: the side of the camera frame where the next frame begins, neighbour_gap_mm away. writing: what
-    stands on this frame.
+    stands on this frame. part_of: the frame of which this is one of several scans; part: from where to where of the
+    whole scan's width it reaches, as shares.
     """
 
     name: str
@@ -233,11 +234,19 @@ class SceneImage:
     neighbour: Side | None = None
     neighbour_gap_mm: float = 3.0
     writing: tuple[Writing, ...] = ()
+    part_of: str = ""
+    part: tuple[float, float] = (0.0, 1.0)
+
+    @property
+    def frame(self) -> str:
+        return self.part_of or self.name
 
     def __post_init__(self) -> None:
         if not self.name or set(self.name) & set("/\\:"):
             raise ValueError(f"an image's name becomes its file's: {self.name!r} is empty or holds one of / \\ :")
         one_of(f"image {self.name}: pose", self.pose, POSES)
+        if not 0.0 <= self.part[0] < self.part[1] <= 1.0:
+            raise ValueError(f"image {self.name}: part is from and to as shares of the scan's width, not {self.part}")
         if self.neighbour is not None:
             one_of(f"image {self.name}: neighbour", self.neighbour, get_args(Side))
 
@@ -363,6 +372,10 @@ class Scene:
         if not self.images:
             raise ValueError("a scene needs at least one image")
         unique("image", [image.name for image in self.images])
+        exterior = {image.frame: image.exterior for image in self.images}
+        for image in self.images:
+            if image.exterior != exterior[image.frame]:
+                raise ValueError(f"image {image.name}: parts of frame {image.frame} have one position and attitude")
         known = {fiducial.id for fiducial in self.camera.fiducials}
         for image in self.images:
             for id in image.covered:

@@ -47,8 +47,8 @@ def folds(network: Network, options: Options) -> tuple[frozenset[str], ...]:
     """
     shown = Counter(
         point
-        for point, kind in zip(network.observations.point, network.observations.kind, strict=True)
-        if kind != "fiducial"
+        for point, on_film in zip(network.observations.point, network.observations.is_fiducial, strict=True)
+        if not on_film
     )
     held = {name for distance in network.distances for name in (distance.start, distance.end)}
     held |= {name.rsplit(".", 1)[0] for name in options.datum_coordinates} | set(options.datum_points)
@@ -102,13 +102,14 @@ def _as_approximations(network: Network, values: dict[str, Array], mirrored: fro
     def of(kind: str) -> dict[str, Array]:
         return {owner[len(kind) :]: each for owner, each in values.items() if owner.startswith(kind)}
 
-    transformation = of("T.")
+    transformation, exterior, join = of("T."), of("EO."), of("JOIN.")
     return Approximations(
         interior={camera: each[:3] for camera, each in of("IO.").items()},
-        exterior=of("EO."),
+        exterior={image.name: exterior[image.frame] for image in network.images},
         transformation={image.name: transformation.get(image.name, np.empty(0)) for image in network.images},
         points=of("PT."),
         mirrored=mirrored,
+        joins={(frame, point): join[f"{frame}.{point}"] for frame, point in network.joins},
     )
 
 
@@ -120,8 +121,8 @@ def _fitted_without(
     observations = network.observations
     kept = [
         row
-        for row, (point, kind) in enumerate(zip(observations.point, observations.kind, strict=True))
-        if kind == "fiducial" or point not in points
+        for row, (point, on_film) in enumerate(zip(observations.point, observations.is_fiducial, strict=True))
+        if on_film or point not in points
     ]
     reduced = replace(
         network,
@@ -199,10 +200,10 @@ def _rays(network: Network, points: frozenset[str]) -> _Rays:
     observations = network.observations
     ordered = sorted(
         (point, image, row)
-        for row, (point, image, kind) in enumerate(
-            zip(observations.point, observations.image, observations.kind, strict=True)
+        for row, (point, image, on_film) in enumerate(
+            zip(observations.point, observations.image, observations.is_fiducial, strict=True)
         )
-        if kind != "fiducial" and point in points
+        if not on_film and point in points
     )
     names = sorted({point for point, _, _ in ordered})
     number = np.array([names.index(point) for point, _, _ in ordered], dtype=np.intp)

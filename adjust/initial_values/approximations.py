@@ -1,5 +1,7 @@
 """Initial values for an adjustment, from the network alone: nobody has to supply approximations."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,7 @@ from adjust.functional_model.sight import Sight
 from adjust.initial_values.closed_form import KnownField
 from adjust.initial_values.fiducial_fit import fit_transformation
 from adjust.initial_values.frames import Frames, frames_of
+from adjust.initial_values.joined_frames import Film, joined_frames, whole_frames
 from adjust.initial_values.orientation import orient
 from adjust.initial_values.principal_distance import find_principal_distance
 from adjust.initial_values.resection import Pose
@@ -29,10 +32,12 @@ def approximate(network: Network) -> Approximations:
     points; exterior orientations as given, or by resection (gross errors tolerated), image after image, with points
     intersected from the images already oriented; where too little is known to begin with, from a model of the images
     themselves. Independent of the order of images, points and observations. An image that shows fiducials alone gets
-    its film transformation and nothing else.
+    its film transformation and nothing else. Frames that were scanned in parts are taken as wholes.
     Raises AdjustmentError, naming the image, camera or point, where something cannot be found, and what would help.
     """
     validate(network)
+    if network.has_parts:
+        return _of_parts(network)
     films = _film_transformations(network)
     transformation = {name: parameters for name, (parameters, _) in films.items()}
     mirrored = frozenset(name for name, (_, is_mirrored) in films.items() if is_mirrored)
@@ -50,14 +55,34 @@ def approximate(network: Network) -> Approximations:
     )
 
 
-def _film_transformations(network: Network) -> dict[str, tuple[Array, bool]]:
-    """By image name the parameters, and whether mirrored."""
+def _of_parts(network: Network) -> Approximations:
+    """Where frames were scanned in parts: those of the whole frames, and how the parts lie in them."""
+    films, joins = dict[str, Film](), dict[tuple[str, str], Array]()
+    for frame in joined_frames(network):
+        films |= frame.films
+        joins |= {(frame.name, point): xy for point, xy in frame.joins.items()}
+    films |= _film_transformations(network)
+    whole = whole_frames(network, films)
+    found = approximate(whole) if whole.images else Approximations({}, {}, {}, {})
+    return replace(
+        found,
+        exterior={image.name: found.exterior[image.frame] for image in network.images if image.frame in found.exterior},
+        transformation={name: parameters for name, (parameters, _) in films.items()},
+        mirrored=frozenset(name for name, (_, is_mirrored) in films.items() if is_mirrored),
+        joins=joins,
+    )
+
+
+def _film_transformations(network: Network) -> dict[str, Film]:
+    """Of the frames that one scan shows, by image name the parameters, and whether mirrored."""
     observations = network.observations
     rows = np.flatnonzero(observations.is_fiducial)
     rows = rows[np.lexsort((np.array([observations.point[row] for row in rows]), network.image_numbers[rows]))]
     starts = np.searchsorted(network.image_numbers[rows], np.arange(len(network.images) + 1))
     films = {}
     for image, start, stop in zip(network.images, starts[:-1], starts[1:], strict=True):
+        if image.part_of:
+            continue
         given = network.camera_by_name[image.camera].fiducials
         marks = [given[observations.point[row]] for row in rows[start:stop]]
         camera_mm = np.array([[mark.x_mm.value, mark.y_mm.value] for mark in marks]).reshape(-1, 2)

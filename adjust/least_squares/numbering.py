@@ -36,10 +36,11 @@ class Touched:
 class Numbering:
     """The free unknowns of a problem, numbered: those that blocks of observations share, then the blocks' own.
 
-    A block is an image, with its orientation and transformation. Where object points have more unknowns than images
-    have, a block is a point with its coordinates, and the images' unknowns are shared: whichever leaves less to share.
-    What an image shows besides, its fiducials and the known points, is then a block without own unknowns. Points and
-    images that further observations tie to others have no unknowns of their own: theirs are shared.
+    A block is a frame, with its orientation and the transformations and joins of its scans. Where object points have
+    more unknowns than frames have, a block is a point with its coordinates, and the frames' unknowns are shared:
+    whichever leaves less to share. What a frame shows besides, its fiducials and the known points, is then a block
+    without own unknowns. Points and frames that further observations tie to others have no unknowns of their own:
+    theirs are shared.
     """
 
     problem: Problem
@@ -69,14 +70,14 @@ class Numbering:
 
     @cached_property
     def summed(self) -> list[Touched]:
-        """What the observations touch of the shared unknowns, by image where points are blocks, by point otherwise."""
+        """What the observations touch of the shared unknowns, by frame where points are blocks, by point otherwise."""
         numbers = self.numbers[self.problem.columns]
         blocks = replace(self._others, owned=np.empty((len(self._others.owned), 0), dtype=np.intp))
         return list(_arranged(np.where(numbers < self._shared_count, numbers, ABSENT), blocks, self.numbers))
 
     @cached_property
     def groups(self) -> Groups:
-        """The shared unknowns of every image, or of every point."""
+        """The shared unknowns of every frame, or of every point."""
         group = self._group[self._shared.positions]
         first = np.flatnonzero(np.diff(group, prepend=-2))  # those of a group stand together
         place = np.arange(len(group)) - np.repeat(first, np.diff(first, append=len(group)))
@@ -108,8 +109,8 @@ class Numbering:
 
     @property
     def _grouped(self) -> Indices:
-        """Positions (g, k) of the unknowns of every image, or of every point: those that blocks do not own."""
-        return self._of_images if self._points_own else self._of_points
+        """Positions (g, k) of the unknowns of every frame, or of every point: those that blocks do not own."""
+        return self._of_frames if self._points_own else self._of_points
 
     @cached_property
     def _group(self) -> Indices:
@@ -134,16 +135,16 @@ class Numbering:
 
     @property
     def _blocks(self) -> "_Blocks":
-        return self._by_point if self._points_own else self._by_image
+        return self._by_point if self._points_own else self._by_frame
 
     @property
     def _others(self) -> "_Blocks":
-        return self._by_image if self._points_own else self._by_point
+        return self._by_frame if self._points_own else self._by_point
 
     @cached_property
     def _points_own(self) -> bool:
         free = np.append(self.problem.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
-        return bool(free[self._by_point.owned].sum() > free[self._by_image.owned].sum())
+        return bool(free[self._by_point.owned].sum() > free[self._by_frame.owned].sum())
 
     @cached_property
     def _tied(self) -> NDArray[np.bool_]:
@@ -154,15 +155,20 @@ class Numbering:
         return tied
 
     @cached_property
-    def _of_images(self) -> Indices:
-        """Positions (images, k) of the unknowns of every image, ABSENT behind those that have less."""
+    def _of_frames(self) -> Indices:
+        """Positions (frames, k) of the unknowns of every frame, ABSENT behind those that have less."""
         unknowns = self.problem.unknowns
-        return side_by_side(
-            [
-                np.concatenate([unknowns.exterior[image.name], unknowns.transformation[image.name]])
-                for image in self.problem.network.images
-            ]
-        )
+        own: dict[str, list[Indices]] = {}
+        for image in self.problem.network.images:
+            own.setdefault(image.frame, [unknowns.exterior[image.name]]).append(unknowns.transformation[image.name])
+        for (frame, _), pair in unknowns.join.items():
+            own[frame].append(pair)
+        return side_by_side([np.concatenate(each) for each in own.values()])
+
+    @cached_property
+    def _frame_of_rows(self) -> Indices:
+        """(n,) the frame of every observation, by its number."""
+        return self.problem.network.frame_numbers[self.problem.image_numbers]
 
     @cached_property
     def _of_points(self) -> Indices:
@@ -170,10 +176,10 @@ class Numbering:
         return np.array(list(self.problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
 
     @cached_property
-    def _by_image(self) -> "_Blocks":
-        owned = self._of_images.copy()
+    def _by_frame(self) -> "_Blocks":
+        owned = self._of_frames.copy()
         owned[self._tied[owned].any(axis=1)] = ABSENT
-        return _Blocks(owned, self.problem.image_numbers)
+        return _Blocks(owned, self._frame_of_rows)
 
     @cached_property
     def _by_point(self) -> "_Blocks":
@@ -183,9 +189,9 @@ class Numbering:
         of_point = np.full(len(unknowns) + 1, len(points), dtype=np.intp)  # the last stands for ABSENT
         of_point[points[:, 0]] = np.arange(len(points))
         block = of_point[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
-        nothing = np.full((len(problem.network.images), 3), ABSENT, dtype=np.intp)
+        nothing = np.full((len(self._of_frames), 3), ABSENT, dtype=np.intp)
         others = block == len(points)
-        return _Blocks(np.concatenate([points, nothing]), block + np.where(others, problem.image_numbers, 0))
+        return _Blocks(np.concatenate([points, nothing]), block + np.where(others, self._frame_of_rows, 0))
 
 
 @dataclass(frozen=True)

@@ -151,14 +151,14 @@ class ObservedAntenna:
 
 
 def _antennas(network: Network, unknowns: Unknowns) -> Iterator[ObservedAntenna]:
-    for image in network.images:
+    for image in {image.frame: image for image in network.images}.values():
         exterior = image.exterior
         if exterior is None or not exterior.has_antenna or image.name in network.unoriented:
             continue
         axes = np.flatnonzero(np.isfinite(exterior.sigmas[:3]))
         if len(axes):
             yield ObservedAntenna(
-                names=tuple(f"{image.name} {'XYZ'[axis]}" for axis in axes),
+                names=tuple(f"{image.frame} {'XYZ'[axis]}" for axis in axes),
                 positions=unknowns.exterior[image.name],
                 observed=exterior.values[axes],
                 covariance=np.diag(exterior.sigmas[axes] ** 2),
@@ -180,8 +180,8 @@ def at_computed(network: Network, unknowns: Unknowns, values: Array) -> Network:
     )
     seen = {each.names[0].rpartition(" ")[0]: each for each in _antennas(network, unknowns)}
     images = tuple(
-        replace(image, exterior=_with_antenna_at(image.exterior, seen[image.name], values))
-        if image.exterior is not None and image.name in seen
+        replace(image, exterior=_with_antenna_at(image.exterior, seen[image.frame], values))
+        if image.exterior is not None and image.frame in seen
         else image
         for image in network.images
     )

@@ -23,7 +23,7 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
     def values(owner: str, names: tuple[str, ...]) -> Array:
         return np.array([adjustment.value(f"{owner}.{each}") for each in names])
 
-    exterior = values(f"EO.{name}", EXTERIOR_NAMES)
+    exterior = values(f"EO.{image.frame}", EXTERIOR_NAMES)
     parameters = values(f"T.{name}", film_parameter_names(image.transformation))
     bend = bend_of(network, image)
     return ImageModel(

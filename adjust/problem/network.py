@@ -24,7 +24,7 @@ Indices = NDArray[np.intp]
 
 Decentering = Literal["reduced", "paper"]
 Transformation = str  # as `adjust.functional_model.transformation` spells it
-ObservationKind = Literal["target", "fiducial", "tie"]
+ObservationKind = Literal["target", "fiducial", "tie", "join"]
 
 
 @dataclass(frozen=True)
@@ -160,9 +160,11 @@ class Scanner:
 
 @dataclass(frozen=True)
 class Image:
-    """One frame: its camera's name, its film transformation, its exterior orientation where something is known.
+    """One scan of a frame: its camera's name, its film transformation, its exterior orientation where it is known.
 
-    scanner: the name of the scanner whose bend is adjusted with it, empty where none is.
+    scanner: the name of the scanner whose bend is adjusted with it, empty where none is. part_of: the name of the frame
+    of which it is one of several overlapping scans, empty where it is the frame's only one. Parts of a frame have
+    transformations of their own and one exterior orientation; points that two of them show are of the kind "join".
     """
 
     name: str
@@ -170,9 +172,15 @@ class Image:
     transformation: Transformation = "affine"
     exterior: Exterior | None = None
     scanner: str = ""
+    part_of: str = ""
 
     def __post_init__(self) -> None:
         film_kind(self.transformation)
+
+    @property
+    def frame(self) -> str:
+        """The name of its frame, whose exterior orientation it has."""
+        return self.part_of or self.name
 
     @property
     def is_observed(self) -> bool:
@@ -194,7 +202,8 @@ class ObjectPoint:
 class Observations:
     """Measured comparator coordinates, one row a mark in an image.
 
-    image, point, kind: (n,) names; a fiducial's point is its id in the image's camera.
+    image, point, kind: (n,) names; a fiducial's point is its id in the image's camera. A "join" is a point of the film
+    that is common to several scans of one frame: what it is in the object need not be known.
     xy_mm (n, 2) in the comparator frame (y up); covariance_mm2 (n, 2, 2).
     """
 
@@ -212,8 +221,8 @@ class Observations:
 
     @cached_property
     def is_fiducial(self) -> NDArray[np.bool_]:
-        """(n,) whether it is a fiducial that is observed, and not an object point."""
-        return np.array([kind == "fiducial" for kind in self.kind], dtype=bool)
+        """(n,) whether it is a place in the camera frame that is observed, fiducial or join, and no object point."""
+        return np.array([kind in ("fiducial", "join") for kind in self.kind], dtype=bool)
 
     @cached_property
     def numbered_points(self) -> tuple[tuple[str, ...], Indices]:
@@ -326,6 +335,26 @@ class Network:
         return np.array([number[name] for name in self.observations.image], dtype=np.intp)
 
     @cached_property
+    def frame_numbers(self) -> Indices:
+        """(images,) the frame of every image, by its number in the order of their first images."""
+        number: dict[str, int] = {}
+        return np.array([number.setdefault(image.frame, len(number)) for image in self.images], dtype=np.intp)
+
+    @cached_property
+    def has_parts(self) -> bool:
+        """Whether a frame was scanned in several parts."""
+        return any(image.part_of for image in self.images)
+
+    @cached_property
+    def joins(self) -> dict[tuple[str, str], Indices]:
+        """The observations of every join, by frame and point."""
+        rows: dict[tuple[str, str], list[int]] = {}
+        for row in np.flatnonzero([kind == "join" for kind in self.observations.kind]):
+            frame = self.images[self.image_numbers[row]].frame
+            rows.setdefault((frame, self.observations.point[row]), []).append(int(row))
+        return {key: np.array(own, dtype=np.intp) for key, own in rows.items()}
+
+    @cached_property
     def observed_points(self) -> frozenset[str]:
         """The object points that are seen in an image."""
         names, of_name = self.observations.numbered_points
@@ -334,13 +363,15 @@ class Network:
     @cached_property
     def observed_fiducials(self) -> frozenset[tuple[str, str]]:
         """(camera, id) of the fiducials that are seen in an image."""
-        rows = np.flatnonzero(self.observations.is_fiducial)
+        rows = np.flatnonzero([kind == "fiducial" for kind in self.observations.kind])
         return frozenset((self.images[self.image_numbers[row]].camera, self.observations.point[row]) for row in rows)
 
     @cached_property
     def without_object(self) -> frozenset[str]:
-        """The images that show no object point, only fiducials or nothing."""
-        targets = np.bincount(self.image_numbers[~self.observations.is_fiducial], minlength=len(self.images))
+        """The images whose frames show no object point, only fiducials or nothing."""
+        frames = self.frame_numbers
+        of_targets = frames[self.image_numbers[~self.observations.is_fiducial]]
+        targets = np.bincount(of_targets, minlength=len(self.images))[frames]
         return frozenset(self.images[i].name for i in np.flatnonzero(targets == 0))
 
     @cached_property
@@ -374,8 +405,9 @@ def _extent(lowest: Array, highest: Array) -> Extent:
 class Approximations:
     """Where the iteration starts: by camera, image and point name, in the units of the network.
 
-    interior (c, x0', y0'); exterior (6,); transformation: the parameters of the image's kind in the order of
-    `functional_model.transformation`; points (3,). mirrored: the images whose scan is mirrored (the determinant of
+    interior (c, x0', y0'); exterior (6,), parts of a frame alike; transformation: the parameters of the image's kind in
+    the order of `functional_model.transformation`; points (3,); joins (2,): places in the camera frame, by frame and
+    point. mirrored: the images whose scan is mirrored (the determinant of
     their transformation is negative), which a congruent, similarity or conformal one has to be told.
     """
 
@@ -384,6 +416,7 @@ class Approximations:
     transformation: Mapping[str, Array]
     points: Mapping[str, Array]
     mirrored: frozenset[str] = frozenset()
+    joins: Mapping[tuple[str, str], Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Approximations({len(self.exterior)} orientations, {len(self.points)} points)"

@@ -223,7 +223,7 @@ class Problem:
 
     @cached_property
     def is_fiducial(self) -> NDArray[np.bool_]:
-        """(n,) whether it is a fiducial that is observed, and not an object point."""
+        """(n,) whether it is a place in the camera frame that is observed, and not an object point."""
         return self.network.observations.is_fiducial
 
     @cached_property
@@ -244,12 +244,14 @@ class Problem:
 
     @cached_property
     def places(self) -> Indices:
-        """(n, 3) positions of the point's coordinates, or of the fiducial's two and ABSENT."""
+        """(n, 3) positions of the point's coordinates, or of the fiducial's or join's two and ABSENT."""
         images, observations = self.network.images, self.network.observations
         names, of_name = observations.numbered_points
         point = side_by_side([self.unknowns.point.get(name, _NOWHERE) for name in names])
         places = point[of_name]
-        for row in np.flatnonzero(self.is_fiducial):
+        for key, rows in self.network.joins.items():
+            places[rows] = *self.unknowns.join[key], ABSENT
+        for row in np.flatnonzero([kind == "fiducial" for kind in observations.kind]):
             camera = images[self.image_numbers[row]].camera
             places[row] = *self.unknowns.fiducial[camera, observations.point[row]], ABSENT
         return places

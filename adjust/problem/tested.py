@@ -18,7 +18,7 @@ PRIOR_GROUPS = ("datum", "control", "interior", "scanner", "exterior")
 class Tested:
     """One image point, or one given quantity: what a gross error would be found in, and taken out with.
 
-    group: target, tie or fiducial in an image; datum (the given place of a fiducial), control (a given object
+    group: target, tie, fiducial or join in an image; datum (the given place of a fiducial), control (a given object
     coordinate), interior, scanner or exterior (a given element). owner: its image, camera or scanner, empty for object
     points. point: its id, empty for the elements. coordinates: x and y where both are tested as one, else a single one.
     """

@@ -23,8 +23,8 @@ class Unknowns:
 
     given (n,): nan where nothing is given. sigma (n,): 0 fixed, inf free. start (n,): where the iteration starts.
     Positions in these: camera by name (c, x0', y0', then the distortion parameters), fiducial by (camera, id),
-    scanner by name, point by id, transformation and exterior by image name. Cameras, scanners and points stand before
-    the images.
+    scanner by name, point by id, transformation and exterior by image name, join by frame and point. Cameras, scanners
+    and points stand before the images. Parts of one frame have the same exterior orientation.
     """
 
     names: tuple[str, ...]
@@ -37,6 +37,7 @@ class Unknowns:
     point: dict[str, Indices]
     transformation: dict[str, Indices]
     exterior: dict[str, Indices]
+    join: dict[tuple[str, str], Indices]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -103,14 +104,21 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
         if ("", each.id) in observed
     }
     transformation = {}
-    exterior = {}
+    exterior: dict[str, Indices] = {}
+    of_frame: dict[str, Indices] = {}
     for image in network.images:
-        quantities = _exterior_quantities(image, approximations)
-        stopped = image.name in network.unoriented
-        exterior[image.name] = listing.add(f"EO.{image.name}", _stopped(quantities) if stopped else quantities)
+        if image.frame not in of_frame:
+            quantities = _exterior_quantities(image, approximations)
+            stopped = image.name in network.unoriented
+            of_frame[image.frame] = listing.add(f"EO.{image.frame}", _stopped(quantities) if stopped else quantities)
+        exterior[image.name] = of_frame[image.frame]
         transformation[image.name] = listing.add(f"T.{image.name}", _transformation_quantities(image, approximations))
+    join = {}
+    for (frame, id_), (x_mm, y_mm) in approximations.joins.items():
+        place: list[Quantity] = [("x", None, float(x_mm)), ("y", None, float(y_mm))]
+        join[frame, id_] = listing.add(f"JOIN.{frame}.{id_}", place)
     given, sigma, start = np.array(listing.rows, dtype=np.float64).T
-    owned = camera, fiducial, scanner, point, transformation, exterior
+    owned = camera, fiducial, scanner, point, transformation, exterior, join
     return Unknowns(tuple(listing.names), given, sigma, start, *owned)
 
 

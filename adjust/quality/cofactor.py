@@ -136,7 +136,7 @@ def _reported(problem: Problem, state: State) -> csr_array:
     degrees, omega and kappa are told by their sum or difference alone (the pseudo-inverse).
     """
     count = len(problem.unknowns)
-    angles = problem.exterior[~problem.keeps_angles, 3:]
+    angles = np.unique(problem.exterior[~problem.keeps_angles, 3:], axis=0)  # scans of one frame have one attitude
     by_vector = np.linalg.pinv(vector_by_angles(state.values[angles]))
     groups = [(angles, by_vector), *problem.films_by_centred(state)]
     others = np.setdiff1d(np.arange(count), np.concatenate([positions.ravel() for positions, _ in groups]))

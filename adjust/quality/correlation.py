@@ -78,7 +78,8 @@ def _of_camera(adjustment: Adjustment, camera: Camera, above: float) -> Iterator
     for i, j in combinations(range(len(own)), 2):
         if abs(of_camera[i, j]) > above:
             yield _of_pair(camera.name, kinds[i], kinds[j], float(of_camera[i, j]), known)
-    images = [image.name for image in adjustment.network.images if image.camera == camera.name]
+    frames = (image.frame for image in adjustment.network.images if image.camera == camera.name)
+    images = list(dict.fromkeys(frames))
     rho = np.concatenate(
         [
             _with_exteriors(adjustment, own, marks, images[i : i + IMAGES_AT_ONCE])

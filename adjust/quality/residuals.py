@@ -63,7 +63,7 @@ def groups(
     weighting: Weighting,
     further: Sequence[FurtherResidual],
 ) -> dict[str, Group]:
-    """The groups of observations: target, tie and fiducial in the comparator, and the priors.
+    """The groups of observations: target, tie, fiducial and join in the comparator, and the priors.
 
     control: object coordinates, whose rms is in millionths of the object unit; datum: the fiducials' given places
     (F5, F6); interior: c, x0', y0' and distortion; exterior; and those of further observations. All behind datum have
@@ -71,7 +71,7 @@ def groups(
     """
     units = TestedUnits(problem)
     result = {}
-    for name in ("target", "tie", "fiducial", "control", "datum", "interior", "scanner", "exterior"):
+    for name in ("target", "tie", "fiducial", "join", "control", "datum", "interior", "scanner", "exterior"):
         members = (units.groups == name) & weighting.used
         if not members.any() and name not in ("target", "fiducial", "control"):
             continue

@@ -236,7 +236,8 @@ def _given_stations(network: Network) -> dict[str, Array]:
 
 def _stations(result: Adjustment, of: dict[str, Array]) -> tuple[Array, Array]:
     """Adjusted stations (n, 3) of some images, and their distances (n,) from the middle of the points."""
-    stations = np.array([[result.value(f"EO.{name}.{axis}0") for axis in "XYZ"] for name in of])
+    frames = [result.network.image_by_name[name].frame for name in of]
+    stations = np.array([[result.value(f"EO.{frame}.{axis}0") for axis in "XYZ"] for frame in frames])
     return stations, np.linalg.norm(stations - _points(result).mean(axis=0), axis=1)
 
 

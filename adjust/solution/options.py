@@ -10,7 +10,7 @@ from adjust.quality.reweighting import WeightFunction
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]
 
-MEASURED_KINDS = ("target", "tie", "fiducial")
+MEASURED_KINDS = ("target", "tie", "fiducial", "join")
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Options:
     robust: what contradicts the others loses weight, "huber" (or True) some and "igg3" at last all; see
     `robust_weights`. snooping: what contradicts the others beyond chance is taken out; see `adjust.quality.snooping`.
     variance_components: the variances of groups are each multiplied by what their residuals say: True for targets, tie
-    points and fiducials in the images, or names of groups (see `Group`).
+    points, fiducials and joins in the images, or names of groups (see `Group`).
     probabilities: of the tests.
     method: "combined", the strict combined model (Gauss-Helmert); "elements", Torlegård's adjustment by elements, which
     takes the distortion at the observed point: the same as long as distortion changes little over a residual, and what

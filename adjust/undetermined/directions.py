@@ -48,6 +48,7 @@ class Lead:
 FOLLOWERS = (  # what follows a motion: the unknowns' kind, quantities (all where empty), words, a word that told it
     ("FID", (), "the fiducial marks", "fiducial mark"),
     ("T", (), "the film transformations", ""),
+    ("JOIN", (), "what joins scans of a frame", ""),
     ("IO", ("x0", "y0"), "the principal point", "principal point's"),
     ("IO", ("c",), "the principal distance", "principal distance"),
     ("EO", ("X0", "Y0", "Z0"), "the stations", ""),
@@ -111,7 +112,7 @@ def camera_leads(problem: Problem, state: State) -> list[Lead]:
 
 def _fiducial_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
     """Shift, rotation, scale, affinity and shear of all fiducials of a camera."""
-    pairs = [positions for (owner, _), positions in problem.unknowns.fiducial.items() if owner == camera]
+    pairs = _film_places(problem, camera)
     if not pairs:
         return []
     positions = np.array(pairs)
@@ -139,13 +140,22 @@ def _fiducial_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
     return listed
 
 
+def _film_places(problem: Problem, camera: str) -> list[Indices]:
+    """Positions (2,) of all fiducials of a camera, and of what joins the scans of its frames, which moves with them."""
+    frames = {image.frame for image in problem.network.images if image.camera == camera}
+    unknowns = problem.unknowns
+    marks = [positions for (owner, _), positions in unknowns.fiducial.items() if owner == camera]
+    joins = [positions for (frame, _), positions in unknowns.join.items() if frame in frames]
+    return marks + joins if marks else []
+
+
 def _tilt_leads(problem: Problem, state: State, camera: str) -> list[Lead]:
     """A tilt of all cameras about x' or y', where every film transformation of a camera can undo it.
 
     It moves the fiducials by t (x'², x'y'), of which the functional takes what no affinity of theirs can be.
     """
     kinds = [image.transformation for image in problem.network.images if image.camera == camera]
-    pairs = [positions for (owner, _), positions in problem.unknowns.fiducial.items() if owner == camera]
+    pairs = _film_places(problem, camera)
     if not pairs or not all(follows_tilts(kind) for kind in kinds):
         return []
     positions = np.array(pairs)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.problem.network import Image
 from adjust.problem.problem import Problem, State
 
 Array = NDArray[np.float64]
@@ -16,7 +17,30 @@ SHOWN = 3  # names that are told one by one
 def own_sentence(problem: Problem, state: State, name: str) -> tuple[str, str]:
     """Cause and remedy where the observations do not determine the image or the point that an unknown is of."""
     kind, owner = name.rsplit(".", 1)[0].split(".", 1)
-    return _of_point(problem, state, owner) if kind == "PT" else _of_image(problem, owner)
+    if kind == "PT":
+        return _of_point(problem, state, owner)
+    parts = _parts(problem, kind, owner)
+    return _of_parts(problem, parts) if parts else _of_image(problem, owner)
+
+
+def _parts(problem: Problem, kind: str, owner: str) -> list[Image]:
+    """The scans of the frame, of several, that an orientation, a transformation or a join is of."""
+    frame = next(
+        (frame for frame, point in problem.unknowns.join if kind == "JOIN" and f"{frame}.{point}" == owner), owner
+    )
+    image = problem.network.image_by_name.get(frame)
+    frame = image.part_of if image is not None else frame
+    return [image for image in problem.network.images if image.part_of and image.part_of == frame]
+
+
+def _of_parts(problem: Problem, parts: Sequence[Image]) -> tuple[str, str]:
+    common = sum(frame == parts[0].part_of for frame, _ in problem.network.joins)
+    return (
+        f"The marks of frame {parts[0].part_of} do not determine its orientation and the transformations of its scans "
+        f"{_listed([part.name for part in parts])}, which {common} points join.",
+        "Measure more fiducial marks and more common points, spread over what the scans have in common, choose a "
+        "transformation with fewer parameters, or leave the frame out.",
+    )
 
 
 def _of_point(problem: Problem, state: State, point: str) -> tuple[str, str]:
@@ -92,6 +116,11 @@ def unnamed_sentence(name: str, followers: str) -> tuple[str, str]:
             return (
                 f"The film transformation of image {owner} can change ({quantity} most){followers}.",
                 "Measure more fiducial marks in this image, or choose a transformation with fewer parameters.",
+            )
+        case "JOIN":
+            return (
+                f"What joins the scans of a frame, {owner}, can move ({quantity} most){followers}.",
+                "Measure more points that both scans show, spread over their overlap.",
             )
         case "SC":
             return (

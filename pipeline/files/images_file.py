@@ -24,12 +24,19 @@ WRITTEN = ("run", "frame", "date", "time", "height", "scale", "camera_number")  
 @dataclass(frozen=True)
 class GivenImages:
     """By image name: exterior orientation (None where the line gives none), the camera file's name and the scanner's
-    ("" where none). asks_writing: whether there is a column for what may be read on the film."""
+    ("" where none), and the frame of which it is one of several overlapping scans ("" where it is the only one): such
+    parts have the orientation that one of their lines gives. asks_writing: whether there is a column for what may be
+    read on the film."""
 
     exterior: Mapping[str, Exterior | None]
     camera: Mapping[str, str]
     scanner: Mapping[str, str] = field(default_factory=dict)
     asks_writing: bool = False
+    part_of: Mapping[str, str] = field(default_factory=dict)
+
+    def parts_of(self, frame: str) -> tuple[str, ...]:
+        """The scans of a frame that was scanned in parts, in the order of their names."""
+        return tuple(sorted(image for image, whole in self.part_of.items() if whole and whole == frame))
 
 
 def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
@@ -38,15 +45,42 @@ def read_images(path: Path, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0
     antenna: the offset of the point whose X0, Y0, Z0 are given from the projection centre, as in `Exterior`.
     """
     exterior: dict[str, Exterior | None] = {}
-    camera, scanner, asks_writing = {}, {}, False
-    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner", *WRITTEN)):
+    camera, scanner, part_of, asks_writing = {}, {}, {}, False
+    for row in read_csv(path, ("image",), (*ELEMENTS, *SIGMAS, "camera", "scanner", "part_of", *WRITTEN)):
         name = image_name(row.name("image"))
         if name in exterior:
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
         exterior[name] = _exterior(row, antenna)
-        camera[name], scanner[name] = row.text("camera"), row.text("scanner")
+        camera[name], scanner[name], part_of[name] = row.text("camera"), row.text("scanner"), row.text("part_of")
         asks_writing = any(column in row.cells for column in WRITTEN)
-    return GivenImages(exterior, camera, scanner, asks_writing)
+    _join(path, exterior, camera, part_of)
+    return GivenImages(exterior, camera, scanner, asks_writing, part_of)
+
+
+def _join(
+    path: Path, exterior: dict[str, Exterior | None], camera: Mapping[str, str], part_of: Mapping[str, str]
+) -> None:
+    """Give all parts of a frame its orientation. Raises InputError where parts contradict each other, or a frame has
+    one part only."""
+    for frame in sorted({frame for frame in part_of.values() if frame}):
+        parts = [image for image in part_of if part_of[image] == frame]
+        if len(parts) == 1:
+            raise InputError(
+                f"{path}: image {parts[0]!r} is the only part of {frame!r} (column part_of). Give the same name to the "
+                "other scans of that frame, or leave the cell blank."
+            )
+        if frame in part_of and frame not in parts:
+            raise InputError(f"{path}: part_of {frame!r} is an image itself. Name the frame otherwise than its scans.")
+        given = [image for image in parts if exterior[image] is not None]
+        if len(given) > 1 and len({str(exterior[image]) for image in given}) > 1:
+            raise InputError(
+                f"{path}: {given[0]!r} and {given[1]!r} are parts of frame {frame!r}, but have different orientations. "
+                "Give it at one of them."
+            )
+        if len({camera[image] for image in parts}) > 1:
+            raise InputError(f"{path}: the parts of frame {frame!r} have different cameras. Give them one.")
+        for image in parts:
+            exterior[image] = exterior[given[0]] if given else None
 
 
 def fill_images(path: Path, values: Mapping[str, Mapping[str, str]]) -> None:

@@ -166,6 +166,10 @@ class Project:
         name = self.given_images.camera.get(image, "") if self.given_images else ""
         return self.cameras[name] if name else self.default_camera
 
+    def part_of(self, image: str) -> str:
+        """The frame of which an image is one of several scans, "" where it is the only one."""
+        return self.given_images.part_of.get(image, "") if self.given_images else ""
+
     def scanner_of(self, image: str) -> str:
         """The name of the scanner of an image; all images that name none are of one."""
         return (self.given_images.scanner.get(image, "") if self.given_images else "") or DEFAULT_SCANNER

@@ -84,7 +84,9 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
         approximations=Approximations(
             interior={camera_name: np.array([values["c"], values["x0"], values["y0"]])},
             exterior={
-                name: np.array([adjustment.value(f"EO.{name}.{each}") for each in EXTERIOR_NAMES]) for name in usable
+                name: np.array([adjustment.value(f"EO.{frame}.{each}") for each in EXTERIOR_NAMES])
+                for name in usable
+                for frame in [adjustment.network.image_by_name[name].frame]
             },
             transformation={name: np.zeros(0) for name in usable},
             points={point: np.array([adjustment.value(f"PT.{point}.{axis}") for axis in "XYZ"]) for point in points},

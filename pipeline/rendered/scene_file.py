@@ -248,6 +248,8 @@ def _image(
         else None,
         neighbour_gap_mm=table.number("neighbour_gap_mm", 3.0, least=0.0),
         writing=(*on_all, *_writing(table)),
+        part_of=table.text("part_of", ""),
+        part=table.pair("part", (0.0, 1.0)),
     )
     film.done()
     table.done()

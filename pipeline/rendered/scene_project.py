@@ -141,9 +141,16 @@ def _given_point(
 
 
 def _images_csv(scene_file: SceneFile, middle: Array, generator: np.random.Generator) -> str:
-    columns = ("image", "X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
-    rows = [[image.name, *_given_exterior(scene_file, image, middle, generator)] for image in scene_file.scene.images]
-    return _csv(columns, rows)
+    """Of a frame that was scanned in parts the orientation stands at the first of them."""
+    columns = ["image", "X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"]
+    images = scene_file.scene.images
+    has_parts = any(image.part_of for image in images)
+    rows, told = [], set[str]()
+    for image in images:
+        exterior = _given_exterior(scene_file, image, middle, generator) if image.frame not in told else [""] * 6
+        told.add(image.frame)
+        rows.append([image.name, *exterior, *([image.part_of] if has_parts else [])])
+    return _csv([*columns, *(["part_of"] if has_parts else [])], rows)
 
 
 def _given_exterior(

@@ -172,7 +172,7 @@ def _image(adjustment: Adjustment, image: Image) -> Json:
         known = image.exterior
         of_antenna = known is not None and known.has_antenna and i < 3
         given = None if known is None or of_antenna else Prior(float(known.values[i]), float(known.sigmas[i]))
-        name = f"EO.{image.name}.{element}"
+        name = f"EO.{image.frame}.{element}"
         if element in ANGLES:
             exterior[f"{element}_deg"] = _quantity(adjustment, name, given, DEG_PER_RAD)
         else:

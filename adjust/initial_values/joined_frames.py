@@ -1,0 +1,145 @@
+"""Frames that were scanned in overlapping parts: how the parts lie to one another, before any adjustment.
+
+One part after the other is brought to the comparator of the first by a similarity through the points that it has in
+common with those placed already. There all fiducial marks of the frame give its film transformation, as if it had been
+scanned at once; each part's own follows from it.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.errors import AdjustmentError
+from adjust.functional_model.transformation import film_kind
+from adjust.initial_values.fiducial_fit import LATTICE, fit_transformation
+from adjust.problem.network import Image, Network, Observations
+
+Array = NDArray[np.float64]
+Film = tuple[Array, bool]  # parameters, and whether the scan is mirrored
+Mark = tuple[str, str]  # kind and point
+
+FEWEST_COMMON = 3  # points of two parts: through two a mirrored part would fit as well
+
+
+@dataclass(frozen=True)
+class JoinedFrame:
+    """name: of the frame. films: of every part, by name; joins: places (2,) in the camera frame in mm, by point."""
+
+    name: str
+    films: Mapping[str, Film]
+    joins: Mapping[str, Array]
+
+
+def joined_frame(network: Network, parts: Sequence[Image]) -> JoinedFrame:
+    """The film transformations of the parts of one frame. Raises AdjustmentError where parts have too little in common,
+    or the frame has too few fiducial marks."""
+    seen = {part.name: _marks(network, part) for part in parts}
+    first_from = _placed(parts[0].part_of, seen)
+    place: dict[Mark, Array] = {}
+    for name, film in first_from.items():
+        moved = film_kind("similarity", film[1]).apply(film[0], np.array(list(seen[name].values())))
+        place |= {mark: xy for mark, xy in zip(seen[name], moved, strict=True) if mark not in place}
+    given = network.camera_by_name[parts[0].camera].fiducials
+    marks = sorted(point for kind, point in place if kind == "fiducial")
+    camera_mm = np.array([[given[mark].x_mm.value, given[mark].y_mm.value] for mark in marks]).reshape(-1, 2)
+    first_mm = np.array([place["fiducial", mark] for mark in marks]).reshape(-1, 2)
+    kind = parts[0].transformation
+    parameters, mirrored = fit_transformation(kind, first_mm, camera_mm)
+    whole = film_kind(kind, mirrored)
+    films = {}
+    for part in parts:
+        xy_mm = np.array(list(seen[part.name].values()))
+        lattice = (xy_mm.min(axis=0) + xy_mm.max(axis=0)) / 2 + np.ptp(xy_mm, axis=0) / 2 * LATTICE
+        turned, is_mirrored = first_from[part.name]
+        in_first = film_kind("similarity", is_mirrored).apply(turned, lattice)
+        films[part.name] = fit_transformation(kind, lattice, whole.apply(parameters, in_first))
+    joins = [(point, xy) for (what, point), xy in place.items() if what == "join"]
+    in_camera = whole.apply(parameters, np.array([xy for _, xy in joins]).reshape(-1, 2))
+    return JoinedFrame(parts[0].part_of, films, {point: xy for (point, _), xy in zip(joins, in_camera, strict=True)})
+
+
+def _marks(network: Network, part: Image) -> dict[Mark, Array]:
+    """Where a part shows what, in its comparator, in the order of the names."""
+    rows = np.flatnonzero(network.image_numbers == network.images.index(part))
+    observations = network.observations
+    return {
+        (observations.kind[row], observations.point[row]): network.straight_xy_mm[row]
+        for row in sorted(rows, key=lambda row: (observations.kind[row], observations.point[row]))
+    }
+
+
+def _placed(frame: str, seen: Mapping[str, Mapping[Mark, Array]]) -> dict[str, Film]:
+    """Similarities from every part's comparator to that of the first; the part that has most in common comes next."""
+    names = list(seen)
+    films: dict[str, Film] = {names[0]: (np.array([0.0, 0.0, 1.0, 0.0]), False)}
+    place = dict(seen[names[0]])
+    while len(films) < len(names):
+        left = [name for name in names if name not in films]
+        name = max(left, key=lambda name: len(place.keys() & seen[name].keys()))
+        common = sorted(place.keys() & seen[name].keys())
+        if len(common) < FEWEST_COMMON:
+            raise AdjustmentError(_why_not_joined(frame, name, list(films), len(common)))
+        own, there = (np.array([where[mark] for mark in common]) for where in (seen[name], place))
+        films[name] = fit_transformation("similarity", own, there)
+        moved = film_kind("similarity", films[name][1]).apply(films[name][0], np.array(list(seen[name].values())))
+        place |= {mark: xy for mark, xy in zip(seen[name], moved, strict=True) if mark not in place}
+    return films
+
+
+def _why_not_joined(frame: str, name: str, others: Sequence[str], common: int) -> str:
+    return (
+        f"frame {frame}: its scan {name} has {common} points in common with {', '.join(others)}; joining them takes "
+        f"{FEWEST_COMMON}, and more to be checked. Scan the frame in parts that overlap, measure crosses that both "
+        "show, or leave the scan out."
+    )
+
+
+def joined_frames(network: Network) -> Iterator[JoinedFrame]:
+    """Every frame that was scanned in parts."""
+    parts = defaultdict(list)
+    for image in network.images:
+        if image.part_of:
+            parts[image.part_of].append(image)
+    for frame in sorted(parts):
+        yield joined_frame(network, sorted(parts[frame], key=lambda image: image.name))
+
+
+def whole_frames(network: Network, films: Mapping[str, Film]) -> Network:
+    """The network as if every frame's points had been measured in the camera frame itself, each once.
+
+    It holds the frames that show object points; film transformations, joins and fiducial marks are no part of it.
+    """
+    first: dict[str, Image] = {}
+    for image in network.images:
+        if image.name not in network.without_object:
+            first.setdefault(image.frame, image)
+    observations, xy_mm = network.observations, network.straight_xy_mm.copy()
+    for i, image in enumerate(network.images):
+        rows = network.image_numbers == i
+        parameters, mirrored = films[image.name]
+        xy_mm[rows] = film_kind(image.transformation, mirrored).apply(parameters, xy_mm[rows])
+    frame_of = {image.name: image.frame for image in network.images}
+    kept: dict[tuple[str, str], int] = {}
+    for row in np.flatnonzero(~observations.is_fiducial):
+        kept.setdefault((frame_of[observations.image[row]], observations.point[row]), int(row))
+    rows = np.array(list(kept.values()), dtype=np.intp)
+    return replace(
+        network,
+        images=tuple(Image(frame, image.camera, "none", image.exterior) for frame, image in first.items()),
+        observations=Observations(
+            tuple(frame for frame, _ in kept),
+            tuple(point for _, point in kept),
+            tuple(observations.kind[row] for row in rows),
+            xy_mm[rows],
+            observations.covariance_mm2[rows],
+        ),
+        distances=tuple(
+            replace(each, start=frame_of.get(each.start, each.start), end=frame_of.get(each.end, each.end))
+            for each in network.distances
+        ),
+        calibrations=(),
+        scanners=(),
+    )
