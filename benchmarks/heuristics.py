@@ -19,7 +19,6 @@ from faint_marks import drawn_frame, measured_faint
 from large_networks import strip
 from measured_marks import CONTRAST, GROUND, drawn, measured, start_off
 from numpy.typing import NDArray
-from search_frames import draw_case, is_overexposed
 from skimage.measure import EllipseModel, find_contours
 from skimage.registration import phase_cross_correlation
 from true_marks import KIND, Border, TrueMark, over_border, some_mark
@@ -29,10 +28,8 @@ import measure.frames.frame_measurement as frame_measurement
 import measure.single_targets.targets as targets
 from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust
-from measure.fiducials import measure_fiducials
 from measure.fitting.picture_fit import PictureFit
 from measure.reason import NO_REASON
-from measure.search.frame_search import FrameSearch
 
 Array = NDArray[np.float64]
 
@@ -62,21 +59,6 @@ def faint(count: int) -> str:
             of += 1
             errors += [] if found is None else [found.center_px - mark.place[:, 2]]
     return f"{len(errors)} of {of} found, {_rms(errors)} px"
-
-
-def exposed_frame(count: int) -> str:
-    """Overexposed frames, with marks that are no part of their edges: how many are found, how many marks, how many of
-    them wrongly."""
-    frames = marks = wrong = 0
-    chosen = [index for index in range(40 * count) if is_overexposed(SEED, index)][: max(count // 3, 1)]
-    for index in chosen:
-        case = draw_case(SEED, index)
-        pitch_um = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
-        frame = measure_fiducials(case.scan, case.layout, pitch_um)
-        seen = [mark for mark in frame.marks if mark.status.is_observation and mark.center_px is not None]
-        off = [float(np.hypot(*(np.asarray(mark.center_px) - case.centers_px[mark.point]))) for mark in seen]
-        frames, marks, wrong = frames + bool(off), marks + len(off), wrong + sum(one > LARGE_PX for one in off)
-    return f"{frames} of {len(chosen)} frames found, {marks} marks, {wrong} wrong"
 
 
 def dusty_disks(count: int) -> str:
@@ -180,7 +162,6 @@ Study = Callable[[int], str]
 SWITCHED: dict[str, tuple[Study, Any, str, Any]] = {
     "borders of the ground": (borders, matching, "_with_border", lambda _given, _part, fit: fit),
     "faint marks": (faint, frame_measurement, "look_for_faint", lambda _sighter, _reach_px: None),
-    "exposed frame": (exposed_frame, FrameSearch, "within_its_edges", lambda _self, _hypotheses: []),
     "dusty disks": (dusty_disks, targets, "doubts", _lone),
     "rounding": (rounding, PictureFit, "unround", lambda _self: None),
     "fronts": (one_front, fronts, "FRONT_COST", 1e30),

@@ -99,7 +99,7 @@ def find_frame(
 def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: bool) -> list[Attempt]:
     """In the middle of the scan where the pitch is given, then anywhere; where what is found may be chance, under other
     pitches; where nothing is, at a closer look: less of what lies beside a mark counts there, for the frame's edge may
-    drown it else. That looks in the whole scan, then only about where the edges of the exposed frame put the marks."""
+    drown it else."""
     given, *others = hypotheses
     close = FrameSearch(wide.scan, wide.layout, wide.options, CLOSE)
     closer = slightly_longer(given[0], _STRETCH) if is_given else given
@@ -109,7 +109,6 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
         Attempt(wide, given, _anywhere, lambda found: found.is_complete, True),
         *(Attempt(wide, group, _in_spite_of_pitch, lambda found: found.is_undoubted) for group in others),
         Attempt(close, closer, _at_a_closer_look, lambda found: found.is_taken),
-        Attempt(close, closer, _within_its_edges, lambda found: found.is_taken),
     ]
 
 
@@ -180,33 +179,18 @@ def _in_spite_of_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) 
 
 
 def _at_a_closer_look(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Seen:
-    """The frames in the whole scan whose marks need not be clear."""
-    found = search.anywhere(hypotheses)
-    return found, _faint(search, found, tried, search.expected_alike)
-
-
-def _within_its_edges(search: FrameSearch, hypotheses: Hypotheses, tried: int) -> Seen:
-    """The same about where the edges of the exposed frame put the marks."""
-    found = search.within_its_edges(hypotheses)
-    return found, _faint(search, found, tried)
-
-
-def _faint(
-    search: FrameSearch, found: Sequence[Placement], tried: int, *others: Callable[[Placement], float]
-) -> list[tuple[float, Frame]]:
-    """The frames on whose places enough marks agree, those first that chance is least expected to make. others: further
-    estimates of how many such placements chance makes; the least of all estimates counts, times their number.
+    """The frames in the whole scan on whose places enough marks agree, those first that chance is least expected to
+    make: estimated from the marks as measured, and as they answer at reduced size; the less counts, times two.
 
     The marks' pictures need not be clear: whether a frame is there is one question, which pose it has another."""
-    seen = list[tuple[float, Frame]]()
+    found, seen = search.anywhere(hypotheses), list[tuple[float, Frame]]()
     for place in _hopeful(search, found, tried):
         frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
         if frames:
             as_measured = min(expected_where_seen(search, frame, _seen_px(frame)) for frame in frames)
-            counts = [as_measured, *(count(place) for count in others)]
             most = max(frames, key=lambda frame: frame.belongs.sum())
-            seen.append((len(counts) * tried * min(counts), most))
-    return sorted(seen, key=_expected)
+            seen.append((2 * tried * min(as_measured, search.expected_alike(place)), most))
+    return found, sorted(seen, key=_expected)
 
 
 def _expected(seen: tuple[float, Frame]) -> float:

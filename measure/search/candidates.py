@@ -64,25 +64,6 @@ class Responses:
         """Pixels of the reduced scan (..., 2) in scan pixels."""
         return reduced_px * self.reduction + (self.reduction - 1) / 2
 
-    def about(self, kinds: Sequence[int], places_px: Array, reach_px: float) -> tuple["Responses", tuple[int, ...]]:
-        """The same of each kind (n,) only about its place (n, 2) in the scan, as far as reach_px: a kind is then one at
-        one place. And for each which of these is its own."""
-        reach = int(np.ceil(reach_px / self.reduction))
-        middles = [tuple(place) for place in np.rint(self.reduced_px(places_px)).astype(int).tolist()]
-        pairs = list(dict.fromkeys(zip(kinds, middles, strict=True)))
-        signs = {sign for _, sign in self.maps}
-        size = np.array(self.maps[next(iter(self.maps))].shape[::-1])
-        first = np.clip(np.array([middle for _, middle in pairs]) - reach, 0, size - 1)
-        last = np.clip(np.array([middle for _, middle in pairs]) + reach, first, size - 1)
-        maps: dict[tuple[int, int], Map] = {}
-        for number, (kind, _) in enumerate(pairs):
-            rows, cols = (slice(first[number, axis], last[number, axis] + 1) for axis in (1, 0))
-            self.expect([kind], [later for later, _ in pairs[number:]])
-            # Copies: a part of a map would hold all of it.
-            maps |= {(number, sign): self.maps[kind, sign][rows, cols].copy() for sign in signs}
-        index = tuple(pairs.index(pair) for pair in zip(kinds, middles, strict=True))
-        return Responses(maps, self.reduction, first, self.surroundings), index
-
 
 @dataclass(frozen=True)
 class Effort:

@@ -34,15 +34,12 @@ _OUTSIDE_COST = 0.1  # of a mark that a placement puts outside of the scan
 
 @dataclass(frozen=True)
 class Bounds:
-    """What is known of the placement: scale is 1 within scale_tolerance for the pitch at hand; it is turned by turn_rad
-    (from right to up), within rotation_rad; and the camera's middle lies within off_mm of middle_mm."""
+    """What is known of the placement: scale is 1 within scale_tolerance for the pitch at hand, and it is turned by no
+    more than rotation_rad."""
 
     scale_tolerance: float
     rotation_rad: float
     misfit_mm: float
-    turn_rad: float = 0.0
-    middle_mm: complex = 0j
-    off_mm: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,10 +220,8 @@ class _Constellation:
             base = self.camera[second] - self.camera[first]
             scale = (of_second[None, :] - of_first[:, None]) / base
             size = np.abs(scale)
-            turned = (scale * np.exp(-1j * self.bounds.turn_rad)).real
-            allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (turned > upright * size)
+            allowed = (np.abs(size - 1) < self.bounds.scale_tolerance) & (scale.real > upright * size)
             offset = of_first[:, None] - scale * self.camera[first]
-            allowed &= np.abs(offset - self.bounds.middle_mm) < self.bounds.off_mm
             scales.append(scale[allowed])
             offsets.append(offset[allowed])
         return np.concatenate(scales), np.concatenate(offsets)

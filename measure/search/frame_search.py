@@ -1,7 +1,7 @@
 """The search for a camera's frame in a scan, under hypotheses about its pitch, and how often chance finds one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import groupby
 
 import numpy as np
@@ -10,14 +10,12 @@ from scipy.special import comb
 
 from measure.fiducial_options import FiducialOptions
 from measure.marks.poses import POSES, up_from_camera
-from measure.marks.rendering import extent_px
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
-from measure.search.candidates import FULL, Effort, Look, Responses, detail_px, respond, respond_about
+from measure.search.candidates import FULL, Effort, Look, Responses, respond, respond_about
 from measure.search.centred_frame import centred_places_px, reach_mm
 from measure.search.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
 from measure.search.correlation import WIDE, Map, Surroundings
-from measure.search.exposed_frame import ExposedFrame, exposed_frame
 from measure.search.held import Held
 from measure.search.pitches import PitchHypothesis
 from measure.search.response_layers import Layer, Reach, layers_of
@@ -26,11 +24,8 @@ Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 _TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
-# Of the marks' middle from that of the exposed frame: one body carries both, but a gate is no datum.
-_OFF_MIDDLE_MM = 0.5
 _WAYS = 3  # of being as good: by heights, by the misfit, or by that under a stretch
 _STRETCHES = np.linspace(-0.03, 0.03, 13)  # of pixels longer one way, in steps that move no mark by more than is narrow
-_TURNED_RAD = 0.01  # of the marks against the exposed frame's edges, and what these leave open
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +40,10 @@ class _Answers:
 
 @dataclass(eq=False)
 class _Searched:
-    """One hypothesis searched, in one pose after another. whole: the search in the whole scan, if this one is only
-    about where the frame's edges put the marks. looks: by pose, the kind of response of every mark; found: by pose,
-    the placements; unlike: poses whose marks do not lie within the tolerance of another pose's before."""
+    """One hypothesis searched, in one pose after another. looks: by pose, the kind of response of every mark; found: by
+    pose, the placements; unlike: poses whose marks do not lie within the tolerance of another pose's before."""
 
     search: PlacementSearch
-    whole: "_Searched | None" = None
     looks: dict[str, tuple[int, ...]] = field(default_factory=dict)
     found: dict[str, list[Placement]] = field(default_factory=dict)
     unlike: list[str] = field(default_factory=list)
@@ -71,12 +64,8 @@ class _Searched:
 
     def share(self, pose: str, index: int, sign: int, place: Array, tolerance_px: float) -> float:
         """Of all places, those that look as much like a mark as one does within the tolerance of a place (2,) of the
-        reduced scan. About the frame's edges more may than elsewhere: the more frequent of both counts."""
-        reach = self.search.layers[self.looks[pose][index], sign].within(tolerance_px)
-        if self.whole is None:
-            return reach.share(place)
-        everywhere = self.whole.share(pose, index, sign, place, tolerance_px)
-        return max(everywhere, reach.share_elsewhere(place, reach.height(place)))
+        reduced scan."""
+        return self.search.layers[self.looks[pose][index], sign].within(tolerance_px).share(place)
 
 
 class FrameSearch:
@@ -104,10 +93,10 @@ class FrameSearch:
         found: list[Placement] = []
         for drawn_mm, alike in groupby(hypotheses, _drawn_mm):
             if self._drawn is None or self._drawn[0] != drawn_mm:
-                looks = self._looks(drawn_mm, self.poses)
+                looks = self._looks(drawn_mm)
                 answers = respond(self.scan, looks, self._signs, self.surroundings, self._maps, self._most_px)
                 self._drawn = drawn_mm, self._answers(*answers)
-            found += self._everywhere(list(alike), self._drawn[1])
+            found += self._placements(list(alike), self._drawn[1])
         return _best_first(found)
 
     def in_the_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
@@ -116,56 +105,9 @@ class FrameSearch:
         linear = _flip(hypothesis.mm)
         places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
         reach_px = reach_mm(self.layout) / max(hypothesis.mm)
-        looks = self._looks(hypothesis.drawn_mm, self.poses)
+        looks = self._looks(hypothesis.drawn_mm)
         about = respond_about(self.scan, looks, np.concatenate(places), reach_px, self._signs)
-        return _best_first(self._everywhere([hypothesis], self._answers(*about)))
-
-    def within_its_edges(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
-        """The placements of a frame whose edges are seen, best first: its marks lie about the middle of what is
-        exposed. `anywhere` must have searched the whole scan under these hypotheses before."""
-        found: list[Placement] = []
-        # Pixels slightly longer one way change the frame's sides by less than these may be wrong.
-        edges_of = {drawn_mm: self._edges(next(alike)) for drawn_mm, alike in groupby(hypotheses, _drawn_mm)}
-        for hypothesis in hypotheses:
-            whole, edges = self._searched[hypothesis.mm], edges_of[hypothesis.drawn_mm]
-            if edges is None:
-                continue
-            frame, poses = edges
-            linear = frame.rotation @ _flip(hypothesis.mm)
-            places = [self._camera_mm @ (linear @ up_from_camera(pose)).T + frame.center_px for pose in poses]
-            kinds = [kind for pose in poses for kind in whole.looks[pose]]
-            reach_px = (_OFF_MIDDLE_MM + self._slack_mm()) / float(np.mean(hypothesis.mm))
-            responses, look_of = whole.search.responses.about(kinds, np.concatenate(places), reach_px)
-            looks = self._looks(hypothesis.drawn_mm, poses)
-            responses = _beside_edges(responses, dict(zip(look_of, looks, strict=True)), frame)
-            right, down = frame.center_px * hypothesis.mm
-            bounds = replace(
-                whole.search.bounds,
-                rotation_rad=_TURNED_RAD,
-                turn_rad=-frame.turn_rad,
-                middle_mm=complex(right, -down),
-                off_mm=_OFF_MIDDLE_MM,
-            )
-            found += self._placements({hypothesis.mm: bounds}, self._answers(responses, look_of), poses, whole)
-        return _best_first(found)
-
-    def _edges(self, hypothesis: PitchHypothesis) -> tuple[ExposedFrame, tuple[str, ...]] | None:
-        """The frame that is seen by its edges, and the poses in which it is as wide and as high."""
-        of_size: dict[Pair, list[str]] = {}
-        for pose in self.poses:
-            width, height = np.abs(up_from_camera(pose)) @ self.layout.frame_mm / hypothesis.mm
-            of_size.setdefault((round(float(width), 3), round(float(height), 3)), []).append(pose)
-        turn = float(np.deg2rad(self.options.rotation_deg))
-        seen = [
-            (frame, tuple(poses))
-            for size, poses in of_size.items()
-            if (frame := exposed_frame(self.scan, size, hypothesis.tolerance, turn))
-        ]
-        return max(seen, key=lambda each: each[0].share, default=None)
-
-    def _slack_mm(self) -> float:
-        """How far from its place a mark may lie by turn, film and the given places."""
-        return _TURNED_RAD * float(np.hypot(*self._camera_mm.T).max()) + self.options.search_mm(self.layout)
+        return _best_first(self._placements([hypothesis], self._answers(*about)))
 
     def expected_alike(self, placement: Placement) -> float:
         """How many placements that answer as well chance would find in a scan like this without any frame, by this
@@ -249,8 +191,7 @@ class FrameSearch:
         span_px = (
             float(np.hypot(*np.ptp(self._camera_mm, axis=0))) / float(search.pitch.mean()) / search.responses.reduction
         )
-        middles_px = np.pi * search.bounds.off_mm**2 / float(np.prod(search.pitch))
-        places = min(self.scan.width_px * self.scan.height_px, middles_px) / search.responses.reduction**2
+        places = self.scan.width_px * self.scan.height_px / search.responses.reduction**2
         of_other = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
         polarities = 2 if len(self._signs) > 1 else 1
         return places / same_px * of_other / same_px * len(searched.unlike) * polarities
@@ -259,53 +200,30 @@ class FrameSearch:
     def _signs(self) -> set[int]:
         return signs_of(self.layout.marks)
 
-    def _looks(self, drawn_mm: Pair, poses: Sequence[str]) -> list[Look]:
+    def _looks(self, drawn_mm: Pair) -> list[Look]:
         linear = _flip(drawn_mm)
-        return [Look(mark.mark, linear @ up_from_camera(pose)) for pose in poses for mark in self.layout.marks]
+        return [Look(mark.mark, linear @ up_from_camera(pose)) for pose in self.poses for mark in self.layout.marks]
 
     def _answers(self, responses: Responses, look_of: tuple[int, ...]) -> _Answers:
         return _Answers(responses, look_of, layers_of(responses, self._reaches))
 
-    def _everywhere(self, hypotheses: Sequence[PitchHypothesis], answers: _Answers) -> list[Placement]:
-        """The placements of a frame that may lie anywhere in the scan, by hypotheses that share a drawing."""
+    def _placements(self, hypotheses: Sequence[PitchHypothesis], answers: _Answers) -> list[Placement]:
+        """The placements under hypotheses that share a drawing. Pose by pose, for the responses of all may be more
+        than can be held."""
+        marks, responses, look_of = self.layout.marks, answers.responses, answers.look_of
         rotation_rad, misfit_mm = float(np.deg2rad(self.options.rotation_deg)), self.options.search_mm(self.layout)
-        bounds = {each.mm: Bounds(each.tolerance, rotation_rad, misfit_mm) for each in hypotheses}
-        return self._placements(bounds, answers, self.poses)
-
-    def _placements(
-        self,
-        bounds: dict[Pair, Bounds],
-        answers: _Answers,
-        poses: Sequence[str],
-        whole: _Searched | None = None,
-    ) -> list[Placement]:
-        """The placements under hypotheses about the pitch, each with its bounds. Pose by pose, for the responses of
-        all poses may be more than can be held."""
-        marks, count, responses, look_of = self.layout.marks, len(self.layout.marks), answers.responses, answers.look_of
-        searches = {mm: PlacementSearch(marks, responses, mm, bounds[mm], answers.layers) for mm in bounds}
-        tried = {mm: _Searched(search, whole) for mm, search in searches.items()}
-        for number, pose in enumerate(poses):
-            own, later = look_of[number * count : (number + 1) * count], look_of[(number + 1) * count :]
+        tried = {
+            each.mm: _Searched(PlacementSearch(marks, responses, each.mm, bounds, answers.layers))
+            for each in hypotheses
+            for bounds in [Bounds(each.tolerance, rotation_rad, misfit_mm)]
+        }
+        for number, pose in enumerate(self.poses):
+            own, later = look_of[number * len(marks) : (number + 1) * len(marks)], look_of[(number + 1) * len(marks) :]
             responses.expect(own, later)
             for searched in tried.values():
                 searched.try_pose(pose, own)
         self._searched |= tried
         return [placement for searched in tried.values() for found in searched.found.values() for placement in found]
-
-
-def _beside_edges(responses: Responses, looks: dict[int, Look], frame: ExposedFrame) -> Responses:
-    """The responses, of a look by kind each, that the frame's edges have no part in: its four corners are like one
-    another, and answer as well as four marks, wherever these are sought."""
-    maps, around = {}, responses.surroundings
-    for kind, look in looks.items():
-        margin_px = (around.beside + around.coarse / 2) * detail_px(look.mark, look.linear)
-        least, greatest = extent_px(look.mark, np.column_stack([look.linear, np.zeros(2)]))
-        for key in ((kind, sign) for sign in (1, -1) if (kind, sign) in responses.maps):
-            row, col = np.indices(responses.maps[key].shape)
-            places = responses.scan_px(np.stack([col, row], axis=-1) + responses.origin(kind).astype(float))
-            free = frame.free_of_edges(places, least - margin_px, greatest + margin_px)
-            maps[key] = np.where(free, responses.maps[key], np.float32(0.0))
-    return replace(responses, maps=maps)
 
 
 def _drawn_mm(hypothesis: PitchHypothesis) -> Pair:

@@ -77,14 +77,6 @@ class Reach:
         col, row = np.clip(np.rint(place).astype(int) - self.origin, 0, np.array(self.map.shape[::-1]) - 1)
         return float(np.mean(self.map >= self.map[row, col]))
 
-    def share_elsewhere(self, place: Array, height: float) -> float:
-        """Of the places that answer, but not to what is at the one (2,), those that answer by height or more."""
-        apart = 2 * np.sqrt(self.area_px / np.pi)
-        row, col = np.indices(self.map.shape)
-        elsewhere = np.hypot(col + self.origin[0] - place[0], row + self.origin[1] - place[1]) > apart
-        elsewhere &= self.map > 0
-        return float(np.mean(self.map[elsewhere] >= height)) if elsewhere.any() else 1.0
-
     def height(self, place: Array) -> float:
         """The highest response within the radius of a place (2,) of the reduced scan."""
         col, row = np.clip(np.rint(place).astype(int) - self.origin, 0, np.array(self.map.shape[::-1]) - 1)
