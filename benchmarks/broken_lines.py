@@ -49,7 +49,12 @@ LINES = (
         "measure/test_sandwich_covariance.py",
     ),
     Broken("measure/noise/noise.py", " - unknowns, 1)", ", 1)", "measure/test_noise.py"),
-    Broken("measure/noise/robust.py", ", 0.0, 1.0) ** 2) ** 2)", ", 0.0, 1.0) ** 2))", "measure/test_robust.py"),
+    Broken(
+        "measure/noise/least_squares.py",
+        ", 0.0, 1.0) ** 2) ** 2)",
+        ", 0.0, 1.0) ** 2))",
+        "measure/test_least_squares.py",
+    ),
     Broken("measure/noise/grain.py", "-squared / (4.0 *", "-squared / (2.0 *", "measure/test_grain.py"),
     Broken("measure/fitting/second_order.py", " @ turning) / 2", " @ turning)", "measure/test_second_order.py"),
     Broken("measure/fitting/clipping.py", "sides * sigma_dn * size", "sides * size", "measure/test_clipping.py"),

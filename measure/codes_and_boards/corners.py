@@ -18,9 +18,9 @@ from scipy.special import erf, ndtr, owens_t
 from measure.codes_and_boards.junction import junction
 from measure.fitting.picture_model import PIXEL_VARIANCE_PX2
 from measure.fitting.scan_window import ScanWindow
+from measure.noise.least_squares import gauss_newton_step, tukey_weights
 from measure.noise.noise import correlated, noise_model, robust_scale
 from measure.noise.pixel_sums import products
-from measure.noise.robust import tukey_weights
 from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]
@@ -37,6 +37,7 @@ _SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
 _MOST_SHIFT = 0.6  # of the reach: farther off, another corner's edges are nearer
 _MOST_TURN_RAD = 0.35  # of an edge: twenty degrees, which no approximate place is wrong by
 _START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # the pixel's share included
+_DAMPING = 1e-9  # of a step: what hardly shows does not run away
 _LONGEST_TURN_RAD = 0.15  # of an edge in a step: its picture is no longer linear in more
 
 
@@ -220,14 +221,11 @@ class _CornerFit:
 
     def _step(self, design: Array, residuals: Array) -> float:
         """A Gauss-Newton step, shortened to what a linearisation can bear; its length in px."""
-        weighted = design * self.weights
-        normal = products(weighted, design)
-        size = np.sqrt(np.diag(normal))
-        if not np.all(size > 0):
+        used = self.weights > 0
+        if not np.all((design[:, used] != 0).any(axis=1)):
             self.reason = Reason("nothing here shows where the edges meet", Code.NO_FIT)
             return 0.0
-        scaled = normal / np.outer(size, size) + 1e-9 * np.eye(self.unknowns)
-        step = np.linalg.solve(scaled, np.tensordot(weighted, residuals, axes=2) / size) / size
+        step = gauss_newton_step(design[:, used], residuals[used], self.weights[used], _DAMPING)
         step /= max(np.hypot(*step[:2]), np.abs(step[2:4]).max() / _LONGEST_TURN_RAD, 1.0)
         self.center += step[:2]
         self.edges += step[2:4]

@@ -19,9 +19,10 @@ from measure.fitting.sandwich_covariance import sandwich_covariance
 from measure.fitting.scan_window import Coding
 from measure.marks.rendering import chip_mask, known, picture
 from measure.marks.shapes import MarkTemplate
+from measure.noise.damage import damage, damage_where_lossy, grown
+from measure.noise.least_squares import solution, tukey_loss, tukey_weights
 from measure.noise.noise import NoiseModel, correlated, may_be_noise, robust_scale
 from measure.noise.pixel_sums import combined, products
-from measure.noise.robust import damage, damage_where_lossy, grown, solution, tukey_loss, tukey_weights
 from measure.noise.steadiness import steadiness
 from measure.noise.weighting import weighted
 from measure.reason import NO_REASON, Code, Reason
@@ -193,15 +194,11 @@ class PictureFit:
 
     def _step_by(self, weights: Array) -> Array | None:
         """Gauss-Newton with weighted derivatives: how far the mark moved, (2,) px; None where it does not settle."""
-        model, priors, start = self.model, self.model.prior_weights(), self.model.state.pixel_from_mark[:, 2]
+        model, start = self.model, self.model.state.pixel_from_mark[:, 2]
         for _ in range(_WEIGHTED_STEPS):
-            normal = products(weights, model.design) + np.diag(priors)
-            right = products(weights, model.residuals[None])[:, 0] - priors * model.departures()
-            step: Array = np.asarray(np.linalg.solve(normal, right), float)
-            if model.blur_is_held(step):
-                free = np.arange(len(step)) != model.blur
-                step = np.zeros(len(right))
-                step[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free])
+            step = self._solve(weights, 1.0)
+            if step is None:
+                return None
             moved = model.step(step)
             model.linearise(self.used)
             if moved < _CLOSE_PX:
@@ -278,7 +275,8 @@ class PictureFit:
         scale_dn = tukey_dn if robust else np.inf
         cost = self._cost(scale_dn)
         for _ in range(_ITERATIONS):
-            step = self._solve(self.used * tukey_weights(model.residuals, scale_dn))
+            weights = model.design * (self.used * tukey_weights(model.residuals, scale_dn))
+            step = self._solve(weights, self.variance_dn2)
             if step is None:
                 self.reason = Reason("the picture does not determine the mark's place", Code.NO_FIT)
                 return
@@ -313,13 +311,13 @@ class PictureFit:
     def _tukey_scale(self) -> float:
         return max(robust_scale(self.model.residuals[self.telling]), _SCALE_FLOOR * self.contrast_dn, 1e-9)
 
-    def _solve(self, weights: Array) -> Array | None:
-        """The step, None where it is not determined. A blur at its limit stays there instead of pulling the others."""
+    def _solve(self, weights: Array, variance_dn2: float) -> Array | None:
+        """The step by weighted derivatives (unknowns, height, width), a pixel's weight being the share of this variance
+        in its own; None where it is not determined. A blur at its limit stays there instead of pulling the others."""
         model = self.model
-        priors = model.prior_weights() * self.variance_dn2
-        weighted = model.design * weights
-        normal = products(weighted, model.design) + np.diag(priors)
-        right = products(weighted, model.residuals[None])[:, 0] - priors * model.departures()
+        priors = model.prior_weights() * variance_dn2
+        normal = products(weights, model.design) + np.diag(priors)
+        right = products(weights, model.residuals[None])[:, 0] - priors * model.departures()
         free = np.ones(len(right), dtype=bool)
         step = solution(normal, right, free)
         if step is not None and model.blur_is_held(step):

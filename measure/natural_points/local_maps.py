@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.natural_points.features import Features
+from measure.noise.least_squares import least_distances
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -48,13 +49,11 @@ class LocalMaps:
 
 
 def _affine_map(here: Array, there: Array, usual: Array, weight: float) -> Array:
-    """(2, 3) from places (n, 2) to places by least distances, a few of which may be false; with a weight on what its
-    linear part is usually."""
-    weights = np.ones(len(here))
-    for _ in range(_REWEIGHTINGS):
-        middle, target = (np.average(places, axis=0, weights=weights) for places in (here, there))
-        a, b = here - middle, there - target
-        normal = (a.T * weights) @ a + weight * np.eye(2)
-        matrix = np.linalg.solve(normal, (a.T * weights) @ b + weight * usual.T).T
-        weights = 1.0 / np.maximum(np.hypot(*(b - a @ matrix.T).T) / _PLACE_PX, 1.0)
+    """(2, 3) from places (n, 2) to places, a few of which may be false; with a weight on what its linear part is
+    usually."""
+    middle = here.mean(axis=0)
+    design = np.column_stack([np.ones(len(here)), here - middle])
+    prior, of_usual = weight * np.diag([0.0, 1.0, 1.0]), np.vstack([np.zeros(2), usual.T])
+    target, *linear = least_distances(design, there, _PLACE_PX, _REWEIGHTINGS, prior, of_usual)
+    matrix = np.transpose(linear)
     return np.column_stack([matrix, target - matrix @ middle])

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import ndtr, ndtri
 
+from measure.noise.least_squares import least_distances
 from measure.probabilities import POINT_OFF_ITS_NEIGHBOURS
 
 Array = NDArray[np.float64]
@@ -46,22 +47,12 @@ def _ratios(first: Array, second: Array, trusted: Indices) -> Array:
     itself[~itself.any(axis=1), -1] = True
     near = near[~itself].reshape(len(first), _NEIGHBOURS)
     design = np.concatenate([np.ones((*near.shape, 1)), first[near] - first[:, None]], axis=2)
-    maps = _least_distances(design, second[near])
+    maps = least_distances(design, second[near], _LEAST_PX, _REWEIGHTINGS)
     scatter = np.median(_lengths(second[near] - design @ maps), axis=1)
     # Few neighbours may lie well by chance: what is usual counts beside them. Outside of them a map is known worse.
     spread = 1.0 + np.linalg.inv(np.swapaxes(design, 1, 2) @ design)[:, 0, 0]
     variance = (scatter**2 + np.median(scatter) ** 2 + _LEAST_PX**2) * spread
     return np.asarray(np.log(np.maximum(_lengths(second - maps[:, 0]), 1e-9)) - np.log(variance) / 2)
-
-
-def _least_distances(design: Array, places: Array) -> Array:
-    """(n, 3, 2) affine maps from design (n, k, 3) to places (n, k, 2) by least distances, as some may be false."""
-    weights = np.ones(design.shape[:2])
-    for _ in range(_REWEIGHTINGS):
-        weighted = np.swapaxes(design * weights[..., None], 1, 2)
-        maps = np.linalg.solve(weighted @ design, weighted @ places)
-        weights = 1.0 / np.maximum(_lengths(places - design @ maps), _LEAST_PX)
-    return np.asarray(maps)
 
 
 def _lengths(vectors: Array) -> Array:

@@ -11,8 +11,8 @@ from scipy import ndimage
 from measure.fitting.matching import Match
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, extent_px, picture
 from measure.marks.shapes import Mark, MarkTemplate
+from measure.noise.least_squares import TukeyFit, tukey_fit
 from measure.noise.noise import robust_scale
-from measure.noise.robust import tukey_weights
 from measure.scans.scan import Scan, means
 from measure.search.candidates import detail_px, quarter_turned
 
@@ -25,7 +25,7 @@ _CUBIC_PX = 3.0  # that an interpolation asks beyond its last place
 _ABOUT_PX = 3.0  # how far about the drawings the ground tells of its grey value
 _PIXELS_PER_DEGREE = 4.0  # of freedom: blur, grain and compression make neighbours alike
 _OUTLIER = 4.0  # in standard deviations: beyond it a pixel's misfit counts no more
-_ROUNDS = 4  # of robust weights
+_ROUNDS, _LEAST_SCALE = 4, 1e-9  # of robust weights
 _FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
 _ALIGNMENTS = 3  # steps: the chip lies right to a cell before
 _FEWEST = 40  # pixels that two chips are compared by
@@ -83,10 +83,10 @@ class View:
         """Moved by the part of a cell that makes it most like a window (size, size), which it lies on to a cell."""
         used, moved, shift = self.told & self.reached, self, np.zeros(2)
         for _ in range(_ALIGNMENTS):
-            _, solution = moved.fitted(window, used)
-            if solution[1] == 0.0:
+            factors = moved.fitted(window, used).factors
+            if factors[1] == 0.0:
                 return self
-            shift = np.clip(shift - solution[2:] / solution[1], -1.0, 1.0)
+            shift = np.clip(shift - factors[2:] / factors[1], -1.0, 1.0)
             moved = replace(self, grey=np.asarray(ndimage.shift(self.grey, shift, order=3, mode="nearest")))
         return moved
 
@@ -98,15 +98,18 @@ class View:
         if used.sum() < _FEWEST:
             return 0.0
         moved = replace(self, told=used, reached=used).aligned(other.grey)
-        residuals, _ = moved.fitted(other.grey, used)
+        residuals = moved.fitted(other.grey, used).residuals
         noise = min(robust_scale(residuals), float(np.hypot(self.noise, other.noise)))
         alike = max(_OUTLIER * noise, _ALIKE)
         return float(((residuals**2 - alike**2) * contrast**2).clip(0.0, _OUTLIER**2).sum())
 
-    def fitted(self, window: Array, used: Mask) -> tuple[Array, Array]:
-        """What it leaves of a window in the pixels used, and the factors: offset, gain, by row and by column."""
+    def fitted(self, window: Array, used: Mask) -> TukeyFit:
+        """The fit to a window in the pixels used, robust against writing and dust in it. Factors: offset, gain, by row
+        and by column."""
         slopes = [np.asarray(np.gradient(self.grey, axis=axis))[used] for axis in (0, 1)]
-        return _robust([np.ones(int(used.sum())), self.grey[used], *slopes], window[used])
+        return tukey_fit(
+            np.stack([np.ones(int(used.sum())), self.grey[used], *slopes]), window[used], _ROUNDS, _LEAST_SCALE
+        )
 
     @property
     def is_chip(self) -> bool:
@@ -228,10 +231,10 @@ class Site:
         if shown.any():
             by_row, by_col = (np.asarray(np.gradient(shown, axis=axis)) for axis in (0, 1))
             columns = [*ground, shown[area], by_row[area], by_col[area]]
-            residuals, solution = _robust(columns, grey)
-            if solution[len(ground)] * self.sign > 0:
-                return residuals
-        return _robust(ground, grey)[0]
+            fit = tukey_fit(np.stack(columns), grey, _ROUNDS, _LEAST_SCALE)
+            if fit.factors[len(ground)] * self.sign > 0:
+                return fit.residuals
+        return tukey_fit(np.stack(ground), grey, _ROUNDS, _LEAST_SCALE).residuals
 
 
 def _drawn(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
@@ -282,15 +285,3 @@ def _area(pictures: Sequence[Array]) -> Mask:
     """The pixels about all drawings: farther off lies what no mark explains."""
     outside = (np.max(pictures, axis=0) - np.min(pictures, axis=0).clip(max=0.0) < _ALIKE).astype(np.uint8)
     return np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= _ABOUT_PX)
-
-
-def _robust(columns: Sequence[Array], grey: Array) -> tuple[Array, Array]:
-    """Residuals and coefficients of a fit that holds against writing and dust in the window."""
-    design, weights = np.stack(columns), np.ones_like(grey)
-    residuals, solution = grey, np.zeros(len(columns))
-    for _ in range(_ROUNDS):
-        weighted = design * weights
-        solution = np.asarray(np.linalg.lstsq(weighted @ design.T, weighted @ grey, rcond=None)[0], dtype=float)
-        residuals = grey - solution @ design
-        weights = tukey_weights(residuals, max(robust_scale(residuals), 1e-9))
-    return residuals, solution

@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.noise.least_squares import gauss_newton_step, tukey_weights
 from measure.noise.noise import SIGMA_OF_DEVIATION
-from measure.noise.robust import tukey_weights
 from measure.single_targets.block import Block
-from measure.single_targets.disk_model import GREYS, UNKNOWNS, DiskModel, DiskStates, each, solved
+from measure.single_targets.disk_model import DAMPING, GREYS, UNKNOWNS, DiskModel, DiskStates, each
 from measure.single_targets.disk_patches import Patches
 from measure.single_targets.disk_pixels import Areas, DiskPixels
 from measure.single_targets.joined import joined
@@ -91,7 +91,7 @@ class _Group:
     @classmethod
     def of(cls, block: Block, disks: DiskStates, pixels: DiskPixels) -> "_Group":
         grey, model = pixels.grey(block), DiskModel(disks.moved(-pixels.corners), *pixels.places)
-        greys = solved(model.grey_design(), grey, pixels.used.astype(np.float32))
+        greys = gauss_newton_step(model.grey_design(), grey, pixels.used.astype(np.float32), DAMPING)
         return cls(disks, pixels, grey, model.with_greys(greys))
 
     @property
@@ -123,7 +123,7 @@ class _Group:
         if is_robust:
             scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.state.greys[:, 0]) + 1e-6)
             weights *= tukey_weights(self.residuals / each(scale), 1.0)
-        step = solved(self.model.design(), self.residuals, weights)
+        step = gauss_newton_step(self.model.design(), self.residuals, weights, DAMPING)
         return replace(self, model=self.model.at(self.state.stepped(step)))
 
     def misfit(self) -> Array:

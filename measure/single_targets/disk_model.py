@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 _BLUR_PX = (0.5, 8.0)  # pixels' own width included
 _LONGEST_STEP = 0.3  # of the radius
-_DAMPING = 1e-4
+DAMPING = 1e-4  # of a step: a disk that hardly shows has unknowns that are not told apart
 GREYS, UNKNOWNS = 4, 10
 _TAIL = 0.2316419, np.array([1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.319381530]) / np.sqrt(2 * np.pi)
 _GENERATORS = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
@@ -157,13 +157,3 @@ def _normal_share(place: Image, density: Image) -> Image:
 def each(values: Array) -> Image:
     """(n, 1)"""
     return np.asarray(values, np.float32)[:, None]
-
-
-def solved(design: Image, residuals: Image, weights: Image) -> Array:
-    """(n, unknowns) of weighted least squares, for design (n, unknowns, pixels)."""
-    weighted = design * weights[:, None]
-    normal = (weighted @ design.swapaxes(1, 2)).astype(float)
-    right = (weighted @ residuals[..., None]).astype(float)
-    size = np.sqrt(np.maximum(np.einsum("nuu->nu", normal), 1e-12))
-    scaled = normal / (size[:, :, None] * size[:, None]) + _DAMPING * np.eye(normal.shape[1])
-    return np.asarray(np.linalg.solve(scaled, right / size[..., None])[..., 0] / size)

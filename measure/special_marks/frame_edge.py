@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
-from measure.noise.noise import robust_scale
-from measure.noise.robust import tukey_weights
+from measure.noise.least_squares import gauss_newton_step, tukey_fit
 from measure.scans.scan import Scan
 from measure.scans.tone import SaidOfTone, Tone
 from measure.search.candidates import FAINT
@@ -32,7 +31,7 @@ _ABOUT_PX = 5.0  # about the line: what an edge under any usual blur takes
 _STEP_PX = 0.5  # of the samples across the edge
 _SMOOTH_PX = 1.5  # across the edge, before its slope is taken
 _TILT = 0.02  # rad: the placement knows the edge's direction better
-_ITERATIONS = 12  # of the steps across an edge
+_ITERATIONS, _DAMPING = 12, 1e-9  # of the steps across an edge
 _ROUNDS = 20  # of Tukey's line, which rests after a few
 _START_BLUR_PX = 1.5  # about that of scans
 _RIM_PX = 2.0  # of a profile: a step so near its end may be another's
@@ -194,20 +193,18 @@ def _fit_steps(grey: Array) -> _Steps:
         slope = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / blur[:, None]
         level, contrast = _linear(step, grey)
         by_place, by_blur = -contrast[:, None] * slope, -contrast[:, None] * slope * z
-        design = np.stack([by_place, by_blur, step, np.ones_like(step)], axis=2)
+        design = np.stack([by_place, by_blur, step, np.ones_like(step)], axis=1)
         residuals = grey - level[:, None] - contrast[:, None] * step
         if not rounds_left:
             break
-        normal = np.einsum("nsi,nsj->nij", design, design)
-        normal += np.eye(4) * (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12)
-        change = np.linalg.solve(normal, np.einsum("nsi,ns->ni", design, residuals)[..., None])[..., 0]
+        change = gauss_newton_step(design, residuals, np.ones_like(residuals), _DAMPING)
         place = place + np.clip(change[:, 0], -1.0, 1.0)
         blur = np.clip(blur + np.clip(change[:, 1], -0.5, 0.5), *_BLUR_RANGE_PX)
     noise = np.sqrt((residuals**2).mean(axis=1))
     spread = np.maximum(grey.std(axis=1), 1e-12)
     likeness = np.sqrt(np.clip(1 - (noise / spread) ** 2, 0.0, 1.0))
     good = np.abs(place) < s[-1] - _RIM_PX
-    return _Steps(place, contrast, blur, noise, likeness, good, grey - residuals, residuals, design)
+    return _Steps(place, contrast, blur, noise, likeness, good, grey - residuals, residuals, design.swapaxes(1, 2))
 
 
 def _linear(step: Array, grey: Array) -> tuple[Array, Array]:
@@ -219,22 +216,18 @@ def _linear(step: Array, grey: Array) -> tuple[Array, Array]:
 
 def _line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask, asked: int) -> Edge | None:
     """Tukey's line, its covariance from the scatter about it and from how far along the edge that is alike."""
-    offset, slope, weights = float(np.median(across)), 0.0, np.ones(len(along))
-    for _ in range(_ROUNDS):
-        slope, offset = (float(value) for value in np.polyfit(along, across, 1, w=np.sqrt(weights)))
-        residuals = across - offset - slope * along
-        weights = tukey_weights(residuals, max(robust_scale(residuals), _SCATTER_FLOOR_PX))
-        if (weights > 0).sum() < _LEAST_SHARE * asked:
-            return None
-    on = weights > 0
-    design = np.stack([np.ones_like(along), along], axis=1)
-    inverse = np.linalg.inv((design * weights[:, None]).T @ design)
-    residuals = across - offset - slope * along
+    design = np.stack([np.ones_like(along), along])
+    line = tukey_fit(design, across, _ROUNDS, _SCATTER_FLOOR_PX)
+    residuals, on = line.residuals, line.weights > 0
+    if on.sum() < _LEAST_SHARE * asked:
+        return None
+    weighted = design * line.weights
+    inverse = np.linalg.inv(weighted @ design.T)
     variance = float((residuals[on] ** 2).sum() / max(int(on.sum()) - 2, 1)) + _SCATTER_FLOOR_PX**2
     kept = np.flatnonzero(good)[on]
     return Edge(
-        offset,
-        slope,
+        float(line.factors[0]),
+        float(line.factors[1]),
         np.asarray(inverse * variance * _alike(residuals, on), dtype=float),
         float(on.sum() / asked),
         float(np.median(steps.contrast[kept])),
@@ -242,9 +235,7 @@ def _line(scan: Scan, along: Array, across: Array, steps: _Steps, good: Mask, as
         float(np.median(steps.blur[kept])),
         float(np.median(steps.likeness[kept])),
         int(on.sum()),
-        None
-        if scan.tone.is_known
-        else _told(scan, steps, kept, np.asarray(inverse @ (design * weights[:, None]).T)[:, on]),
+        None if scan.tone.is_known else _told(scan, steps, kept, np.asarray(inverse @ weighted)[:, on]),
     )
 
 

@@ -1,6 +1,4 @@
-"""Least squares that hold against dust: Tukey's biweight, the search for damage, and a guarded solution."""
-
-from typing import TypeVar
+"""Damage of the film in what a fit leaves: dust, hairs and scratches, as regions of the picture."""
 
 import cv2
 import numpy as np
@@ -11,46 +9,7 @@ from measure.noise.noise import robust_scale
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-Real = TypeVar("Real", np.float32, np.float64)
-
-MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
-STUDENT_FREEDOM = 4.0  # of Student's t: a fifth of false observations moves little
-_TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
 _SMOOTHING_PX = 0.8  # of residuals: hardly more than a pixel, so that the finest specks stand out too
-
-
-def tukey_weights(residuals: NDArray[Real], scale_dn: float) -> NDArray[Real]:
-    """Weights between 0 and 1, all 1 where the scale is infinite."""
-    if not np.isfinite(scale_dn):
-        return np.ones_like(residuals)
-    return np.asarray((1 - np.clip(np.abs(residuals) / (_TUKEY * scale_dn), 0.0, 1.0) ** 2) ** 2)
-
-
-def tukey_loss(residuals: Array, scale_dn: float) -> float:
-    """Tukey's loss, in units of squares; the sum of squares itself where the scale is infinite."""
-    if not np.isfinite(scale_dn):
-        return float(np.sum(residuals**2))
-    limit = _TUKEY * scale_dn
-    return float(np.sum(1 - np.clip(1 - (residuals / limit) ** 2, 0.0, None) ** 3) * limit**2 / 3)
-
-
-def student_weights(squares: Array, dimensions: float) -> Array:
-    """Of observations of so many dimensions that lie so many standard deviations off, squared, in Student's t
-    distribution (Lange, Little and Taylor 1989)."""
-    return np.asarray((STUDENT_FREEDOM + dimensions) / (STUDENT_FREEDOM + squares))
-
-
-def solution(normal: Array, right: Array, free: Mask) -> Array | None:
-    """The solution for the free unknowns, 0 for the others; None where the equations are singular."""
-    size = np.sqrt(np.diag(normal))[free]
-    if not np.all(size > 0) or not np.all(np.isfinite(size)):
-        return None
-    values, vectors = np.linalg.eigh(normal[np.ix_(free, free)] / np.outer(size, size))
-    if not values[-1] < 1e10 * values[0]:
-        return None
-    result = np.zeros(len(right))
-    result[free] = vectors @ (right[free] / size @ vectors / values) / size
-    return result
 
 
 def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float) -> Mask:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from measure.noise.robust import damage, damage_where_lossy, tukey_loss, tukey_weights
+from measure.noise.damage import damage, damage_where_lossy
 
 
 def test_damage_lies_about_its_speck_on_all_sides_alike() -> None:
@@ -30,15 +30,3 @@ def test_where_compression_is_lossy_a_thin_tail_is_none_of_the_speck_and_its_nei
     assert not cut_lossy[20, 28:].any()
     assert cut_lossy[18:23, 16:25].all()
     assert cut_lossy[:, :24].sum() > cut[:, :24].sum()
-
-
-def test_tukeys_weights_are_the_published_ones_and_his_loss_has_them_as_slope() -> None:
-    """Beaton and Tukey's biweight, with 4.685 standard deviations as its end: w = (1 - (r / c)²)², and rho' = r w."""
-    share = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 2.0])
-    residuals = 4.685 * 2.5 * share
-    expected = [1.0, 0.87890625, 0.5625, 0.19140625, 0.0, 0.0]
-    np.testing.assert_allclose(tukey_weights(residuals, 2.5), expected, atol=1e-12)
-    step = 1e-5
-    for residual, weight in zip(residuals, expected, strict=True):
-        ends = [tukey_loss(np.array([residual + side * step]), 2.5) for side in (-1, 1)]
-        np.testing.assert_allclose((ends[1] - ends[0]) / (2 * step), 2 * residual * weight, atol=1e-4)

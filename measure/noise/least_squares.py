@@ -1,0 +1,104 @@
+"""Least squares that hold against outliers: Gauss and Newton's step, and weights by Tukey's and Student's functions."""
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.noise.noise import robust_scale
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Real = TypeVar("Real", np.float32, np.float64)
+
+MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, against one from the mean of squares
+STUDENT_FREEDOM = 4.0  # of Student's t: a fifth of false observations moves little
+_TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
+_WORST_CONDITION = 1e10  # of normal equations that determine their unknowns
+
+
+def tukey_weights(residuals: NDArray[Real], scale: float) -> NDArray[Real]:
+    """Weights between 0 and 1, all 1 where the scale is infinite."""
+    if not np.isfinite(scale):
+        return np.ones_like(residuals)
+    return np.asarray((1 - np.clip(np.abs(residuals) / (_TUKEY * scale), 0.0, 1.0) ** 2) ** 2)
+
+
+def tukey_loss(residuals: Array, scale: float) -> float:
+    """Tukey's loss, in units of squares; the sum of squares itself where the scale is infinite."""
+    if not np.isfinite(scale):
+        return float(np.sum(residuals**2))
+    limit = _TUKEY * scale
+    return float(np.sum(1 - np.clip(1 - (residuals / limit) ** 2, 0.0, None) ** 3) * limit**2 / 3)
+
+
+def student_weights(squares: Array, dimensions: float) -> Array:
+    """Of observations of so many dimensions that lie so many standard deviations off, squared, in Student's t
+    distribution (Lange, Little and Taylor 1989)."""
+    return np.asarray((STUDENT_FREEDOM + dimensions) / (STUDENT_FREEDOM + squares))
+
+
+def gauss_newton_step(design: NDArray[Real], residuals: NDArray[Real], weights: NDArray[Real], damping: float) -> Array:
+    """(..., unknowns) by which residuals (..., observations) shrink most, for derivatives (..., unknowns,
+    observations) of the model and weights (..., observations). damping: what is added to the normal equations' unit
+    diagonal, to which they are scaled (Levenberg)."""
+    weighted = design * weights[..., None, :]
+    normal = (weighted @ design.swapaxes(-1, -2)).astype(float)
+    right = (weighted @ residuals[..., None]).astype(float)
+    size = np.sqrt(np.maximum(np.einsum("...uu->...u", normal), 1e-12))
+    scaled = normal / (size[..., :, None] * size[..., None, :]) + damping * np.eye(normal.shape[-1])
+    return np.asarray(np.linalg.solve(scaled, right / size[..., None])[..., 0] / size)
+
+
+def solution(normal: Array, right: Array, free: Mask) -> Array | None:
+    """The solution of normal equations (unknowns, unknowns) for the free unknowns, 0 for the others; None where they
+    are singular."""
+    size = np.sqrt(np.diag(normal))[free]
+    if not np.all(size > 0) or not np.all(np.isfinite(size)):
+        return None
+    scaled = normal[np.ix_(free, free)] / np.outer(size, size)
+    values = np.linalg.eigvalsh(scaled)
+    if not values[-1] < _WORST_CONDITION * values[0]:
+        return None
+    result = np.zeros(len(right))
+    result[free] = np.linalg.solve(scaled, right[free] / size) / size
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class TukeyFit:
+    """values = factors (unknowns,) @ design + residuals (observations,); weights (observations,) by the latter."""
+
+    factors: Array
+    residuals: Array
+    weights: Array
+
+
+def tukey_fit(design: Array, values: Array, rounds: int, least_scale: float) -> TukeyFit:
+    """The linear fit of design (unknowns, observations) to values by Tukey's weights, whose scale is that of the
+    residuals, but no less than the least; plain in the first of the rounds."""
+    weights = np.ones_like(values)
+    for _ in range(rounds):
+        weighted = design * weights
+        factors = np.asarray(np.linalg.lstsq(weighted @ design.T, weighted @ values, rcond=None)[0], dtype=float)
+        residuals = values - factors @ design
+        weights = tukey_weights(residuals, max(robust_scale(residuals), least_scale))
+    return TukeyFit(factors, residuals, weights)
+
+
+def least_distances(
+    design: Array, places: Array, least: float, rounds: int, prior: Array | None = None, usual: Array | None = None
+) -> Array:
+    """(..., unknowns, 2) maps from design (..., n, unknowns) to places (..., n, 2) by least distances, as some may be
+    false; distances below the least weigh alike. prior (unknowns, unknowns): the weight of what the map is usually
+    (unknowns, 2), that of a place being 1 at most."""
+    weights, unknowns = np.ones(design.shape[:-1]), design.shape[-1]
+    prior = np.zeros((unknowns, unknowns)) if prior is None else prior
+    usual = np.zeros((unknowns, 2)) if usual is None else usual
+    for _ in range(rounds):
+        weighted = np.swapaxes(design * weights[..., None], -1, -2)
+        maps = np.linalg.solve(weighted @ design + prior, weighted @ places + prior @ usual)
+        off = places - design @ maps
+        weights = least / np.maximum(np.hypot(off[..., 0], off[..., 1]), least)
+    return np.asarray(maps)
