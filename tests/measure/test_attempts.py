@@ -78,12 +78,11 @@ def test_where_nothing_was_seen_the_reason_says_so(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize(("is_given", "looks"), [(True, 4), (False, 3)])
 def test_the_attempts_in_their_order(is_given: bool, looks: int, tmp_path: Path) -> None:
-    """As given, longer one way and filling the scan, at a closer look anywhere and within the frame's edges; a small
-    scan is searched as a whole at once. Where no pitch is given, two groups of sizes stand in the place of three."""
+    """As given, longer one way and filling the scan, at a closer look; a small scan is searched as a whole at once.
+    Where no pitch is given, two groups of sizes stand in the place of three."""
     hypotheses = pitch_hypotheses(SCAN, ALIKE, (50.0, 50.0) if is_given else None, FiducialOptions())
     listed = attempts._attempts(FrameSearch(SCAN, ALIKE, FiducialOptions()), hypotheses, is_given)
     assert len(listed) == looks
     assert [each.is_given for each in listed] == [True, *[False] * (looks - 1)]
     assert [each.hypotheses for each in listed[: len(hypotheses)]] == hypotheses
     assert listed[-1].search is not listed[-2].search is listed[0].search
-    assert listed[-1].hypotheses is listed[-2].hypotheses
