@@ -1,4 +1,4 @@
-"""Corrections of the observed camera point, as the papers define them; OpenCV's distortion of the ray is its own."""
+"""Corrections of the observed or the ideal camera point, as the papers define them; OpenCV distorts the ray itself."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,13 @@ JUHL_UNIT = 1e-5  # a micrometre in dm
 
 
 def correction(distortion: Distortion, reduced: ComplexArray, point: Array) -> ComplexArray:
-    """(n, 2) what is subtracted from an observed point to get the ideal one, mm.
+    """(n, 2) what is subtracted from an observed point to get the ideal one, mm; with aicon from the ideal one.
 
-    reduced (n, 2): observed camera coordinates less the principal point (2,). Complex for derivatives by complex steps.
+    reduced (n, 2): camera coordinates less the principal point (2,). Complex for derivatives by complex steps.
     """
     value = dict.fromkeys(PARAMETERS[distortion.family], 0.0) | dict(distortion.parameters)
-    family = {"torlegard": _torlegard, "brown": _brown, "juhl": _juhl}[distortion.family]
-    return family(distortion, value, reduced, point)
+    families = {"torlegard": _torlegard, "brown": _brown, "australis": _australis, "aicon": _aicon, "juhl": _juhl}
+    return families[distortion.family](distortion, value, reduced, point)
 
 
 def _torlegard(distortion: Distortion, value: dict[str, float], reduced: ComplexArray, point: Array) -> ComplexArray:
@@ -41,6 +41,26 @@ def _brown(_: Distortion, value: dict[str, float], reduced: ComplexArray, __: Ar
     dx = x * radial + value["p1"] * (r2 + 2 * x * x) + 2 * value["p2"] * x * y + value["b1"] * x + value["b2"] * y
     dy = y * radial + 2 * value["p1"] * x * y + value["p2"] * (r2 + 2 * y * y)
     return np.stack([dx, dy], axis=1)
+
+
+def _australis(_: Distortion, value: dict[str, float], reduced: ComplexArray, __: Array) -> ComplexArray:
+    """Added to the observed point."""
+    x, y = reduced.T
+    r2 = x * x + y * y
+    radial = value["k1"] * r2 + value["k2"] * r2**2 + value["k3"] * r2**3
+    dx = x * radial + value["p1"] * (r2 + 2 * x * x) + 2 * value["p2"] * x * y + value["b1"] * x + value["b2"] * y
+    dy = y * radial + 2 * value["p1"] * x * y + value["p2"] * (r2 + 2 * y * y)
+    return np.stack([-dx, -dy], axis=1)
+
+
+def _aicon(distortion: Distortion, value: dict[str, float], reduced: ComplexArray, _: Array) -> ComplexArray:
+    """Added to the ideal point, which is what is given here."""
+    x, y = reduced.T
+    r2, zero2 = x * x + y * y, distortion.r0_mm**2
+    radial = sum(value[f"a{n}"] * (r2**n - zero2**n) for n in (1, 2, 3))
+    dx = x * radial + value["b1"] * (r2 + 2 * x * x) + 2 * value["b2"] * x * y + value["c1"] * x + value["c2"] * y
+    dy = y * radial + value["b2"] * (r2 + 2 * y * y) + 2 * value["b1"] * x * y
+    return np.stack([-dx, -dy], axis=1)
 
 
 def _juhl(distortion: Distortion, value: dict[str, float], reduced: ComplexArray, point: Array) -> ComplexArray:

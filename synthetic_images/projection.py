@@ -9,7 +9,10 @@ from synthetic_images.scene import Distortion, SceneCamera
 
 Array = NDArray[np.float64]
 
-OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+OF_THE_RAY = {  # families of OpenCV with their coefficients in its order
+    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+    "opencv_fisheye": ("k1", "k2", "k3", "k4"),
+}
 INVERSION_MM = 1e-13
 INVERSION_STEPS = 50
 
@@ -50,9 +53,11 @@ def _distorted(camera: SceneCamera, tangents: Array) -> Array:
     family = camera.distortion.family
     if family == "none":
         return np.asarray(ideal + point)
-    if family == "opencv":
+    if family in OF_THE_RAY:
         return np.asarray(c * _opencv_distorted(camera.distortion, tangents) + point)
-    return np.asarray(_observed(camera.distortion, ideal, point) + point)
+    if family == "aicon":
+        return np.asarray(ideal - correction(camera.distortion, ideal.astype(np.complex128), point).real + point)
+    return np.asarray(_inverted(camera.distortion, ideal, point) + point)
 
 
 def ray_from_camera(camera: SceneCamera, exterior: tuple[float, ...], camera_mm: Array) -> Array:
@@ -60,10 +65,12 @@ def ray_from_camera(camera: SceneCamera, exterior: tuple[float, ...], camera_mm:
     c, point = camera.principal_distance_mm, np.asarray(camera.principal_point_mm)
     reduced = camera_mm - point
     family = camera.distortion.family
-    if family == "opencv":
+    if family in OF_THE_RAY:
         tangents = _opencv_ideal(camera.distortion, reduced / c)
     elif family == "none":
         tangents = reduced / c
+    elif family == "aicon":
+        tangents = _inverted(camera.distortion, reduced, point) / c
     else:
         tangents = (reduced - correction(camera.distortion, reduced.astype(np.complex128), point).real) / c
     rays = np.column_stack([tangents, np.full(len(tangents), -1.0)])
@@ -72,33 +79,44 @@ def ray_from_camera(camera: SceneCamera, exterior: tuple[float, ...], camera_mm:
 
 def _opencv_ideal(distortion: Distortion, tangents: Array) -> Array:
     """The inverse of `_opencv_distorted`, by OpenCV's iteration."""
-    down = np.array([1.0, -1.0])
-    stretch = np.array([1.0 + distortion.parameters.get("b1", 0.0), 1.0])
-    coefficients = np.array([distortion.parameters.get(name, 0.0) for name in OPENCV_ORDER])
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 4 * INVERSION_STEPS, 1e-14)
-    seen = np.ascontiguousarray(tangents * down / stretch).reshape(-1, 1, 2)
-    ideal = cv2.undistortPoints(seen, np.eye(3), coefficients, criteria=until)
-    return np.asarray(np.reshape(ideal, (-1, 2)) * down, np.float64)
+    seen = np.linalg.solve(_axes(distortion), tangents.T).T.reshape(-1, 1, 2)
+    if distortion.family == "opencv_fisheye":
+        ideal = cv2.fisheye.undistortPoints(seen, np.eye(3), _coefficients(distortion), criteria=until)
+    else:
+        ideal = cv2.undistortPoints(seen, np.eye(3), _coefficients(distortion), criteria=until)
+    return np.asarray(np.reshape(ideal, (-1, 2)) * [1.0, -1.0], np.float64)
 
 
 def _opencv_distorted(distortion: Distortion, tangents: Array) -> Array:
-    """OpenCV's own model, whose y points down; b1 makes its fx = c (1 + b1)."""
-    down = np.array([1.0, -1.0])
-    stretch = np.array([1.0 + distortion.parameters.get("b1", 0.0), 1.0])
-    coefficients = np.array([distortion.parameters.get(name, 0.0) for name in OPENCV_ORDER])
+    """OpenCV's own models, whose y points down."""
     seen = np.isfinite(tangents).all(axis=1)
     result = np.full_like(tangents, np.nan)
     if seen.any():
-        directions = np.column_stack([tangents[seen] * down, np.ones(seen.sum())])
-        projected, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
-        result[seen] = np.asarray(projected).reshape(-1, 2) * down * stretch
+        directions = np.column_stack([tangents[seen] * [1.0, -1.0], np.ones(seen.sum())])
+        whole = (np.zeros(3), np.zeros(3), np.eye(3), _coefficients(distortion))
+        if distortion.family == "opencv_fisheye":
+            projected, _ = cv2.fisheye.projectPoints(directions[:, None], *whole)
+        else:
+            projected, _ = cv2.projectPoints(directions, *whole)
+        result[seen] = np.asarray(projected).reshape(-1, 2) @ _axes(distortion).T
     return result
 
 
-def _observed(distortion: Distortion, ideal: Array, point: Array) -> Array:
-    """The observed points, reduced to the principal point, whose correction leads to the ideal ones: Newton's method.
+def _coefficients(distortion: Distortion) -> Array:
+    return np.array([distortion.parameters.get(name, 0.0) for name in OF_THE_RAY[distortion.family]])
 
-    The correction is defined at the observed point, and therefore has to be inverted here.
+
+def _axes(distortion: Distortion) -> Array:
+    """(2, 2) from OpenCV's axes to x right, y up; b1 makes its fx = c (1 + b1), b2 its skew c b2."""
+    b1, b2 = (distortion.parameters.get(name, 0.0) for name in ("b1", "b2"))
+    return np.array([[1.0 + b1, b2], [0.0, -1.0]])
+
+
+def _inverted(distortion: Distortion, ideal: Array, point: Array) -> Array:
+    """The points, reduced to the principal point, whose correction leads to the given ones: Newton's method.
+
+    A correction is defined at the observed point, aicon's at the ideal one: one way it has to be inverted.
     """
     observed = ideal.copy()
     open_ = np.asarray(np.isfinite(ideal).all(axis=1))

@@ -18,7 +18,7 @@ from synthetic_images.writing import FONTS
 
 Array = NDArray[np.float64]
 
-Family = Literal["none", "torlegard", "brown", "opencv", "juhl"]
+Family = Literal["none", "torlegard", "brown", "australis", "aicon", "opencv", "opencv_fisheye", "juhl"]
 Side = Literal["left", "right", "top", "bottom"]
 Compression = Literal["none", "lzw", "deflate", "zstd", "jpeg"]
 Background = Literal["plain", "wall", "terrain"]
@@ -30,7 +30,10 @@ PARAMETERS: Mapping[Family, tuple[str, ...]] = {
     "none": (),
     "torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"),
     "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
-    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1"),
+    "australis": ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
+    "aicon": ("a1", "a2", "a3", "b1", "b2", "c1", "c2"),
+    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2"),
+    "opencv_fisheye": ("k1", "k2", "k3", "k4", "b1", "b2"),
     "juhl": ("t1", "t2", "t3", "t4", "r1", "r2", "r3", "af", "sh"),
 }
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.functional_model.families import parameter_names
+from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.transformation import marks_needed
 from adjust.problem.network import Calibration, Network, Prior, Transformation
 
@@ -20,11 +20,6 @@ TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
     "polynomial(2)": ("congruent", "similarity", "affine", "conformal(2)", "bilinear"),
 }
 
-PHYSICAL = {
-    "torlegard": ("k3", "k3 k5", "k3 p1 p2", "k3 k5 p1 p2", "k3 k5 k7 p1 p2"),
-    "brown": ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2"),
-    "opencv": ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3"),
-}
 SETS = {"ebner": ("b1", "b2"), "legendre(3)": ("a10", "a01")}  # with their parameters of affinity and shear
 
 
@@ -102,16 +97,16 @@ def transformations(network: Network) -> tuple[Transformation, ...]:
 
 
 def lenses(network: Network, transformation: Transformation, with_sets: bool) -> tuple[Model, ...]:
-    """No distortion, a ladder of the camera's own family (Torlegård's where that is none of PHYSICAL), the sets.
+    """No distortion, a ladder of the camera's own family (Torlegård's where that has none), the sets.
 
     And the network's own, where it is none of these. Fiducials alone say nothing of a lens: then there is none.
     """
     if len(network.idle_cameras) == len(network.cameras):
         return (Model(transformation),)
-    family = network.cameras[0].distortion.family
-    ladder = family if family in PHYSICAL else "torlegard"
+    own_family = network.cameras[0].distortion.family
+    ladder = own_family if family(own_family).ladder else "torlegard"
     models = [Model(transformation)]
-    models += [Model(transformation, ladder, tuple(names.split())) for names in PHYSICAL[ladder]]
+    models += [Model(transformation, ladder, tuple(names.split())) for names in family(ladder).ladder]
     if with_sets:
         for name, affinity in SETS.items():
             films = (transformation, *TRANSFORMATIONS.get(transformation, ()))

@@ -2,10 +2,10 @@
 
 Every family is one pair of equations between the observed point (x', y') and the ideal ray (u, v) = (-U/W, -V/W):
 
-    F = (x', y') - (x0', y0') - c h(u, v) - d(x', y') = 0
+    F = (x', y') - (x0', y0') - h(u, v, c) - d(x', y') = 0
 
-`opencv` distorts the ray by h (d is 0), all others correct the observed point by d (h is the ray itself). All arrays
-may be complex: the derivatives are tested by complex steps.
+Families of the object side make an image h of the ray (d is 0), those of the image side correct the observed point by
+d (h is c times the ray). All arrays may be complex: the derivatives are tested by complex steps.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,6 @@ class ImageEquations:
     """
 
     value: Array
-    c: float
     imaged: Imaged
     correction: Correction
 
@@ -39,7 +38,7 @@ class ImageEquations:
 
     @property
     def by_ray(self) -> Array:
-        return np.asarray(-self.c * self.imaged.by_ray)
+        return -self.imaged.by_ray
 
     @property
     def by_interior(self) -> Array:
@@ -53,10 +52,10 @@ class ImageEquations:
     def by_quantity(self, k: int) -> Array:
         """Derivative (n, 2) by c, x0', y0' or a parameter of the family, in this order."""
         if k == 0:
-            return -self.imaged.value
+            return -self.imaged.by_distance
         if k < 3:
             return np.asarray(-np.eye(2)[:, k - 1] - self.correction.by_principal_point[..., k - 1])
-        return np.asarray(-self.c * self.imaged.by_parameter(k - 3) - self.correction.by_parameters[..., k - 3])
+        return np.asarray(-self.imaged.by_parameter(k - 3) - self.correction.by_parameters[..., k - 3])
 
 
 def image_equations(
@@ -67,14 +66,13 @@ def image_equations(
     interior (3,): c, x0', y0' in mm. parameters (k,): in the order of `families.parameter_names`. xy_mm (n, 2):
     observed camera coordinates. ray (n, 2): -U/W, -V/W.
     """
-    return equations_of(distortion, interior, parameters, xy_mm, family(distortion.family).image(ray, parameters))
+    imaged = family(distortion.family).image(distortion, interior[0], ray, parameters)
+    return equations_of(distortion, interior, parameters, xy_mm, imaged)
 
 
 def equations_of(
     distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array, imaged: Imaged
 ) -> ImageEquations:
     """The same of points whose rays' images are known."""
-    c, principal_point = interior[0], interior[1:]
-    correction = family(distortion.family).correct(distortion, xy_mm, principal_point, parameters)
-    value = xy_mm - principal_point - c * imaged.value - correction.value
-    return ImageEquations(value, c, imaged, correction)
+    correction = family(distortion.family).correct(distortion, xy_mm, interior[1:], parameters)
+    return ImageEquations(xy_mm - interior[1:] - imaged.value - correction.value, imaged, correction)

@@ -1,6 +1,7 @@
 """The table of distortion families: their parameters and what they do to a point or a ray.
 
-A family with an order is spelled with it: "legendre(3)".
+A family with an order is spelled with it: "legendre(3)". Whatever works with distortion asks this table: a new family
+is a formula with its derivatives and an entry here.
 """
 
 import re
@@ -11,21 +12,40 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.correction import Correction, Imaged, Settings, no_correction, undistorted
+from adjust.functional_model.correction import (
+    Correct,
+    Image,
+    no_correction,
+    of_ideal_point,
+    of_ray,
+    undistorted,
+)
 from adjust.functional_model.fourier_sets import by_order, fourier, fourier_names
-from adjust.functional_model.juhl import JUHL_GROUPS, JUHL_NAMES, juhl
+from adjust.functional_model.juhl import JUHL_GROUPS, JUHL_NAMES, JUHL_UNITS, juhl
 from adjust.functional_model.opencv_family import (
+    FISHEYE_GROUPS,
+    FISHEYE_NAMES,
     OPENCV_DENOMINATOR,
     OPENCV_GROUPS,
     OPENCV_NAMES,
+    OPENCV_UNITS,
+    OPENCV_Y_DOWN,
     expanded,
     opencv,
+    opencv_fisheye,
 )
 from adjust.functional_model.physical import (
+    AICON_GROUPS,
+    AICON_NAMES,
+    AUSTRALIS_NAMES,
     BROWN_GROUPS,
     BROWN_NAMES,
+    BROWN_UNITS,
     TORLEGARD_GROUPS,
     TORLEGARD_NAMES,
+    TORLEGARD_UNITS,
+    aicon,
+    australis,
     brown,
     torlegard,
 )
@@ -41,19 +61,29 @@ FOURIER_ORDERS = range(1, 10)
 class Family:
     """A distortion family.
 
-    parameters: their names. image(ray, parameters): what it does to the ray. correct(settings, xy, principal point,
-    parameters): what is subtracted from the observed point. needs: the setting that it cannot do without. groups: the
-    parameters that are one cause, or of one degree, by its name. alike_at_zero: parameters that do the same as others
-    while they are 0; apart(parameters): others, of nearly the same distortion, with which they do not.
+    parameters: their names; units: theirs, mm where none is said. image, of the object side: what it makes of a ray.
+    correct, of the image side: what is subtracted from the observed point. needs: the setting that it cannot do
+    without. y_down: parameters of a family whose axes are x right, y down, that would have the other sign with y up.
+    groups: the parameters that are one cause, or of one degree, by its name. ladder: what a choice of a model tries of
+    it, simplest first. alike_at_zero: parameters that do the same as others while they are 0; apart(parameters):
+    others, of nearly the same distortion, with which they do not. is_pinhole_at_zero: whether it leaves every point
+    where it is while all parameters are 0.
     """
 
     parameters: tuple[str, ...] = ()
-    image: Callable[[Array, Array], Imaged] = undistorted
-    correct: Callable[[Settings, Array, Array, Array], Correction] = no_correction
+    image: Image = undistorted
+    correct: Correct = no_correction
+    units: tuple[str, ...] = ()
     needs: str = ""
+    y_down: tuple[str, ...] = ()
     groups: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    ladder: tuple[str, ...] = ()
     alike_at_zero: tuple[str, ...] = ()
     apart: Callable[[Array], Array] = np.copy
+    is_pinhole_at_zero: bool = True
+
+    def unit(self, parameter: str) -> str:
+        return self.units[self.parameters.index(parameter)] if self.units else "mm"
 
 
 def _polynomials(of: PolynomialSet) -> Family:
@@ -68,14 +98,47 @@ def _fourier(order: int) -> Family:
     return Family(fourier_names(order), correct=partial(fourier, order), needs="half_mm", groups=by_order(order))
 
 
+_BROWN_LADDER = ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2")
 _FAMILIES = {
     "none": Family(),
-    "torlegard": Family(TORLEGARD_NAMES, correct=torlegard, groups=TORLEGARD_GROUPS),
-    "brown": Family(BROWN_NAMES, correct=brown, groups=BROWN_GROUPS),
-    "opencv": Family(
-        OPENCV_NAMES, image=opencv, groups=OPENCV_GROUPS, alike_at_zero=OPENCV_DENOMINATOR, apart=expanded
+    "torlegard": Family(
+        TORLEGARD_NAMES,
+        correct=torlegard,
+        units=TORLEGARD_UNITS,
+        groups=TORLEGARD_GROUPS,
+        ladder=("k3", "k3 k5", "k3 p1 p2", "k3 k5 p1 p2", "k3 k5 k7 p1 p2"),
     ),
-    "juhl": Family(JUHL_NAMES, correct=juhl, needs="r0_mm", groups=JUHL_GROUPS),
+    "brown": Family(BROWN_NAMES, correct=brown, units=BROWN_UNITS, groups=BROWN_GROUPS, ladder=_BROWN_LADDER),
+    "australis": Family(
+        AUSTRALIS_NAMES, correct=australis, units=BROWN_UNITS, groups=BROWN_GROUPS, ladder=_BROWN_LADDER
+    ),
+    "aicon": Family(
+        AICON_NAMES,
+        image=of_ideal_point(aicon),
+        units=BROWN_UNITS,
+        groups=AICON_GROUPS,
+        ladder=("a1", "a1 a2", "a1 b1 b2", "a1 a2 b1 b2", "a1 a2 a3 b1 b2"),
+    ),
+    "opencv": Family(
+        OPENCV_NAMES,
+        image=of_ray(opencv),
+        units=OPENCV_UNITS,
+        y_down=OPENCV_Y_DOWN,
+        groups=OPENCV_GROUPS,
+        ladder=("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3"),
+        alike_at_zero=OPENCV_DENOMINATOR,
+        apart=expanded,
+    ),
+    "opencv_fisheye": Family(
+        FISHEYE_NAMES,
+        image=of_ray(opencv_fisheye),
+        units=("–",) * len(FISHEYE_NAMES),
+        y_down=("b2",),
+        groups=FISHEYE_GROUPS,
+        ladder=("k1", "k1 k2", "k1 k2 k3", "k1 k2 k3 k4"),
+        is_pinhole_at_zero=False,
+    ),
+    "juhl": Family(JUHL_NAMES, correct=juhl, units=JUHL_UNITS, needs="r0_mm", groups=JUHL_GROUPS),
     "ebner": _polynomials(EBNER),
     "gruen": _polynomials(GRUEN),
 }

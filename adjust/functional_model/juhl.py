@@ -8,6 +8,7 @@ from adjust.functional_model.correction import Correction, Settings
 Array = NDArray[np.float64]
 
 JUHL_NAMES = ("t1", "t2", "t3", "t4", "r1", "r2", "r3", "af", "sh")
+JUHL_UNITS = ("µm at 1 dm",) * len(JUHL_NAMES)
 JUHL_GROUPS = (("tangential", JUHL_NAMES[:4]), ("radial", JUHL_NAMES[4:7]), ("affinity", JUHL_NAMES[7:]))
 MM_PER_DM = 100.0
 UM_PER_MM = 1000.0

@@ -1,14 +1,19 @@
-"""OpenCV's model, which distorts the ideal ray: its documentation of camera calibration, "detailed description"."""
+"""OpenCV's models, which distort the ideal ray.
+
+Sources: OpenCV's documentation of camera calibration ("detailed description") and of its name space fisheye. Their axes
+are x right and y DOWN, those of the camera here have y up. The parameters keep OpenCV's values, so that they belong to
+its axes.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.correction import Imaged, undistorted
+from adjust.functional_model.correction import DistortedRay, straight
 from adjust.linear_algebra.small_matrices import applied, matrices, product, vectors
 
 Array = NDArray[np.float64]
 
-OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1")
+OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1", "b2")
 OPENCV_DENOMINATOR = ("k4", "k5", "k6")  # at 0 their derivatives are those of k1, k2, k3 with the other sign
 OPENCV_GROUPS = (
     ("radial", ("k1", "k2", "k3", "k4", "k5", "k6")),
@@ -16,35 +21,91 @@ OPENCV_GROUPS = (
     ("decentering", ("p1", "p2")),
     ("thin prism", ("s1", "s2", "s3", "s4")),
     ("tilt", ("tau_x", "tau_y")),
+    ("affinity", ("b1", "b2")),
 )
+OPENCV_Y_DOWN = ("p1", "s3", "s4", "tau_x", "b2")  # with y up they would have the other sign
+OPENCV_UNITS = (*["–"] * 12, "rad", "rad", "–", "–")
+FISHEYE_NAMES = ("k1", "k2", "k3", "k4", "b1", "b2")
+FISHEYE_GROUPS = (("radial", FISHEYE_NAMES[:4]), ("affinity", FISHEYE_NAMES[4:]))
+DOWN = np.array([1.0, -1.0])  # from axes with y up to OpenCV's, and back
+CENTRAL = 1e-4  # tangents below which an angle and its tangent are expanded: the next term is below 1e-16
 
 
-def opencv(ray: Array, parameters: Array) -> Imaged:
+def opencv(ray: Array, parameters: Array) -> DistortedRay:
     """The image of rays (n, 2) in the camera's axes, y up; the parameters are those of OpenCV's axes, y down.
 
-    tau_x, tau_y, the tilt of the sensor, in rad. b1 scales x: OpenCV's fx is c (1 + b1), its fy is c, both over the
-    pitch.
+    tau_x, tau_y, the tilt of the sensor, in rad. b1 scales x and b2 shears it, as the camera matrix does: OpenCV's fx
+    is c (1 + b1), its fy is c, the skew of Zhang's matrix is c b2, all over the pitch.
     """
-    tau_x, tau_y, b1 = parameters[12:]
-    # From OpenCV's axes to the camera's: the image's y, and the ray's, turn their signs.
-    scale, mirror = np.array([1 + b1, -1.0]), np.array([1.0, -1.0])
-    straight = _lens(ray * mirror, parameters[:12])
+    tau_x, tau_y, b1, b2 = parameters[12:]
+    straight_lens = _lens(ray * DOWN, parameters[:12])
     is_tilted = tau_x != 0.0 or tau_y != 0.0
-    tilted = _tilt(straight.value, tau_x, tau_y) if is_tilted else undistorted(straight.value, parameters)
+    tilted = _tilt(straight_lens.value, tau_x, tau_y) if is_tilted else straight(straight_lens.value)
 
     def by_parameter(k: int) -> Array:
-        match OPENCV_NAMES[k]:
-            case "b1":
-                return vectors(tilted.value[:, 0], np.zeros_like(tilted.value[:, 0]))
-            case "tau_x" | "tau_y" as name:
-                column = _tilt(straight.value, tau_x, tau_y).by_parameter(name == "tau_y")
-            case _:
-                column = straight.by_parameter(k)
-                column = applied(tilted.by_ray, column) if is_tilted else column
-        return np.asarray(column * scale)
+        if OPENCV_NAMES[k] in ("tau_x", "tau_y"):
+            return _tilt(straight_lens.value, tau_x, tau_y).by_parameter(k - OPENCV_NAMES.index("tau_x"))
+        column = straight_lens.by_parameter(k)
+        return applied(tilted.by_ray, column) if is_tilted else column
 
-    by_ray = product(tilted.by_ray, straight.by_ray) if is_tilted else straight.by_ray
-    return Imaged(tilted.value * scale, by_ray * scale[:, None] * mirror, by_parameter)
+    by_ray = product(tilted.by_ray, straight_lens.by_ray) if is_tilted else straight_lens.by_ray
+    return _in_camera(DistortedRay(tilted.value, by_ray, by_parameter), b1, b2, OPENCV_NAMES.index("b1"))
+
+
+def opencv_fisheye(ray: Array, parameters: Array) -> DistortedRay:
+    """The same of OpenCV's fisheye: theta (1 + k1 theta² + ... + k4 theta⁸) off the axis, theta being the ray's angle.
+
+    In rad; equidistant where k1 to k4 are 0. As of every family, an image ends below 90 degrees off the axis. b1 and b2
+    as in `opencv`: OpenCV's alpha is b2 / (1 + b1).
+    """
+    *k, b1, b2 = parameters
+    x, y = (ray * DOWN).T
+    r2 = x**2 + y**2
+    central = r2.real < CENTRAL**2
+    outer2 = np.where(central, 1.0, r2)
+    tangent = np.sqrt(outer2)
+    theta2 = np.where(central, r2 * (1.0 - 2.0 / 3.0 * r2), np.arctan(tangent) ** 2)
+    bent = np.where(central, 1.0 - r2 / 3.0, np.arctan(tangent) / tangent)  # theta over its tangent
+    bent_by_r2 = np.where(
+        central, -1.0 / 3.0 + 0.4 * r2, (1.0 / (1.0 + r2) - bent) / (2.0 * np.where(central, 1.0, r2))
+    )
+    theta2_by_r2 = bent / (1.0 + r2)
+    series = 1.0 + theta2 * (k[0] + theta2 * (k[1] + theta2 * (k[2] + theta2 * k[3])))
+    series_by_theta2 = k[0] + theta2 * (2 * k[1] + theta2 * (3 * k[2] + theta2 * 4 * k[3]))
+    radial = bent * series
+    radial_by_r2 = bent_by_r2 * series + bent * series_by_theta2 * theta2_by_r2
+    by_ray = matrices(
+        (radial + 2 * x * x * radial_by_r2, 2 * x * y * radial_by_r2),
+        (2 * x * y * radial_by_r2, radial + 2 * y * y * radial_by_r2),
+    )
+
+    def by_parameter(number: int) -> Array:
+        factor = bent * theta2 ** (number + 1)
+        return vectors(x * factor, y * factor)
+
+    lens = DistortedRay(vectors(x * radial, y * radial), by_ray, by_parameter)
+    return _in_camera(lens, b1, b2, FISHEYE_NAMES.index("b1"))
+
+
+def _in_camera(lens: DistortedRay, b1: float, b2: float, first: int) -> DistortedRay:
+    """What OpenCV's axes show of rays in them, stretched and sheared, in the camera's axes; first: the number of b1
+    among the parameters, b2 is the next."""
+    scale = np.array([1.0 + b1, -1.0]) + 0.0 * b2  # as complex as they are
+
+    def seen(straight: Array) -> Array:
+        """Of vectors (2, ...) with the axes first."""
+        sheared = (straight.T * scale).T
+        if b2 != 0.0:
+            sheared[0] += b2 * straight[1]
+        return np.asarray(sheared)
+
+    def by_parameter(k: int) -> Array:
+        if k >= first:
+            return vectors(lens.value[:, k - first], np.zeros_like(lens.value[:, 0]))
+        return seen(lens.by_parameter(k).T).T
+
+    by_ray = np.moveaxis(seen(np.moveaxis(lens.by_ray, 0, -1)), -1, 0)
+    return DistortedRay(seen(lens.value.T).T, by_ray * DOWN, by_parameter)
 
 
 def expanded(parameters: Array) -> Array:
@@ -57,7 +118,7 @@ def expanded(parameters: Array) -> Array:
     return np.array([k[name] for name in OPENCV_NAMES])
 
 
-def _lens(ray: Array, parameters: Array) -> Imaged:
+def _lens(ray: Array, parameters: Array) -> DistortedRay:
     """Radial, tangential and thin prism distortion."""
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = parameters
     x, y = ray.T
@@ -94,10 +155,10 @@ def _lens(ray: Array, parameters: Array) -> Imaged:
                 factor = -radial * powers[int(name[1]) - 4] / below
         return vectors(x * factor, y * factor)
 
-    return Imaged(vectors(xd, yd), by_ray, by_parameter)
+    return DistortedRay(vectors(xd, yd), by_ray, by_parameter)
 
 
-def _tilt(point: Array, tau_x: float, tau_y: float) -> Imaged:
+def _tilt(point: Array, tau_x: float, tau_y: float) -> DistortedRay:
     """The point on a sensor that is tilted about its axes: R33 (r1 p / r3 p, r2 p / r3 p) - (R13, R23).
 
     r1, r2, r3 are the rows of R = Ry(tau_y) Rx(tau_x), p = (x, y, 1).
@@ -124,7 +185,7 @@ def _tilt(point: Array, tau_x: float, tau_y: float) -> Imaged:
         )
 
     value = [rotation[2, 2] * at - rotation[axis, 2] for axis, at in enumerate(over)]
-    return Imaged(vectors(*value), matrices(*by_point), by_angle)
+    return DistortedRay(vectors(*value), matrices(*by_point), by_angle)
 
 
 def _turned(matrix: Array, point: Array) -> list[Array]:

@@ -1,4 +1,10 @@
-"""Corrections with a physical cause, of the observed point: Torlegård's and Brown's radial and decentering terms."""
+"""Corrections with a physical cause: radial and decentering terms, affinity and shear, as several programs have them.
+
+Torlegård's and Brown's are subtracted from the observed point, Fraser's are added to it, Luhmann's are added to the
+ideal one.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +16,13 @@ Array = NDArray[np.float64]
 
 TORLEGARD_NAMES = ("k3", "k5", "k7", "p1", "p2", "p3", "p4")
 BROWN_NAMES = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
+AUSTRALIS_NAMES = BROWN_NAMES
+AICON_NAMES = ("a1", "a2", "a3", "b1", "b2", "c1", "c2")
+TORLEGARD_UNITS = ("mm⁻²", "mm⁻⁴", "mm⁻⁶", "mm⁻¹", "mm⁻¹", "mm⁻²", "mm⁻⁴")
+BROWN_UNITS = (*TORLEGARD_UNITS[:5], "–", "–")
 TORLEGARD_GROUPS = (("radial", TORLEGARD_NAMES[:3]), ("decentering", TORLEGARD_NAMES[3:5]))
 BROWN_GROUPS = (("radial", BROWN_NAMES[:3]), ("decentering", BROWN_NAMES[3:5]), ("affinity", BROWN_NAMES[5:]))
+AICON_GROUPS = (("radial", AICON_NAMES[:3]), ("decentering", AICON_NAMES[3:5]), ("affinity", AICON_NAMES[5:]))
 
 
 def torlegard(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
@@ -21,12 +32,37 @@ def torlegard(settings: Settings, xy: Array, principal_point: Array, parameters:
 
 def brown(_: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
     """Brown's terms of the observed point: Torlegård's with r0 = 0, and an affinity b1, b2 of x'."""
-    b1, b2 = parameters[5:]
-    common = _radial_and_decentering(xy, principal_point, np.concatenate([parameters[:5], np.zeros(2)]), 0.0, False)
+    return _with_affinity(xy, principal_point, parameters, 0.0)
+
+
+def australis(_: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
+    """Fraser's terms of the observed point, which are added to it: Brown's with the other sign.
+
+    Source: C. S. Fraser, Digital camera self-calibration, ISPRS Journal 52 (1997), the model of Australis and iWitness.
+    """
+    at = _with_affinity(xy, principal_point, -parameters, 0.0)
+    return replace(at, by_parameters=-at.by_parameters)
+
+
+def aicon(settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
+    """Balanced radial terms with a second zero at r0, decentering, affinity c1 and shear c2 of x'; for the ideal point.
+
+    Sources: T. Luhmann, S. Robson, S. Kyle, J. Boehm, Close-Range Photogrammetry and 3D Imaging, the standard
+    interior orientation; AICON's .ior files (A1 to A3, R0, B1, B2, C1, C2) as JAICOV's `IORFileReader` reads them, and
+    the distortion models in its `bundle.derivation`, which add all terms to x0 - c U/W.
+    """
+    return _with_affinity(xy, principal_point, parameters, settings.r0_mm)
+
+
+def _with_affinity(xy: Array, principal_point: Array, parameters: Array, r0_mm: float) -> Correction:
+    """Three radial and two decentering terms, and an affinity of x' with two."""
+    stretch, shear = parameters[5:]
+    whole = np.concatenate([parameters[:5], np.zeros(2)])
+    common = _radial_and_decentering(xy, principal_point, whole, r0_mm, False)
     reduced = xy - principal_point
     zero = np.zeros(len(xy))
     by_affinity = matrices((reduced[:, 0], reduced[:, 1]), (zero, zero))
-    affinity = np.array([[b1, b2], [0.0, 0.0]])
+    affinity = np.array([[stretch, shear], [0.0, 0.0]])
     return Correction(
         value=common.value + reduced @ affinity.T,
         by_xy=common.by_xy + affinity,

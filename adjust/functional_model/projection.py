@@ -87,13 +87,13 @@ def camera_from_ray(distortion: DistortionModel, interior: Array, parameters: Ar
     The correction is defined at the observed point, so that it is inverted by Newton's method. Where the distortion
     folds the image over, which a polynomial does far enough outside, nothing is found.
     """
-    return camera_from_image(distortion, interior, parameters, imaged_ray(distortion, parameters, ray))
+    return camera_from_image(distortion, interior, parameters, imaged_ray(distortion, interior, parameters, ray))
 
 
-def imaged_ray(distortion: DistortionModel, parameters: Array, ray: Array) -> Imaged:
-    """The images of rays (n, 2) at c = 1."""
+def imaged_ray(distortion: DistortionModel, interior: Array, parameters: Array, ray: Array) -> Imaged:
+    """The images of rays (n, 2)."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return family(distortion.family).image(ray, parameters)
+        return family(distortion.family).image(distortion, interior[0], ray, parameters)
 
 
 def camera_from_image(
@@ -104,7 +104,7 @@ def camera_from_image(
     correct = family(distortion.family).correct
     found = np.zeros(len(imaged.value), dtype=bool)
     with np.errstate(over="ignore", invalid="ignore"):
-        xy_mm = ideal_mm = principal_point + c * imaged.value
+        xy_mm = ideal_mm = principal_point + imaged.value
         unfolded = _unfolded(determinant(imaged.by_ray))
         if correct is no_correction:
             return ideal_mm, unfolded & np.isfinite(ideal_mm).all(axis=1)
@@ -123,7 +123,7 @@ def ideal_from_observed(
     distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array
 ) -> tuple[Array, Mask]:
     """Camera coordinates (n, 2) in mm free of distortion, of observed ones (n, 2); which were found."""
-    if not parameters.any():  # of every family: it corrects nothing
+    if is_pinhole(distortion, parameters):
         return xy_mm, np.asarray(np.isfinite(xy_mm).all(axis=1))
     ray = (xy_mm - interior[1:]) / interior[0]
     found = np.zeros(len(ray), dtype=bool)
@@ -138,10 +138,15 @@ def ideal_from_observed(
     return interior[1:] + interior[0] * ray, found
 
 
+def is_pinhole(distortion: DistortionModel, parameters: Array) -> bool:
+    """Whether these parameters (k,) leave every point where it is."""
+    return family(distortion.family).is_pinhole_at_zero and not parameters.any()
+
+
 def folded_over(distortion: DistortionModel, interior: Array, parameters: Array, xy_mm: Array) -> Mask:
     """Which observed camera points (n, 2) in mm lie beyond where the distortion turns the image back on itself."""
     ideal_mm, found = ideal_from_observed(distortion, interior, parameters, xy_mm)
-    if not parameters.any():
+    if is_pinhole(distortion, parameters):
         return ~found
     with np.errstate(over="ignore", invalid="ignore"):
         at = image_equations(distortion, interior, parameters, xy_mm, (ideal_mm - interior[1:]) / interior[0])

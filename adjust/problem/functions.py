@@ -104,8 +104,9 @@ def _seen(problem: Problem, state: State, camera: str, targets: Indices) -> Seen
     sight = sight_vectors(problem.network.line_of_sight, stations, points)
     rotation = of_each(state.rotations, images)
     ray, in_camera = rays(rotation, sight.vector)
-    _, parameters, distortion = _camera(problem, state, camera)
-    return SeenTargets(camera, rows, sight, rotation, ray, in_camera, imaged_ray(distortion, parameters, ray))
+    interior, parameters, distortion = _camera(problem, state, camera)
+    imaged = imaged_ray(distortion, interior, parameters, ray)
+    return SeenTargets(camera, rows, sight, rotation, ray, in_camera, imaged)
 
 
 def _camera(problem: Problem, state: State, name: str) -> tuple[Array, Array, Distortion]:

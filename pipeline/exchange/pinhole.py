@@ -142,7 +142,7 @@ def frame_lens(block: Block, frame: OutFrame, names: Sequence[str], ideal: bool 
         given = dict(zip(parameter_names(family), lens.parameters, strict=True))
         start[0] *= 1.0 + given["b1"]
         start[4:] = [given[name] if name in names else 0.0 for name in NAMES[4:]]
-        if not any(given[name] for name in NAMES[4:] if name not in names):
+        if not any(given[name] for name in (*NAMES[4:], "b2") if name not in names):
             return FittedLens(start, 0.0)
     grid = image_grid(frame_corners_mm(block, frame))
     free = tuple(name for name in INTERIOR if name != "fy" or family not in _ONE_SCALE)

@@ -33,9 +33,11 @@ COUNTERPARTS: Mapping[str, Mapping[str, str]] = {
     "none": {},
     "torlegard": {"k3": "k1", "k5": "k2", "k7": "k3", "p1": "p1", "p2": "p2"},
     "brown": {"k1": "k1", "k2": "k2", "k3": "k3", "p1": "p1", "p2": "p2", "b1": "fy"},
-    "opencv": {name: name for name in parameter_names("opencv") if name != "b1"} | {"b1": "fy"},
+    "australis": {"k1": "k1", "k2": "k2", "k3": "k3", "p1": "p1", "p2": "p2", "b1": "fy"},
+    "aicon": {"a1": "k1", "a2": "k2", "a3": "k3", "b1": "p2", "b2": "p1", "c1": "fy"},
+    "opencv": {name: name for name in parameter_names("opencv") if name not in ("b1", "b2")} | {"b1": "fy"},
 }
-# What OpenCV estimates together or not at all.
+# Its own parameters that OpenCV estimates together or not at all.
 FREE_TOGETHER = (frozenset({"p1", "p2"}), frozenset({"s1", "s2", "s3", "s4"}), frozenset({"tau_x", "tau_y"}))
 
 
@@ -106,7 +108,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
 def in_opencv_model(problem: BareProblem, parameters: Array) -> BareProblem:
     """The same problem with OpenCV's own distortion, from parameters (18,) in the order of `opencv_model.NAMES`."""
     values = dict(zip(NAMES, parameters.tolist(), strict=True))
-    values["b1"] = values["fx"] / values["fy"] - 1
+    values |= {"b1": values["fx"] / values["fy"] - 1, "b2": 0.0}
     free = set(problem.freedom.names) - {"fy"} | ({"b1"} if "fy" in problem.freedom.names else set())
     priors = {name: Prior(value, np.inf if name in free else 0.0) for name, value in values.items()}
     camera = replace(
@@ -130,8 +132,9 @@ def free_parameters(camera: Camera) -> set[str]:
     counterparts = COUNTERPARTS[camera.distortion.family]
     free = {name for name in counterparts if name in given and given[name].sigma > 0}
     for together in FREE_TOGETHER:
-        if free & together:
-            free |= together
+        own = {name for name, counterpart in counterparts.items() if counterpart in together}
+        if free & own:
+            free |= own
     interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
     return free | {name for name, prior in interior.items() if prior is None or prior.sigma > 0}
 

@@ -81,8 +81,9 @@ def _hindrance(camera: Camera) -> str:
     free = free_parameters(camera)
     if ("x0" in free) != ("y0" in free):
         return "OpenCV holds both coordinates of the principal point or neither; here one is fixed."
-    if "b1" in free and "c" not in free:
-        return "OpenCV holds both focal lengths or neither; here the principal distance is fixed and b1 is not."
+    stretch = [name for name in free if COUNTERPARTS[camera.distortion.family].get(name) == "fy"]
+    if stretch and "c" not in free:
+        return f"OpenCV holds both focal lengths or neither; here c is fixed and {stretch[0]} is not."
     if not free:
         return "Everything of this camera is fixed: there is nothing to compare."
     return ""

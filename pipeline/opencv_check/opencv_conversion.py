@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.problem.result import Adjustment
-from pipeline.opencv_check.bare_problem import BareProblem
+from pipeline.opencv_check.bare_problem import COUNTERPARTS, BareProblem
 from pipeline.opencv_check.opencv_model import NAMES, Freedom, Refit, image_grid, refit, refit_jacobian
 
 Array = NDArray[np.float64]
@@ -41,7 +41,9 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
 def _whole(family: str) -> Freedom:
     """All parameters that a family can need in OpenCV's model: what is not estimated is held at the refit's values."""
     fixed_ratio = ("fx", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-    return Freedom({"opencv": ("fx", "fy", "cx", "cy"), "brown": ("fy", *fixed_ratio)}.get(family, fixed_ratio))
+    if family == "opencv":
+        return Freedom(("fx", "fy", "cx", "cy"))
+    return Freedom(("fy", *fixed_ratio) if "fy" in COUNTERPARTS[family].values() else fixed_ratio)
 
 
 def _start(family: str, interior: Array, parameters: Array) -> Array:

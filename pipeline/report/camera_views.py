@@ -12,7 +12,7 @@ from pipeline.report.data import Json, ReportData
 from pipeline.report.frame_views import camera_of, residuals_by_image
 from pipeline.report.lens_map import LensMap, lens_map
 from pipeline.report.numbers import fixed, value_and_sigma
-from pipeline.report.parameters import ParameterRow, group_sentences, high_correlations, parameter_rows
+from pipeline.report.parameters import ParameterRow, axes_sentence, group_sentences, high_correlations, parameter_rows
 from pipeline.report.verdict import camera_is_calibrated
 from pipeline.results.adjustment_reader import Covariance
 
@@ -65,6 +65,7 @@ class CameraView:
     radius_mm: float
     parameters: list[ParameterRow]
     groups: list[str]
+    axes: str
     in_given_figure: list[tuple[str, str, str]]
     distances: list[fiducials.Distance]
     correlations: list[tuple[str, str, float]]
@@ -106,6 +107,7 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
         radius_mm=radius_mm,
         parameters=parameter_rows(name, camera, stored["sigma0"] or 1.0, radius_mm) if calibrated else [],
         groups=group_sentences(camera),
+        axes=axes_sentence(camera),
         in_given_figure=_in_given_figure(form) if form and calibrated else [],
         distances=form.distances if form else [],
         correlations=high_correlations(name, camera, covariance) if covariance else [],

@@ -44,10 +44,14 @@ class Lens:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Observed less ideal point (n, 2) in um, and its derivatives (n, 2, 1 + k) by c and the parameters."""
+    """Observed less ideal point (n, 2) in um, and its derivatives (n, 2, 1 + k) by c and the parameters.
+
+    imaged (n,): which points the lens shows anything at; the others are nan, the derivatives 0.
+    """
 
     value_um: Array
     by_unknowns_um: Array
+    imaged: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -77,19 +81,23 @@ def displacement(of: Lens, from_principal_point_mm: Array) -> Displacement:
     """
     c, principal_point = of.interior[0], of.interior[1:]
     xy = principal_point + from_principal_point_mm
-    ideal, _ = ideal_from_observed(of.distortion, of.interior, of.parameters, xy)
+    ideal, imaged = ideal_from_observed(of.distortion, of.interior, of.parameters, xy)
+    ideal[~imaged] = principal_point
     ray = (ideal - principal_point) / c
     equations = image_equations(of.distortion, of.interior, of.parameters, xy, ray)
     by_unknowns = np.concatenate([equations.by_interior[:, :, :1], equations.by_parameters], axis=2)
     derivatives = c * np.linalg.solve(equations.by_ray, by_unknowns)
     derivatives[:, :, 0] -= ray
-    return Displacement(1e3 * (xy - ideal), 1e3 * derivatives)
+    derivatives[~imaged] = 0.0
+    return Displacement(np.where(imaged[:, None], 1e3 * (xy - ideal), np.nan), 1e3 * derivatives, imaged)
 
 
 def curves(of: Lens, covariance: Covariance, largest_radius_mm: float) -> Curves:
-    """The curves from the principal point out to a radius."""
+    """The curves from the principal point out to a radius, or as far as the lens makes an image."""
     radius = np.linspace(0.0, largest_radius_mm, RADII)[1:]
     outward = _directions()
+    imaged = displacement(of, (radius[:, None, None] * outward).reshape(-1, 2)).imaged.reshape(len(radius), -1)
+    radius = radius[np.logical_and.accumulate(imaged.all(axis=1))]
     moved = displacement(of, (radius[:, None, None] * outward).reshape(-1, 2))
     value = moved.value_um.reshape(len(radius), DIRECTIONS, 2)
     by = moved.by_unknowns_um.reshape(len(radius), DIRECTIONS, 2, -1)

@@ -29,6 +29,7 @@ class LensMap:
 def lens_map(of: Lens, covariance: Covariance, on: Plane) -> LensMap:
     """The displacement at a grid of observed points over a plane, from the ideal to the observed place."""
     xy = _grid(on)
+    xy = xy[displacement(of, xy - of.interior[1:]).imaged]  # a fisheye's image does not fill the corners
     moved = displacement(of, xy - of.interior[1:])
     size = np.hypot(*moved.value_um.T)
     at = int(size.argmax())

@@ -16,14 +16,7 @@ from pipeline.results.adjustment_reader import Covariance
 MOSTLY_PRIOR = 0.9  # of the prior's sigma is left: the data have told little
 HIGH_CORRELATION = 0.9
 
-UNITS = {
-    "torlegard": dict(zip(("k3", "k5", "k7", "p1", "p2", "p3", "p4"), (-2, -4, -6, -1, -1, -2, -4), strict=True)),
-    "brown": dict(zip(("k1", "k2", "k3", "p1", "p2", "b1", "b2"), (-2, -4, -6, -1, -1, 0, 0), strict=True)),
-}
-JUHL_UNIT = "µm at 1 dm"
-ANGLES = ("tau_x", "tau_y")
 _SYMBOLS = {"x0": "x₀′", "y0": "y₀′"}
-_POWERS = {0: "–", -1: "mm⁻¹", -2: "mm⁻²", -4: "mm⁻⁴", -6: "mm⁻⁶"}
 
 
 @dataclass(frozen=True)
@@ -50,7 +43,7 @@ def parameter_rows(name: str, camera: Json, sigma0: float, radius_mm: float) -> 
         quantity = camera["distortion"].get(parameter)
         if quantity is not None and (quantity["value"] != 0.0 or quantity["sigma"] != 0.0):
             effect = _effect(quantity, effects[parameter])
-            rows.append(_row(parameter, _unit(family, parameter), quantity, effect, _significance(quantity)))
+            rows.append(_row(parameter, family_of(family).unit(parameter), quantity, effect, _significance(quantity)))
     return rows
 
 
@@ -87,6 +80,18 @@ def group_sentences(camera: Json) -> list[str]:
         + _verdict(f"F = {significant(test['F'], 3)}", test["p"])
         for test in camera.get("significance", ())
     ]
+
+
+def axes_sentence(camera: Json) -> str:
+    """Of a family with axes of its own, which they are; empty of the others."""
+    name = camera["distortion"]["family"]
+    shown = [each for each in family_of(name).y_down if camera["distortion"].get(each, {"value": 0.0})["value"]]
+    if not shown:
+        return ""
+    return (
+        f"The values of {name} are OpenCV’s own and belong to its axes, x right and y down. With y up, as everywhere "
+        f"else here, {', '.join(shown)} would have the other sign."
+    )
 
 
 def _group(name: str) -> str:
@@ -165,11 +170,3 @@ def _chance(p: float) -> str:
 def _effect(quantity: Json, um_per_unit: float) -> str:
     value, sigma = value_and_sigma(um_per_unit * quantity["value"], um_per_unit * (quantity["sigma"] or 0.0))
     return f"{value} ± {sigma}" if quantity["sigma"] else significant(um_per_unit * quantity["value"], 3)
-
-
-def _unit(family: str, parameter: str) -> str:
-    if family_of(family).needs == "half_mm":
-        return "mm"
-    if parameter in ANGLES:
-        return "rad"
-    return JUHL_UNIT if family == "juhl" else _POWERS[UNITS.get(family, {}).get(parameter, 0)]

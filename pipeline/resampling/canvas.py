@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
+from adjust.functional_model.families import family
 from measure.errors import MeasurementError
 from pipeline.resampling.frame_chain import FrameChain
 
 Array = NDArray[np.float64]
 
+_WIDEST = 2.0  # half of a fisheye's ideal picture, in principal distances
 _EDGE_POINTS = 65  # of the scan's outline, a side
 _NODES_PX = 16  # between the places at which the chain is asked; between them it is interpolated cubically
 _BEYOND = 3  # nodes on either side of a tile, for the interpolation
@@ -37,13 +39,18 @@ class Canvas:
 def canvas_of(chain: FrameChain, width_px: int, height_px: int, pitch_mm: float) -> Canvas:
     """The canvas that holds the whole outline of a scan, its pixels at whole multiples of the pitch.
 
+    A fisheye's ideal picture has no end: it is cut off where it would be stretched five times over (63 degrees).
+
     Raises MeasurementError where the lens or the film folds within the scan.
     """
     across, down = np.linspace(-0.5, width_px - 0.5, _EDGE_POINTS), np.linspace(-0.5, height_px - 0.5, _EDGE_POINTS)
     sides = [(across, np.full_like(across, row)) for row in (down[0], down[-1])]
     sides += [(np.full_like(down, col), down) for col in (across[0], across[-1])]
     outline, found = chain.frame_from_scan(np.concatenate([np.stack(side, axis=1) for side in sides]))
-    if not found.all():
+    if chain.lens is not None and not family(chain.lens.distortion.family).is_pinhole_at_zero:
+        corners_mm = chain.lens.interior[1:] + _WIDEST * chain.lens.interior[0] * np.array([[-1.0], [1.0]])
+        outline = np.clip(outline, *corners_mm) if found.all() else corners_mm
+    elif not found.all():
         raise MeasurementError("its distortion folds the image over within the scan: resample without --lens.")
     (left, bottom), (right, top) = outline.min(axis=0) / pitch_mm, outline.max(axis=0) / pitch_mm
     first, last = (ceil(left), floor(top)), (floor(right), ceil(bottom))

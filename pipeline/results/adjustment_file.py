@@ -120,6 +120,8 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
         distortion["decentering"] = camera.distortion.decentering
     if family(camera.distortion.family).needs == "half_mm":
         distortion["half_mm"] = list(camera.distortion.half_mm)
+    if family(camera.distortion.family).y_down:
+        distortion["axes"] = "x right, y down"
     for parameter in parameter_names(camera.distortion.family):
         given = camera.distortion.parameters.get(parameter, Prior(0.0))
         distortion[parameter] = quantity(parameter, given)

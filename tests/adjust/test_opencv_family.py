@@ -1,5 +1,6 @@
 """The `opencv` family against OpenCV itself, and the corrections inverted."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -24,6 +25,8 @@ Array = NDArray[np.float64]
 PIXEL_MM = 0.005
 SIZE_PX = np.array([4000.0, 3000.0])
 FX, FY, CX, CY = 4810.0, 4800.0, 2010.0, 1490.0
+SKEW = 7.0
+FISHEYE = np.array([0.03, -0.02, 0.004, -0.001])
 LENS = [-0.12, 0.09, 0.0012, -0.0008, -0.03, 0.02, -0.01, 0.004, 0.0011, -0.0007, 0.0005, 0.0009]
 TILT = [0.02, -0.015]
 DISTORTION = np.array([*LENS, *TILT])
@@ -48,7 +51,7 @@ def mm(pixels: Array) -> Array:
 def camera(free: bool) -> Camera:
     """The camera; its denominator is fixed, from which a numerator in the same powers can hardly be told."""
     sigma = np.inf if free else 0.0
-    values = [*DISTORTION, FX / FY - 1.0]
+    values = [*DISTORTION, FX / FY - 1.0, 0.0]
     parameters = {
         name: Prior(value, 0.0 if name in ("k4", "k5", "k6") else sigma)
         for name, value in zip(parameter_names("opencv"), values, strict=True)
@@ -79,10 +82,44 @@ def test_projection_is_opencvs() -> None:
     np.testing.assert_allclose(projected, mm(opencv_pixels(angles, station, xyz)), atol=1e-11)
 
 
+def skewed(rays: Array) -> Array:
+    """Pixels (n, 2) of rays in the camera's axes, y up, by OpenCV's distortion and a matrix with skew, as Zhang's."""
+    directions = np.column_stack([rays * [1.0, -1.0], np.ones(len(rays))])
+    distorted, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), np.eye(3), DISTORTION)
+    return np.asarray(np.reshape(distorted, (-1, 2)) @ np.array([[FX, SKEW], [0.0, FY]]).T + [CX, CY])
+
+
+def fisheye(rays: Array) -> Array:
+    """The same by OpenCV's fisheye, whose skew is alpha fx."""
+    directions = np.column_stack([rays * [1.0, -1.0], np.ones(len(rays))])[:, None]
+    matrix = np.array([[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0]])
+    pixels, _ = cv2.fisheye.projectPoints(directions, np.zeros(3), np.zeros(3), matrix, FISHEYE, alpha=SKEW / FX)
+    return np.asarray(np.reshape(pixels, (-1, 2)))
+
+
+@pytest.mark.parametrize(
+    ("family", "lens", "pixels", "largest"),
+    [("opencv", DISTORTION, skewed, 0.5), ("opencv_fisheye", FISHEYE, fisheye, 3.0)],
+)
+def test_skew_and_fisheye_are_opencvs(
+    family: str, lens: Array, pixels: Callable[[Array], Array], largest: float
+) -> None:
+    """Up to 72 degrees off the axis for the fisheye; the middle too; and back again."""
+    rays = np.vstack([np.random.default_rng(3).uniform(-largest, largest, (60, 2)) / np.sqrt(2.0), np.zeros(2)])
+    interior = np.array([FY, CX, -CY]) * PIXEL_MM
+    values = np.array([*lens, FX / FY - 1.0, SKEW / FY])
+    seen, found = camera_from_ray(Distortion(family), interior, values, rays)
+    assert found.all()
+    np.testing.assert_allclose(seen, mm(pixels(rays)), atol=1e-11)
+    ideal, found = ideal_from_observed(Distortion(family), interior, values, seen)
+    assert found.all()
+    np.testing.assert_allclose((ideal - interior[1:]) / interior[0], rays, atol=1e-12)
+
+
 def test_corrected_points_are_opencvs_undistorted_points() -> None:
     rng = np.random.default_rng(4)
     pixels = rng.uniform([0, 0], SIZE_PX, (40, 2))
-    values = np.array([*DISTORTION, FX / FY - 1.0])
+    values = np.array([*DISTORTION, FX / FY - 1.0, 0.0])
     interior = np.array([FY, CX, -CY]) * PIXEL_MM
     ideal, found = ideal_from_observed(Distortion("opencv"), interior, values, mm(pixels))
     matrix = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
@@ -161,7 +198,7 @@ def test_what_has_no_image_is_told() -> None:
     parameters = np.array([4e-5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # x - k3 x³ turns back at 91 mm
     _, found = camera_from_ray(fold, np.array([100.0, 0.0, 0.0]), parameters, np.array([[0.3, 0.0], [2.0, 0.0]]))
     assert list(found) == [True, False]
-    barrel = np.array([-0.3] + [0.0] * 14)  # OpenCV's k1: the image of a ray turns back at a slope of 1.05
+    barrel = np.array([-0.3] + [0.0] * 15)  # OpenCV's k1: the image of a ray turns back at a slope of 1.05
     _, found = camera_from_ray(
         Distortion("opencv"), np.array([100.0, 0.0, 0.0]), barrel, np.array([[0.9, 0], [1.2, 0]])
     )

@@ -4,6 +4,8 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
+from lens_networks import LENSES, network_of
 from simulated import Truth, field_points, simulated
 from simulated_project import write_project
 
@@ -32,3 +34,23 @@ def test_ebners_set_from_the_camera_file_to_the_report(tmp_path: Path) -> None:
     assert "Distortion vectors over the camera frame" in page
     assert "Distortion over the radius with its 95 % band" in page
     assert "effect in the frame (µm)" in page
+
+
+@pytest.mark.parametrize("name", list(LENSES))
+def test_a_lens_from_the_camera_file_to_the_report(name: str, tmp_path: Path) -> None:
+    """Noisy images, nothing known of the lens; what OpenCV can and cannot compare is said."""
+    project = write_project(network_of(name, np.random.default_rng(4)), tmp_path)
+    assert run(["run", str(project)]) in (DONE, LOOK)
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    distortion = result["cameras"]["L"]["distortion"]
+    assert (distortion["family"], distortion["r0_mm"]) == (name, 13.0)
+    assert ("axes" in distortion) == name.startswith("opencv")
+    assert 0.8 < result["sigma0"] < 1.2
+    for each, value in LENSES[name][1].items():
+        assert abs(distortion[each]["value"] - value) < 4.0 * distortion[each]["sigma"], each
+    check = json.loads((tmp_path / "out" / "check.json").read_text(encoding="utf-8"))["cameras"]["L"]
+    assert check["verdict"] == "not possible"  # a skew, and a fisheye, are none of cv2.calibrateCamera's models
+    assert ("OpenCV's model cannot take this lens" in check["reason"]) == (name != "opencv_fisheye")
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert ("belong to its axes, x right and y down" in page) == name.startswith("opencv")
+    assert "Distortion over the radius with its 95 % band" in page

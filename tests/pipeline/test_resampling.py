@@ -18,6 +18,7 @@ from adjust.problem.network import Distortion
 from measure.errors import MeasurementError
 from measure.scans.scan import open_scan
 from pipeline.cli import run
+from pipeline.resampling.canvas import canvas_of, scan_places
 from pipeline.resampling.frame_chain import FrameChain, Lens
 from pipeline.resampling.resample_stage import BEST, FAST, ResampleTask, resampled
 from pipeline.resampling.source import source_of
@@ -184,6 +185,23 @@ def test_a_lens_is_taken_out_as_opencv_has_it(scan: Path, tmp_path: Path) -> Non
     inside = (col > 8) & (col < WIDTH - 8) & (row > 8) & (row < HEIGHT - 8)
     assert inside.sum() > 0.8 * WIDTH * HEIGHT
     assert np.abs(pixels[inside] - light(col[inside], row[inside])).max() < 20.0
+
+
+def test_a_fisheyes_ideal_picture_ends_where_it_would_be_stretched_without_end() -> None:
+    """A picture of 180 degrees: two principal distances to either side, and pixels where OpenCV's fisheye has them."""
+    c, k = 5.0, np.array([0.02, -0.005, 0.0, 0.0])
+    lens = Lens(Distortion("opencv_fisheye"), np.array([c, 8.0, -8.0]), np.array([*k, 0.0, 0.0]))
+    chain = FrameChain((10.0, 10.0), Film("none", np.empty(0), np.zeros(2)), lens=lens)
+    canvas = canvas_of(chain, 1600, 1600, 0.01)
+    assert (canvas.width_px, canvas.height_px) == (2001, 2001)
+    assert (canvas.x_mm, canvas.y_mm) == pytest.approx((8.0 - 2 * c, -8.0 + 2 * c))
+    columns, rows = scan_places(chain, canvas, 1000, 1000, 64)
+    at = np.arange(1000, 1064, dtype=np.float64)
+    ideal = canvas.camera_mm(at, at) - lens.interior[1:]
+    rays = np.concatenate([ideal / c * [1.0, -1.0], np.ones((64, 64, 1))], axis=2).reshape(-1, 1, 3)
+    matrix = np.array([[500.0, 0.0, 800.0], [0.0, 500.0, 800.0], [0.0, 0.0, 1.0]])
+    expected, _ = cv2.fisheye.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, k)
+    np.testing.assert_allclose(np.stack([columns, rows], axis=2).reshape(-1, 2), expected.reshape(-1, 2), atol=1e-4)
 
 
 def test_a_frame_is_kept_until_something_changes(scan: Path, tmp_path: Path) -> None:
