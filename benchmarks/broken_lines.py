@@ -43,7 +43,7 @@ LINES = (
         "measure/test_frame_settling.py",
     ),
     Broken(
-        "measure/fitting/sandwich_covariance.py",
+        "measure/fitting/linear_fit.py",
         " * (2 * np.pi * _ALIKE_PX**2)",
         "",
         "measure/test_sandwich_covariance.py",
@@ -56,7 +56,7 @@ LINES = (
         "measure/test_least_squares.py",
     ),
     Broken("measure/noise/grain.py", "-squared / (4.0 *", "-squared / (2.0 *", "measure/test_grain.py"),
-    Broken("measure/fitting/second_order.py", " @ turning) / 2", " @ turning)", "measure/test_second_order.py"),
+    Broken("measure/fitting/linear_fit.py", " @ turning) / 2", " @ turning)", "measure/test_second_order.py"),
     Broken("measure/fitting/clipping.py", "sides * sigma_dn * size", "sides * size", "measure/test_clipping.py"),
     Broken(
         "measure/fitting/rounding.py", "- 0.5) / sigma\n    log", "- 0.4) / sigma\n    log", "measure/test_rounding.py"

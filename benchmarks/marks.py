@@ -35,7 +35,7 @@ from true_marks import (
     whitened_rms,
 )
 
-from measure.scans.quantisation import rounding_step_dn
+from measure.scans.compression import rounding_step_dn
 
 Array = NDArray[np.float64]
 

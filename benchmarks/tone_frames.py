@@ -20,8 +20,8 @@ from measure.marks.shapes import (
     ring_cross,
     turned_part,
 )
+from measure.scans.compression import rounding_step_dn
 from measure.scans.picture_scan import WholePicture
-from measure.scans.quantisation import rounding_step_dn
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
 from pipeline.rendered.scene_file import scene_mark

@@ -1,15 +1,37 @@
-"""A fit linearised at its solution: from it follows what else the same grey values say, a second place for example."""
+"""A fit linearised at its solution: what else the same grey values say, a second place for example, and how well it is
+known where residuals are uneven, and where the model bends.
+
+The sandwich covariance: what a chip leaves of another picture is no noise alone: detail that was sampled too coarsely
+returns at the edges, which are what tells the place. A covariance that takes residuals as alike everywhere promises too
+much there. This one asks each pixel what it left and how much that weighs, and its neighbours whether they left the
+same (Conley, 1999, GMM estimation with cross sectional dependence).
+
+Where a mark is soft and faint, its place, blur and contrast are unknown by so much that the picture bends within their
+errors. Two terms of the second order count, both in what the picture's slopes change by as the mark moves:
+
+- What of those changes no unknown takes up correlates with the noise, and turns the normal equations: the statistical
+  curvature (Efron, 1975, Defining the curvature of a statistical problem). It is taken in its mean rather than from the
+  residuals, as the observed information has it: so it is never negative, and what is damaged has no part in it.
+- What the unknowns do take up changes with them how well the place is known: a mark that came out too sharp claims too
+  much. The logarithm of the variance is as uncertain as they are, and its exponential on average larger by half the
+  square of that.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
+from measure.fitting.picture_model import GREY
 from measure.noise.noise import NoiseModel, correlated
-from measure.noise.pixel_sums import products
+from measure.noise.pixel_sums import combined, products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+_ALIKE_PX = 1.0  # standard deviation of the weights by distance: what is sampled too coarsely is alike no farther
+_LEAST_SLOPE = 1e-3  # of a clipped grey value: what tells less tells nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,3 +53,38 @@ class LinearFit:
         white = self.noise.variance_dn2 * by_grey
         covariance = products(by_grey, white if self.noise.is_white else correlated(by_grey, self.noise))
         return np.asarray((covariance + covariance.T) / 2)
+
+
+def sandwich_covariance(inverse: Array, weights: Array, residuals: Array, used: Mask) -> Array:
+    """(unknowns, unknowns) covariance of an adjustment that has `sum weights * residuals = 0` over the pixels used.
+
+    inverse: (unknowns, unknowns) of its normal matrix; weights: (unknowns, height, width), weighted derivatives;
+    residuals, used: (height, width).
+    """
+    shares = weights * np.where(used, residuals, 0.0)
+    about = gaussian_filter(shares, (0.0, _ALIKE_PX, _ALIKE_PX), mode="constant") * (2 * np.pi * _ALIKE_PX**2)
+    scatter = np.einsum("ihw,jhw->ij", about, shares)
+    return np.asarray(inverse @ ((scatter + scatter.T) / 2) @ inverse.T)
+
+
+def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, priors_dn2: Array) -> float:
+    """By what share of itself the variance of a place is larger than a linearised adjustment has it.
+
+    design (unknowns, height, width): derivatives of the model, the first two by column and row, the last four by the
+    greys; slopes (height, width): their part in what clipped grey values tell, 1 elsewhere; used (height, width): the
+    pixels that count; covariance (unknowns, unknowns); priors_dn2 (unknowns,): weights of the priors, that of a pixel
+    being 1. The bends are compared pixel by pixel, with grain in the covariance only: its weights amplify them as no
+    noise does."""
+    moving = len(design) - GREY + 1  # all but the ground's
+    among, seen = covariance[:moving, :moving], design * used
+    by_grey = combined(np.asarray(np.linalg.inv(products(seen, seen) + np.diag(priors_dn2)), float), seen)
+    # All that moves with the mark changes by its slope, against the move.
+    whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
+    changes = -np.concatenate(np.gradient(whole, axis=(2, 1))) * slopes * used
+    taken_up = products(by_grey, changes)
+    by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # of the variance's logarithm, negative
+    left = changes - combined(taken_up.T, seen)
+    turning = np.einsum("jl,ijml->im", among, products(left, left).reshape(2, moving, 2, moving))
+    curvature = np.trace(products(by_grey[:2], by_grey[:2]) @ turning) / 2
+    # Lags that are noise themselves may leave the covariance of the other unknowns indefinite.
+    return max(float(curvature + by_unknown @ among @ by_unknown / 2), 0.0)

@@ -20,19 +20,17 @@ from measure.fitting.bordered_model import BorderedModel
 from measure.fitting.clipping import Sides, clear_of_ends
 from measure.fitting.generators import is_round
 from measure.fitting.hidden_causes import Landscape, covariance_of_changed_tone
-from measure.fitting.linear_fit import LinearFit
+from measure.fitting.linear_fit import LinearFit, second_order
 from measure.fitting.own_shape import OwnShape, own_shape
 from measure.fitting.picture_fit import EDGE_BLURS, PictureFit
 from measure.fitting.picture_model import GREY, PictureModel, State, background_px
 from measure.fitting.scan_window import Coding, ScanWindow
-from measure.fitting.second_order import second_order
 from measure.fitting.second_place import SecondPlace, edge_place, sloping_place
 from measure.fitting.tone_estimate import told_tone, untold_tone
 from measure.marks.rendering import extent_px, frame_beside, known
 from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Polygon
 from measure.match_options import MatchOptions
-from measure.noise.blank_film import blank_patches, is_coloured
-from measure.noise.grain import grain_model
+from measure.noise.grain import blank_patches, grain_model, is_coloured
 from measure.noise.noise import NoiseModel, is_textured, noise_model
 from measure.noise.pixel_sums import combined, factors, products
 from measure.reason import Reason

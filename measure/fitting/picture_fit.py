@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.fitting.clipping import noise_scale
+from measure.fitting.linear_fit import sandwich_covariance
 from measure.fitting.picture_model import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel
 from measure.fitting.rounding import (
     COARSEST_VARIANCE,
@@ -15,7 +16,6 @@ from measure.fitting.rounding import (
     unrounded,
     unrounded_variance,
 )
-from measure.fitting.sandwich_covariance import sandwich_covariance
 from measure.fitting.scan_window import Coding
 from measure.marks.rendering import chip_mask, known, picture
 from measure.marks.shapes import MarkTemplate
@@ -23,8 +23,7 @@ from measure.noise.damage import damage, damage_where_lossy, grown
 from measure.noise.least_squares import solution, tukey_loss, tukey_weights
 from measure.noise.noise import NoiseModel, correlated, may_be_noise, robust_scale
 from measure.noise.pixel_sums import combined, products
-from measure.noise.steadiness import steadiness
-from measure.noise.weighting import weighted
+from measure.noise.weighting import steadiness, weighted
 from measure.reason import NO_REASON, Code, Reason
 
 Array = NDArray[np.float64]

@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Cause
-from measure.fitting.beyond_edge import beyond_edge
 from measure.fitting.matching import Match, MatchOptions, match, window_about
-from measure.fitting.scan_window import read_window
+from measure.fitting.scan_window import beyond_edge, read_window
 from measure.frames.first_look import seen
 from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
-from measure.noise.blank_film import BESIDE_PX
+from measure.noise.grain import BESIDE_PX
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression
 from measure.scans.scan import Scan
@@ -68,7 +67,7 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
     reason = _unlike(fit, expected, scan.full_scale_dn)
     if reason:
         return Sighting(predicted, True, None, reason)
-    loss = covariance_of_compression(scan, fit.stored_contrast_dn)
+    loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     return Sighting(predicted, True, fit, chance=chance)
 

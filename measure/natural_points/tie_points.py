@@ -17,8 +17,8 @@ from scipy.special import ndtri
 
 from measure.natural_points.bending import Bending, bending_variance
 from measure.natural_points.epipolar import contradicting
+from measure.natural_points.local_maps import outliers
 from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
-from measure.natural_points.neighbours import outliers
 from measure.natural_points.tie_candidates import TieCandidate, widened
 from measure.natural_points.tie_frame import TieFrame
 from measure.noise.noise import robust_scale

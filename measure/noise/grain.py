@@ -6,7 +6,8 @@ film's needs one or two sizes, a landscape, which has detail of every size, many
 The residuals alone mislead. Each unknown takes noise out of them, most of it where noise is strongest, at low
 frequencies; in a small window little of that is left, and a covariance from the residuals' own autocovariance comes out
 too small. So what a model of noise would leave after the very same fit is compared with what is left, lag by lag; in
-the mark's own window, and in patches of blank film beside it, where there are any.
+the mark's own window, and in patches of blank film beside it, where there are any: what these show is grain and noise
+alone, and more of it than the window holds.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import nnls
 
-from measure.noise.blank_film import PATCH_PX, PLANE
 from measure.noise.noise import NoiseModel, padded
 from measure.noise.pixel_sums import combined, products
 
@@ -26,6 +26,10 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Single = NDArray[np.float32]
 
+PATCH_PX = 15  # a side: thrice as far as film's grain reaches
+BESIDE_PX = 2 * PATCH_PX + 4.0  # how much of the film beside a mark is asked
+_AS_NOISY = 3.0  # times the variance of the mark's own residuals, or a part of it: beyond it is a picture, text or dust
+_FEWEST = 6  # patches that tell more than the mark's own window
 # Standard deviations of the Gaussian that smears white noise into grain, and the coarsest that is still film's.
 GRAIN_PX = (0.4, 0.5, 0.6, 0.7, 0.8, 0.95, 1.1, 1.3, 1.5, 1.8, 2.2)
 _COARSEST_PX = 1.8
@@ -34,6 +38,45 @@ _HERE = REACH_PX  # index of no lag at all
 _FARTHEST_PX = 3.0  # lags that are compared: beyond it the residuals hold the fit's marks rather than the noise's
 _FARTHEST_BLANK_PX = 5.0  # the same of blank film, which has no marks in it
 _ALIKE = 1e-10  # of the largest eigenvalue: what unknowns tell apart by less is no direction of its own
+
+
+def blank_patches(window: Array, free: Mask, variance_dn2: float) -> Array:
+    """(n, PATCH_PX, PATCH_PX) grey values less a plane, of patches of the window (height, width) that are wholly free
+    and vary about as much as the noise of that variance; none where there are too few."""
+    patches = _squares(window)[_squares(free).all(axis=(1, 2))].reshape(-1, PATCH_PX**2)
+    rest = patches - patches @ PLANE @ PLANE.T
+    variances = (rest**2).sum(axis=1) / (PATCH_PX**2 - PLANE.shape[1])
+    alike = (variances > variance_dn2 / _AS_NOISY) & (variances < variance_dn2 * _AS_NOISY)
+    if alike.sum() < _FEWEST:
+        return np.zeros((0, PATCH_PX, PATCH_PX))
+    return np.asarray(rest[alike].reshape(-1, PATCH_PX, PATCH_PX))
+
+
+def is_coloured(patches: Array) -> bool:
+    """Whether neighbouring pixels of the patches are alike, by more than three standard errors of chance."""
+    if not len(patches):
+        return False
+    sums = (patches[:, :, 1:] * patches[:, :, :-1]).sum() + (patches[:, 1:] * patches[:, :-1]).sum()
+    # A plane takes three pixels' worth out of a patch, and as much out of the products.
+    correlation = sums / (2 * (patches**2).sum()) + PLANE.shape[1] / PATCH_PX**2
+    return bool(abs(correlation) > 3 / np.sqrt(2 * patches.size))
+
+
+def _plane() -> Array:
+    """(pixels, 3) an orthonormal base of the planes over a patch."""
+    row, col = np.mgrid[:PATCH_PX, :PATCH_PX].reshape(2, -1) - (PATCH_PX - 1) / 2
+    base, _ = np.linalg.qr(np.stack([np.ones(PATCH_PX**2), col, row], axis=1))
+    return np.asarray(base, dtype=np.float64)
+
+
+PLANE = _plane()
+
+
+def _squares(image: Array | Mask) -> Array:
+    """(n, PATCH_PX, PATCH_PX) the squares that an image divides into."""
+    rows, cols = (size // PATCH_PX for size in image.shape)
+    inner = image[: rows * PATCH_PX, : cols * PATCH_PX].reshape(rows, PATCH_PX, cols, PATCH_PX)
+    return np.asarray(inner.swapaxes(1, 2).reshape(-1, PATCH_PX, PATCH_PX), float)
 
 
 def grain_model(

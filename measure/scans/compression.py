@@ -1,23 +1,131 @@
-"""What lossy compression takes from a mark's place.
+"""Lossy compression: how coarsely a file rounds or was rounded before, and what that takes from a mark's place.
 
-JPEG rounds the fine detail of every 8 x 8 pixels, a mark's edges and the grain alike. Residuals show most of it, so
-that a standard deviation from them is right, where the mark's contrast is many of the file's rounding steps; what faint
-marks lose of their edges they do not show. The grain that is left is the compression's own making, and no weights are
-taken from it.
+JPEG rounds the cosine coefficients of every 8 x 8 pixels to multiples of a step, each its own (ITU-T T.81): its tables
+stand in the file (B.2.4.1). A TIFF or PNG file made of a JPEG keeps the coefficients so, to some tenths of a grey
+value: with blocks begun where those of the JPEG began, and with no others, they lie on a comb. (The principle:
+Neelamani et al., "JPEG compression history estimation for color images", IEEE Trans. Image Processing 15, 2006.)
+
+The fine detail goes, a mark's edges and the grain alike. Residuals show most of it, so that a standard deviation from
+them is right, where the mark's contrast is many of the file's rounding steps; what faint marks lose of their edges they
+do not show. The grain that is left is the compression's own making, and no weights are taken from it.
 """
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct
+from scipy.special import ndtri, stdtrit
 
-from measure.scans.scan import Scan
+from measure.probabilities import JPEG_GRID, JPEG_STEP
 
 Array = NDArray[np.float64]
 
+_DQT = 0xDB
+UNKNOWN_DN = 15.0  # where a file does not say it: as at quality 50, which no scan should be below
+_COARSE = 15  # coefficients in the order of the table: up to two periods in a block of 8 px, as blurred edges have them
+BLOCK_PX = 8
+_PERIODS = 5  # coefficients (u, v) with 0 < u + v below it: up to two periods in a block, as blurred edges have them
+_STEPS_DN = np.arange(2, 51)  # a step of 1 takes nothing away; 50 is that of quality 15
+_BIN_DN = 0.25
+_LARGEST_DN = 150.0  # of a coefficient that is looked at: three times the largest step
 _LOST_PX = 0.25  # times the square of step over contrast: rms of what residuals do not show (benchmarks/marks.py)
 _MOST_LOST_PX = 1.0  # where the contrast is hardly two steps, there is nothing left to measure
 
 
-def covariance_of_compression(scan: Scan, contrast_dn: float) -> Array:
-    """(2, 2) px2: what the scan's compression adds to the covariance of a mark of that contrast."""
-    lost = min(_LOST_PX * (scan.rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, _MOST_LOST_PX)
+def jpeg_headers(data: bytes) -> list[tuple[int, bytes]]:
+    """Marker and body of the segments before the picture's data."""
+    headers, position = [], 2
+    while position + 4 <= len(data) and data[position] == 0xFF and data[position + 1] not in (0xDA, 0xD9):
+        length = int.from_bytes(data[position + 2 : position + 4], "big")
+        headers.append((data[position + 1], data[position + 4 : position + 2 + length]))
+        position += 2 + max(length, 2)
+    return headers
+
+
+def rounding_step_dn(data: bytes) -> float:
+    """The mean step to which the coarser detail of the luminance is rounded, in grey values: from a JPEG file, or its
+    beginning up to the picture's data."""
+    for marker, body in jpeg_headers(data):
+        if marker == _DQT:
+            table = _table(body, 0)
+            if table:
+                return sum(table[:_COARSE]) / _COARSE
+    return UNKNOWN_DN
+
+
+def _table(body: bytes, wanted: int) -> list[int]:
+    """The 64 steps of a table of that number, empty where the segment does not hold it."""
+    position = 0
+    while position < len(body):
+        size, number = 1 + (body[position] >> 4), body[position] & 15
+        steps = body[position + 1 : position + 1 + 64 * size]
+        if number == wanted and len(steps) == 64 * size:
+            return [int.from_bytes(steps[at : at + size], "big") for at in range(0, len(steps), size)]
+        position += 1 + 64 * size
+    return []
+
+
+def earlier_step_dn(grey: NDArray[np.floating]) -> float:
+    """The mean step, in grey values, to which the coarser detail was rounded; 0 where nothing shows that it was.
+
+    grey: (height, width), a part of the picture in grey values of 8 bits, neither resampled nor stretched since.
+    """
+    if min(grey.shape) < 2 * BLOCK_PX:
+        return 0.0
+    combs = _combs(_coefficients(grey))
+    strength = combs.max(axis=2).sum(axis=1)
+    best = int(strength.argmax())
+    clearness, steps = combs[best].max(axis=1), _STEPS_DN[combs[best].argmax(axis=1)]
+    if clearness.max() < _limit(JPEG_GRID, combs.size) or not _stands_out(strength[best], np.delete(strength, best)):
+        return 0.0
+    return float(steps[clearness > _limit(JPEG_STEP, len(_STEPS_DN))].mean())
+
+
+def _coefficients(grey: NDArray[np.floating]) -> Array:
+    """(places, blocks, coefficients): the coarser cosine coefficients of all blocks, for each of the 64 places where
+    the first of them may begin."""
+    waves = dct(np.eye(BLOCK_PX), axis=0, norm="ortho")[:_PERIODS]
+    down = np.lib.stride_tricks.sliding_window_view(grey, BLOCK_PX, axis=0) @ waves.T
+    both = np.lib.stride_tricks.sliding_window_view(down, BLOCK_PX, axis=1) @ waves.T
+    periods = np.add.outer(range(_PERIODS), range(_PERIODS))
+    coarse = both[..., (periods > 0) & (periods < _PERIODS)]  # no means: ground of one grey value is a comb of its own
+    tall, wide = (side // BLOCK_PX for side in coarse.shape[:2])
+    blocks = coarse[: tall * BLOCK_PX, : wide * BLOCK_PX].reshape(tall, BLOCK_PX, wide, BLOCK_PX, -1)
+    return blocks.transpose(1, 3, 0, 2, 4).reshape(BLOCK_PX**2, tall * wide, -1)
+
+
+def _combs(coefficients: Array) -> Array:
+    """(places, coefficients, steps): how plainly they are multiples of each step, in standard deviations of chance.
+
+    Coefficients below half a step count for nothing. Chance lays the others anywhere between two multiples, so that the
+    cosine over the step is 0 in the mean, or below it: there are more small ones than large ones.
+    """
+    size = np.abs(coefficients)
+    places, _, kinds = size.shape
+    bins = int(_LARGEST_DN / _BIN_DN) + 1
+    row = np.arange(places)[:, None, None] * kinds + np.arange(kinds)
+    bin_of = np.minimum(np.rint(size / _BIN_DN), bins).astype(np.intp)  # the last bin holds what is too large
+    counts = np.bincount((row * (bins + 1) + bin_of).ravel(), minlength=places * kinds * (bins + 1))
+    counts = counts.reshape(places * kinds, bins + 1)[:, :bins].astype(float)
+    centres = np.arange(bins)[:, None] * _BIN_DN
+    counted = centres > _STEPS_DN / 2
+    phases = np.cos(2 * np.pi * centres / _STEPS_DN) * counted
+    clearness: Array = np.sqrt(2) * (counts @ phases) / np.sqrt(np.maximum(counts @ counted, 1))
+    return clearness.reshape(places, kinds, -1)
+
+
+def _limit(chance: float, looks: int) -> float:
+    """The clearness that one of so many looks at no comb exceeds with that chance."""
+    return -float(ndtri(chance / looks))
+
+
+def _stands_out(strength: float, others: Array) -> bool:
+    """Whether one of the places differs from all others as chance does not make it (Student's t)."""
+    spread = others.std(ddof=1) * np.sqrt(1 + 1 / len(others))
+    limit = -stdtrit(len(others) - 1, JPEG_GRID / (len(others) + 1))
+    return bool(strength - others.mean() > limit * spread)
+
+
+def covariance_of_compression(rounding_step_dn: float, contrast_dn: float) -> Array:
+    """(2, 2) px2: what a scan's compression adds to the covariance of a mark of that contrast."""
+    lost = min(_LOST_PX * (rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, _MOST_LOST_PX)
     return np.asarray(lost**2 * np.eye(2))

@@ -12,7 +12,7 @@ from tifffile import TiffFile, TiffPage
 
 from measure.scans.addresses import tiff_file
 from measure.scans.broken import DECODING_ERRORS
-from measure.scans.quantisation import jpeg_headers
+from measure.scans.compression import jpeg_headers
 from measure.scans.tone import Tone, power, sampled, srgb
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from measure.scans.quantisation import jpeg_headers
+from measure.scans.compression import jpeg_headers
 
 Decode = Callable[[bytes], NDArray[np.generic]]
 

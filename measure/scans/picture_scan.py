@@ -13,8 +13,8 @@ from tifffile import TiffFile
 
 from measure.errors import MeasurementError
 from measure.scans.broken import DECODING_ERRORS, broken
+from measure.scans.compression import jpeg_headers, rounding_step_dn
 from measure.scans.jpeg_stream import decoded, picture_size
-from measure.scans.quantisation import jpeg_headers, rounding_step_dn
 from measure.scans.radiometry import Radiometry, Samples
 from measure.scans.resolution import JFIF_UNIT, NO_TAGS, PNG_UNIT, Pitch, pitch_from_density
 from measure.scans.segments import LostPart, Place, Segments

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from measure.errors import MeasurementError, MissingError
 from measure.scans.addresses import Address, scan_path
-from measure.scans.earlier_compression import earlier_step_dn
+from measure.scans.compression import earlier_step_dn
 from measure.scans.parallel import side_by_side
 from measure.scans.picture_scan import open_picture
 from measure.scans.radiometry import Samples
 from measure.scans.resolution import Pitch
-from measure.scans.segment_cache import SegmentCache
-from measure.scans.segments import LostPart, Segments
+from measure.scans.segments import LostPart, SegmentCache, Segments
 from measure.scans.tiff_scan import TIFF_STARTS, open_tiff
 from measure.scans.tiff_segments import RawRows
 from measure.scans.tone import LINEAR, Tone

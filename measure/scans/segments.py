@@ -1,12 +1,17 @@
-"""What a scan file is to those who read windows: a grid of segments."""
+"""What a scan file is to those who read windows: a grid of segments, of which those decoded last are held."""
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import product
+from threading import Lock
 from typing import Protocol
 
 from measure.scans.radiometry import Samples
 
 Place = tuple[int, int]  # row and column in a grid of segments
+
+CACHE_BYTES = 40 << 20  # seven rows of tiles of 256 px, 16 bit, 11,500 px across
 
 
 @dataclass(frozen=True)
@@ -51,3 +56,83 @@ class Segments(Protocol):
         `fetched` gives it."""
 
     def close(self) -> None: ...
+
+
+@dataclass(eq=False)
+class _Segment:
+    """samples: None until the thread that decodes them, which holds the lock, is done."""
+
+    samples: Samples | None = None
+    lock: Lock = field(default_factory=Lock)
+
+
+class SegmentCache:
+    """As many segments as a memory limit allows, and at least two rows of the grid: reading a scan
+    from top to bottom decodes each once, wherever its bands begin. A thread that wants what another is decoding waits
+    for it."""
+
+    def __init__(self, segments: Segments) -> None:
+        self._segments = segments
+        self._row_bytes = segments.width_px * segments.channels * segments.sample_bytes
+        tall = min(2 * segments.segment_height_px, segments.height_px)
+        self._limit = max(CACHE_BYTES, tall * self._row_bytes)
+        self._held = 0
+        self._kept: OrderedDict[tuple[int, int], _Segment] = OrderedDict()
+        self._lock = Lock()
+
+    @property
+    def rows_kept(self) -> int:
+        """How many rows of the picture have room."""
+        return self._limit // self._row_bytes
+
+    def fill(self, samples: Samples, row0: int, col0: int) -> None:
+        """Samples (height, width, channels) of the picture from a row and column on. Segments that other threads are
+        decoding come last: there may be more to decode meanwhile."""
+        tall, wide = self._segments.segment_height_px, self._segments.segment_width_px
+        height, width, _ = samples.shape
+        rows = range(row0 // tall, (row0 + height - 1) // tall + 1)
+        cols = range(col0 // wide, (col0 + width - 1) // wide + 1)
+
+        def take(i: int, j: int, decoded: Samples) -> None:
+            row, col = i * tall - row0, j * wide - col0
+            part = decoded[max(-row, 0) : height - row, max(-col, 0) : width - col]
+            row, col = max(row, 0), max(col, 0)
+            samples[row : row + part.shape[0], col : col + part.shape[1]] = part
+
+        others: list[tuple[tuple[int, int], _Segment]] = []
+        wanted = {key: self._segment(key) for key in product(rows, cols)}
+        stored = self._segments.fetched(
+            [key for key, segment in wanted.items() if segment.samples is None and not segment.lock.locked()]
+        )
+        for key, segment in wanted.items():
+            if segment.samples is None and segment.lock.locked():
+                others.append((key, segment))
+            else:
+                take(*key, self._decoded(key, segment, stored.get(key, ())))
+        for key, segment in others:
+            take(*key, self._decoded(key, segment))
+
+    def _segment(self, key: tuple[int, int]) -> _Segment:
+        """Of the grid, by row and column."""
+        with self._lock:
+            segment = self._kept.setdefault(key, _Segment())
+            self._kept.move_to_end(key)
+        return segment
+
+    def _decoded(self, key: tuple[int, int], segment: _Segment, stored: Sequence[bytes] = ()) -> Samples:
+        """Decoded here unless another thread has begun to."""
+        with segment.lock:
+            samples = segment.samples
+            if samples is None:
+                samples = segment.samples = self._segments.read(*key, stored)
+                self._make_room(samples.nbytes)
+        return samples
+
+    def _make_room(self, added: int) -> None:
+        """For so many bytes, from the segments that were wanted longest ago."""
+        with self._lock:
+            self._held += added
+            while self._held > self._limit:
+                oldest, samples = next((key, own.samples) for key, own in self._kept.items() if own.samples is not None)
+                self._held -= samples.nbytes
+                del self._kept[oldest]

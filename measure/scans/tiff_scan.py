@@ -10,7 +10,7 @@ from tifffile import TiffFile, TiffPage
 from measure.errors import MeasurementError
 from measure.scans.addresses import tiff_file
 from measure.scans.broken import DECODING_ERRORS, broken, unsupported
-from measure.scans.quantisation import rounding_step_dn
+from measure.scans.compression import rounding_step_dn
 from measure.scans.radiometry import Radiometry
 from measure.scans.resolution import NO_TAGS, TIFF_UNIT, Pitch, pitch_from_density
 from measure.scans.segments import Segments

@@ -15,8 +15,7 @@ from measure.marks.shapes import Bar, Mark, MarkShape, MarkTemplate, thinnest_mm
 from measure.scans.parallel import side_by_side
 from measure.scans.scan import SINGLE_CHANNELS, Scan
 from measure.search.correlation import WIDE, Map, Surroundings
-from measure.search.held import Held
-from measure.search.scan_maps import ScanMaps, Sought
+from measure.search.scan_maps import Held, ScanMaps, Sought
 
 Array = NDArray[np.float64]
 Grid = TypeVar("Grid", NDArray[np.float64], NDArray[np.bool_])

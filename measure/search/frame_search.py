@@ -16,9 +16,9 @@ from measure.search.candidates import FULL, Effort, Look, Responses, respond, re
 from measure.search.centred_frame import centred_places_px, reach_mm
 from measure.search.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
 from measure.search.correlation import WIDE, Map, Surroundings
-from measure.search.held import Held
 from measure.search.pitches import PitchHypothesis
 from measure.search.response_layers import Layer, Reach, layers_of
+from measure.search.scan_maps import Held
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from measure.search.candidates import Responses
 from measure.search.correlation import Map
-from measure.search.held import Held
+from measure.search.scan_maps import Held
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,9 @@
 """The correlations of a whole scan with the looks of marks, made when they are asked for, and the last of them held."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -9,10 +11,39 @@ from numpy.typing import NDArray
 
 from measure.scans.scan import Scan
 from measure.search.correlation import Map, Surroundings, correlation, variation
-from measure.search.held import Held
 
 Array = NDArray[np.float64]
+
+Kept = TypeVar("Kept")
+
 Key = tuple[int, int]
+
+
+class Held(Generic[Kept]):
+    """Things by a key each. The one asked for longest ago goes first where there is no room."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        self.limit_bytes = limit_bytes
+        self._kept: OrderedDict[Hashable, tuple[Kept, int]] = OrderedDict()
+        self._bytes = 0
+
+    def find(self, key: Hashable) -> Kept | None:
+        """What is held of a key, None if nothing is."""
+        if key not in self._kept:
+            return None
+        self._kept.move_to_end(key)
+        return self._kept[key][0]
+
+    def keep(self, key: Hashable, kept: Kept, size_bytes: int) -> None:
+        """Hold what is not held yet."""
+        self.make_room(size_bytes)
+        self._kept[key] = kept, size_bytes
+        self._bytes += size_bytes
+
+    def make_room(self, size_bytes: int) -> None:
+        """Let go of the oldest until so much more can be held, or nothing is."""
+        while self._kept and self._bytes + size_bytes > self.limit_bytes:
+            self._bytes -= self._kept.popitem(last=False)[1][1]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """A part of a scan that one thread looks at: its grey values at full resolution and reduced, with a margin about it."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 import numpy as np
@@ -10,7 +11,12 @@ from numpy.typing import NDArray
 from measure.scans.radiometry import Samples
 from measure.scans.scan import Scan, means, weighted
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Image = NDArray[np.float32]
+
+Record = TypeVar("Record", bound="DataclassInstance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,3 +76,9 @@ def _nearly_means(samples: Samples, factor: int) -> Samples | Image:
         samples = half.astype(samples.dtype, copy=False).reshape(height // 2, width // 2, channels)
         factor //= 2
     return samples if factor == 1 else means(samples, factor)
+
+
+def joined(first: Record, *others: Record) -> Record:
+    """One record of what several of a kind hold."""
+    names = [field.name for field in fields(first)]
+    return type(first)(*(np.concatenate([getattr(record, name) for record in (first, *others)]) for name in names))

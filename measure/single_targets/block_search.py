@@ -13,9 +13,8 @@ from scipy.spatial import cKDTree
 from measure.scans.parallel import side_by_side
 from measure.scans.radiometry import Samples
 from measure.scans.scan import Scan
-from measure.single_targets.block import Block
+from measure.single_targets.block import Block, joined
 from measure.single_targets.disk_patches import Candidate, Patches
-from measure.single_targets.joined import joined
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

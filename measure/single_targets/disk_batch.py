@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from measure.noise.least_squares import gauss_newton_step, tukey_weights
 from measure.noise.noise import SIGMA_OF_DEVIATION
-from measure.single_targets.block import Block
+from measure.single_targets.block import Block, joined
 from measure.single_targets.disk_model import DAMPING, GREYS, UNKNOWNS, DiskModel, DiskStates, each
 from measure.single_targets.disk_patches import Patches
 from measure.single_targets.disk_pixels import Areas, DiskPixels
-from measure.single_targets.joined import joined
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

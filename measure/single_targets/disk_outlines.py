@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.single_targets.joined import joined
+from measure.single_targets.block import joined
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

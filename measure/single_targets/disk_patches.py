@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.noise.noise import robust_scales
+from measure.single_targets.block import joined
 from measure.single_targets.disk_outlines import REACH, Blobs, Outlines, outlines_about
-from measure.single_targets.joined import joined
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

@@ -12,7 +12,7 @@ from measure.fitting.picture_model import GREY
 from measure.fitting.scan_window import read_window
 from measure.fitting.second_place import SecondPlace
 from measure.marks.shapes import Disk, MarkShape
-from measure.noise.blank_film import BESIDE_PX
+from measure.noise.grain import BESIDE_PX
 from measure.noise.noise import may_be_noise
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.compression import covariance_of_compression
@@ -169,7 +169,7 @@ def _fit_by_margin(
 
     def fitted(margin_px: float) -> FittedDisk:
         fit = match(window, shape, start, replace(options, margin_px=margin_px))
-        loss = covariance_of_compression(scan, fit.stored_contrast_dn)
+        loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
         disk = FittedDisk(
             center_px=fit.center_px,
             covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss),

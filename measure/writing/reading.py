@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from measure.marks.shapes import Side
 from measure.scans.scan import Scan
-from measure.writing.detection import Picture, Place, find_writing
 from measure.writing.line import Line, of_one_face
-from measure.writing.networks import Networks
-from measure.writing.recognition import HEIGHT_PX, WAYS, read_ways
+from measure.writing.networks import HEIGHT_PX, WAYS, Networks, Picture, Place, find_writing, read_ways
 
 Array = NDArray[np.float64]
 

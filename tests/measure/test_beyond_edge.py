@@ -7,7 +7,7 @@ from drawn_frames import layout_of, paint
 
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
-from measure.fitting.beyond_edge import beyond_edge
+from measure.fitting.scan_window import beyond_edge
 from measure.frames.refinement import sight
 from measure.marks.shapes import MarkShape, cross, polygon
 from measure.match_options import MatchOptions

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from measure.noise.blank_film import PATCH_PX, PLANE
-from measure.noise.grain import grain_model
+from measure.noise.grain import PATCH_PX, PLANE, grain_model
 from measure.noise.noise import noise_model
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.natural_points.neighbours import outliers
+from measure.natural_points.local_maps import outliers
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from measure.fitting.matching import match
 from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkShape, ring_cross
-from measure.scans.compression import covariance_of_compression
+from measure.scans.compression import UNKNOWN_DN, covariance_of_compression, rounding_step_dn
 from measure.scans.picture_scan import WholePicture
-from measure.scans.quantisation import UNKNOWN_DN, rounding_step_dn
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan, open_scan
 
@@ -104,6 +103,6 @@ def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_said() -> None:
         start = placed(10.0, tuple(place[:, 2] + rng.uniform(-0.5, 0.5, 2)))
         fit = match(ScanWindow(stored_after_jpeg(grey, 30).astype(float), is_lossy=True), mark, start)
         scan = Scan(Path("lossy.tif"), WholePicture(even[..., None], rounding_step_dn=step_dn), NO_TAGS)
-        variance = np.trace(fit.covariance_px2 + covariance_of_compression(scan, fit.contrast_dn)) / 2
+        variance = np.trace(fit.covariance_px2 + covariance_of_compression(scan.rounding_step_dn, fit.contrast_dn)) / 2
         ratios.append((fit.center_px - place[:, 2]) / np.sqrt(variance))
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.25

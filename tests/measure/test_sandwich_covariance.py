@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from true_marks import KIND, some_mark
 
+from measure.fitting.linear_fit import sandwich_covariance
 from measure.fitting.matching import MatchOptions, match
-from measure.fitting.sandwich_covariance import sandwich_covariance
 from measure.fitting.scan_window import ScanWindow
 from measure.marks.shapes import MarkTemplate
 

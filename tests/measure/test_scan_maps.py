@@ -8,8 +8,7 @@ from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
 from measure.search.correlation import WIDE, Map
-from measure.search.held import Held
-from measure.search.scan_maps import ScanMaps, Sought
+from measure.search.scan_maps import Held, ScanMaps, Sought
 
 RNG = np.random.default_rng(4)
 SCAN = Scan(Path("noise.tif"), WholePicture(RNG.integers(0, 65535, (90, 110, 3), np.uint16)), NO_TAGS)

@@ -8,7 +8,7 @@ from true_marks import KIND, some_mark, whitened_rms
 from measure.fitting.matching import match
 from measure.fitting.scan_window import read_window
 from measure.match_options import MatchOptions
-from measure.noise.steadiness import steadiness
+from measure.noise.weighting import steadiness
 from measure.scans.tone import Tone, power
 
 FULL = 65535.0
