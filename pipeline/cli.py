@@ -347,6 +347,34 @@ def import_files(
 
 
 @app.command()
+def convert(
+    file: Annotated[Path, typer.Argument(metavar="CAMERA.toml|adjustment.json", show_default=False)],
+    family: Annotated[str, typer.Argument(metavar="FAMILY", help="See docs/distortion.md.", show_default=False)],
+    out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the file goes.", show_default=False)],
+    r0_mm: Annotated[float, typer.Option("--r0-mm", metavar="MM", min=0.0, help="Of torlegard, aicon, juhl.")] = 0.0,
+    parameters: Annotated[
+        str,
+        typer.Option(metavar="A,B,...", help="Those of the other family that are fitted; by default the usual ones."),
+    ] = "",
+    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Which one, where a file holds several.")] = None,
+    misfit_um: Annotated[
+        float, typer.Option("--misfit-um", metavar="UM", min=0.0, help="How far the other family may be off.")
+    ] = 0.1,
+    as_json: AsJson = False,
+) -> int:
+    """A camera's lens in the words of another distortion family, with its covariance."""
+    from pipeline.exchange.convert_stage import ConvertOptions, conversion_json, conversion_lines, run_convert
+
+    named = tuple(name.strip() for name in parameters.split(",") if name.strip())
+    done = run_convert(file, out_dir, ConvertOptions(family, r0_mm, named, camera))
+    if as_json:
+        _echo_json(conversion_json(done))
+    for line in () if as_json else (*conversion_lines(done), f"{out_dir}: {counted(len(done.files), 'file')}"):
+        typer.echo(plain(line))
+    return LOOK if done.misfit_um > misfit_um else DONE
+
+
+@app.command()
 def block(
     project: ProjectFile,
     out_dir: Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the block goes.", show_default=False)],

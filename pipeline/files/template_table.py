@@ -3,6 +3,7 @@
 What was learned from scans stands in `[mark.NAME.learned]`: a chip that somebody cut out has none of it.
 """
 
+import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from measure.errors import MeasurementError
 from measure.marks.shapes import MarkTemplate
 from measure.scans.scan import open_scan
-from pipeline.text.atomic import atomic_path
+from pipeline.text.atomic import write_atomically
 from pipeline.text.tables import Table
 from pipeline.text.toml_text import numbers, quoted
 
@@ -30,11 +31,17 @@ def saved_in(folder: Path, prefix: str = "") -> SavePicture:
 
     def save(name: str, picture: Picture) -> str:
         file = f"{prefix}{name}.tif"
-        with atomic_path(folder / file) as temporary:
-            tifffile.imwrite(temporary, picture, metadata=None, software="reseau")
+        write_atomically(folder / file, picture_file(picture))
         return file
 
     return save
+
+
+def picture_file(picture: Picture) -> bytes:
+    """A picture as the TIFF file that `saved_in` stores."""
+    file = io.BytesIO()
+    tifffile.imwrite(file, picture, metadata=None, software="reseau")
+    return file.getvalue()
 
 
 def template_lines(template: MarkTemplate, name: str, save: SavePicture) -> list[str]:

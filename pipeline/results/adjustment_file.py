@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.images import adjusted_image
-from adjust.problem.network import EXTERIOR_NAMES, Camera, Image, ObjectPoint, Prior, Scanner
+from adjust.problem.network import EXTERIOR_NAMES, Camera, Distortion, Image, ObjectPoint, Prior, Scanner
 from adjust.problem.result import Adjustment, FurtherResidual
 from adjust.quality.correlation import correlations
 from adjust.quality.significance import SignificanceTest, group_tests, parameter_tests, scanner_tests
@@ -115,13 +115,7 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
         known = _quantity(adjustment, f"IO.{camera.name}.{name}", given)
         return known | {"sigma": math.nan} if idle else known | tests.get(name, {})
 
-    distortion: Json = {"family": camera.distortion.family, "r0_mm": camera.distortion.r0_mm}
-    if camera.distortion.family == "torlegard":
-        distortion["decentering"] = camera.distortion.decentering
-    if family(camera.distortion.family).needs == "half_mm":
-        distortion["half_mm"] = list(camera.distortion.half_mm)
-    if family(camera.distortion.family).y_down:
-        distortion["axes"] = "x right, y down"
+    distortion = distortion_settings(camera.distortion)
     for parameter in parameter_names(camera.distortion.family):
         given = camera.distortion.parameters.get(parameter, Prior(0.0))
         distortion[parameter] = quantity(parameter, given)
@@ -142,6 +136,18 @@ def _camera(adjustment: Adjustment, camera: Camera) -> Json:
             for id, fiducial in camera.fiducials.items()
         },
     }
+
+
+def distortion_settings(distortion: Distortion) -> Json:
+    """What stands beside a family's parameters: its name and settings, and its axes where they are not the camera's."""
+    settings: Json = {"family": distortion.family, "r0_mm": distortion.r0_mm}
+    if distortion.family == "torlegard":
+        settings["decentering"] = distortion.decentering
+    if family(distortion.family).needs == "half_mm":
+        settings["half_mm"] = list(distortion.half_mm)
+    if family(distortion.family).y_down:
+        settings["axes"] = "x right, y down"
+    return settings
 
 
 def _scanner(adjustment: Adjustment, scanner: Scanner) -> Json:

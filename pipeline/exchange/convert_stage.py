@@ -1,0 +1,279 @@
+"""`reseau convert`: a camera's lens in the words of another distortion family, with its covariance."""
+
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.choices.lens_conversion import ConvertedLens, convert_lens
+from adjust.functional_model.families import FAMILY_NAMES, family, parameter_names
+from adjust.problem.network import Distortion, Prior
+from pipeline.errors import InputError
+from pipeline.exchange.export_stage import README, check_folder, publish
+from pipeline.files.camera_file import read_camera
+from pipeline.files.camera_text import camera_text
+from pipeline.files.template_table import Picture, picture_file
+from pipeline.results.adjustment_file import distortion_settings
+from pipeline.results.adjustment_reader import (
+    Covariance,
+    calibrated_lens,
+    covariance_path,
+    read_adjustment,
+    read_covariance,
+)
+from pipeline.results.fingerprints import of_content
+from pipeline.text.spelling import did_you_mean
+from pipeline.text.text_file import read_bytes
+from pipeline.text.wording import listed
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+
+INTERIOR = ("c", "x0", "y0")
+
+
+@dataclass(frozen=True)
+class ConvertOptions:
+    """parameters: those of the other family that are fitted, () for the usual ones; camera: which, of several."""
+
+    family: str
+    r0_mm: float = 0.0
+    parameters: tuple[str, ...] = ()
+    camera: str | None = None
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """sigmas (3 + k,): of c, x0', y0' and the parameters; inf free. told: the lines of the README; misfit_um: the
+    largest over the frame."""
+
+    lens: ConvertedLens
+    sigmas: Array
+    told: tuple[str, ...]
+    files: tuple[str, ...]
+
+    @property
+    def misfit_um(self) -> float:
+        return 1e3 * self.lens.largest_mm
+
+
+def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
+    """Write the camera of a camera file, or of adjustment.json with its covariance, with another family.
+
+    Raises InputError for a family or a parameter that there is not, for a camera whose lens or frame is not known, and
+    for a folder that holds anything else.
+    """
+    try:
+        of = family(options.family)
+    except ValueError as error:
+        raise InputError(f"{error}.{did_you_mean(options.family, FAMILY_NAMES)}") from None
+    unknown = sorted(set(options.parameters) - set(of.parameters))
+    if unknown:
+        raise InputError(f"{options.family} has no parameter {listed(unknown)}; it has {listed(of.parameters)}.")
+    if of.needs == "r0_mm" and not options.r0_mm > 0.0:
+        raise InputError(f"{options.family} needs a radius r0: say with --r0-mm which.")
+    check_folder(folder)
+    convert = _adjustment if path.suffix == ".json" else _camera_file
+    return convert(path, folder, options)
+
+
+def _converted(
+    lens: tuple[Distortion, Array, Array], sigmas: Array, corners_mm: Array, options: ConvertOptions
+) -> tuple[ConvertedLens, tuple[str, ...]]:
+    """The lens, and what is to be said of it; sigmas (k,): of its parameters."""
+    names = parameter_names(lens[0].family)
+    uncertain = [name for name, sigma in zip(names, sigmas, strict=True) if sigma > 0.0]
+    half = np.abs(corners_mm).max(axis=0) if family(options.family).needs == "half_mm" else np.zeros(2)
+    into = Distortion(options.family, r0_mm=options.r0_mm, half_mm=(float(half[0]), float(half[1])))
+    found = convert_lens(*lens, into, corners_mm, options.parameters or None, uncertain)
+    size = "{:.4g} x {:.4g} mm".format(*(corners_mm[1] - corners_mm[0]))
+    if found.is_same:
+        told = f"{lens[0].family} and {options.family} mean the same here: what is left over {size} is rounding."
+    else:
+        told = (
+            f"{options.family} does not take this lens quite: over {size} it is off by up to "
+            f"{1e3 * found.largest_mm:.3g} um, rms {1e3 * found.rms_mm:.3g} um a point. "
+            "The standard deviations do not count that."
+        )
+    return found, (told, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")
+
+
+def _adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
+    """The whole adjustment.json and adjustment.npz, with one camera's lens converted."""
+    content, covariance = read_adjustment(path), read_covariance(path)
+    if not content["converged"]:
+        raise InputError(f"{path}: holds no calibration: its adjustment did not converge.")
+    cameras = list(content["cameras"])
+    name = options.camera or cameras[0]
+    if name not in cameras or (options.camera is None and len(cameras) > 1):
+        raise InputError(f"{path}: holds the cameras {listed(cameras)}. Say which one: --camera NAME.")
+    camera = content["cameras"][name]
+    given = calibrated_lens(camera)
+    if not np.isfinite([*given[1], *given[2]]).all():
+        raise InputError(f"{path}: holds no interior orientation of {name!r}: no object point told it.")
+    known = np.sqrt(np.diag(covariance.of(_names(name, given[0])[3:])))
+    lens, told = _converted(given, known, _observed_corners_mm(path, content, name), options)
+    moved = _moved_covariance(covariance, name, given[0], lens)
+    sigmas = np.sqrt(np.diag(moved.of(_names(name, lens.distortion))))
+    entry = _camera_entry(camera, given[0], lens, sigmas)
+    gone = {f"IO.{name}.{each}" for each in parameter_names(given[0].family)}
+    correlations = [row for row in content["correlations"] if not gone & set(row["parameters"])]
+    content |= {"cameras": content["cameras"] | {name: entry}, "correlations": correlations}
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    arrays = io.BytesIO()
+    with np.load(io.BytesIO(read_bytes(covariance_path(path))), allow_pickle=False) as stored:
+        kept = {key: stored[key] for key in stored.files}
+    kept |= {"names": np.array(moved.names), "values": moved.values, "matrix": moved.matrix}
+    kept["fingerprint"] = np.array(of_content(text.encode("utf-8")))
+    np.savez_compressed(arrays, allow_pickle=False, **kept)
+    files: dict[str, str | bytes] = {"adjustment.json": text, "adjustment.npz": arrays.getvalue()}
+    return _written(path, folder, files, Conversion(lens, sigmas, told, tuple(files)))
+
+
+def _observed_corners_mm(path: Path, content: Json, name: str) -> Array:
+    """(2, 2) two corners of where the camera was observed."""
+    seen = [
+        (row["camera_x_mm"], row["camera_y_mm"])
+        for row in content["residuals"]
+        if content["images"].get(row["image"], {}).get("camera") == name and row["camera_x_mm"] is not None
+    ]
+    if not seen:
+        raise InputError(f"{path}: no image of {name!r} has an observation, so nothing says how large its frame is.")
+    return np.array([np.min(seen, axis=0), np.max(seen, axis=0)])
+
+
+def _names(camera: str, distortion: Distortion) -> tuple[str, ...]:
+    return tuple(f"IO.{camera}.{each}" for each in (*INTERIOR, *parameter_names(distortion.family)))
+
+
+def _moved_covariance(covariance: Covariance, camera: str, source: Distortion, lens: ConvertedLens) -> Covariance:
+    """That of all quantities, the camera's own in the other family: with all others, too."""
+    old, new = _names(camera, source), _names(camera, lens.distortion)
+    others = tuple(name for name in covariance.names if name not in old)
+    by_old = np.zeros((len(new) + len(others), len(old) + len(others)))
+    by_old[: len(new), : len(old)] = lens.by_source
+    by_old[len(new) :, len(old) :] = np.eye(len(others))
+    matrix = by_old @ covariance.of((*old, *others)) @ by_old.T
+    value = dict(zip(covariance.names, covariance.values, strict=True))
+    values = np.concatenate([lens.interior, lens.parameters, [value[name] for name in others]])
+    return Covariance((*new, *others), values, (matrix + matrix.T) / 2.0)
+
+
+def _camera_entry(camera: Json, source: Distortion, lens: ConvertedLens, sigmas: Array) -> Json:
+    c, x0, y0, *parameters = (
+        {"value": float(value), "sigma": float(sigma)}
+        for value, sigma in zip([*lens.interior, *lens.parameters], sigmas, strict=True)
+    )
+    named = dict(zip(parameter_names(lens.distortion.family), parameters, strict=True))
+    return camera | {
+        "principal_distance_mm": c,
+        "principal_point_mm": {"x": x0, "y": y0},
+        "distortion": distortion_settings(lens.distortion) | named,
+        "significance": [],
+        "converted": {
+            "from": distortion_settings(source),
+            "same": lens.is_same,
+            "largest_um": 1e3 * lens.largest_mm,
+            "rms_um": 1e3 * lens.rms_mm,
+        },
+    }
+
+
+def _camera_file(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
+    """camera.toml with the values and standard deviations of its lens converted."""
+    camera = read_camera(path)
+    distance, point = camera.principal_distance_mm, camera.principal_point_mm
+    if distance is None or point is None or camera.frame_mm is None:
+        missing = "frame_mm" if camera.frame_mm is None else "principal distance or principal point"
+        raise InputError(f"{path}: has no {missing}, and a lens is converted over its frame. Give it there.")
+    names = parameter_names(camera.distortion.family)
+    priors = [camera.distortion.parameters.get(name, Prior(0.0)) for name in names]
+    interior, parameters = np.array([distance, *point]), np.array([prior.value for prior in priors])
+    middle = np.zeros(2) if camera.fiducials else interior[1:]
+    half = np.array(camera.frame_mm) / 2.0
+    corners_mm = np.array([middle - half, middle + half])
+    given = np.array([camera.principal_distance_sigma_mm, *camera.principal_point_sigma_mm, *(p.sigma for p in priors)])
+    lens, told = _converted((camera.distortion, interior, parameters), given[3:], corners_mm, options)
+    sigmas = _sigmas(given, camera.distortion, lens)
+    if np.count_nonzero(np.isfinite(sigmas) & (sigmas > 0.0)) > 1:
+        told += (
+            "A camera file holds no correlations: to keep them convert adjustment.json, and name the result there.",
+        )
+    if camera.calibration is not None:
+        told += (f"The earlier calibration {camera.calibration.path} is left out: convert it by itself.",)
+    sigma = dict(zip(parameter_names(lens.distortion.family), sigmas[3:].tolist(), strict=True))
+    value = dict(zip(sigma, lens.parameters.tolist(), strict=True))
+    estimated = {name: Prior(value[name], sigma[name]) for name in lens.estimated}
+    converted = replace(
+        camera,
+        path=folder / "camera.toml",
+        principal_distance_mm=float(lens.interior[0]),
+        principal_point_mm=(float(lens.interior[1]), float(lens.interior[2])),
+        principal_distance_sigma_mm=float(sigmas[0]),
+        principal_point_sigma_mm=(float(sigmas[1]), float(sigmas[2])),
+        distortion=replace(lens.distortion, parameters=estimated),
+        calibration=None,
+    )
+    files: dict[str, str | bytes] = {}
+
+    def save(name: str, picture: Picture) -> str:
+        files[f"{name}.tif"] = picture_file(picture)
+        return f"{name}.tif"
+
+    files["camera.toml"] = camera_text(converted, save)
+    return _written(path, folder, files, Conversion(lens, sigmas, told, tuple(files)))
+
+
+def _sigmas(given: Array, source: Distortion, lens: ConvertedLens) -> Array:
+    """Standard deviations (3 + k,) of those of the source, taken as uncorrelated; what hangs on a free one is free."""
+    free = np.isinf(given)
+    sigmas = np.sqrt(np.maximum(np.diag(lens.covariance(np.diag(np.where(free, 0.0, given) ** 2))), 0.0))
+    is_free = np.zeros(len(sigmas), dtype=bool)
+    is_free[:3] = free[:3]
+    if free[3:].any():
+        names = parameter_names(lens.distortion.family)
+        is_free[[3 + names.index(name) for name in lens.estimated]] = True
+        is_free[0] |= source.r0_mm != lens.distortion.r0_mm
+    sigmas[is_free] = math.inf
+    return np.asarray(sigmas)
+
+
+def _written(path: Path, folder: Path, files: dict[str, str | bytes], conversion: Conversion) -> Conversion:
+    head = [f"Written by reseau {version('reseau')}: a lens converted", "", f"From: {path.name}", ""]
+    publish(folder, {**files, README: "\n".join([*head, *(f"- {line}" for line in conversion.told)]) + "\n"})
+    return conversion
+
+
+def conversion_json(conversion: Conversion) -> Json:
+    """As `--json` prints it."""
+    lens = conversion.lens
+    values = [*lens.interior.tolist(), *lens.parameters.tolist()]
+    names = (*INTERIOR, *parameter_names(lens.distortion.family))
+    sigmas = [sigma if math.isfinite(sigma) else "free" for sigma in conversion.sigmas.tolist()]
+    return {
+        **distortion_settings(lens.distortion),
+        "same": lens.is_same,
+        "largest_um": conversion.misfit_um,
+        "rms_um": 1e3 * lens.rms_mm,
+        "values": {
+            name: {"value": value, "sigma": sigma} for name, value, sigma in zip(names, values, sigmas, strict=True)
+        },
+    }
+
+
+def conversion_lines(conversion: Conversion) -> Sequence[str]:
+    """As it is printed: what holds, and the parameters."""
+    rows = conversion_json(conversion)["values"].items()
+    numbers = [
+        f"  {name:6s} {row['value']:>16.9g}  {row['sigma'] if row['sigma'] == 'free' else format(row['sigma'], '.2g')}"
+        for name, row in rows
+        if row["value"] != 0.0 or row["sigma"] != 0.0
+    ]
+    return (*conversion.told, *numbers)

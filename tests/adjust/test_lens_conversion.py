@@ -1,0 +1,147 @@
+"""Lenses in other words: formulas where two families mean the same, and the same data adjusted in both."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from lens_networks import LENSES, network_of
+from numpy.typing import NDArray
+
+from adjust.choices.lens_conversion import convert_lens
+from adjust.errors import AdjustmentError
+from adjust.functional_model.families import parameter_names
+from adjust.initial_values.approximations import approximate
+from adjust.problem.network import Distortion, Network, Prior
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
+
+Array = NDArray[np.float64]
+
+CORNERS_MM = np.array([[-17.0, -12.0], [18.0, 12.0]])
+INTERIOR = np.array([28.8, 0.05, -0.03])
+
+
+def values(family: str, **given: float) -> Array:
+    return np.array([given.get(name, 0.0) for name in parameter_names(family)])
+
+
+def test_another_r0_is_another_principal_distance() -> None:
+    """c, k and p are divided by 1 + k3 r0² + k5 r0⁴: exact, and the derivative by k3 is that of the quotient."""
+    r0, k3, k5, p1 = 9.0, 1.1e-4, -2e-7, 4e-6
+    lens = values("torlegard", k3=k3, k5=k5, p1=p1)
+    found = convert_lens(Distortion("torlegard", r0_mm=r0), INTERIOR, lens, Distortion("brown"), CORNERS_MM)
+    s = 1 + k3 * r0**2 + k5 * r0**4
+    assert found.is_same
+    assert found.estimated == ("k1", "k2", "p1")
+    np.testing.assert_allclose(found.interior, [INTERIOR[0] / s, *INTERIOR[1:]], rtol=1e-12)
+    np.testing.assert_allclose(found.parameters, values("brown", k1=k3 / s, k2=k5 / s, p1=p1 / s), rtol=1e-8)
+    c_by_k3 = -INTERIOR[0] * r0**2 / s**2
+    assert found.by_source[0, 3] == pytest.approx(c_by_k3, rel=1e-7)
+    assert found.by_source[3, 3] == pytest.approx(1 / s - k3 * r0**2 / s**2, rel=1e-6)
+
+
+def test_the_ideal_point_in_mm_and_without_units() -> None:
+    """aicon with r0 = 0 is OpenCV's: k1 = a1 c², p1 = -b2 c, p2 = b1 c, as cv2 projects."""
+    c = INTERIOR[0]
+    given = {"a1": -1.1e-4, "a2": 1.5e-7, "b1": 6e-6, "b2": -9e-6}
+    found = convert_lens(Distortion("aicon"), INTERIOR, values("aicon", **given), Distortion("opencv"), CORNERS_MM)
+    assert found.is_same
+    k1, k2, p1, p2 = found.parameters[:4]
+    expected = [given["a1"] * c**2, given["a2"] * c**4, -given["b2"] * c, given["b1"] * c]
+    np.testing.assert_allclose([k1, k2, p1, p2], expected, rtol=1e-9)
+    ray = np.array([0.3, 0.2])  # by hand, beside OpenCV with y down
+    u, v = c * ray
+    r2 = u * u + v * v
+    radial = given["a1"] * r2 + given["a2"] * r2**2
+    by_hand = [
+        u * (1 + radial) + given["b1"] * (r2 + 2 * u * u) + 2 * given["b2"] * u * v,
+        v * (1 + radial) + 2 * given["b1"] * u * v + given["b2"] * (r2 + 2 * v * v),
+    ]
+    matrix = np.diag([c, c, 1.0])
+    seen, _ = cv2.projectPoints(
+        np.array([[0.3, -0.2, 1.0]]), np.zeros(3), np.zeros(3), matrix, np.array([k1, k2, p1, p2])
+    )
+    np.testing.assert_allclose(np.ravel(seen) * [1, -1], by_hand, rtol=1e-12)
+
+
+def test_frasers_terms_are_browns_with_the_other_sign() -> None:
+    given = {"k1": 1e-4, "k2": -1e-7, "p1": 5e-6, "p2": -8e-6, "b1": 1e-4, "b2": -2e-4}
+    found = convert_lens(Distortion("brown"), INTERIOR, values("brown", **given), Distortion("australis"), CORNERS_MM)
+    assert found.is_same
+    np.testing.assert_allclose(found.parameters, -values("brown", **given), rtol=1e-8)
+    back = convert_lens(Distortion("australis"), found.interior, found.parameters, Distortion("brown"), CORNERS_MM)
+    used = [0, 1, 2, 3, 4, 6, 7, 8, 9]  # k3 is 0 and certain: nothing takes its place
+    np.testing.assert_allclose((back.by_source @ found.by_source)[np.ix_(used, used)], np.eye(9), atol=1e-6)
+
+
+def test_what_is_0_and_uncertain_has_its_counterpart() -> None:
+    """A lens that is yet to be found: k3 and p1 free at 0 are k1 and p1, and nothing else."""
+    lens = Distortion("torlegard"), INTERIOR, np.zeros(7)
+    found = convert_lens(*lens, Distortion("brown"), CORNERS_MM, None, ("k3", "p1"))
+    assert found.is_same
+    assert found.estimated == ("k1", "p1")
+    assert convert_lens(*lens, Distortion("brown"), CORNERS_MM).estimated == ()
+
+
+def test_covariance_is_that_of_the_same_data_adjusted_in_the_other_family() -> None:
+    """Values to a millionth of their sigmas, the covariance to a millionth: aicon with r0 as OpenCV's."""
+    rng = np.random.default_rng(2)
+    first = adjusted(network_of("aicon", rng), ("a1", "a2", "b1", "b2"))
+    network = first.network
+    second = adjusted(in_family(network, "opencv"), ("k1", "k2", "p1", "p2"))
+    source, names = quantities("aicon"), quantities("opencv")
+    lens = np.array([first.value(name) for name in source])
+    found = convert_lens(network.cameras[0].distortion, lens[:3], lens[3:], Distortion("opencv"), CORNERS_MM)
+    assert found.is_same
+    covariance, expected = found.covariance(first.cofactor_of(source)), second.cofactor_of(names)
+    sigmas = np.sqrt(np.diag(expected))
+    free = sigmas > 0.0
+    assert (np.abs(np.concatenate([found.interior, found.parameters]) - [second.value(n) for n in names])[free]
+            < 1e-4 * sigmas[free]).all()  # fmt: skip
+    scale = np.outer(sigmas, sigmas)[np.ix_(free, free)]
+    np.testing.assert_allclose(covariance[np.ix_(free, free)] / scale, expected[np.ix_(free, free)] / scale, atol=1e-5)
+    assert not covariance[~free].any()
+
+
+def quantities(family: str) -> list[str]:
+    return [f"IO.L.{name}" for name in ("c", "x0", "y0", *parameter_names(family))]
+
+
+def in_family(network: Network, family: str) -> Network:
+    return replace(network, cameras=(replace(network.cameras[0], distortion=Distortion(family)),))
+
+
+def adjusted(network: Network, free: tuple[str, ...]) -> Adjustment:
+    camera = network.cameras[0]
+    distortion = replace(camera.distortion, parameters={name: Prior(0.0, np.inf) for name in free})
+    network = replace(network, cameras=(replace(camera, distortion=distortion),))
+    return adjust(network, approximate(network))
+
+
+def test_what_no_family_takes_is_told_by_its_residual() -> None:
+    """A correction of the observed point as one of the ideal point: 0.7 um are left."""
+    lens = values("torlegard", k3=1e-4, k5=-1e-7, p1=5e-6, p2=-8e-6)
+    found = convert_lens(Distortion("torlegard"), INTERIOR, lens, Distortion("opencv"), CORNERS_MM)
+    assert not found.is_same
+    assert 1e-4 < found.largest_mm < 1e-3
+    assert found.rms_mm < found.largest_mm
+
+
+@pytest.mark.parametrize("source", list(LENSES))
+@pytest.mark.parametrize("target", ["torlegard", "brown", "australis", "aicon", "opencv", "opencv_fisheye"])
+def test_every_lens_comes_near_every_other(source: str, target: str) -> None:
+    c, given = LENSES[source]
+    lens = values(source, **given), np.array([c, 0.12, -0.07])
+    into = Distortion(target, r0_mm=10.0 if target in ("torlegard", "aicon") else 0.0)
+    found = convert_lens(Distortion(source, r0_mm=13.0), lens[1], lens[0], into, CORNERS_MM / 2.0)
+    assert found.largest_mm < 0.03
+
+
+def test_a_frame_without_an_image_is_refused() -> None:
+    with pytest.raises(AdjustmentError, match="makes no image at"):
+        convert_lens(
+            Distortion("opencv_fisheye"), np.array([5.0, 0.0, 0.0]), np.zeros(6), Distortion("opencv"), CORNERS_MM
+        )
+    with pytest.raises(ValueError, match="brown has no parameter a1"):
+        convert_lens(Distortion("opencv"), INTERIOR, np.zeros(16), Distortion("brown"), CORNERS_MM, ("a1",))
