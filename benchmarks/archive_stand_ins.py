@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from measure.covariance import Cause, Covariance
+from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
 from pipeline.archive.witness import Witnessed
@@ -22,6 +23,7 @@ from pipeline.results.measured_scan import MeasuredScan
 FIDUCIALS = ((-106, -106), (106, -106), (106, 106), (-106, 106), (0, -110), (110, 0), (0, 110), (-110, 0))
 _PITCH_UM = 20.0
 _SIGMA_PX = 0.02
+_COVERED = Reason("a part of it is covered", Code.COVERED)
 CAMERA = 'name = "stand-in"\nframe_mm = [228.0, 228.0]\n' + "".join(
     f'[[fiducial]]\nid = "{number}"\nxy_mm = [{x}.0, {y}.0]\nsigma_mm = 0.01\nmark = "m"\n'
     for number, (x, y) in enumerate(FIDUCIALS, 1)
@@ -41,7 +43,8 @@ def write_project(folder: Path, scans: int, a_folder: int = 1000) -> Path:
 
 
 def stand_in(task: ScanTask) -> Witnessed:
-    """Measured in the time that RESEAU_STAND_IN_S says, 0 by default; RESEAU_STAND_IN_LOG: where its begin is told."""
+    """Measured in the time that RESEAU_STAND_IN_S says, 0 by default; RESEAU_STAND_IN_LOG: where its begin is told;
+    RESEAU_STAND_IN_WEAK: how many of its marks are weak."""
     if told := os.environ.get("RESEAU_STAND_IN_LOG"):
         with Path(told).open("a", encoding="utf-8") as file:
             file.write(f"{task.name}\n")
@@ -50,6 +53,8 @@ def stand_in(task: ScanTask) -> Witnessed:
     rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
     matrix = np.array([[50.0, 0.0, 5750.0], [0.0, -50.0, 5750.0]]) + rng.normal(0, [[1e-3, 1e-3, 30.0]] * 2)
     marks = tuple(_mark(str(number), xy, matrix, rng) for number, xy in enumerate(FIDUCIALS, 1))
+    weak = int(os.environ.get("RESEAU_STAND_IN_WEAK", "0"))
+    marks = tuple(replace(one, status=Status.WEAK, reason=_COVERED) if k < weak else one for k, one in enumerate(marks))
     pose = Pose("0", True, ("set in the project.",))
     frame = FrameMeasurement(task.name, marks, pose, matrix)
     scan = MeasuredScan(task.scan, 11500, 11500, (_PITCH_UM, _PITCH_UM), frame, ("It is a stand-in.",))

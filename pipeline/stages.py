@@ -216,7 +216,12 @@ def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublish
 
 def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) -> None:
     frames = (scan.frame for scan in measured_scans(store.path, digest))
-    write_comparator(new.place(project.comparator), frames, pitches(store, digest), digest, decisions_by(store, digest))
+    decided = decisions_by(store, digest)
+    for camera in project.cameras.values():
+        if camera.clicks is not None and camera.clicks.who:  # one decision more: how its marks look
+            who = camera.path.name, camera.clicks.who
+            decided[who] = decided.get(who, 0) + 1
+    write_comparator(new.place(project.comparator), frames, pitches(store, digest), digest, decided)
     if not write_frames(new.place(project.frames_path), measured_scans(store.path, digest)):
         new.remove(project.frames_path)
 

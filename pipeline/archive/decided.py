@@ -16,7 +16,7 @@ from measure.fiducial_options import CLICK_SIGMA_PX, Click
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.status import Status
-from pipeline.files.decisions_file import About, Choice, Decision, standing
+from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, standing
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
 
@@ -32,10 +32,11 @@ class Decided:
 
 
 def by_image(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
-    """The decisions about each scan, the oldest first."""
+    """The decisions about each scan, the oldest first; those about a camera's marks left out."""
     told = defaultdict[str, list[Decision]](list)
     for one in decisions:
-        told[one.image].append(one)
+        if one.about[2] != LEARNED:
+            told[one.image].append(one)
     return told
 
 

@@ -97,6 +97,11 @@ class CameraFile:
         return tuple(one for one in self.fiducials if isinstance(one.mark, shapes.LearnedMark))
 
     @property
+    def is_asked(self) -> bool:
+        """Whether a person may be asked where its marks are: they are to be learned, and its own file shows none."""
+        return bool(self.learned) and (self.clicks is None or bool(self.clicks.who))
+
+    @property
     def drawn(self) -> tuple[shapes.LayoutMark, ...]:
         """The fiducials that can be found in a scan."""
         return tuple(

@@ -11,10 +11,15 @@ from pipeline.text.tables import Table
 
 @dataclass(frozen=True)
 class Clicks:
-    """Where somebody saw the marks in one scan: px by fiducial, column and row."""
+    """Where somebody saw the marks in one scan: px by fiducial, column and row.
+
+    sha256: of the scan's file, as it was then, and who saw them; "" where the camera's file says it.
+    """
 
     scan: str
     px: Mapping[str, Point]
+    sha256: str = ""
+    who: str = ""
 
 
 @dataclass(frozen=True)

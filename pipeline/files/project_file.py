@@ -16,9 +16,10 @@ from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.decisions_file import FILE as DECISIONS
-from pipeline.files.decisions_file import Decision, read_decisions
+from pipeline.files.decisions_file import Decision, learned_from, read_decisions
 from pipeline.files.distances_file import GivenDistance, read_distances
 from pipeline.files.images_file import GivenImages, read_images
+from pipeline.files.learned_table import Clicks
 from pipeline.files.library import camera_path
 from pipeline.files.pitch import FINEST_PITCH_UM
 from pipeline.files.points_file import GivenPoints, read_points
@@ -221,7 +222,7 @@ def read_project(path: Path) -> Project:
         given_distances=read_distances(named["distances"]) if "distances" in named else (),
         images_path=named.get("images"),
     )
-    project = replace(project, decisions=read_decisions(project.decisions_path))
+    project = with_decisions(project)
     if not project.scans and not project.comparator.exists():
         raise InputError(
             f"{path}: there are no scans and no comparator coordinates. Give scans = [...] to measure, or comparator = "
@@ -229,6 +230,31 @@ def read_project(path: Path) -> Project:
         )
     _check_written(table, project, named)
     return project
+
+
+def with_decisions(project: Project) -> Project:
+    """The project with what is decided now. Marks that are to be learned, and that the camera's own file does not show,
+    are shown where a person decided. Raises InputError naming the line, or the marks that are missing."""
+    decisions = read_decisions(project.decisions_path)
+    cameras = dict(project.cameras)
+    for name, camera in project.cameras.items():
+        if camera.is_asked:
+            images = {image for image in project.scans if project.camera_of(image) is camera}
+            cameras[name] = replace(camera, clicks=_shown(project, camera, learned_from(decisions, images)))
+    return replace(project, cameras=cameras, decisions=decisions)
+
+
+def _shown(project: Project, camera: CameraFile, shown: Decision | None) -> Clicks | None:
+    if shown is None:
+        return None
+    missing = [one.id for one in camera.learned if one.id not in shown.px]
+    if missing:
+        raise InputError(
+            f"{project.decisions_path}: the decision to learn the marks of {camera.name} from {shown.image} says "
+            f"nothing of {', '.join(missing)}. Show all of them in `reseau review`, or take the line out."
+        )
+    px = {one.id: shown.px[one.id] for one in camera.learned}
+    return Clicks(shown.image, px, shown.fingerprint, shown.who or "somebody")
 
 
 def _antenna(objects: Table) -> tuple[float, float, float]:

@@ -34,8 +34,8 @@ _REACH = 1.0  # sizes of a mark: how far from its coordinates it is sought
 _COMPARED = 8  # scans: more do not tell better what they have in common
 _LEAST_EXCESS = 0.15  # of correlations, the best less the second best: what chance leaves among landscape is half of it
 _NOT_COMMON = (
-    "the marks cannot be learned from what the scans have in common. Show them by a table [clicks] in one scan: scan = "
-    '"..." and a table [clicks.px] of column and row by fiducial;'
+    "the marks cannot be learned from what the scans have in common. Click them in one scan in `reseau review`, or "
+    'show them here by a table [clicks] with scan = "..." and a table [clicks.px] of column and row by fiducial;'
 )
 
 
@@ -55,6 +55,11 @@ def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> C
             f"They are {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}."
         )
     with task.opened() as scan:
+        if clicks.sha256 and clicks.sha256 != digest(scan.path):
+            raise InputError(
+                f"{camera.path}: its marks were shown in {clicks.scan}, whose file is another one since. Click them "
+                "again in `reseau review`."
+            )
         for id, place in clicks.px.items():
             if not (0 <= place[0] < scan.width_px and 0 <= place[1] < scan.height_px):
                 raise InputError(
@@ -72,8 +77,9 @@ def _in_common(camera: CameraFile, tasks: Sequence[ScanTask], workers: Executor 
     """The marks that recur in all scans near their coordinates."""
     if len(tasks) < 2:
         raise InputError(
-            f"{camera.path}: the marks are to be learned, and with one scan nothing says what is a mark. Show them: "
-            'a table [clicks] with scan = "..." and a table [clicks.px] of column and row by fiducial.'
+            f"{camera.path}: the marks are to be learned, and with one scan nothing says what is a mark. Click them in "
+            "`reseau review`, or show them here by a table [clicks] with scan = "
+            '"..." and a table [clicks.px] of column and row by fiducial.'
         )
     compared = [tasks[round(k)] for k in np.linspace(0, len(tasks) - 1, min(len(tasks), _COMPARED))]
     views = list(mapped(workers, _view, compared))

@@ -41,18 +41,25 @@ def learn_marks(
     they cannot be learned. A scan that cannot be measured adds nothing to them. What was learned once
     stays, whatever scans come or go, as long as its files stand in out/learned."""
     files = _file_names([camera.path for camera in project.cameras.values()], _learned_folder(project))
-    cameras = dict(project.cameras)
-    for name, camera in project.cameras.items():
-        if not camera.learned:
-            cameras[name] = _known(project, camera)
-            continue
-        place, key = folder / f"{files[camera.path]}.toml", _key(project, camera)
-        kept = _kept(project, camera, memory.told(key))
-        if kept is None:
-            kept = _learned(project, camera, place, reporter, measure, workers)
+    known = with_learned(project, memory)
+    cameras = dict(known.cameras)
+    for name, camera in known.cameras.items():
+        if camera.learned:
+            place = folder / f"{files[camera.path]}.toml"
+            cameras[name] = _learned(project, camera, place, reporter, measure, workers)
             if place.exists():
-                memory.tell(key, {"file": place.name, "sha256": of_file(place)})
-        cameras[name] = kept
+                memory.tell(_key(project, camera), {"file": place.name, "sha256": of_file(place)})
+    return replace(project, cameras=cameras)
+
+
+def with_learned(project: Project, memory: Memory) -> Project:
+    """The project with what was learned of its marks before; of other cameras they are yet to be learned."""
+    cameras = {
+        name: (_kept(project, camera, memory.told(_key(project, camera))) or camera)
+        if camera.learned
+        else _known(project, camera)
+        for name, camera in project.cameras.items()
+    }
     return replace(project, cameras=cameras)
 
 

@@ -76,12 +76,12 @@ class LookedAt:
         size = self.mark(point, kind).quality.get("size_px", 0.0)
         return int(max(_LEAST_PX, np.ceil(_REACH_SIZES * size / 2)))
 
-    def mark_json(self, point: str, kind: str) -> Json:
+    def detail_json(self, point: str, kind: str) -> Json:
         """All that the page shows of a mark."""
         mark = self.mark(point, kind)
         drawn, linear = self.drawn.get(point), self.pixel_from_mark(point, kind)
         return {
-            **_row_json(mark),
+            **mark_json(mark),
             "image": self.scan.frame.image,
             "camera": self.camera.name,
             "verdict": self.verdict,
@@ -103,7 +103,7 @@ class LookedAt:
         """All that the page shows of a frame."""
         frame, pose = self.scan.frame, self.scan.frame.pose
         marks = [
-            {**_row_json(mark), "place": _pair(self._known_place(mark))} for mark in frame.marks if mark.kind != "tie"
+            {**mark_json(mark), "place": _pair(self._known_place(mark))} for mark in frame.marks if mark.kind != "tie"
         ]
         return {
             "image": frame.image,
@@ -119,6 +119,7 @@ class LookedAt:
             else {"name": pose.name, "decided": pose.decided, "evidence": list(pose.evidence), "roll": pose.roll},
             "marks": marks,
             "fiducials": list(self.drawn),
+            "writing": [{"text": line.text, "outline": line.outline_px} for line in frame.writing or ()],
         }
 
     def _known_place(self, mark: MarkMeasurement) -> Array | None:
@@ -133,6 +134,8 @@ class Looking:
         self._store, self._folder, self._camera_of = store, folder, camera_of
 
     def judging(self) -> Judging | None:
+        if not self._store.exists():
+            return None
         with Store(self._store) as store:
             return latest(store)
 
@@ -180,7 +183,8 @@ def _own_marks(db: sqlite3.Connection, judging: int, result: int) -> list[Json]:
     return [mark_of(row) for row in db.execute(query, (judging, result))]
 
 
-def _row_json(mark: MarkMeasurement) -> Json:
+def mark_json(mark: MarkMeasurement) -> Json:
+    """What is shown of any mark."""
     return {
         "point": mark.point,
         "kind": mark.kind,

@@ -39,6 +39,12 @@ class Pictures:
             while self._open:
                 self._open.popitem()[1].close()
 
+    def size(self, scan: str) -> tuple[tuple[int, int], tuple[float, float] | None]:
+        """Width and height in px, and the pitch in um as far as its file tells it."""
+        with self._reading:
+            file = self._scan(scan)
+            return (file.width_px, file.height_px), file.pitch_um
+
     def window(self, scan: str, col0: int, row0: int, size: int) -> bytes:
         """A square window; one of many pixels is reduced. Raises MeasurementError where the file cannot be read."""
         return self._png(("window", scan, col0, row0, size), lambda: _window(self._scan(scan), col0, row0, size))

@@ -1,38 +1,44 @@
 """What of a project needs a person's eye, from the store: the worst first, each question once.
 
-A pose comes first, for all names of its frame hang on it, and once where it is the same question for the frames of a
-roll; then frames in which nothing was found; then marks, those of frames with few others before those with many, for
-there a decision changes more.
+How a camera's marks look comes first, where nothing tells it, for without them nothing is found. Then a pose, for all
+names of its frame hang on it, and once where it is the same question for the frames of a roll; then frames in which
+nothing was found; then marks, those of frames with few others before those with many, for there a decision changes
+more.
 """
 
 import json
 import sqlite3
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 from measure.reason import Code
 from measure.status import Status
-from pipeline.archive.verdicts import Verdict
-from pipeline.files.decisions_file import About
+from pipeline.files.project_file import Project
 
 
 class Question(StrEnum):
     """What is asked, in the order in which it is."""
 
+    CAMERA = "camera"
     POSE = "pose"
     FRAME = "frame"
     MARK = "mark"
 
 
+_UNKNOWN = "how its marks look is not known: click each of them in one scan that shows them well."
+_COMMON = (
+    "its marks were learned from what its scans have in common. Click them in one scan to learn them anew from there."
+)
 _WORST = (Status.REJECTED, Status.WEAK, Status.PREDICTED, Status.ABSENT)
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A question. images: of a pose all frames that it is the same for, else one. fingerprints: of the results that
-    are looked at, in the order of the images. marks: how many were found in the frame. point, kind, status: of a mark.
+    """A question. images: of a camera all its scans, of a pose all frames that it is the same for, else one.
+    fingerprints: of the results that are looked at, in the order of the images; none of a camera. marks: how many were
+    found in the frame, or in one of the camera's. point, kind, status: of a mark.
     """
 
     question: Question
@@ -53,25 +59,26 @@ class Entry:
         return json.dumps([self.question, self.images[0], self.point, self.kind], ensure_ascii=False)
 
     @property
-    def abouts(self) -> tuple[About, ...]:
-        """What decisions that answer it are about; of a frame without marks no single one does."""
-        return tuple((image, self.point, self.kind) for image in self.images)
+    def is_left(self) -> bool:
+        """Whether it needs an answer. Marks that are found by what their scans have in common need not be shown."""
+        return self.question is not Question.CAMERA or self.marks == 0
 
     @property
     def folder(self) -> str:
         return self.images[0].rpartition("/")[0]
 
 
-def queue_of(db: sqlite3.Connection, judging: int) -> tuple[Entry, ...]:
-    """Every question of a judging, the worst first."""
-    frames = {frame.result: frame for frame in _frames(db, judging)}
-    marks = sorted(_marks(db, judging, frames), key=_badness)
+def queue_of(project: Project, db: sqlite3.Connection | None, judging: int) -> tuple[Entry, ...]:
+    """Every question of a judging, the worst first. db: None where nothing is judged yet."""
+    frames = {frame.result: frame for frame in _frames(db, judging)} if db else {}
+    marks = sorted(_marks(db, judging, frames), key=_badness) if db else []
     bare = [
         Entry(Question.FRAME, (f.image,), (f.key,), f.camera, f.verdict, 0, f.problem or "no mark was found in it")
         for f in sorted(frames.values(), key=lambda frame: frame.image)
         if f.marks == 0
     ]
-    return (*_poses(list(frames.values())), *bare, *marks)
+    with_marks = {frame.image for frame in frames.values() if frame.marks}
+    return (*_cameras(project, with_marks), *_poses(list(frames.values())), *bare, *marks)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +132,17 @@ def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
         yield _Frame(image, result, key, camera, verdict, found.get(result, 0), is_decided, evidence, roll, problem)
 
 
+def _cameras(project: Project, with_marks: Collection[str]) -> Iterator[Entry]:
+    """One for each camera whose marks are learned from its scans. with_marks: images in which some were found."""
+    for camera in project.cameras.values():
+        images = (
+            tuple(image for image in project.scans if project.camera_of(image) is camera) if camera.is_asked else ()
+        )
+        if images:
+            found = sum(image in with_marks for image in images)
+            yield Entry(Question.CAMERA, images, (), camera.path.name, "", found, _COMMON if found else _UNKNOWN)
+
+
 def _poses(frames: Sequence[_Frame]) -> Iterator[Entry]:
     """One for each roll's question, and for each frame that is asked about by itself: those first that concern many."""
     groups = defaultdict[tuple[str, str], list[_Frame]](list)
@@ -150,8 +168,3 @@ def _marks(db: sqlite3.Connection, judging: int, frames: dict[int, _Frame]) -> I
 def _badness(entry: Entry) -> tuple[int, bool, int, str]:
     is_target = entry.kind != "fiducial"  # of which there are many, and of which few change anything
     return (entry.marks if not is_target else 0, is_target, _WORST.index(Status(entry.status)), entry.images[0])
-
-
-def verdicts() -> list[str]:
-    """Those by which a queue can be filtered."""
-    return [str(verdict) for verdict in Verdict]

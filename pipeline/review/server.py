@@ -22,16 +22,21 @@ from measure.errors import MeasurementError
 from measure.fiducial_options import Click
 from measure.marks.poses import POSES
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import KINDS, MEANING, Choice, Decision
+from pipeline.files.decisions_file import KINDS, LEARNED, MEANING, OF_SCANS, Choice, Decision
 from pipeline.files.project_file import Project
+from pipeline.measuring.scan_task import few_of
+from pipeline.results.measured_scan import MeasuredScan
+from pipeline.review.looked_at import mark_json
 from pipeline.review.pictures import Pictures
 from pipeline.review.safety import Guard
 from pipeline.review.session import Filters, Session
-from pipeline.review.trial import measured_from_clicks
+from pipeline.review.trial import measured_as_shown, measured_from_clicks
 
 _FILES = {"review.js": "text/javascript", "review.css": "text/css", "index.html": "text/html"}
-_LARGEST_BODY = 200_000  # bytes: decisions about a roll of a thousand frames
+_LARGEST_BODY = 200_000  # bytes
 _WIDEST_PX = 60_000
+_OFFERED, _TRIED = 100, 4  # scans: to click a camera's marks in, and to try what was learned
+_HALF_PX = 40  # of a window about a mark whose size in pixels is not known
 
 
 class Server:
@@ -95,12 +100,15 @@ def _application(session: Session, pictures: Pictures) -> Starlette:
         Route("/api/queue", _json(answers.queue)),
         Route("/api/mark", _json(answers.mark)),
         Route("/api/frame", _json(answers.frame)),
+        Route("/api/camera", _json(answers.camera)),
+        Route("/api/scan", _json(answers.scan)),
         Route("/api/window.png", _png(answers.window)),
         Route("/api/residual.png", _png(answers.residual)),
         Route("/api/frame.png", _png(answers.whole)),
         Route("/api/pose.png", _png(answers.posed)),
         Route("/api/decide", _json(answers.decide), methods=["POST"]),
         Route("/api/measure", _json(answers.measure), methods=["POST"]),
+        Route("/api/learn", _json(answers.learn), methods=["POST"]),
     ]
     return Starlette(routes=routes)
 
@@ -130,7 +138,7 @@ class _Answers:
         seen, session = self._session.looking.at(image), self._session
         others = [session.looking.at(name) for name in session.looking.others(image, point, kind)]
         return {
-            **seen.mark_json(point, kind),
+            **seen.detail_json(point, kind),
             "decided": session.decided_in(image),
             "others": [
                 {
@@ -145,6 +153,27 @@ class _Answers:
     def frame(self, query: "_Query", body: Any) -> Any:
         image = query.text("image")
         return {**self._session.looking.at(image).frame_json(), "decided": self._session.decided_in(image)}
+
+    def camera(self, query: "_Query", body: Any) -> Any:
+        """Whose marks are to be learned: which they are, and scans to click them in."""
+        entry = self._session.entry(query.text("key"))
+        camera = self._session.project.camera_of(entry.images[0])
+        return {
+            "camera": camera.name,
+            "fiducials": [one.id for one in camera.learned],
+            "images": few_of(entry.images, _OFFERED),
+            "tried": few_of(entry.images, _TRIED),
+        }
+
+    def scan(self, query: "_Query", body: Any) -> Any:
+        """A scan that need not be measured yet."""
+        image = query.text("image")
+        camera = self._session.project.camera_of(image)
+        size_px, pitch_um = self._pictures.size(self._session.scan_of(image))
+        pitch_um = self._session.project.pitch_um or pitch_um
+        most_mm = max((one.learned_mm for one in camera.learned), default=0.0)
+        half_px = 500.0 * most_mm / min(pitch_um) if pitch_um else _HALF_PX
+        return {"image": image, "size": size_px, "half": max(_HALF_PX, round(half_px))}
 
     def window(self, query: "_Query") -> bytes:
         place = (query.whole("col", -_WIDEST_PX, 10**6), query.whole("row", -_WIDEST_PX, 10**6))
@@ -172,7 +201,7 @@ class _Answers:
         given = body.get("decisions") if isinstance(body, dict) else None
         if not isinstance(given, list) or not given:
             raise InputError("decisions are missing.")
-        self._session.decide([_decision(one) for one in given])
+        self._session.decide([_decision(one) for one in given], str(body.get("key", "")))
         return self.queue(query, None)
 
     def measure(self, query: "_Query", body: Any) -> Any:
@@ -183,27 +212,19 @@ class _Answers:
         if not isinstance(clicks, list) or len(clicks) < 3:
             raise InputError("three clicks on named marks or more are needed.")
         told = [Click(str(one["point"]), float(one["col_px"]), float(one["row_px"])) for one in clicks]
-        scan = measured_from_clicks(self._session.project, image, told)
-        marks = [
-            {
-                "point": mark.point,
-                "kind": mark.kind,
-                "status": str(mark.status),
-                "reason": str(mark.reason),
-                "center": None if mark.center_px is None else mark.center_px.round(3).tolist(),
-            }
-            for mark in scan.frame.marks
-        ]
-        pose = scan.frame.pose
-        failure = "" if scan.failure is None else scan.failure.sentence
-        return {
-            "marks": marks,
-            "pose": pose and pose.name,
-            "problems": [failure] if failure else list(map(str, scan.frame.problems)),
-        }
+        return _trial_json(measured_from_clicks(self._session.learned, image, told))
+
+    def learn(self, query: "_Query", body: Any) -> Any:
+        """One scan measured with the marks as another one, or itself, shows them."""
+        if not isinstance(body, dict) or not isinstance(body.get("px"), dict):
+            raise InputError("clicks are missing.")
+        shown, image = str(body.get("image", "")), str(body.get("of", ""))
+        for name in (shown, image):
+            self._session.scan_of(name)  # raises for one that is none
+        return _trial_json(measured_as_shown(self._session.project, shown, _places(body["px"]), image))
 
     def _scan(self, query: "_Query") -> str:
-        return self._session.looking.at(query.text("image")).scan.scan
+        return self._session.scan_of(query.text("image"))
 
 
 class _Query:
@@ -234,15 +255,36 @@ def _decision(given: Any) -> Decision:
     }
     if not all(isinstance(value, str) and len(value) < 4000 for value in texts.values()):
         raise InputError("names of a decision are text.")
-    if texts["decision"] not in list(Choice) or (texts["point"] and texts["kind"] not in KINDS):
+    kinds = KINDS if texts["point"] else ("", LEARNED)
+    if texts["decision"] not in list(Choice) or texts["kind"] not in kinds:
         raise InputError(f"{texts['decision']!r} about {texts['kind']!r} is no decision.")
     choice = Choice(texts.pop("decision"))
-    if not texts["point"] and choice not in (Choice.POSE, Choice.UNDO):
+    if not texts["point"] and choice not in OF_SCANS:
         raise InputError("a decision about a mark needs its name.")
+    if (texts["kind"] == LEARNED) != (choice is Choice.LEARN) and choice is not Choice.UNDO:
+        raise InputError("how marks look is learned.")
+    px = _places(given.get("px")) if choice is Choice.LEARN else {}
     numbers: Any = {name: given.get(name) for name in ("col_px", "row_px")} if choice is Choice.PLACE else {}
     if not all(isinstance(one, int | float) and abs(one) < 1e7 for one in numbers.values()):
         raise InputError("place needs col_px and row_px.")
-    return Decision(decision=choice, window=_four(given.get("window")), **texts, **numbers)
+    return Decision(decision=choice, window=_four(given.get("window")), px=px, **texts, **numbers)
+
+
+def _places(given: Any) -> dict[str, tuple[float, float]]:
+    if not isinstance(given, dict) or not all(isinstance(one, list) and len(one) == 2 for one in given.values()):
+        raise InputError("px is column and row by fiducial.")
+    return {str(point): (float(col), float(row)) for point, (col, row) in given.items()}
+
+
+def _trial_json(scan: MeasuredScan) -> Any:
+    pose = scan.frame.pose
+    failure = "" if scan.failure is None else scan.failure.sentence
+    return {
+        "image": scan.frame.image,
+        "marks": [mark_json(mark) for mark in scan.frame.marks],
+        "pose": pose and pose.name,
+        "problems": [failure] if failure else list(map(str, scan.frame.problems)),
+    }
 
 
 def _four(window: Any) -> tuple[float, float, float, float] | None:

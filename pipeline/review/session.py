@@ -2,22 +2,25 @@
 
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from measure.marks.poses import POSES
 from pipeline.archive.store import Store
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import About, Choice, Decision, append_decisions, read_decisions, standing
-from pipeline.files.project_file import Project
+from pipeline.files.decisions_file import LEARNED, Choice, Decision, append_decisions
+from pipeline.files.project_file import Project, with_decisions
+from pipeline.measuring.first_pictures import digest
+from pipeline.measuring.learn_stage import with_learned
+from pipeline.review.ledger import Ledger
 from pipeline.review.looked_at import Looking
 from pipeline.review.queue import Entry, Question, queue_of
 
 Json = dict[str, Any]
 
+_NONE = -1  # no judging: nothing is measured yet
 PAGE = 100  # entries that a page gets at a time
 
 
@@ -45,76 +48,92 @@ class Filters:
         )
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """The questions that filters let through, and the keys of those that need an answer."""
+
+    filters: Filters
+    entries: tuple[Entry, ...]
+    asked: frozenset[str]
+
+    @classmethod
+    def of(cls, filters: Filters, queue: Sequence[Entry]) -> "_Shown":
+        entries = tuple(filter(filters.lets_through, queue))
+        return cls(filters, entries, frozenset(entry.key for entry in entries if entry.is_left))
+
+
 class Session:
     """A review of a project. Threads may call any of it."""
 
     def __init__(self, project: Project, who: str) -> None:
+        """Raises InputError where there is nothing to ask yet."""
         self.project, self.who = project, who
         folder = project.path.resolve().parent
-        self.looking = Looking(project.measurement_path, folder, project.camera_of)
+        self.looking = Looking(project.measurement_path, folder, lambda image: self.learned.camera_of(image))
         self._lock = threading.RLock()
-        self._judging = -1
-        self._file_state: tuple[int, int] | None = None
-        self._queue: tuple[Entry, ...] = ()
-        self._by_key: Mapping[str, Entry] = {}
-        self._of_image: Mapping[str, Sequence[Entry]] = {}
-        self._standing: Mapping[About, Decision] = {}
+        self._judging: int | None = None
+        self._ledger = Ledger(project.decisions_path)
         self._answers: dict[str, Decision] = {}
-        self._totals: Counter[Question] = Counter()
-        self._shown: tuple[Filters, tuple[Entry, ...]] | None = None
+        self._shown: _Shown | None = None
         self.refresh()
+        if self._judging == _NONE and not self._queue:
+            raise InputError(f"{project.measurement_path}: nothing in it is judged. Run `reseau measure` first.")
 
     def refresh(self) -> None:
         """Know what another process measured, or another window decided."""
         with self._lock:
             judging = self.looking.judging()
-            if judging is None:
-                raise InputError(
-                    f"{self.project.measurement_path}: nothing in it is judged. Run `reseau measure` first."
-                )
-            state = _state(self.project.decisions_path)
-            if (judging.row, state) == (self._judging, self._file_state):
-                return
-            if judging.row != self._judging:
-                self._take_queue(judging.row)
-            if state != self._file_state:
-                self._standing = standing(read_decisions(self.project.decisions_path))
-                self._file_state = state
-            self._answers = dict(self._all_answers())
+            row = _NONE if judging is None else judging.row
+            changed = self._ledger.read_on()
+            if row != self._judging:
+                self._take_queue(row)
+                changed = None
+            if changed is None:
+                self._answers, self._left = {}, Counter(entry.question for entry in self._queue if entry.is_left)
+            for entry in self._queue if changed is None else self._entries_of(changed):
+                before, now = self._answers.pop(entry.key, None), self._answer_of(entry)
+                if now is not None:
+                    self._answers[entry.key] = now
+                if entry.is_left:
+                    self._left[entry.question] += (before is not None) - (now is not None)
 
-    def decide(self, decisions: Sequence[Decision]) -> None:
-        """Write decisions down, all of them or none. Raises InputError for what cannot be decided."""
+    def decide(self, decisions: Sequence[Decision], key: str = "") -> None:
+        """Write decisions down, all of them or none. key: of a question about several frames, for all of which they
+        are. Raises InputError for what cannot be decided, and KeyError for a question that is none any more."""
         when = datetime.now(UTC).isoformat(timespec="seconds")
         with self._lock:
             for one in decisions:
                 self._check(one)
-            append_decisions(self.project.decisions_path, [replace(one, who=self.who, when=when) for one in decisions])
+            if key:
+                entry = self._by_key[key]
+                frames = tuple(zip(entry.images, entry.fingerprints, strict=True))
+                decisions = [replace(one, image=image, fingerprint=seen) for one in decisions for image, seen in frames]
+            told = [replace(self._of_file(one), who=self.who, when=when) for one in decisions]
+            append_decisions(self.project.decisions_path, told)
             self.refresh()
 
     def page(self, filters: Filters, start: int = 0) -> Json:
         """Counts of what is left, and some of the questions that filters let through, from one on."""
         self.refresh()
         with self._lock:
-            answered = Counter(self._by_key[key].question for key in self._answers)
-            left = {str(question): self._totals[question] - answered[question] for question in Question}
-            if self._shown is None or self._shown[0] != filters:
-                self._shown = (filters, tuple(entry for entry in self._queue if filters.lets_through(entry)))
-            shown = self._shown[1]
-        return {
-            "judging": self._judging,
-            "total": len(self._queue),
-            "left": {"all": sum(left.values()), **left},
-            "shown": len(shown),
-            "shown_left": len(shown) - sum(filters.lets_through(self._by_key[key]) for key in self._answers),
-            "start": start,
-            "entries": [self.entry_json(entry) for entry in shown[start : start + PAGE]],
-        }
+            if self._shown is None or self._shown.filters != filters:
+                self._shown = _Shown.of(filters, self._queue)
+            shown = self._shown
+            return {
+                "judging": self._judging,
+                "total": sum(entry.is_left for entry in self._queue),
+                "left": {"all": self._left.total(), **{str(question): self._left[question] for question in Question}},
+                "shown": len(shown.entries),
+                "shown_left": len(shown.asked - self._answers.keys()),
+                "start": start,
+                "entries": [self.entry_json(entry) for entry in shown.entries[start : start + PAGE]],
+            }
 
     def choices(self) -> Json:
         """What filters can be set to."""
         return {
             "questions": [str(question) for question in Question],
-            "verdicts": sorted({entry.verdict for entry in self._queue}),
+            "verdicts": sorted({entry.verdict for entry in self._queue if entry.verdict}),
             "statuses": sorted({entry.status for entry in self._queue if entry.status}),
             "codes": sorted({code for entry in self._queue for code in entry.code.split()}),
             "cameras": sorted({entry.camera for entry in self._queue}),
@@ -126,13 +145,13 @@ class Session:
         return self._by_key[key]
 
     def entry_json(self, entry: Entry) -> Json:
-        answer = self.answer(entry)
+        answer = self._answers.get(entry.key)
         return {
             "key": entry.key,
             "question": str(entry.question),
-            "images": entry.images,
-            "fingerprints": entry.fingerprints,
+            "image": entry.images[0],
             "count": len(entry.images),
+            "fingerprint": entry.fingerprints[0] if entry.fingerprints else "",
             "point": entry.point,
             "kind": entry.kind,
             "status": entry.status,
@@ -141,50 +160,72 @@ class Session:
             "camera": entry.camera,
             "verdict": entry.verdict,
             "marks": entry.marks,
+            "is_left": entry.is_left,
             "answer": None if answer is None else _answer_json(answer),
             "old": self._old_json(entry),
         }
 
-    def answer(self, entry: Entry) -> Decision | None:
-        """The decision that answers a question; of a frame without marks: one about any of its marks, or its pose."""
-        return self._answers.get(entry.key)
+    def scan_of(self, image: str) -> str:
+        """The path or the address of its file. Raises KeyError where no such image is known."""
+        given = self.project.scans.get(image)
+        return self.looking.at(image).scan.scan if given is None else str(given)
+
+    def decided_in(self, image: str) -> list[Json]:
+        """All that stands decided in a frame."""
+        with self._lock:
+            return [_answer_json(one) for one in self._ledger.of_image(image)]
 
     def _take_queue(self, judging: int) -> None:
-        with Store(self.project.measurement_path) as store:
-            self._queue = queue_of(store.connection, judging)
+        self.project = self.learned = with_decisions(self.project)
+        if judging == _NONE:
+            self._queue = queue_of(self.project, None, judging)
+        else:
+            with Store(self.project.measurement_path) as store:
+                self.learned = with_learned(self.project, store)
+                self._queue = queue_of(self.project, store.connection, judging)
         self._by_key = {entry.key: entry for entry in self._queue}
-        self._totals = Counter(entry.question for entry in self._queue)
         of_image = defaultdict[str, list[Entry]](list)
         for entry in self._queue:
             for image in entry.images:
                 of_image[image].append(entry)
         self._of_image, self._judging, self._shown = of_image, judging, None
 
-    def _all_answers(self) -> Iterator[tuple[str, Decision]]:
-        for about, one in self._standing.items():
-            for entry in self._of_image.get(about[0], ()):
-                asked = entry.question is Question.FRAME or about in entry.abouts
-                if asked and _is_about(one, entry) and all(self._is_answered(about, entry) for about in entry.abouts):
-                    yield entry.key, one
+    def _entries_of(self, images: Collection[str]) -> Collection[Entry]:
+        return {entry.key: entry for image in images for entry in self._of_image.get(image, ())}.values()
 
-    def _is_answered(self, about: About, entry: Entry) -> bool:
-        """A question about several frames is answered when all of them are."""
-        one = self._standing.get(about)
-        return entry.question is Question.FRAME or (one is not None and _is_about(one, entry))
-
-    def decided_in(self, image: str) -> list[Json]:
-        """All that stands decided in a frame."""
-        return [_answer_json(one) for about, one in self._standing.items() if about[0] == image]
+    def _answer_of(self, entry: Entry) -> Decision | None:
+        """What answers a question: about all of its frames; of one without marks, about any of its marks."""
+        match entry.question:
+            case Question.CAMERA:
+                return self._ledger.learned(frozenset(entry.images))
+            case Question.FRAME:
+                told = [one for one in self._ledger.of_image(entry.images[0]) if _is_about(one, entry.fingerprints[0])]
+                return told[-1] if told else None
+        first = None
+        for image, seen in zip(entry.images, entry.fingerprints, strict=True):
+            one = self._ledger.get((image, entry.point, entry.kind))
+            if one is None or not _is_about(one, seen):
+                return None
+            first = first or one
+        return first
 
     def _old_json(self, entry: Entry) -> Json | None:
         """A decision about another result than the one that is there now."""
-        if entry.question is Question.FRAME:
+        if entry.question in (Question.CAMERA, Question.FRAME):
             return None
-        one = self._standing.get(entry.abouts[0])
-        return None if one is None or _is_about(one, entry) else _answer_json(one)
+        one = self._ledger.get((entry.images[0], entry.point, entry.kind))
+        return None if one is None or _is_about(one, entry.fingerprints[0]) else _answer_json(one)
+
+    def _of_file(self, one: Decision) -> Decision:
+        """Pictures are learned from the file as it is now, and from no other one of its name."""
+        is_learned = one.decision is Choice.LEARN
+        return replace(one, fingerprint=digest(self.project.scans[one.image])) if is_learned else one
 
     def _check(self, one: Decision) -> None:
-        """Images and points are those of the store, and never paths."""
+        """Images and points are those of the project and its store, and never paths."""
+        if one.about[2] == LEARNED:
+            self._check_learned(one)
+            return
         try:
             seen = self.looking.at(one.image)
             mark = seen.mark(one.point, one.about[2]) if one.point else None
@@ -197,20 +238,20 @@ class Session:
         if one.decision is Choice.POSE and one.pose not in POSES:
             raise InputError(f"{one.pose!r} is no pose; {', '.join(POSES)} are.")
 
+    def _check_learned(self, one: Decision) -> None:
+        if one.image not in self.project.scans:
+            raise InputError(f"there is no image or mark {one.image!r}.")
+        wanted = {mark.id for mark in self.project.camera_of(one.image).learned}
+        if one.decision is Choice.LEARN and set(one.px) != wanted:
+            raise InputError(f"{one.image}: click {', '.join(sorted(wanted))}: all marks of its camera, and no others.")
 
-def _is_about(one: Decision, entry: Entry) -> bool:
+
+def _is_about(one: Decision, fingerprint: str) -> bool:
     """Whether a decision is about the result that is there now."""
-    return not one.fingerprint or one.fingerprint in entry.fingerprints
+    return one.fingerprint in ("", fingerprint)
 
 
 def _answer_json(one: Decision) -> Json:
     told = {"decision": str(one.decision), "point": one.point, "kind": one.about[2], "who": one.who, "when": one.when}
-    return {**told, "pose": one.pose, "note": one.note, "col_px": one.col_px, "row_px": one.row_px}
-
-
-def _state(path: Path) -> tuple[int, int] | None:
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_size, found.st_mtime_ns
+    place = {"pose": one.pose, "note": one.note, "col_px": one.col_px, "row_px": one.row_px}
+    return {**told, **place, "image": one.image, "px": one.px}

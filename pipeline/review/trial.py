@@ -1,13 +1,15 @@
 """A frame measured at once from where a person points, to be looked at: nothing of it is kept but the clicks."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from measure.fiducial_options import Click
 from pipeline.errors import InputError
+from pipeline.files.learned_table import Clicks
 from pipeline.files.project_file import Project
+from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.measured import measured_scan
-from pipeline.measuring.scan_task import scan_tasks
+from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.results.measured_scan import MeasuredScan
 
 
@@ -19,6 +21,23 @@ def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) 
     if unknown:
         raise InputError(f"{image}: its camera has no mark {', '.join(unknown)}.")
     (task,) = scan_tasks(project, [image])
-    fiducials = replace(task.options.fiducials, clicks=tuple(clicks), writing="none")
-    options = replace(task.options, fiducials=fiducials, targets=None, exterior=None)
-    return measured_scan(replace(task, options=options))
+    fiducials = replace(task.options.fiducials, clicks=tuple(clicks))
+    return _tried(replace(task, options=replace(task.options, fiducials=fiducials)))
+
+
+def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float, float]], image: str) -> MeasuredScan:
+    """A scan's fiducials, found by the pictures of marks that are to be learned at places of one scan, which may be
+    itself. shown: that scan; px: column and row of its camera's marks. Raises InputError for a mark that is missing."""
+    camera = project.camera_of(shown)
+    missing = [one.id for one in camera.learned if one.id not in px]
+    if missing:
+        raise InputError(f"{shown}: click {', '.join(missing)}, too.")
+    (task,) = scan_tasks(project, [shown])
+    start = first_pictures(replace(camera, clicks=Clicks(shown, px)), [task.fiducials_alone("linear")], None)
+    own = {name: start if one.path == camera.path else one for name, one in project.cameras.items()}
+    return _tried(scan_tasks(replace(project, cameras=own), [image])[0])
+
+
+def _tried(task: ScanTask) -> MeasuredScan:
+    fiducials = replace(task.options.fiducials, writing="none")
+    return measured_scan(replace(task, options=replace(task.options, fiducials=fiducials, targets=None, exterior=None)))

@@ -1,20 +1,18 @@
 """The review page: who may ask, and a person's whole session in a real browser, whose decisions lead to the right marks
 and to no others."""
 
-import csv
 import http.client
 import json
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote, urlsplit
 
 import numpy as np
 import pytest
 from browser import browser_page, needs_browser
-from brute_marks import Array
 from playwright.sync_api import Page, Position, expect
+from review_pages import comparator, decisions, steer
 from review_server import BARE, GOOD, SCRATCHED, TURNED, Served, mark_px, served, write_faults
 
 from pipeline.cli import run
@@ -277,17 +275,6 @@ def place_frame_by_keys(page: Page) -> None:
     page.keyboard.press("Enter")
 
 
-def steer(page: Page, view: str, place_px: Array) -> None:
-    """Arrow keys until the cursor, which the page tells, is there."""
-    for axis, (less, more) in enumerate((("ArrowLeft", "ArrowRight"), ("ArrowUp", "ArrowDown"))):
-        for _ in range(400):
-            at = json.loads(page.locator(f"#{view}").get_attribute("data-cursor") or "null")
-            left = 1.0 if at is None else place_px[axis] - at[axis]
-            if at is not None and abs(left) < 0.6:
-                break
-            page.keyboard.press(more if left > 0 else less)
-
-
 def click_in_frame(page: Page, point: str) -> None:
     box = page.locator("#whole").bounding_box()
     assert box is not None
@@ -320,13 +307,3 @@ def check_measured_again(folder: Path, before: Mapping[tuple[str, str], Mapping[
         assert row["status"] == "measured", row
         place = np.array([float(row["col_px"]), float(row["row_px"])])
         np.testing.assert_allclose(place, mark_px(TURNED, point), atol=0.1)
-
-
-def decisions(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "decisions.jsonl").read_text(encoding="utf-8").splitlines()]
-
-
-def comparator(folder: Path) -> Mapping[tuple[str, str], Mapping[str, str]]:
-    lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
-    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
-    return {(row["image"], row["point"]): row for row in rows}

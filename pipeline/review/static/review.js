@@ -2,6 +2,7 @@
 
 const by = (id) => document.getElementById(id);
 const FILTERS = ["question", "verdict", "status", "code", "camera", "folder"];
+const VIEWS = ["mark-view", "pose-view", "frame-view", "whole-view", "near-view", "facts-view", "tries-view"];
 const CLICK_HALF_PX = 40; // of the window about a coarse click
 const POLL_MS = 3000; // after which another window's decisions are known here
 const COLOURS = { measured: "--measured", second: "--second", predicted: "--predicted", outline: "--outline" };
@@ -9,6 +10,7 @@ const COLOURS = { measured: "--measured", second: "--second", predicted: "--pred
 const state = {
   entries: [], start: 0, at: -1, page: null, mark: null, frame: null, poses: [], clicks: new Map(), named: "", trial: null,
   overlay: true, generation: 0, ahead: new Map(), // ahead: what is fetched of the next marks, by key
+  click: null, // what clicks in a whole scan are for: its camera's marks, or a frame that was not found
 };
 
 // --- asking the server
@@ -68,7 +70,7 @@ class View {
 
   scan(x, y) {
     const { width, height } = this.canvas;
-    return [(x - width / 2) / this.zoom + this.center[0], (y - height / 2) / this.zoom + this.center[1]];
+    return [(x - width / 2) / this.zoom + this.center[0], (y - height / 2) / this.zoom + this.center[1]].map((px) => Math.round(px * 100) / 100);
   }
 
   async load(image) {
@@ -184,11 +186,11 @@ function take(page, keep = true) {
 
 function showQueue() {
   const { left, total, shown, shown_left: shownLeft, start } = state.page;
-  const kinds = [["pose", "poses"], ["frame", "frames"], ["mark", "marks"]];
+  const kinds = [["camera", "cameras"], ["pose", "poses"], ["frame", "frames"], ["mark", "marks"]];
   const parts = kinds.filter(([one]) => left[one]).map(([one, many]) => `${left[one]} ${left[one] === 1 ? one : many}`);
   by("left").textContent = left.all ? `${left.all} left: ${parts.join(", ")}` : "Nothing is left. Run reseau measure.";
   by("progress").max = Math.max(total, 1);
-  by("progress").value = total - left.all;
+  by("progress").value = total ? total - left.all : 1;
   const last = start + state.entries.length;
   by("shown").textContent = shown ? `${start + 1} to ${last} of ${shown}, ${shownLeft} left` : "nothing";
   by("earlier").disabled = start === 0;
@@ -202,19 +204,22 @@ function queueItem(entry, index) {
   const small = document.createElement("small");
   button.type = "button";
   button.append(title(entry), small);
-  const answer = entry.answer;
-  small.textContent = answer ? `${answer.decision}${answer.pose ? ` ${answer.pose}` : ""}, ${answer.who}` : entry.status || entry.verdict;
-  button.classList.toggle("done", Boolean(answer));
+  small.textContent = entry.answer ? short(entry.answer) : entry.status || entry.verdict || (entry.is_left ? "not known" : "as learned");
+  button.classList.toggle("done", !isLeft(entry));
   button.setAttribute("aria-current", index === state.at);
   button.addEventListener("click", () => open(index));
   item.append(button);
   return item;
 }
 
+const short = ({ decision, pose, image, who }) => `${decision}${pose ? ` ${pose}` : ""}${decision === "learn" ? ` from ${image}` : ""}, ${who}`;
+const isLeft = (entry) => entry.is_left && !entry.answer;
+
 function title(entry) {
-  if (entry.question === "mark") return `${entry.images[0]}: ${entry.kind} ${entry.point}`;
+  if (entry.question === "camera") return `${entry.camera}: how its marks look`;
+  if (entry.question === "mark") return `${entry.image}: ${entry.kind} ${entry.point}`;
   const more = entry.count > 1 ? ` and ${entry.count - 1} more` : "";
-  return entry.question === "pose" ? `${entry.images[0]}${more}: how it lies` : `${entry.images[0]}: no mark was found`;
+  return entry.question === "pose" ? `${entry.image}${more}: how it lies` : `${entry.image}: no mark was found`;
 }
 
 async function open(index) {
@@ -222,25 +227,26 @@ async function open(index) {
     state.at = index;
     state.generation += 1;
     state.clicks = new Map();
-    state.mark = state.frame = state.trial = null; // what is not shown yet cannot be decided
+    state.mark = state.frame = state.trial = state.click = null; // what is not shown yet cannot be decided
     for (const view of Object.values(views)) Object.assign(view, { cursor: null });
     showQueue();
     by("queue").children[index]?.scrollIntoView({ block: "nearest" });
     const entry = state.entries[index];
-    for (const id of ["mark-view", "pose-view", "frame-view", "whole-view", "near-view", "facts-view"]) by(id).hidden = true;
+    for (const id of VIEWS) by(id).hidden = true;
     by("title").textContent = entry ? title(entry) : "Nothing is left";
     by("reason").textContent = entry ? entry.reason : "";
     showAnswer(entry);
     if (!entry) return;
     if (entry.question === "mark") await openMark(entry, state.generation);
     if (entry.question === "pose") await openPose(entry, state.generation);
+    if (entry.question === "camera") await openCamera(entry, state.generation);
     if (entry.question === "frame") await openFrame(entry, state.generation);
   });
 }
 
 function showAnswer(entry) {
   const told = entry?.answer ?? entry?.old;
-  const what = told && `${told.decision}${told.pose ? ` ${told.pose}` : ""} by ${told.who}, ${told.when}`;
+  const what = told && `${short({ ...told, who: `by ${told.who}` }).replace(", by", " by")}, ${told.when}`;
   by("decided").classList.toggle("old", Boolean(entry?.old));
   by("decided").textContent = !told ? "" : entry.answer ? `Decided: ${what}` : `Decided before, about another result: ${what}. Please look again.`;
 }
@@ -278,8 +284,8 @@ async function turn(pages, index) {
 }
 
 async function nextLeft() {
-  const rest = state.entries.findIndex((entry, index) => index > state.at && !entry.answer);
-  const first = rest >= 0 ? rest : state.entries.findIndex((entry) => !entry.answer);
+  const rest = state.entries.findIndex((entry, index) => index > state.at && isLeft(entry));
+  const first = rest >= 0 ? rest : state.entries.findIndex(isLeft);
   if (first >= 0) return open(first);
   const more = state.page.shown_left > 0 && state.start + state.entries.length < state.page.shown;
   return more ? turn(1, 0) : open(state.at);
@@ -287,10 +293,11 @@ async function nextLeft() {
 
 // --- deciding
 
-async function decide(decisions, advance = true) {
+// key: of a question about several frames, for all of which the decisions are.
+async function decide(decisions, advance = true, key = "") {
   await guarded(async () => {
     state.ahead.delete(state.entries[state.at]?.key); // what was decided about it is another now
-    take(await json("/api/decide", { ...values(), start: state.start }, { decisions }));
+    take(await json("/api/decide", { ...values(), start: state.start }, { decisions, key }));
     if (advance) await nextLeft();
     else await open(state.at);
   });
@@ -310,9 +317,11 @@ function decideMark(decision, rest = {}) {
 
 function decidePose(pose) {
   const entry = state.entries[state.at];
-  const images = by("roll").checked ? entry.images : entry.images.slice(0, 1);
-  return decide(images.map((image, index) => ({ image, decision: "pose", pose, fingerprint: entry.fingerprints[index] })));
+  const { image, fingerprint } = entry;
+  return decide([{ image, decision: "pose", pose, fingerprint }], true, wholeRoll(entry));
 }
+
+const wholeRoll = (entry) => (entry.question === "pose" && by("roll").checked ? entry.key : "");
 
 async function undo() {
   const entry = state.entries[state.at];
@@ -324,15 +333,17 @@ async function undo() {
     state.at = last;
     return undo();
   }
-  const images = entry.question === "pose" ? entry.images : entry.images.slice(0, 1);
-  const about = entry.question === "frame" ? state.frame?.decided ?? [] : [entry];
-  const lines = images.flatMap((image) => about.map(({ point = "", kind = "" }) => ({ image, point, kind, decision: "undo" })));
-  await decide(lines.length ? lines : [{ image: images[0], decision: "undo" }], false);
+  const { image } = entry;
+  let about = [entry];
+  if (entry.question === "frame") about = state.frame?.decided ?? [];
+  if (entry.question === "camera") about = [{ image: answer.image, kind: "learned" }];
+  const lines = about.map((one) => ({ image: one.image ?? image, point: one.point ?? "", kind: one.kind ?? "", decision: "undo" }));
+  await decide(lines.length ? lines : [{ image, decision: "undo" }], false, wholeRoll(entry));
 }
 
 // --- a mark
 
-const markOf = (entry) => json("/api/mark", { image: entry.images[0], point: entry.point, kind: entry.kind });
+const markOf = (entry) => json("/api/mark", { image: entry.image, point: entry.point, kind: entry.kind });
 const zoomOf = (mark, width) => Math.max(1, width / (2 * mark.half));
 
 async function openMark(entry, generation) {
@@ -410,20 +421,24 @@ async function showResidual(mark, generation) {
 
 async function showOthers(mark, generation) {
   const figures = await Promise.all(
-    mark.others.map(async ({ image, place, half }) => {
-      const [figure, canvas, caption] = ["figure", "canvas", "figcaption"].map((tag) => document.createElement(tag));
-      canvas.width = canvas.height = 106;
-      canvas.setAttribute("aria-label", `mark ${mark.point} in ${image}`);
-      caption.textContent = image;
-      figure.append(canvas, caption);
-      const view = new View(canvas, null);
-      view.zoom = 106 / (2 * half);
-      view.center = place;
-      await view.load(image);
-      return figure;
-    }),
+    mark.others.map(({ image, place, half }) => smallPicture(image, place, half, image, `mark ${mark.point} in ${image}`)),
   );
   if (generation === state.generation) by("others").replaceChildren(...figures);
+}
+
+async function smallPicture(image, place, half, caption, label, marks = () => {}) {
+  const [figure, canvas, told] = ["figure", "canvas", "figcaption"].map((tag) => document.createElement(tag));
+  canvas.width = canvas.height = 106;
+  canvas.setAttribute("role", "img");
+  canvas.setAttribute("aria-label", label);
+  told.textContent = caption;
+  figure.append(canvas, told);
+  const view = new View(canvas, null);
+  view.zoom = 106 / (2 * half);
+  view.center = place;
+  view.marks = (pen) => marks(view, pen);
+  await view.load(image);
+  return figure;
 }
 
 // --- a pose
@@ -432,17 +447,42 @@ async function openPose(entry, generation) {
   by("pose-view").hidden = false;
   by("roll-label").hidden = entry.count === 1;
   by("roll-told").textContent = `The same for all ${entry.count} frames of the roll`;
-  const frame = await json("/api/frame", { image: entry.images[0] });
+  const frame = await json("/api/frame", { image: entry.image });
   if (generation !== state.generation) return;
   state.frame = frame;
-  const chosen = entry.answer?.pose ?? "";
+  showPoses(entry, frame);
+  await showWhole(frame, generation);
+}
+
+// The frame of a mark that is looked at: the whole scan, and how it lies.
+async function showFrame() {
+  const [entry, generation] = [state.entries[state.at], state.generation];
+  if (entry?.question !== "mark") return;
+  if (!by("whole-view").hidden) {
+    by("whole-view").hidden = by("pose-view").hidden = true;
+    return;
+  }
+  await guarded(async () => {
+    const frame = await json("/api/frame", { image: entry.image });
+    if (generation !== state.generation) return;
+    state.frame = frame;
+    by("pose-view").hidden = false;
+    by("roll-label").hidden = true;
+    showPoses(entry, frame);
+    await showWhole(frame, generation);
+    by("whole-view").scrollIntoView({ block: "nearest" });
+  });
+}
+
+function showPoses(entry, frame) {
+  const chosen = frame.decided.find((one) => one.decision === "pose")?.pose ?? (frame.pose?.decided ? frame.pose.name : "");
   by("poses").replaceChildren(
     ...state.poses.map((pose, index) => {
       const [button, picture, told, key] = ["button", "img", "span", "kbd"].map((tag) => document.createElement(tag));
       button.type = "button";
-      picture.src = `/api/pose.png?${new URLSearchParams({ image: entry.images[0], pose })}`;
+      picture.src = `/api/pose.png?${new URLSearchParams({ image: entry.image, pose })}`;
       picture.alt = `as it is seen if its pose is ${pose}`;
-      told.textContent = `${pose}${pose === frame.pose?.name ? " (assumed)" : ""} `;
+      told.textContent = `${pose}${pose === frame.pose?.name && !frame.pose.decided ? " (assumed)" : ""} `;
       key.textContent = index + 1;
       button.append(picture, told, key);
       button.setAttribute("aria-pressed", pose === chosen);
@@ -450,11 +490,11 @@ async function openPose(entry, generation) {
       return button;
     }),
   );
-  await showWhole(frame, generation);
 }
 
 async function showWhole(frame, generation) {
   by("whole-view").hidden = false;
+  by("words").textContent = frame.writing?.length ? `Read on the film: ${frame.writing.map(({ text }) => text).join(" · ")}` : "";
   const view = views.whole;
   view.zoom = Math.min(by("whole").width / frame.size[0], by("whole").height / frame.size[1]);
   view.center = [frame.size[0] / 2 - 0.5, frame.size[1] / 2 - 0.5];
@@ -466,6 +506,7 @@ async function showWhole(frame, generation) {
 }
 
 function drawFrame(view, pen, frame) {
+  for (const { outline } of frame.writing ?? []) view.line(pen, outline, colour("second"));
   const found = state.trial?.marks ?? frame.marks.filter((mark) => mark.kind === "fiducial");
   for (const { point, status, center, place } of found) {
     const at = center ?? place;
@@ -480,19 +521,55 @@ function drawFrame(view, pen, frame) {
   }
 }
 
-// --- a frame in which nothing was found
+// --- clicks in a whole scan: of a frame in which nothing was found, or of marks that are to be learned
 
 async function openFrame(entry, generation) {
-  const frame = await json("/api/frame", { image: entry.images[0] });
+  const frame = await json("/api/frame", { image: entry.image });
   if (generation !== state.generation) return;
-  state.frame = frame;
-  state.named = frame.fiducials[0] ?? "";
   for (const { decision, point, col_px: col, row_px: row } of frame.decided) {
     if (decision === "place") state.clicks.set(point, [col, row]);
   }
+  state.click = { points: frame.fiducials, least: 3, half: CLICK_HALF_PX, tries: tryFrame, kept: keptFrame };
+  by("click-told").textContent = "Choose a mark, click near it in the scan, then exactly in the window beside it. Three marks find the frame.";
+  by("scan-label").hidden = true;
+  await clickIn(frame, generation);
+}
+
+async function openCamera(entry, generation) {
+  const camera = await json("/api/camera", { key: entry.key });
+  if (generation !== state.generation) return;
+  const shown = entry.answer?.image ?? camera.images[0];
+  state.clicks = new Map(Object.entries(entry.answer?.px ?? {}));
+  state.click = { points: camera.fiducials, least: camera.fiducials.length, tried: camera.tried, half: CLICK_HALF_PX, tries: tryCamera, kept: keptCamera };
+  by("click-told").textContent = "Choose a scan that shows the marks well, and click every one of them: near it in the scan, then exactly in the window beside it.";
+  by("scan-label").hidden = false;
+  options("scan", [...new Set([shown, ...camera.images])], false);
+  await clickInScan(shown, generation);
+}
+
+async function clickInScan(image, generation) {
+  const scan = await json("/api/scan", { image });
+  if (generation !== state.generation) return;
+  state.click.half = scan.half;
+  await clickIn({ ...scan, marks: [], decided: [] }, generation);
+}
+
+function chooseScan() {
+  state.clicks = new Map();
+  state.trial = null;
+  state.generation += 1;
+  return guarded(() => clickInScan(by("scan").value, state.generation));
+}
+
+async function clickIn(frame, generation) {
+  state.frame = frame;
+  state.named = state.click.points[0] ?? "";
   by("frame-view").hidden = by("near-view").hidden = false;
+  by("tries-view").hidden = true;
   by("trial").textContent = "";
-  views.near.picture = null;
+  by("tries").replaceChildren();
+  Object.assign(views.near, { picture: null, wanted: "", cursor: null, marks: () => {} });
+  Object.assign(views.whole, { picture: null, cursor: null });
   views.near.draw();
   showNames();
   await showWhole(frame, generation);
@@ -500,18 +577,21 @@ async function openFrame(entry, generation) {
 }
 
 function showNames() {
+  const { points, least } = state.click;
   by("names").replaceChildren(
-    ...state.frame.fiducials.map((point, index) => {
-      const button = document.createElement("button");
+    ...points.map((point, index) => {
+      const [button, key] = ["button", "kbd"].map((tag) => document.createElement(tag));
       button.type = "button";
       button.setAttribute("role", "radio");
       button.setAttribute("aria-checked", point === state.named);
-      button.textContent = `${point}${state.clicks.has(point) ? " ✓" : ""}${index < 9 ? `  [${index + 1}]` : ""}`;
+      button.append(`${point}${state.clicks.has(point) ? " ✓" : ""} `);
+      key.textContent = index + 1;
+      if (index < 9) button.append(key);
       button.addEventListener("click", () => nameMark(point));
       return button;
     }),
   );
-  by("measure").disabled = by("keep").disabled = state.clicks.size < 3;
+  by("measure").disabled = by("keep").disabled = state.clicks.size < least;
   by("forget").disabled = state.clicks.size === 0;
 }
 
@@ -522,12 +602,12 @@ function nameMark(point) {
 }
 
 function clickedWhole(col, row) {
-  if (state.entries[state.at]?.question !== "frame" || !state.named) return;
+  if (!state.click || !state.named) return;
   guarded(async () => {
     const view = views.near;
     state.trial = null;
     state.clicks.set(state.named, [col, row]);
-    view.zoom = view.canvas.width / (2 * CLICK_HALF_PX);
+    view.zoom = view.canvas.width / (2 * state.click.half);
     view.center = view.cursor = [col, row];
     view.marks = (pen) => drawFrame(view, pen, { marks: [] });
     await view.load(state.frame.image);
@@ -538,10 +618,10 @@ function clickedWhole(col, row) {
 }
 
 function clickedNear(col, row) {
-  if (!views.near.picture || !state.named) return;
+  if (!views.near.picture || !state.click || !state.named) return;
   state.clicks.set(state.named, [col, row]);
   views.near.draw();
-  const next = state.frame.fiducials.find((point) => !state.clicks.has(point));
+  const next = state.click.points.find((point) => !state.clicks.has(point));
   if (next) state.named = next;
   showNames();
   views.whole.draw();
@@ -549,38 +629,77 @@ function clickedNear(col, row) {
 }
 
 function measureClicks() {
-  if (state.clicks.size < 3 || state.entries[state.at]?.question !== "frame") return;
+  if (!state.click || state.clicks.size < state.click.least) return;
   by("trial").textContent = "measuring…";
   guarded(async () => {
     try {
-      const clicks = [...state.clicks].map(([point, [col_px, row_px]]) => ({ point, col_px, row_px }));
-      state.trial = await json("/api/measure", {}, { image: state.frame.image, clicks });
-      const counts = {};
-      for (const { status } of state.trial.marks) counts[status] = (counts[status] ?? 0) + 1;
-      const told = Object.entries(counts).map(([status, count]) => `${count} ${status}`).join(", ");
-      by("trial").textContent = `${told}; pose ${state.trial.pose}. ${state.trial.problems.join(" ")}`;
+      await state.click.tries(state.generation);
       by("keep").focus({ preventScroll: true }); // Enter keeps them
     } catch (error) {
       by("trial").textContent = "";
       throw error;
     }
-    views.whole.draw();
   });
 }
 
-function keepClicks() {
-  const entry = state.entries[state.at];
-  if (state.clicks.size < 3 || entry?.question !== "frame") return;
-  const { image, fingerprint } = state.frame;
-  const lines = [...state.clicks].map(([point, [col_px, row_px]]) => ({ image, point, kind: "fiducial", decision: "place", col_px, row_px, fingerprint }));
-  return decide(lines);
+async function tryFrame(generation) {
+  const clicks = [...state.clicks].map(([point, [col_px, row_px]]) => ({ point, col_px, row_px }));
+  const trial = await json("/api/measure", {}, { image: state.frame.image, clicks });
+  if (generation !== state.generation) return;
+  state.trial = trial;
+  by("trial").textContent = counted(trial);
+  views.whole.draw();
 }
+
+// The scan that was clicked in first, then others with what it shows: each told as soon as it is measured.
+async function tryCamera(generation) {
+  const { image } = state.frame;
+  const px = Object.fromEntries(state.clicks);
+  const told = [];
+  by("tries").replaceChildren();
+  by("tries-view").hidden = false;
+  for (const of of [image, ...state.click.tried.filter((name) => name !== image)]) {
+    const trial = await json("/api/learn", {}, { image, px, of });
+    if (generation !== state.generation) return;
+    if (of === image) state.trial = trial;
+    told.push(`${of}: ${counted(trial)}`);
+    by("trial").textContent = told.join("\n");
+    views.whole.draw();
+    const found = trial.marks.filter(({ center }) => center);
+    const figures = await Promise.all(
+      found.map(({ point, center }) =>
+        smallPicture(of, center, state.click.half, `${of}: ${point}`, `mark ${point} in ${of}`, (view, pen) => view.cross(pen, center, colour("measured"), 4, 12)),
+      ),
+    );
+    if (generation !== state.generation) return;
+    by("tries").append(...figures);
+  }
+}
+
+function counted({ marks, pose, problems }) {
+  const counts = {};
+  for (const { status } of marks) counts[status] = (counts[status] ?? 0) + 1;
+  const told = Object.entries(counts).map(([status, count]) => `${count} ${status}`).join(", ");
+  return `${[told, pose && `pose ${pose}`].filter(Boolean).join("; ")}. ${problems.join(" ")}`;
+}
+
+function keepClicks() {
+  if (!state.click || state.clicks.size < state.click.least) return;
+  return decide(state.click.kept(state.frame));
+}
+
+function keptFrame({ image, fingerprint }) {
+  return [...state.clicks].map(([point, [col_px, row_px]]) => ({ image, point, kind: "fiducial", decision: "place", col_px, row_px, fingerprint }));
+}
+
+const keptCamera = ({ image }) => [{ image, kind: "learned", decision: "learn", px: Object.fromEntries(state.clicks) }];
 
 function forgetClicks() {
   state.clicks = new Map();
   state.trial = null;
   showNames();
   views.whole.draw();
+  views.near.draw();
 }
 
 // --- keys and buttons
@@ -606,6 +725,7 @@ const KEYS = {
   u: () => undo(),
   m: () => measureClicks(),
   o: () => toggleOverlay(),
+  f: () => showFrame(),
   "+": () => zoom(2),
   "=": () => zoom(2),
   "-": () => zoom(0.5),
@@ -617,7 +737,7 @@ const KEYS = {
 function number(index) {
   const entry = state.entries[state.at];
   if (entry?.question === "pose" && index < state.poses.length) decidePose(state.poses[index]);
-  if (entry?.question === "frame" && state.frame?.fiducials[index]) nameMark(state.frame.fiducials[index]);
+  if (state.click?.points[index]) nameMark(state.click.points[index]);
 }
 
 document.addEventListener("keydown", (event) => {
@@ -631,13 +751,14 @@ document.addEventListener("keydown", (event) => {
   event.preventDefault();
 });
 
-for (const [id, key] of [["accept", "a"], ["reject", "r"], ["absent", "n"], ["measure", "m"], ["keep", "Enter"], ["help-button", "?"], ["closer", "+"], ["farther", "-"]]) {
+for (const [id, key] of [["accept", "a"], ["reject", "r"], ["absent", "n"], ["measure", "m"], ["keep", "Enter"], ["help-button", "?"], ["closer", "+"], ["farther", "-"], ["show-frame", "f"]]) {
   by(id).addEventListener("click", () => KEYS[key]());
 }
 for (const [name, work] of [["undo", undo], ["previous", () => step(-1)], ["next", () => step(1)]]) {
   for (const button of document.getElementsByClassName(name)) button.addEventListener("click", () => work());
 }
 by("forget").addEventListener("click", forgetClicks);
+by("scan").addEventListener("change", chooseScan);
 by("overlay").addEventListener("change", toggleOverlay);
 by("earlier").addEventListener("click", () => turn(-1, 0));
 by("later").addEventListener("click", () => turn(1, 0));
@@ -648,7 +769,7 @@ async function filtered() {
     state.start = 0;
     state.at = -1;
     await refresh(false);
-    const first = state.entries.findIndex((entry) => !entry.answer);
+    const first = state.entries.findIndex(isLeft);
     await open(first >= 0 ? first : 0);
   });
 }
@@ -660,9 +781,9 @@ by("search").addEventListener("input", () => {
   typing = setTimeout(filtered, 250);
 });
 
-function options(name, choices) {
+function options(name, choices, withAll = true) {
   by(name).replaceChildren(
-    ...["", ...choices].map((value) => {
+    ...[...(withAll ? [""] : []), ...choices].map((value) => {
       const option = document.createElement("option");
       option.value = value;
       option.textContent = value || "all";
