@@ -19,9 +19,10 @@ from archive_stand_ins import stand_in, write_project
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.status import Status
-from pipeline.archive.identity import Identity, file_state, parts_hash
-from pipeline.archive.judging import JudgedScan, judge
-from pipeline.archive.measurement import measured_scans, pitches, tell_place
+from pipeline.archive.file_state import Identity, file_state
+from pipeline.archive.identity import parts_hash
+from pipeline.archive.judging import JudgedScan, judge, judged_marks, judging_of
+from pipeline.archive.measurement import pitches, tell_place
 from pipeline.archive.store import Kept, Store
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.scan_task import scan_tasks
@@ -54,8 +55,9 @@ def _keep(project: Project) -> None:
     with Store(project.measurement_path) as store:
         tell_place(store, home)
         digest = judge(store, measured_from(project), "kept", _frames(project, store, home))
-        marks = (scan.frame for scan in measured_scans(store.path, digest))
-        write_comparator(project.comparator, marks, pitches(store, digest), digest)
+        judging = judging_of(store, digest)
+        assert judging is not None
+        write_comparator(project.comparator, judged_marks(store, judging), pitches(store, digest), digest)
 
 
 def _frames(project: Project, store: Store, home: Path) -> Iterator[JudgedScan]:

@@ -67,7 +67,7 @@ def followed() -> Followed:
     from pipeline.archive.store import Store
     from pipeline.files.project_file import read_project
     from pipeline.progress import Reporter
-    from pipeline.results.comparator_file import write_comparator
+    from pipeline.results.comparator_file import mark_rows, write_comparator
 
     with TemporaryDirectory() as place:
         path = write_project(Path(place), ["frame"])
@@ -82,7 +82,7 @@ def followed() -> Followed:
                 measure_archive.measure_archive(project, store, dict, Path(place) / "learned", Reporter())
             scans = read_measurement(project.measurement_path)
             pitch_um = {scan.frame.image: scan.pitch_um for scan in scans}
-            write_comparator(project.comparator, [scan.frame for scan in scans], pitch_um)
+            write_comparator(project.comparator, mark_rows([scan.frame for scan in scans]), pitch_um)
         finally:
             sys.setprofile(None)
     return calls

@@ -8,15 +8,25 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from adjust.problem.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
-from pipeline.archive.judging import drop_all_but, judging_of, rejudge
-from pipeline.archive.measurement import decisions_by, measured_scans, pitches, read_measurement, tell_place
+from pipeline.archive.archive_summary import archive_summary, shard_summary
+from pipeline.archive.judging import drop_all_but, judged_marks, judging_of, rejudge
+from pipeline.archive.measurement import (
+    decisions_by,
+    fingerprints_of,
+    measured_scans,
+    pitches,
+    read_measurement,
+    tell_place,
+    written_scans,
+)
 from pipeline.archive.merge import Merged, merge
-from pipeline.archive.status import archive_summary, shard_summary
 from pipeline.archive.store import Store
+from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.archive.work_options import NotMeasured, WorkOptions
 from pipeline.errors import InputError, WriteError
 from pipeline.files.images_file import WRITTEN, fill_images
@@ -24,6 +34,7 @@ from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.publishing.made_from import adjusted_from, measured_from
 from pipeline.publishing.publishing import Unpublished, unpublished
+from pipeline.report.data import ReportData
 from pipeline.report.page import write_frame_page, write_report
 from pipeline.report_data import adjusted, frame_data, measured, report_data
 from pipeline.results.adjustment_file import write_adjustment
@@ -35,6 +46,9 @@ from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.summary import Summary, summarise
 from pipeline.text.atomic import write_atomically
+
+if TYPE_CHECKING:
+    from pipeline.thumbnails import Thumbnails
 
 _ONE_BY_ONE = 2000  # scans: of more the summary tells totals and what needs a look, from the store
 _WRITTEN = "comparator.csv"
@@ -83,8 +97,9 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
 
 def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
     """The stores of shards into that of the project; and, where they hold all its scans, the marks of all together."""
-    with Store(project.measurement_path) as store:
+    with Store(project.measurement_path) as store, ThumbnailStore.beside(store.path) as thumbnails:
         taken = merge(store, stores)
+        thumbnails.take(stores)
     try:
         return taken, run_measure(project, reporter, WorkOptions(only_kept=True))
     except NotMeasured:
@@ -134,13 +149,11 @@ def run_report(project: Project, reporter: Reporter) -> Summary:
 def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter) -> dict[str, Path]:
     """Everything about some images, each in a page of its own; where these stand, by image. Raises InputError for an
     image that there is not."""
-    from pipeline.thumbnails import Thumbnails
-
     with unpublished(project) as new, reporter.stage("reporting") as count:
         _given_marks(project, new)
         data = frame_data(project, new.at, frozenset(images))
         pages = {image: project.frame_page_path(image) for image in images}
-        with Thumbnails((data.measurement or {}).values(), project.max_pixels) as pictures:
+        with _thumbnails(project, data) as pictures:
             for done, (image, path) in enumerate(pages.items()):
                 count(image, done, len(pages))
                 write_frame_page(replace(data, thumbnail=pictures.of), image, new.place(path))
@@ -215,14 +228,16 @@ def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublish
 
 
 def _write_marks(project: Project, store: Store, digest: str, new: Unpublished) -> None:
-    frames = (scan.frame for scan in measured_scans(store.path, digest))
+    judging = judging_of(store, digest)
+    assert judging is not None
     decided = decisions_by(store, digest)
     for camera in project.cameras.values():
         if camera.clicks is not None and camera.clicks.who:  # one decision more: how its marks look
             who = camera.path.name, camera.clicks.who
             decided[who] = decided.get(who, 0) + 1
-    write_comparator(new.place(project.comparator), frames, pitches(store, digest), digest, decided)
-    if not write_frames(new.place(project.frames_path), measured_scans(store.path, digest)):
+    marks = judged_marks(store, judging)
+    write_comparator(new.place(project.comparator), marks, pitches(store, digest), digest, decided)
+    if not write_frames(new.place(project.frames_path), written_scans(store, digest)):
         new.remove(project.frames_path)
 
 
@@ -264,12 +279,18 @@ def _write_check(project: Project, adjustment: Adjustment, new: Unpublished) -> 
 
 
 def _reported(project: Project, new: Unpublished) -> Summary:
-    from pipeline.thumbnails import Thumbnails
-
     data = report_data(project, new.at)
-    scans = data.measurement.values() if data.measurement else ()
-    with Thumbnails(scans, project.max_pixels) as pictures:
+    with _thumbnails(project, data) as pictures:
         write_report(replace(data, thumbnail=pictures.of), new.place(project.report_path))
     files = {"comparator coordinates": project.comparator, "adjustment": project.adjustment_path}
     written = {word: path for word, path in files.items() if word != "adjustment" or data.adjustment}
     return summarise(data, {**written, "report": project.report_path})
+
+
+def _thumbnails(project: Project, data: ReportData) -> "Thumbnails":
+    """The pictures of the marks that data shows."""
+    from pipeline.thumbnails import Thumbnails
+
+    scans, path = data.measurement or {}, project.measurement_path
+    keys = fingerprints_of(path, data.made_from.get(path.name, ""), scans)
+    return Thumbnails(scans.values(), project.max_pixels, path, keys)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 Array = NDArray[np.float64]
 
@@ -33,6 +32,8 @@ class Probabilities:
         Of one coordinate 4.13 with the usual probabilities. Source: W. Baarda, A Testing Procedure for Use in Geodetic
         Networks, 1968.
         """
+        from scipy import special
+
         return float(np.sqrt(special.chndtrinc(special.chdtri(size, self.alpha), size, 1.0 - self.power)))
 
     def critical(self, sizes: NDArray[np.intp], tests: int) -> Array:
@@ -40,6 +41,8 @@ class Probabilities:
 
         The probability `family` is shared out evenly (Sidak).
         """
+        from scipy import special
+
         return np.asarray(special.chdtri(np.maximum(sizes, 1), _sidak(self.family, tests)), dtype=np.float64)
 
     def critical_tau(self, redundancy: int, tests: int = 1) -> float:
@@ -51,6 +54,8 @@ class Probabilities:
         if redundancy < 2:
             return np.inf
         alpha = self.alpha if tests == 1 else _sidak(self.family, tests)
+        from scipy import special
+
         t = special.stdtrit(redundancy - 1, 1.0 - 0.5 * alpha)
         return float(t * np.sqrt(redundancy / (redundancy - 1 + t**2)))
 

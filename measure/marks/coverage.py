@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +46,8 @@ def _pixel_means(cell_values: NDArray[np.floating], cells: int) -> Array:
     """Means over the cells of each pixel of an image (rows, columns)."""
     rows, cols = cell_values.shape
     size = (cols // cells, rows // cells)
+    import cv2  # not every command that reads a camera's drawing needs it
+
     return np.asarray(cv2.resize(cell_values, size, interpolation=cv2.INTER_AREA), dtype=float)
 
 

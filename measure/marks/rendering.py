@@ -8,7 +8,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from measure.marks.coverage import CELLS, cell_coverage
 from measure.marks.frame_border import drawn_outline_mm, known_outline_mm
@@ -152,6 +151,8 @@ def chip_steadiness(mark: MarkTemplate, pixel_from_mark: Array, width: int, heig
     if mark.steadiness is None:
         return np.ones((height, width))
     col, row = _chip_positions(mark, pixel_from_mark, width, height, 1)
+    from scipy import ndimage
+
     return np.asarray(ndimage.map_coordinates(mark.steadiness, [row, col], order=1, mode="nearest"))
 
 
@@ -300,6 +301,8 @@ def _pixels_per_sample(mark: MarkTemplate, pixel_from_mark: Array) -> float:
 
 def _sampled(mark: MarkTemplate, pixel_from_mark: Array, width: int, height: int, cells: int) -> Array:
     col, row = _chip_positions(mark, pixel_from_mark, width, height, cells)
+    from scipy import ndimage
+
     sampled = ndimage.map_coordinates(mark.image, [row, col], order=3, mode="nearest")
     return np.asarray((sampled - mark.image.min()) / max(np.ptp(mark.image), 1e-12), dtype=float)
 

@@ -10,11 +10,12 @@ from importlib import import_module
 from io import BufferedIOBase
 from pathlib import Path, PosixPath
 from threading import Lock
-from typing import Any, TypeVar
-
-from tifffile import TiffFile
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile
 
 Made = TypeVar("Made")
 Extent = tuple[int, int]  # first byte, and the byte after the last
@@ -125,8 +126,10 @@ def found_addresses(pattern: str) -> list[Path]:
     return [Address(f"s3://{name}") for name in sorted(names)]
 
 
-def tiff_file(path: Path) -> TiffFile:
+def tiff_file(path: Path) -> "TiffFile":
     """A TIFF file opened, wherever it is. Raises one of DECODING_ERRORS, or as `Address` does."""
+    from tifffile import TiffFile
+
     return TiffFile(path.open("rb") if isinstance(path, Address) else path)
 
 

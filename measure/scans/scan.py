@@ -205,6 +205,11 @@ class Scan:
             self._reduced[factor] = self._reduced_channels(factor, width, height)
         return weighted(self._reduced[factor], self._weights(weights))
 
+    @property
+    def seen_whole(self) -> tuple[int, Array] | None:
+        """The factor and the grey values of the whole scan as it was reduced last; None where nobody asked for it."""
+        return next(((f, weighted(grey, self._grey_weights)) for f, grey in self._reduced.items()), None)
+
     def reduced_window(
         self, factor: int, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None
     ) -> Array:

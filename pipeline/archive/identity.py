@@ -1,9 +1,6 @@
-"""What tells a scan from any other: where it stands, how large and old its file is, and what stands in the telling
-parts of it."""
+"""What stands in the telling parts of a scan's file, and in the whole of it."""
 
 import hashlib
-import os
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,50 +14,6 @@ from pipeline.results.fingerprints import of_scan
 _HEAD_BYTES = 1 << 16
 _MIDDLE_PX = 256
 _PIECE_BYTES = 1 << 20
-
-
-@dataclass(frozen=True)
-class FileState:
-    """What is known of a scan's file without reading it.
-
-    uri: its path relative to the project's folder with `/`, or its address. bytes: its size, -1 where it is not there.
-    mtime_ns: when it was last changed, local files; etag: the same of objects.
-    """
-
-    uri: str
-    bytes: int
-    mtime_ns: int = 0
-    etag: str = ""
-
-
-@dataclass(frozen=True)
-class Identity:
-    """state: of the file. parts_hash: SHA-256 of its telling parts."""
-
-    state: FileState
-    parts_hash: str
-
-
-def file_state(path: Path, folder: Path) -> FileState:
-    """The state of a file or an object; one that does not answer is as one that is not there. folder: that of the
-    project, which may be moved as a whole."""
-    try:
-        stat = path.stat()
-        if isinstance(path, Address):
-            return FileState(str(path), stat.st_size, etag=path.etag)
-    except (OSError, MissingError, UnreachableError):
-        return FileState(uri_of(path, folder), -1)
-    return FileState(uri_of(path, folder), stat.st_size, stat.st_mtime_ns)
-
-
-def uri_of(path: Path, folder: Path) -> str:
-    """Relative to the folder, where that is possible, with `/`; an address as it is."""
-    if isinstance(path, Address):
-        return str(path)
-    try:
-        return Path(os.path.relpath(os.path.abspath(path), os.path.abspath(folder))).as_posix()
-    except ValueError:  # on another drive
-        return path.absolute().as_posix()
 
 
 def parts_hash(path: Path, max_pixels: int | None = None) -> str:

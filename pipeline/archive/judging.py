@@ -7,13 +7,14 @@ process is ended. The one before is dropped when the files that name this one ar
 import hashlib
 import json
 import sqlite3
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
 from pipeline.archive.store import MARK_COLUMNS, Json, Store, mark_of, places, row_of
 from pipeline.archive.verdicts import Verdict, verdict_of
+from pipeline.results.comparator_file import MarkRow
 
 _AT_A_TIME = 500  # frames in a transaction
 _UNFINISHED = "digest like 'unfinished%'"  # the process that made it was ended
@@ -38,9 +39,23 @@ class JudgedScan:
     record: Json
 
 
+@dataclass(frozen=True)
+class Lot:
+    """Frames that are judged beside one another, and beside no others. input: SHA-256 of all that this starts from, ""
+    where that is not known; frames: gives them judged, if that is asked for."""
+
+    input: str
+    frames: Callable[[], Iterable[JudgedScan]]
+
+
 def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: Iterable[JudgedScan]) -> str:
-    """Keep a judging of all frames, whole or not at all, and give its digest. Of a frame only what is another than it
-    was measured takes room."""
+    """`judge_lots` of a single one, which is taken from no other judging."""
+    return judge_lots(store, made_from, input_hash, [Lot("", lambda: frames)])
+
+
+def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots: Iterable[Lot]) -> str:
+    """Keep a judging of all frames, whole or not at all, and give its digest. A lot whose input was judged before is
+    taken from there. Of a frame only what is another than it was measured takes room."""
     told = hashlib.sha256(json.dumps([dict(made_from), input_hash], sort_keys=True).encode())
     db = store.connection
     with store.writing():
@@ -48,16 +63,55 @@ def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: I
         values = (f"unfinished {input_hash}", json.dumps(dict(made_from)), input_hash)
         row = db.execute("insert into judging (digest, made_from, input) values (?, ?, ?)", values).lastrowid
         assert row is not None
-    left = iter(frames)
-    while some := list(islice(left, _AT_A_TIME)):  # what makes them may have to measure, and write, meanwhile
+    for number, lot in enumerate(lots):
+        output = _taken(store, row, number, lot) or _judged(store, row, number, lot.frames())
+        told.update(output.encode())
         with store.writing():
-            for frame in some:
-                told.update(_write(db, row, frame, store.record(frame.result)))
+            db.execute("insert into judged_lot values (?, ?, ?, ?)", (row, number, lot.input, output))
     digest = told.hexdigest()
     with store.writing():
         db.execute("delete from judging where digest = ?", (digest,))
         db.execute("update judging set digest = ? where id = ?", (digest, row))
     return digest
+
+
+def _taken(store: Store, judging: int, number: int, lot: Lot) -> str:
+    """Take a lot from an earlier judging, and give what is told of it; "" where none has it."""
+    if not lot.input:
+        return ""
+    db = store.connection
+    found = db.execute(
+        "select judging, lot, output from judged_lot join judging on judging.id = judging "
+        f"where judged_lot.input = ? and not {_UNFINISHED} order by judging desc limit 1",
+        (lot.input,),
+    ).fetchone()
+    if found is None:
+        return ""
+    before, old, output = found
+    with store.writing():
+        db.execute(
+            "insert into judged_frame (judging, lot, scan, result, name, verdict, own_marks, detail) "
+            "select ?, ?, scan, result, name, verdict, own_marks, detail from judged_frame "
+            "where judging = ? and lot = ?",
+            (judging, number, before, old),
+        )
+        db.execute(
+            f"insert into judged (judging, result, number, {MARK_COLUMNS}) select ?, result, number, {MARK_COLUMNS} "
+            "from judged where judging = ? and result in "
+            "(select result from judged_frame where judging = ? and lot = ? and own_marks)",
+            (judging, before, before, old),
+        )
+    return str(output)
+
+
+def _judged(store: Store, judging: int, number: int, frames: Iterable[JudgedScan]) -> str:
+    """Judge a lot, and give what is told of it."""
+    told, left = hashlib.sha256(), iter(frames)
+    while some := list(islice(left, _AT_A_TIME)):  # what makes them may have to measure, and write, meanwhile
+        with store.writing():
+            for frame in some:
+                told.update(_write(store.connection, judging, number, frame, store.record(frame.result)))
+    return told.hexdigest()
 
 
 def drop_all_but(store: Store, digest: str) -> None:
@@ -109,7 +163,37 @@ def judged_records(store: Store, judging: Judging, images: Collection[str] | Non
         yield name, {**record, "scan": uri}
 
 
-def _write(db: sqlite3.Connection, judging: int, frame: JudgedScan, measured: Json) -> bytes:
+def judged_marks(store: Store, judging: Judging) -> Iterator[MarkRow]:
+    """Every mark of every frame, by the frames' names, as all scans together show it."""
+    db = store.connection
+    columns = (
+        "point, kind, col_px, row_px, var_col, var_row, cov, case when var_col is null then causes end, status, reason"
+    )
+    as_measured = f"select {columns} from mark where result = ?2 order by number"
+    own = f"select {columns} from judged where judging = ?1 and result = ?2 order by number"
+    frames = db.execute(
+        "select name, result, own_marks from judged_frame where judging = ? order by name", (judging.row,)
+    )
+    for name, result, own_marks in frames:
+        for point, kind, col, row, *spread, causes, status, reason in db.execute(
+            own if own_marks else as_measured, (judging.row, result)
+        ):
+            center = None if col is None else (col, row)
+            yield MarkRow(name, point, kind, center, _covariance(spread, causes), status, reason)
+
+
+def _covariance(spread: Sequence[float | None], causes: str | None) -> tuple[float, float, float] | None:
+    """Numbers that are not finite stand in the causes alone."""
+    of_col, of_row, both = spread
+    if of_col is not None and of_row is not None and both is not None:
+        return of_col, of_row, both
+    if causes is None:
+        return None
+    (first, second), (_, third) = json.loads(causes)["sum"]
+    return float(first), float(third), float(second)
+
+
+def _write(db: sqlite3.Connection, judging: int, lot: int, frame: JudgedScan, measured: Json) -> bytes:
     """Write what of a frame is another than it was measured, and give all that was written."""
     now = frame.record
     changed = {k: v for k, v in now.items() if k not in ("marks", "scan") and v != measured.get(k)}
@@ -118,8 +202,8 @@ def _write(db: sqlite3.Connection, judging: int, frame: JudgedScan, measured: Js
     verdict: Verdict = verdict_of(now)
     scan, key = db.execute("select scan, fingerprint from result where id = ?", (frame.result,)).fetchone()
     db.execute(
-        f"insert into judged_frame (judging, scan, result, name, verdict, own_marks, detail) values ({places(7)})",
-        (judging, scan, frame.result, frame.name, str(verdict), own_marks, detail),
+        f"insert into judged_frame (judging, lot, scan, result, name, verdict, own_marks, detail) values ({places(8)})",
+        (judging, lot, scan, frame.result, frame.name, str(verdict), own_marks, detail),
     )
     rows: list[tuple[Any, ...]] = [row_of(mark) for mark in now["marks"]] if own_marks else []
     db.executemany(

@@ -4,7 +4,7 @@ import hashlib
 import json
 
 from measure.revision import MEASURE_REVISION
-from pipeline.archive.identity import Identity
+from pipeline.archive.file_state import Identity
 
 
 def fingerprint(identity: Identity, options_hash: str, revision: int = MEASURE_REVISION) -> str:

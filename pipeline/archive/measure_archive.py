@@ -4,15 +4,17 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from measure.errors import MeasurementError
 from pipeline.archive.cluster import cluster_executor
-from pipeline.archive.judging import judge, latest
+from pipeline.archive.judging import judge_lots, latest
 from pipeline.archive.key import shard_of
 from pipeline.archive.moved import find_moved, hash_contents
 from pipeline.archive.store import Store
-from pipeline.archive.together import find_copies, input_of, judged_scans
+from pipeline.archive.thumbnails import ThumbnailStore
+from pipeline.archive.together import find_copies, input_of, judged_lots
 from pipeline.archive.work import Counts, Work
 from pipeline.archive.work_options import WorkOptions
 from pipeline.files.project_file import Project
@@ -20,6 +22,7 @@ from pipeline.measuring.learn_stage import learn_marks
 from pipeline.measuring.measurable import check_measurable
 from pipeline.measuring.roll import with_known_lines
 from pipeline.measuring.scan_task import scan_tasks
+from pipeline.measuring.tied import tied
 from pipeline.measuring.tone_stage import said_of_tones
 from pipeline.progress import Reporter
 from pipeline.workers import worker_pool
@@ -51,13 +54,13 @@ def measure_archive(
     names = check_measurable(project)
     if options.retry:
         store.forget_failed()
-    with _executor(project, options) as executor:
-        work = Work(project, store, executor, options)
+    with _executor(project, options) as executor, ThumbnailStore.beside(store.path) as thumbnails:
+        work = Work(project, store, executor, options, thumbnails)
         learned = learn_marks(project, reporter, work.measure, executor, learned_folder, store)
         tasks = scan_tasks(learned, names, said_of_tones(learned, reporter, work.measure, store))
         tasks, _ = with_known_lines(tasks, work.measure, reporter)
         if options.moved:
-            find_moved(store, tasks, work, reporter)
+            thumbnails.rekey(find_moved(store, tasks, work, reporter))
         store.set_project({work.state(task).uri: task.name for task in tasks})
         if options.shard is not None:
             part, parts = options.shard
@@ -73,8 +76,9 @@ def measure_archive(
         before = latest(store)
         if before is not None and before.input == told:
             return Done(before.digest, work.counts)
-        scans = judged_scans(learned, tasks, work, copies, reporter, executor)
-        return Done(judge(store, made, told, scans), work.counts)
+        share = partial(tied, learned, reporter=reporter, executor=executor)
+        lots = judged_lots(learned, tasks, work, copies, share, told)
+        return Done(judge_lots(store, made, told, lots), work.counts)
 
 
 def _executor(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:

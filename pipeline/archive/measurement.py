@@ -56,6 +56,30 @@ def decisions_by(store: Store, digest: str) -> dict[DecidedBy, int]:
     return dict(sorted(counts.items()))
 
 
+def written_scans(store: Store, digest: str) -> Iterator[MeasuredScan]:
+    """Those scans of a judging on which something is written, by name."""
+    rows = store.connection.execute(
+        "select judged_frame.name, result from judged_frame join judging on judging.id = judging "
+        "where judging.digest = ?",
+        (digest,),
+    ).fetchall()
+    written = store.written()
+    return measured_scans(store.path, digest, {name for name, result in rows if result in written})
+
+
+def fingerprints_of(path: Path, digest: str, images: Collection[str]) -> dict[str, str]:
+    """Of some images of a judging the fingerprints of their results; of none where there is no such judging."""
+    if not digest or not path.exists():
+        return {}
+    query = (
+        "select fingerprint from judged_frame join result on result.id = result join judging on judging.id = judging "
+        "where judging.digest = ? and judged_frame.name = ?"
+    )
+    with Store(path) as store:
+        found = {image: store.connection.execute(query, (digest, image)).fetchone() for image in images}
+    return {image: row[0] for image, row in found.items() if row is not None}
+
+
 def tell_place(store: Store, project_folder: Path) -> None:
     """Let the store know where the paths of its scans begin, seen from itself: so a whole project can be moved."""
     told = os.path.relpath(project_folder.resolve(), store.path.resolve().parent)

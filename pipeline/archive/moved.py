@@ -4,16 +4,18 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 from measure.scans.addresses import scan_path
-from pipeline.archive.identity import Identity, content_hash, parts_hash
+from pipeline.archive.file_state import Identity
+from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.archive.store import Store
 from pipeline.archive.work import Work
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
 
 
-def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> None:
-    """Give files that the store does not know as they are the results of those whose whole content they have. Only
-    results count whose content was hashed: an earlier call with `--moved` did that."""
+def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> dict[str, str]:
+    """Give files that the store does not know as they are the results of those whose whole content they have, and say
+    what fingerprints these have now, by the earlier ones. Only results count whose content was hashed: an earlier call
+    with `--moved` did that."""
     known = store.identities()
     by_size = defaultdict[int, dict[str, str]](dict)
     for uri, content in store.content_hashes().items():
@@ -24,7 +26,7 @@ def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Re
         if task.scan and work.state(task) != getattr(known.get(work.state(task).uri), "state", None)
     ]
     taken = {work.state(task).uri for task in tasks} - {work.state(task).uri for task in unknown}
-    found = 0
+    found, keys = 0, dict[str, str]()
     with reporter.stage("looked for in the store") as count:
         for done, task in enumerate(unknown, 1):
             count(task.name, done, len(unknown))
@@ -34,7 +36,7 @@ def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Re
             content = content_hash(scan_path(task.scan))
             uri = by_size[state.bytes].get(content, "")
             if content and uri and uri not in taken:
-                store.move(uri, Identity(state, parts_hash(scan_path(task.scan), task.max_pixels)))
+                keys |= store.move(uri, Identity(state, parts_hash(scan_path(task.scan), task.max_pixels)))
                 taken.add(state.uri)
                 del by_size[state.bytes][content]
                 found += 1
@@ -43,6 +45,7 @@ def find_moved(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Re
             f"{found} of {len(unknown)} files that are new or changed have the content of ones that are measured"
         )
     work.refresh()
+    return keys
 
 
 def hash_contents(store: Store, tasks: Sequence[ScanTask], work: Work, reporter: Reporter) -> None:

@@ -184,9 +184,8 @@ def project_text(new: NewProject) -> str:
 
 def images_text(new: NewProject) -> str:
     """images.csv."""
-    cameras = new.cameras
-    names = names_below(cameras)
-    rows = sorted((names[path], f"{PREFIX}{camera}" if camera else "") for path, camera in cameras.items())
+    named = zip(names_below(new.cameras), new.cameras.values(), strict=True)
+    rows = sorted((name, f"{PREFIX}{camera}" if camera else "") for name, camera in named)
     return "\n".join([csv_line(("image", "camera")), *map(csv_line, rows)]) + "\n"
 
 

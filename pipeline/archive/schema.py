@@ -1,4 +1,4 @@
-"""The tables of out/measurement.db, and how files of earlier versions become files of this one: forward only.
+"""The tables of the project's SQLite files, and how files of earlier versions become files of this one: forward only.
 
 The number of the version stands in the file (`pragma user_version`). A change of the tables is a new entry at the end
 of MIGRATIONS, and none that stands there is changed any more.
@@ -6,6 +6,7 @@ of MIGRATIONS, and none that stands there is changed any more.
 
 import math
 import sqlite3
+from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
@@ -94,36 +95,58 @@ select image, point, kind, col_px * px_mm as x_mm, -row_px * py_mm as y_mm,
 from seen order by image, number;
 """
 
-MIGRATIONS: tuple[str, ...] = (_FIRST,)
+_LOTS = """
+create table judged_lot (
+    judging integer not null references judging on delete cascade, lot integer not null,
+    input text not null,                     -- SHA-256 of all that judging these frames starts from
+    output text not null,                    -- SHA-256 of what it says of them
+    primary key (judging, lot)
+) without rowid;
+create index judged_lot_by_input on judged_lot (input);
+alter table judged_frame add column lot integer not null default 0;
+"""
+
+MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS)
 VERSION = len(MIGRATIONS)
 
 
-def opened(path: Path) -> sqlite3.Connection:
-    """The store, brought to this version; made where there is none. Raises InputError for a file of another kind, or of
-    a later version."""
+@dataclass(frozen=True)
+class Schema:
+    """A kind of file. application: its number, by which it is known; what: it holds."""
+
+    application: int
+    migrations: tuple[str, ...]
+    what: str
+
+
+def opened(path: Path, schema: Schema | None = None) -> sqlite3.Connection:
+    """The file, brought to this version; made where there is none. schema: if it is not that of measurements. Raises
+    InputError for a file of another kind, or of a later version."""
+    schema = schema or _measurements()
     path.parent.mkdir(parents=True, exist_ok=True)
     connection = sqlite3.connect(path, timeout=60.0, isolation_level=None)
     try:
-        _check(connection, path)
+        _check(connection, path, schema)
         connection.execute("pragma journal_mode = wal")
         connection.execute("pragma synchronous = normal")
         connection.execute("pragma foreign_keys = on")
-        migrate(connection)
+        migrate(connection, schema)
         connection.create_function("sqrt", 1, _sqrt, deterministic=True)  # not every SQLite is built with it
     except sqlite3.DatabaseError as error:
         connection.close()
-        raise InputError(f"{path}: cannot be used as a store of measurements ({error}). {_MOVE}") from error
+        raise InputError(f"{path}: cannot be used as a store of {schema.what} ({error}). {_MOVE}") from error
     except BaseException:
         connection.close()
         raise
     return connection
 
 
-def migrate(connection: sqlite3.Connection) -> None:
+def migrate(connection: sqlite3.Connection, schema: Schema | None = None) -> None:
     """To this version from any earlier one, each step whole or not at all."""
+    schema = schema or _measurements()
     version = connection.execute("pragma user_version").fetchone()[0]
-    for number, script in enumerate(MIGRATIONS[version:], version + 1):
-        marks = f"pragma application_id = {APPLICATION}; pragma user_version = {number}"
+    for number, script in enumerate(schema.migrations[version:], version + 1):
+        marks = f"pragma application_id = {schema.application}; pragma user_version = {number}"
         try:
             connection.executescript(f"begin immediate; {script}; {marks}; commit;")
         except sqlite3.Error:
@@ -132,18 +155,23 @@ def migrate(connection: sqlite3.Connection) -> None:
             raise
 
 
+def _measurements() -> Schema:
+    return Schema(APPLICATION, MIGRATIONS, "measurements")
+
+
 _MOVE = "Move it away, and run `reseau measure` again."
 
 
-def _check(connection: sqlite3.Connection, path: Path) -> None:
+def _check(connection: sqlite3.Connection, path: Path, schema: Schema) -> None:
     version = connection.execute("pragma user_version").fetchone()[0]
     application = connection.execute("pragma application_id").fetchone()[0]
     tables = connection.execute("select count(*) from sqlite_master").fetchone()[0]
-    if tables and application != APPLICATION:
-        raise InputError(f"{path}: is an SQLite file that was not written by reseau. {_MOVE}")
-    if version > VERSION:
+    if tables and application != schema.application:
+        raise InputError(f"{path}: is an SQLite file that was not written by reseau for {schema.what}. {_MOVE}")
+    newest = len(schema.migrations)
+    if version > newest:
         raise InputError(
-            f"{path}: is of version {version}, written by a later reseau than this one, which knows up to {VERSION}. "
+            f"{path}: is of version {version}, written by a later reseau than this one, which knows up to {newest}. "
             "Install that, or move the file away."
         )
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from measure.revision import MEASURE_REVISION
-from pipeline.archive.identity import FileState, Identity
+from pipeline.archive.file_state import FileState, Identity
 from pipeline.archive.key import fingerprint, options_hash
 from pipeline.archive.schema import opened
 from pipeline.archive.verdicts import Verdict, verdict_of
@@ -106,9 +106,18 @@ class Store:
 
     def record(self, result: int) -> Json:
         """The record of a result, as it was kept."""
-        (detail,) = self._db.execute("select detail from result where id = ?", (result,)).fetchone()
         rows = self._db.execute(f"select {MARK_COLUMNS} from mark where result = ? order by number", (result,))
-        return {**json.loads(detail), "marks": [mark_of(row) for row in rows]}
+        return {**self.detail(result), "marks": [mark_of(row) for row in rows]}
+
+    def detail(self, result: int) -> Json:
+        """All of its record but the marks."""
+        (detail,) = self._db.execute("select detail from result where id = ?", (result,)).fetchone()
+        return dict(json.loads(detail))
+
+    def written(self) -> set[int]:
+        """The rows of the results of scans on which something is written."""
+        rows = self._db.execute("select id from result where coalesce(detail ->> '$.writing', '[]') <> '[]'")
+        return {row for (row,) in rows}
 
     def seconds(self, result: int) -> float:
         """What measuring it took."""
@@ -157,8 +166,9 @@ class Store:
                 ((name, uri) for uri, name in copies.items()),
             )
 
-    def move(self, uri: str, identity: Identity) -> None:
-        """A scan's file is elsewhere or touched, its content the same: its results have the key of what it is now."""
+    def move(self, uri: str, identity: Identity) -> dict[str, str]:
+        """A scan's file is elsewhere or touched, its content the same: its results have the key of what it is now.
+        These keys by the earlier ones."""
         state = identity.state
         with self.writing():
             if uri != state.uri:  # what stood there before is another scan, whose results nobody can ask for any more
@@ -168,15 +178,17 @@ class Store:
                 (state.uri, state.bytes, state.mtime_ns, state.etag, identity.parts_hash, uri),
             )
             results = self._db.execute(
-                "select result.id, hash, measure_revision from result join scan on scan.id = result.scan "
+                "select result.fingerprint, hash, measure_revision from result join scan on scan.id = result.scan "
                 "join options on options.id = result.options join program on program.id = result.program "
                 "where uri = ?",
                 (state.uri,),
             ).fetchall()
+            keys = {before: fingerprint(identity, told, revision) for before, told, revision in results}
             self._db.executemany(
-                "update result set fingerprint = ? where id = ?",
-                ((fingerprint(identity, told, revision), row) for row, told, revision in results),
+                "update result set fingerprint = ? where fingerprint = ?",
+                ((now, before) for before, now in keys.items()),
             )
+        return keys
 
     def _forget(self, uri: str) -> None:
         self._db.execute("delete from judging")

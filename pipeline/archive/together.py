@@ -3,52 +3,74 @@
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from importlib.metadata import version
 
 from measure.reason import Code, Reason
-from measure.results import FrameMeasurement
+from measure.revision import MEASURE_REVISION
 from measure.scans.addresses import scan_path
 from measure.status import Status
 from pipeline.archive.identity import content_hash
-from pipeline.archive.judging import JudgedScan
+from pipeline.archive.judging import JudgedScan, Lot
+from pipeline.archive.key import shard_of
 from pipeline.archive.store import Store
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
+from pipeline.measuring.camera_plate import with_plates
 from pipeline.measuring.checked import CheckedScan, checked
 from pipeline.measuring.roll import roll_of
 from pipeline.measuring.same_frames import with_same_frames
 from pipeline.measuring.scan_task import ScanTask
-from pipeline.measuring.tied import tied
-from pipeline.progress import Reporter
+from pipeline.results.fingerprints import fingerprint
 from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan
 
 _TOGETHER = 2000  # frames of a camera that are checked beside one another: more would only take memory
+Said = Mapping[str, tuple[tuple[Reason, ...], tuple[str, ...]]]  # by image problems and notes
 
 
-def judged_scans(
+def judged_lots(
     project: Project,
     tasks: Sequence[ScanTask],
     work: Work,
     copies: Mapping[str, str],
-    reporter: Reporter,
-    executor: Executor | None,
-) -> Iterator[JudgedScan]:
-    """Every scan as all of them show it. project: with its learned marks. copies: by image the one whose file its own
-    is a copy of. Frames that only the checks of their camera concern are not held longer than these take."""
+    share: Callable[[Sequence[CheckedScan]], Iterable[MeasuredScan]],
+    told: str,
+) -> Iterator[Lot]:
+    """Every scan as all of them show it, in lots: those whose scans are as they were need not be judged again.
+
+    project: with its learned marks. copies: by image the one whose file its own is a copy of. share: the third step of
+    measuring, where targets or natural points ask for it; told: `input_of` all. Of frames that only the checks of their
+    camera concern, a lot is held at a time.
+    """
     own = [task for task in tasks if task.name not in copies]
-    scans = _checked_scans(project, own, work)
+    lots, keys = _beside(project, own), work.keys()
+
+    def lot(some: Sequence[ScanTask], depends_on: object, scans: Callable[[], Iterable[MeasuredScan]]) -> Lot:
+        results = [[task.name, keys[task.name], work.counting(task.name)] for task in some]
+        made_by = [version("reseau"), MEASURE_REVISION]
+        return Lot(
+            fingerprint([results, depends_on, made_by]), lambda: (_judged(scan, work, project) for scan in scans())
+        )
+
     if project.ties is not None or project.targets is not None:
-        every: Iterator[MeasuredScan] = iter(tied(project, list(scans), reporter, executor))
+        yield lot(own, told, lambda: share([scan for each in lots for scan in _checked_beside(project, *each, work)]))
     else:
-        every = _with_same_frames(scans, [task.name for task in own], work)
-    for scan in every:
-        yield _judged(scan, work, project)
-    for name, original in sorted(copies.items()):
-        yield _judged(_copy(work.read(name), original), work, project)
+        said = _said_by_writing(project, own, work)
+        for camera, some in lots:
+            of_writing = [said[task.name] for task in some if task.name in said]
+            beside = partial(_with_said, project, camera, some, work, said)
+            yield lot(some, [camera, project.film_sigma_mm, of_writing], beside)
+    if copies:
+        again = sorted(copies.items())
+        yield lot(
+            [task for task in tasks if task.name in copies],
+            again,
+            lambda: [_copy(work.read(name), original) for name, original in again],
+        )
 
 
 def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str, str]:
@@ -78,35 +100,56 @@ def input_of(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str], m
     """SHA-256 of all that judging starts from: the results, and what the project has."""
     keys = work.keys()
     results = [[task.name, keys[task.name]] for task in tasks]
-    told = json.dumps([results, sorted(copies.items()), dict(made_from)], sort_keys=True)
+    made_by = [version("reseau"), MEASURE_REVISION]
+    told = json.dumps([results, sorted(copies.items()), dict(made_from), made_by], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()
 
 
-def _checked_scans(project: Project, tasks: Sequence[ScanTask], work: Work) -> Iterator[CheckedScan]:
-    """The second step, camera by camera. Scans whose marks change names beside the others are measured again."""
+def _beside(project: Project, tasks: Sequence[ScanTask]) -> list[tuple[CameraFile, Sequence[ScanTask]]]:
+    """The scans of each camera that are checked beside one another: all of them, or of many as good as half of
+    `_TOGETHER` or more, by chance, of which one scan more changes a single lot."""
+    found = list[tuple[CameraFile, Sequence[ScanTask]]]()
     for camera in project.cameras.values():
         own = [task for task in tasks if project.camera_of(task.name) is camera]
-        for first in range(0, len(own), _TOGETHER):
-            yield from _checked_beside(project, camera, own[first : first + _TOGETHER], work)
+        lots = 1
+        while len(own) > lots * _TOGETHER:
+            lots *= 2
+        some = defaultdict[int, list[ScanTask]](list)
+        for task in own:
+            some[shard_of(task.name, lots)].append(task)
+        found += [(camera, some[lot]) for lot in sorted(some)]
+    return found
 
 
 def _checked_beside(
     project: Project, camera: CameraFile, tasks: Sequence[ScanTask], work: Work
 ) -> tuple[CheckedScan, ...]:
+    """The second step. Scans whose marks change names beside the others are measured again."""
     scans = [work.read(task.name) for task in tasks]
     roll = roll_of(tasks, scans, camera.writing)
     again = list(work.measure(roll.tasks)) if roll.tasks else []
     return checked(camera, scans, roll, again, project.film_sigma_mm)
 
 
-def _with_same_frames(scans: Iterator[CheckedScan], names: Sequence[str], work: Work) -> Iterator[MeasuredScan]:
-    """As `tied` does it, of all scans no more being held than what is written on them."""
-    written = [scan for scan in map(work.read, names) if scan.frame.writing]
-    bare = [replace(scan, frame=FrameMeasurement(scan.frame.image, (), writing=scan.frame.writing)) for scan in written]
-    said = {scan.frame.image: scan.frame.problems for scan in with_same_frames(bare)}
-    for scan in scans:
-        problems = said.get(scan.frame.image, ())
-        yield replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, *problems))) if problems else scan
+def _said_by_writing(project: Project, tasks: Sequence[ScanTask], work: Work) -> Said:
+    """What is written on the scans says of others, as `tied` has it: plates of other cameras, frames that were scanned
+    twice. No more of the scans is held than that."""
+    names = work.written([task.name for task in tasks])
+    bare = dict[str, MeasuredScan]()
+    for camera in project.cameras.values():
+        own = [work.read_writing(name) for name in names if project.camera_of(name) is camera]
+        bare |= {scan.frame.image: scan for scan in with_plates(camera, own, project.cameras)}
+    seen = with_same_frames([bare[name] for name in names])
+    return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in seen if scan.frame.problems or scan.notes}
+
+
+def _with_said(
+    project: Project, camera: CameraFile, tasks: Sequence[ScanTask], work: Work, said: Said
+) -> Iterator[MeasuredScan]:
+    for scan in _checked_beside(project, camera, tasks, work):
+        problems, notes = said.get(scan.frame.image, ((), ()))
+        frame = replace(scan.frame, problems=(*scan.frame.problems, *problems))
+        yield replace(scan, frame=frame, notes=(*scan.notes, *notes))
 
 
 def _judged(scan: MeasuredScan, work: Work, project: Project) -> JudgedScan:

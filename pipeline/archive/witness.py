@@ -5,34 +5,40 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.scans.addresses import TRAFFIC, scan_path
-from pipeline.archive.identity import FileState, file_state, parts_hash
+from pipeline.archive.file_state import FileState, FileStates
+from pipeline.archive.identity import parts_hash
 from pipeline.measuring.measured import measured_scan
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.thumbnail import StoredThumbnail, stored_thumbnails
 
 _COUNTED = Path("/proc/self/io")
 
 
 @dataclass(frozen=True)
 class Witnessed:
-    """scan: as measured, or why not. parts_hash: of its file. bytes_read: from the file; -1 where nobody counts."""
+    """scan: as measured, or why not. parts_hash: of its file. bytes_read: from the file; -1 where nobody counts.
+    thumbnails: cut from what was decoded for it."""
 
     scan: MeasuredScan
     parts_hash: str
     bytes_read: int
+    thumbnails: tuple[StoredThumbnail, ...] = ()
 
 
 def witnessed_scan(task: ScanTask) -> Witnessed:
     """Measure a scan. Raises nothing but interrupts, as `measured_scan` does."""
     before = _bytes_read()
-    scan = measured_scan(task)
+    thumbnails = list[StoredThumbnail]()
+    scan = measured_scan(task, lambda *seen: thumbnails.extend(stored_thumbnails(*seen)))
     bytes_read = _bytes_read() - before if before >= 0 else -1
-    return Witnessed(scan, parts_hash(scan_path(task.scan), task.max_pixels) if task.scan else "", bytes_read)
+    parts = parts_hash(scan_path(task.scan), task.max_pixels) if task.scan else ""
+    return Witnessed(scan, parts, bytes_read, tuple(thumbnails))
 
 
-def state_of(task: ScanTask, folder: Path) -> FileState:
-    """The state of a task's file. folder: of the project."""
-    return file_state(scan_path(task.scan), folder) if task.scan else FileState(f"(none) {task.name}", -1)
+def state_of(task: ScanTask, files: FileStates) -> FileState:
+    """The state of a task's file."""
+    return files.of(scan_path(task.scan)) if task.scan else FileState(f"(none) {task.name}", -1)
 
 
 def _bytes_read() -> int:

@@ -10,9 +10,11 @@ from functools import lru_cache
 from measure.scans.addresses import scan_path
 from pipeline.archive.decided import after_checks, before_checks, by_image, decided
 from pipeline.archive.expected_time import ExpectedTime
-from pipeline.archive.identity import FileState, Identity, parts_hash
+from pipeline.archive.file_state import FileState, FileStates, Identity
+from pipeline.archive.identity import parts_hash
 from pipeline.archive.key import fingerprint, options_hash
 from pipeline.archive.store import Kept, Store
+from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.archive.witness import Witnessed, state_of, witnessed_scan
 from pipeline.archive.work_options import NotMeasured, WorkOptions
 from pipeline.files.decisions_file import About, Decision
@@ -41,14 +43,20 @@ class Work:
     """Scans measured as tasks ask for them: what the store holds is read there, all else measured and kept at once."""
 
     def __init__(
-        self, project: Project, store: Store, executor: Executor | None, options: WorkOptions | None = None
+        self,
+        project: Project,
+        store: Store,
+        executor: Executor | None,
+        options: WorkOptions | None = None,
+        thumbnails: ThumbnailStore | None = None,
     ) -> None:
         options = options or WorkOptions()
-        self._project, self._store, self._executor = project, store, executor
+        self._project, self._store, self._executor, self._thumbnails = project, store, executor, thumbnails
         self._at_a_time = options.workers or os.cpu_count() or 1
         self._only_kept = options.only_kept
         self._folder = project.path.resolve().parent
         self._identities, self._rows = store.identities(), store.fingerprints()
+        self._files = FileStates(self._folder)
         self._states: dict[str, FileState] = {}
         self._decisions = by_image(project.decisions)
         self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, of what was asked for last
@@ -85,6 +93,20 @@ class Work:
         scan = scan_of(name, self._store.record(self.results[name]), self._folder)
         return before_checks(scan, self._counting.get(name, {}))
 
+    def written(self, names: Sequence[str]) -> list[str]:
+        """Those of the images on which something is written."""
+        written = self._store.written()
+        return [name for name in names if self.results[name] in written]
+
+    def read_writing(self, name: str) -> MeasuredScan:
+        """What was asked for last of an image, without its marks, problems and notes."""
+        bare = {"marks": (), "problems": (), "problem_codes": (), "notes": ()}
+        return scan_of(name, {**self._store.detail(self.results[name]), **bare}, self._folder)
+
+    def counting(self, name: str) -> list[Decision]:
+        """The decisions that count of an image."""
+        return [one for _, one in sorted(self._counting.get(name, {}).items())]
+
     def decided(self, scan: MeasuredScan) -> MeasuredScan:
         """A scan that was checked, as decisions have it."""
         return after_checks(scan, self._counting.get(scan.frame.image, {}))
@@ -101,7 +123,7 @@ class Work:
     def state(self, task: ScanTask) -> FileState:
         """Of the task's file, as it was when it was first asked for."""
         if task.scan not in self._states or not task.scan:
-            self._states[task.scan] = state_of(task, self._folder)
+            self._states[task.scan] = state_of(task, self._files)
         return self._states[task.scan]
 
     def _complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
@@ -158,6 +180,8 @@ class Work:
         for task, result in results_of(witnessed_scan, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
             seen = result if isinstance(result, Witnessed) else Witnessed(ended_scan(task, result), "", -1)
             kept = self._kept(task, states[task.name], seen)
+            if self._thumbnails is not None and seen.thumbnails:
+                self._thumbnails.keep(kept.fingerprint, seen.thumbnails)
             row = self._store.keep(kept, task.name if as_scans else None, as_scans)
             self._identities[kept.identity.state.uri], self._rows[kept.fingerprint] = kept.identity, row
             yield task, row, kept

@@ -5,13 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import cast, get_args
+from typing import TYPE_CHECKING, cast, get_args
 
 from adjust.problem.network import ObjectPoint, Prior
 from measure.fiducial_options import Reads
 from measure.film import SCATTER_MM
 from measure.marks.poses import POSES
-from measure.scans.scan import Scan, open_scan
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
 from pipeline.files.camera_file import CameraFile, read_camera
@@ -28,6 +27,9 @@ from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 from pipeline.results.adjustment_reader import covariance_path
 from pipeline.text.tables import Table, read_toml
+
+if TYPE_CHECKING:
+    from measure.scans.scan import Scan
 
 _COARSEST_PITCH_UM = 1e4  # above it nm were meant: film of a few pixels shows no mark
 DEFAULT_SCANNER = "1"  # the name of that of all images that name none
@@ -70,8 +72,10 @@ class Project:
     crs: str = ""
     decisions: tuple[Decision, ...] = ()
 
-    def open_scan(self, name: str) -> Scan:
+    def open_scan(self, name: str) -> "Scan":
         """The scan of an image. Raises MeasurementError where it cannot be read."""
+        from measure.scans.scan import open_scan
+
         return open_scan(self.scans[name], self.max_pixels)
 
     @property
@@ -105,6 +109,10 @@ class Project:
     def measurement_path(self) -> Path:
         return self.output / "measurement.db"
 
+    @property
+    def thumbnails_path(self) -> Path:
+        return self.output / "thumbnails.db"
+
     def shard_path(self, part: int, parts: int) -> Path:
         """The store of one of several parts of the scans."""
         return self.output / f"measurement.{part}-of-{parts}.db"
@@ -127,7 +135,8 @@ class Project:
     @property
     def results(self) -> tuple[Path, ...]:
         """What the program may write: an earlier result at most may stand there."""
-        measured = (self.comparator, self.measurement_path, self.frames_path) if self.scans else ()
+        stores = (self.measurement_path, self.thumbnails_path)
+        measured = (self.comparator, *stores, self.frames_path) if self.scans else ()
         adjusted = (self.adjustment_path, covariance_path(self.adjustment_path), self.check_path, self.choice_path)
         return (*measured, *adjusted, self.report_path)
 
@@ -290,9 +299,10 @@ def _check_written(table: Table, project: Project, named: Mapping[str, Path]) ->
         if camera.calibration is not None:
             given[f"the earlier calibration of {camera.name}"] = camera.calibration.path
             given[f"the covariance of {camera.name}'s earlier calibration"] = covariance_path(camera.calibration.path)
-    given |= {f"the scan {name}": path for name, path in project.scans.items()}
     if not project.scans:
         given["the comparator coordinates"] = project.comparator
+    written = {path.resolve().name for path in project.results}  # of the scans only those are looked at
+    given |= {f"the scan {name}": path for name, path in project.scans.items() if path.name in written}
     places = {path.resolve(): f"{what}, {path}" for what, path in given.items()}
     for path in project.results:
         what = places.get(path.resolve())

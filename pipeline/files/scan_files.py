@@ -2,7 +2,9 @@
 called."""
 
 import glob
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +26,7 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
     """The scan files that the patterns find, without those that `exclude` names or finds. Raises InputError for a
     pattern that finds nothing, and for files whose images would have the same name."""
     folder = table.file.parent
-    found = dict[Path, None]()
+    found = dict[str, Path]()  # paths are slow keys
     for pattern in patterns:
         try:
             own = _found(pattern, folder)
@@ -34,9 +36,9 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
             raise table.error("scans", f"{pattern!r} finds no object. Check the bucket, the folder and the ending.")
         if not own:
             raise table.error("scans", _nothing_found(pattern, folder / pattern))
-        found |= dict.fromkeys(own)
-    left_out = {file for pattern in exclude for file in _found(pattern, folder)}
-    files = [file for file in found if file not in left_out]
+        found |= {str(file): file for file in own}
+    left_out = {str(file): file for pattern in exclude for file in _found(pattern, folder)}
+    files = [file for text, file in found.items() if text not in left_out]
     if not files:
         what = "leaves no scan of those that scans names. Shorten it." if found else ""
         raise table.error(
@@ -44,13 +46,13 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
             what or 'is an empty list. Name files or patterns, such as ["scans/**/*.tif"].',
         )
     scans: dict[str, Path] = {}
-    for file, name in names_below(files).items():
+    for file, name in zip(files, names_below(files), strict=True):
         if not name.isprintable():
             raise table.error("scans", f"the file name {file.name!a} is not text in UTF-8 on one line. Rename it.")
         if name in scans:
             raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
         scans[name] = file
-    return FoundScans(scans, frozenset(names_below(files, left_out).values()))
+    return FoundScans(scans, frozenset(names_below(files, left_out.values())))
 
 
 def _found(pattern: str, folder: Path) -> list[Path]:
@@ -61,7 +63,16 @@ def _found(pattern: str, folder: Path) -> list[Path]:
     if (folder / pattern).is_file():
         return [folder / pattern]
     names = glob.glob(pattern, root_dir=folder, recursive=True)
-    return [path for path in (folder / name for name in sorted(names)) if not path.is_dir()]
+    return _without_folders([folder / name for name in sorted(names)])
+
+
+def _without_folders(paths: Sequence[Path]) -> list[Path]:
+    """What is a folder is asked once for all that stands in one."""
+    folders = set[str]()
+    for parent in {text[: text.rfind(os.sep) + 1] for text in map(str, paths)}:
+        with suppress(OSError), os.scandir(parent or os.curdir) as entries:  # it may be opened, and not listed
+            folders |= {parent + entry.name for entry in entries if entry.is_dir()}
+    return [path for path in paths if str(path) not in folders]
 
 
 def _nothing_found(pattern: str, whole: Path) -> str:

@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
-from measure.codes_and_boards.board_specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec
-from measure.codes_and_boards.ring_codes import RingCode
 from measure.marks.shapes import Polarity
 from pipeline.text.tables import Table
+
+if TYPE_CHECKING:
+    from measure.codes_and_boards.board_specs import BoardSpec
+    from measure.codes_and_boards.ring_codes import RingCode
 
 KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco")
 
@@ -29,8 +31,8 @@ class TargetSettings:
     arm_mm: float | None = None
     cross_line: float | None = None
     polarity: Polarity = "auto"
-    board: BoardSpec | None = None
-    code: RingCode | None = None
+    board: "BoardSpec | None" = None
+    code: "RingCode | None" = None
     numbers: Mapping[int, str] = field(default_factory=dict)
 
 
@@ -48,7 +50,7 @@ def read_targets(table: Table) -> TargetSettings:
             board = _board(kind, table)
         except ValueError as error:
             raise table.error("kind", f"this {kind} is impossible: {error}.") from None
-        diameter = board.diameter_mm if isinstance(board, CircleGridSpec) else None
+        diameter = getattr(board, "diameter_mm", None)
         settings = TargetSettings(kind, diameter, board=board)
     table.done()
     return settings
@@ -62,6 +64,8 @@ def _crosses(table: Table) -> TargetSettings:
 
 
 def _coded(table: Table) -> TargetSettings:
+    from measure.codes_and_boards.ring_codes import RingCode
+
     default = RingCode()
     diameter = table.number("diameter_mm", above=0.0) if "diameter_mm" in table else None
     bits = table.whole("bits", default.bits)
@@ -72,7 +76,7 @@ def _coded(table: Table) -> TargetSettings:
     return TargetSettings("coded-ring", diameter, polarity=_polarity(table), code=code, numbers=_numbers(table, code))
 
 
-def _numbers(table: Table, code: RingCode) -> dict[int, str]:
+def _numbers(table: Table, code: "RingCode") -> dict[int, str]:
     """The point of each number that the table names, the number as it is read from a picture."""
     codes = table.table("codes")
     points: dict[int, str] = {}
@@ -91,7 +95,9 @@ def _polarity(table: Table) -> Polarity:
     return cast(Polarity, table.text("polarity", "auto", ("auto", "light", "dark")))
 
 
-def _board(kind: str, table: Table) -> BoardSpec:
+def _board(kind: str, table: Table) -> "BoardSpec":
+    from measure.codes_and_boards.board_specs import ArucoSpec, CharucoSpec, ChessboardSpec, CircleGridSpec
+
     columns, rows = (table.whole(key, least=1, most=_MOST_OF_A_BOARD) for key in ("columns", "rows"))
     if kind == "chessboard":
         return ChessboardSpec(columns, rows, table.number("square_mm", above=0.0))

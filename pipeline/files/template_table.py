@@ -9,12 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from measure.errors import MeasurementError
 from measure.marks.shapes import MarkTemplate
-from measure.scans.scan import open_scan
 from pipeline.text.atomic import write_atomically
 from pipeline.text.tables import Table
 from pipeline.text.toml_text import numbers, quoted
@@ -39,6 +37,8 @@ def saved_in(folder: Path, prefix: str = "") -> SavePicture:
 
 def picture_file(picture: Picture) -> bytes:
     """A picture as the TIFF file that `saved_in` stores."""
+    import tifffile
+
     file = io.BytesIO()
     tifffile.imwrite(file, picture, metadata=None, software="reseau")
     return file.getvalue()
@@ -120,6 +120,8 @@ def _of_pixels(table: Table, key: str, shape: tuple[int, ...]) -> Array | None:
 
 
 def _image(table: Table, key: str) -> Array:
+    from measure.scans.scan import open_scan
+
     try:
         with open_scan(table.path_of(key)) as chip:
             return chip.window(0, 0, chip.width_px, chip.height_px).astype(np.float64)

@@ -1,10 +1,13 @@
 """The table [ties] of project.toml: natural points, and how much of their heights is known."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from adjust.problem.network import ObjectPoint, Prior
-from measure.natural_points.ties import TieOptions
 from pipeline.text.tables import Table
+
+if TYPE_CHECKING:
+    from measure.natural_points.ties import TieOptions
 
 
 @dataclass(frozen=True)
@@ -12,7 +15,7 @@ class TieSettings:
     """height: of the ground on which the natural points lie, object units, with its standard deviation; None where it
     is not known."""
 
-    options: TieOptions
+    options: "TieOptions"
     height: Prior | None = None
 
     def point(self, id: str) -> ObjectPoint:
@@ -22,6 +25,8 @@ class TieSettings:
 
 def read_ties(table: Table) -> TieSettings:
     """Read the table. Raises InputError naming the key that is wrong."""
+    from measure.natural_points.ties import TieOptions
+
     usual = TieOptions()
     wanted, images = table.whole("wanted", usual.wanted), table.whole("images", usual.images)
     try:

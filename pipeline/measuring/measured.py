@@ -2,7 +2,7 @@
 
 import time
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +28,8 @@ from pipeline.measuring.target_stage import measure_targets
 from pipeline.measuring.tone_stage import tone_before
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
+Look = Callable[[Scan, MeasuredScan], None]
+
 
 def measure_scans(
     tasks: Iterable[ScanTask], executor: Submits | None = None, in_flight: int | None = None
@@ -51,12 +53,12 @@ def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
     )
 
 
-def measured_scan(task: ScanTask) -> MeasuredScan:
+def measured_scan(task: ScanTask, look: Look | None = None) -> MeasuredScan:
     """Measure one scan: its fiducials, then its targets. A scan that cannot be measured is a result that says why: this
-    raises nothing but interrupts."""
+    raises nothing but interrupts. look: gets the scan while it is open, and what was measured in it."""
     start = time.monotonic()
     try:
-        measured = _opened_and_measured(task)
+        measured = _opened_and_measured(task, look)
     except Exception as error:
         measured = failed_scan(task, *_failure(task, error))
     return replace(measured, seconds=time.monotonic() - start)
@@ -99,7 +101,7 @@ def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
     )
 
 
-def _opened_and_measured(task: ScanTask) -> MeasuredScan:
+def _opened_and_measured(task: ScanTask, look: Look | None) -> MeasuredScan:
     options = task.options
     with task.opened() as scan:
         # Fiducials are seen through the curve; targets have edges all round, and are measured as they are.
@@ -116,7 +118,10 @@ def _opened_and_measured(task: ScanTask) -> MeasuredScan:
                 measured, frame=replace(frame, problems=(*frame.problems, Reason(misplaced, Code.OFF_GIVEN)))
             )
         measured = measure_targets(options, scan, measured)
-        return replace(measured, frame=with_damage(scan, measured.frame))
+        measured = replace(measured, frame=with_damage(scan, measured.frame))
+        if look is not None:
+            look(scan, measured)
+        return measured
 
 
 def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:

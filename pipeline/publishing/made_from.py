@@ -5,7 +5,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.identity import Identity, file_state, parts_hash
+from pipeline.archive.file_state import FileStates, Identity
+from pipeline.archive.identity import parts_hash
 from pipeline.archive.store import known_identities
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -45,7 +46,7 @@ _ORIGIN = {"path", "source"}
 def measured_from(project: Project) -> MadeFrom:
     """Of a measurement: every scan, what is sought in it, and what tells where to look. The last changes no mark that
     was measured, but which are found, and what they are named."""
-    known = known_identities(project.measurement_path)
+    known, files = known_identities(project.measurement_path), FileStates(project.path.resolve().parent)
     coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
     places = [
         coordinates,
@@ -60,7 +61,7 @@ def measured_from(project: Project) -> MadeFrom:
         **({DECISIONS: fingerprint(project.decisions)} if project.decisions else {}),
         **{f"{CAMERA}{camera.name}": fingerprint(_sought(camera)) for camera in project.cameras.values()},
         **{
-            f"{SCAN}{image}": fingerprint([*_parts(path, project, known), project.camera_of(image).name])
+            f"{SCAN}{image}": fingerprint([*_parts(path, project, known, files), project.camera_of(image).name])
             for image, path in project.scans.items()
         },
     }
@@ -82,10 +83,10 @@ def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFro
     }
 
 
-def _parts(path: Path, project: Project, known: Mapping[str, Identity]) -> tuple[int, str]:
+def _parts(path: Path, project: Project, known: Mapping[str, Identity], files: FileStates) -> tuple[int, str]:
     """Of a scan's file its size and what its telling parts hold: read only where it is not as the store knows it. A
     file that was touched, or stands elsewhere, is the same."""
-    state = file_state(path, project.path.resolve().parent)
+    state = files.of(path)
     found = known.get(state.uri)
     is_known = found is not None and found.state == state
     return state.bytes, found.parts_hash if found is not None and is_known else parts_hash(path, project.max_pixels)

@@ -10,27 +10,9 @@ from numpy.typing import NDArray
 from pipeline.results.adjustment_reader import Covariance
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_scan import MeasuredScan
+from pipeline.results.thumbnail import Thumbnail
 
 Json = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Thumbnail:
-    """A mark cut from its scan.
-
-    pixels (rows, columns): grey values on any scale; origin_px: column and row, in the scan, of the centre of its
-    top-left pixel; step_px: scan pixels to a thumbnail pixel, above 1 where it was reduced.
-    """
-
-    pixels: NDArray[np.generic]
-    origin_px: tuple[float, float]
-    step_px: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.pixels.ndim != 2 or 0 in self.pixels.shape:
-            raise ValueError(f"a thumbnail has rows and columns of grey values, not the shape {self.pixels.shape}")
-        if not self.step_px > 0.0:
-            raise ValueError(f"step_px must be positive, not {self.step_px}")
 
 
 @dataclass(frozen=True)

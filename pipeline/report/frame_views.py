@@ -10,11 +10,12 @@ from markupsafe import Markup
 from measure.covariance import MEANING, Covariance
 from measure.status import Status
 from pipeline.report import thumbnails, vectors
-from pipeline.report.data import Json, ReportData, Thumbnail
+from pipeline.report.data import Json, ReportData
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.verdict import suspect_rows
 from pipeline.report.writing import written
+from pipeline.results.thumbnail import Thumbnail
 
 OPEN_FRAMES = 12  # with more frames, only those with a lost mark are unfolded
 PLOT_PX = 330.0

@@ -8,9 +8,10 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from pipeline.report import svg
-from pipeline.report.data import Json, Thumbnail
+from pipeline.report.data import Json
 from pipeline.report.marks import Frame, Mark
 from pipeline.report.vectors import LEAST_UM
+from pipeline.results.thumbnail import Thumbnail
 
 SIZE_PX = 92.0  # a picture's width and height on the page
 TARGETS = 600  # pictures of targets in a report; with more of them, only the worst of each frame are shown

@@ -13,7 +13,7 @@ import numpy as np
 from measure.errors import MeasurementError
 from measure.scans.addresses import scan_path
 from measure.scans.scan import open_scan
-from pipeline.archive.identity import file_state
+from pipeline.archive.file_state import file_state
 from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project

@@ -3,20 +3,21 @@
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.metadata import version
 from itertools import chain, takewhile
 from pathlib import Path
 from sys import intern
 from types import MappingProxyType
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.problem.network import ObservationKind
-from measure.results import FrameMeasurement, MarkMeasurement
+from measure.results import FrameMeasurement
 from measure.status import Status
 from pipeline.errors import InputError
 from pipeline.text.atomic import atomic_path
@@ -52,21 +53,42 @@ class ComparatorPoint:
     line: int = 0
 
 
+class MarkRow(NamedTuple):
+    """A mark in an image as it was measured. center_px: column and row; covariance_px2: variances of the column and the
+    row, and their covariance. None where it has none."""
+
+    image: str
+    point: str
+    kind: str
+    center_px: tuple[float, float] | None
+    covariance_px2: tuple[float, float, float] | None
+    status: str
+    reason: str
+
+
+def mark_rows(frames: Iterable[FrameMeasurement]) -> Iterator[MarkRow]:
+    """Every mark of every frame, by the frames' names."""
+    for frame in sorted(frames, key=lambda frame: frame.image):
+        for mark in frame.marks:
+            center = None if mark.center_px is None else (float(mark.center_px[0]), float(mark.center_px[1]))
+            px2 = mark.covariance_px2
+            spread = None if px2 is None else (float(px2[0, 0]), float(px2[1, 1]), float(px2[0, 1]))
+            yield MarkRow(frame.image, mark.point, mark.kind, center, spread, str(mark.status), str(mark.reason))
+
+
 def write_comparator(
     path: Path,
-    frames: Iterable[FrameMeasurement],
+    marks: Iterable[MarkRow],
     pitch_um: Mapping[str, tuple[float, float]],
     measurement: str = "",
     decided: Mapping[DecidedBy, int] | None = None,
 ) -> None:
-    """Write every mark of every frame. Raises InputError where the file cannot be written.
+    """Write every mark, in their order. Raises InputError where the file cannot be written.
 
-    pitch_um: by image, NaN of a scan that could not be measured. frames: a sequence is
-    sorted by name; what is no sequence has that order. measurement: the digest of the judging in measurement.db that
-    has the same marks. decided: how many decisions of whom stand behind the marks of a camera.
+    pitch_um: by image, NaN of a scan that could not be measured. measurement: the digest of the judging in
+    measurement.db that has the same marks. decided: how many decisions of whom stand behind the marks of a camera.
     """
-    ordered = sorted(frames, key=lambda frame: frame.image) if isinstance(frames, Sequence) else frames
-    rows = (_line(frame.image, mark, pitch_um[frame.image]) for frame in ordered for mark in frame.marks)
+    rows = (_line(mark, *pitch_um[mark.image]) for mark in marks)
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(
             f"{line}\n" for line in chain(_head(pitch_um, measurement, decided or {}), rows)
@@ -120,18 +142,25 @@ def pixel_from_comparator(xy_mm: Array, pitch_um: tuple[float, float]) -> Array:
     return np.divide(xy_mm, np.array([pitch_um[0], -pitch_um[1]]) / 1000.0)
 
 
-def _line(image: str, mark: MarkMeasurement, pitch_um: tuple[float, float]) -> str:
-    place = sigma = pixel = [""] * 2
-    rho = ""
+def _line(mark: MarkRow, across_um: float, down_um: float) -> str:
+    """As `comparator_from_pixel` has it, one by one: an archive has many."""
+    place = pixel = ","
+    sigma_rho = ",,"
+    x_mm, y_mm = across_um / 1000.0, -down_um / 1000.0
     if mark.center_px is not None:
-        x, y = comparator_from_pixel(mark.center_px, pitch_um)
-        place, pixel = [f"{x:.7f}", f"{y:.7f}"], [f"{value:.4f}" for value in mark.center_px]
+        col, row = mark.center_px
+        place, pixel = f"{col * x_mm:.7f},{row * y_mm:.7f}", f"{col:.4f},{row:.4f}"
     if mark.covariance_px2 is not None:
-        covariance = comparator_from_pixel(comparator_from_pixel(mark.covariance_px2, pitch_um).T, pitch_um)
-        sx, sy = np.sqrt(np.diag(covariance))
-        sigma, rho = [f"{sx:.7f}", f"{sy:.7f}"], f"{covariance[0, 1] / (sx * sy):.4f}"
-    cells = [image, mark.point, mark.kind, *place, *sigma, rho, *pixel, mark.status, mark.reason]
-    return csv_line([str(cell) for cell in cells])
+        of_col, of_row, both = mark.covariance_px2
+        sx, sy = math.sqrt(of_col * x_mm * x_mm), math.sqrt(of_row * y_mm * y_mm)
+        sigma_rho = f"{sx:.7f},{sy:.7f},{both * x_mm * y_mm / (sx * sy):.4f}"
+    name = _start(mark.image, mark.point, mark.kind)
+    return f"{name},{place},{sigma_rho},{pixel},{csv_line([mark.status, mark.reason])}"
+
+
+@lru_cache(maxsize=4096)
+def _start(image: str, point: str, kind: str) -> str:
+    return csv_line([image, point, kind])
 
 
 def measurement_of(path: Path) -> str:

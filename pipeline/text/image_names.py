@@ -1,7 +1,7 @@
 """Names of images, as tables and files of all kinds have them."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Collection
 from pathlib import Path
 
 SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".png")
@@ -15,10 +15,13 @@ def image_name(text: str) -> str:
     return folder + slash + (name if ending.lower() in SCAN_ENDINGS else file).strip()
 
 
-def names_below(files: Iterable[Path], others: Iterable[Path] | None = None) -> dict[Path, str]:
-    """The names of images by their files: the path below the folder that all the files share. others: whose names are
-    asked for, if not those of the files."""
-    absolute = {file: os.path.abspath(file) for file in files}
-    shared = os.path.commonpath([os.path.dirname(path) for path in absolute.values()]) if absolute else ""
-    asked = absolute if others is None else {file: os.path.abspath(file) for file in others}
-    return {file: image_name(Path(os.path.relpath(path, shared)).as_posix()) for file, path in asked.items()}
+def names_below(files: Collection[Path], others: Collection[Path] | None = None) -> list[str]:
+    """The names of images, in the order of their files: the path below the folder that all the files share. others:
+    whose names are asked for, if not those of the files."""
+    given = {text[: text.rfind(os.sep) + 1] for text in map(str, files)}
+    places = [text.rpartition(os.sep) for text in map(str, files if others is None else others)]
+    folders = {folder: os.path.abspath(folder) for folder in given.union(folder + sign for folder, sign, _ in places)}
+    shared = os.path.commonpath([folders[folder] for folder in given] or [os.sep])
+    below = {folder: Path(os.path.relpath(path, shared)).as_posix() for folder, path in folders.items()}
+    before = {folder: "" if path == os.curdir else f"{path}/" for folder, path in below.items()}
+    return [image_name(before[folder + sign] + name) for folder, sign, name in places]

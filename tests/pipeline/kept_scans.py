@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pipeline.archive.identity import Identity, file_state, parts_hash
+from pipeline.archive.file_state import Identity, file_state
+from pipeline.archive.identity import parts_hash
 from pipeline.archive.judging import JudgedScan, judge, judged_records, judging_of
 from pipeline.archive.measurement import tell_place
 from pipeline.archive.store import Kept, Store
@@ -27,7 +28,9 @@ def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str
 
 def content(file: Path) -> bytes:
     """Of a result; of a store what it says of the marks that stand in comparator.csv, and not which page it stands on
-    nor when it was measured."""
+    nor when it was measured; of thumbnails, which may be deleted, nothing."""
+    if file.name.startswith("thumbnails"):
+        return b""
     if file.suffix != ".db":
         return file.read_bytes()
     comparator = file.parents[1] / "comparator.csv"

@@ -5,7 +5,7 @@ import random
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.identity import FileState, Identity
+from pipeline.archive.file_state import FileState, Identity
 from pipeline.archive.store import Kept, Store
 
 Json = dict[str, Any]

@@ -4,9 +4,10 @@ import json
 import os
 import shutil
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import nullcontext
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,11 @@ from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.archive.witness import Witnessed, witnessed_scan
 from pipeline.cli import run
+from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import read_project
+from pipeline.measuring.checked import CheckedScan, checked
 from pipeline.measuring.scan_task import ScanTask
+from pipeline.results.measured_scan import MeasuredScan
 
 SAID = pytest.CaptureFixture[str]
 pytestmark = pytest.mark.usefixtures("in_one_process")
@@ -300,6 +304,35 @@ def test_status_tells_what_changed_outside(folder: Path, capsys: SAID) -> None:
 def test_the_page_of_archives_has_the_table_of_verdicts() -> None:
     text = (Path(__file__).parents[2] / "docs" / "archives.md").read_text(encoding="utf-8")
     assert all(f"| `{verdict}` | {MEANING[verdict]} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)
+
+
+def test_of_many_scans_only_the_lot_of_a_new_one_is_judged_again(
+    folder: Path, three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.archive.together._TOGETHER", 1)
+    beside = list[list[str]]()
+
+    def counted(camera: CameraFile, scans: Sequence[MeasuredScan], *more: Any) -> tuple[CheckedScan, ...]:
+        beside.append([scan.frame.image for scan in scans])
+        return checked(camera, scans, *more)
+
+    monkeypatch.setattr("pipeline.archive.together.checked", counted)
+    shutil.copy(three / "a.tif", folder / "other.tif")  # a copy is no frame of its own, and needs no checks
+    pixels = tifffile.imread(three / "a.tif")
+    for number, (name, lots) in enumerate({"d": [["d"]], "h": [["h"]], "e": [["a", "b", "c", "e"]]}.items()):
+        pixels[5, 5 + number] ^= 1
+        tifffile.imwrite(folder / f"{name}.tif", pixels)
+        if name == "h":
+            (folder / "d.tif").unlink()
+        measure(folder)
+        assert [sorted(lot) for lot in beside] == lots  # by the SHA-256 of their names a, b, c and e are of one lot
+        beside.clear()
+    anew = tmp_path / "anew"
+    shutil.copytree(folder, anew)
+    (anew / "out" / "measurement.db").unlink()
+    measure(anew)
+    assert sorted(chain.from_iterable(beside)) == ["a", "b", "c", "e", "h"]
+    assert marks(anew) == marks(folder)
 
 
 def test_other_programs_read_the_marks(folder: Path) -> None:

@@ -21,7 +21,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
-from pipeline.results.comparator_file import decisions_of, decisions_told, read_comparator, write_comparator
+from pipeline.results.comparator_file import decisions_of, decisions_told, mark_rows, read_comparator, write_comparator
 from pipeline.results.measured_scan import MeasuredScan
 
 TASK = ScanTask("a", "a.tif", ScanOptions(cast(CameraFile, SimpleNamespace()), None, FiducialOptions()))
@@ -220,7 +220,7 @@ def test_what_is_decided_is_not_open_and_every_command_says_who_decided(
 def test_whose_decisions_stand_behind_a_file_is_read_from_its_head(tmp_path: Path) -> None:
     decided = {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line\nend"): 3}
     path = tmp_path / "comparator.csv"
-    write_comparator(path, [FrameMeasurement("f", (weak("1"),))], {"f": (20.0, 20.0)}, decided=decided)
+    write_comparator(path, mark_rows([FrameMeasurement("f", (weak("1"),))]), {"f": (20.0, 20.0)}, decided=decided)
     read = decisions_of(path)
     assert read == {("a.toml", "ann, the second"): 2, ("b.toml", "bob"): 1, ("b.toml", "line end"): 3}
     said = "a.toml: 2 of ann, the second; b.toml: 1 of bob, 3 of line end"

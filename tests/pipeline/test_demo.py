@@ -13,7 +13,7 @@ from single_scans import measure_scan
 from pipeline.cli import DONE, run
 from pipeline.files.project_file import read_project
 from pipeline.rendered.against_truth import compare_with_truth
-from pipeline.results.comparator_file import write_comparator
+from pipeline.results.comparator_file import mark_rows, write_comparator
 
 in_its_group = pytest.mark.xdist_group("demonstration")  # one run of it serves all
 
@@ -59,7 +59,7 @@ def test_the_order_of_points_csv_changes_no_digit(finished: tuple[Path, int], tm
     (tmp_path / "points.csv").write_text("\n".join([head, *rows]), encoding="utf-8")
     project = read_project(tmp_path / "project.toml")
     scan = measure_scan(project, "frame1")
-    write_comparator(project.comparator, [scan.frame], {"frame1": scan.pitch_um})
+    write_comparator(project.comparator, mark_rows([scan.frame]), {"frame1": scan.pitch_um})
     before = (finished[0] / "comparator.csv").read_text(encoding="utf-8").splitlines()
     shuffled = project.comparator.read_text(encoding="utf-8").splitlines()
     assert marks_of("frame1", shuffled) == marks_of("frame1", before)

@@ -28,6 +28,7 @@ from pipeline.files.template_table import saved_in
 from pipeline.measuring.measurable import check_measurable
 from pipeline.results.comparator_file import (
     comparator_from_pixel,
+    mark_rows,
     pixel_from_comparator,
     read_comparator,
     write_comparator,
@@ -244,7 +245,7 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
         MarkMeasurement("7", "target", None, None, Status.ABSENT, Reason('outside, "far" off', Code.OUTSIDE)),
     )
     path = tmp_path / "comparator.csv"
-    write_comparator(path, [FrameMeasurement("#1", marks)], {"#1": (20.0, 10.0)})
+    write_comparator(path, mark_rows([FrameMeasurement("#1", marks)]), {"#1": (20.0, 10.0)})
     first, second = read_comparator(path)
     assert first.image == "#1"  # a line that begins with # would be a comment
     assert first.xy_mm is not None

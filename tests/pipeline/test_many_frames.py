@@ -18,7 +18,7 @@ from pipeline.cli import run
 from pipeline.many_frames import MOST_FRAMES, reduced
 from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.page import render_frame_page
-from pipeline.results.comparator_file import ComparatorPoint, write_comparator
+from pipeline.results.comparator_file import ComparatorPoint, mark_rows, write_comparator
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
 FRAMES, MARKS = 3000, 8
@@ -189,7 +189,7 @@ def test_scans_come_from_the_store_one_after_the_other(tmp_path: Path) -> None:
         scans.append(replace(one, scan=str(file), frame=replace(one.frame, image=file.stem)))
     digest = keep_scans(tmp_path / "out" / "measurement.db", scans)
     pitches = {each.frame.image: each.pitch_um for each in scans}
-    write_comparator(tmp_path / "comparator.csv", [each.frame for each in scans], pitches, digest)
+    write_comparator(tmp_path / "comparator.csv", mark_rows([each.frame for each in scans]), pitches, digest)
     assert run(["report", str(project), "--frames", "0001", "0010"]) == 0
     assert "12000 × 12000 px" in (tmp_path / "out" / "frames" / "0010.html").read_text(encoding="utf-8")
     assert run(["report", str(project)]) == 1

@@ -12,7 +12,8 @@ from moto.server import ThreadedMotoServer
 from range_server import range_server
 
 from measure.scans import addresses
-from pipeline.archive.identity import file_state, parts_hash
+from pipeline.archive.file_state import file_state
+from pipeline.archive.identity import parts_hash
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project

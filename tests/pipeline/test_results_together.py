@@ -24,7 +24,7 @@ from pipeline.cli import run
 from pipeline.files.project_file import read_project
 from pipeline.publishing.made_from import measured_from
 from pipeline.report_data import adjusted
-from pipeline.results.comparator_file import read_comparator, write_comparator
+from pipeline.results.comparator_file import mark_rows, read_comparator, write_comparator
 from pipeline.results.fingerprints import fingerprint, of_scan
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.summary import summarise
@@ -55,7 +55,7 @@ def measured_as(folder: Path, scans: tuple[MeasuredScan, ...]) -> None:
     project = read_project(folder / "project.toml")
     digest = keep_scans(project.measurement_path, scans, measured_from(project))
     frames, pitch_um = [scan.frame for scan in scans], {scan.frame.image: scan.pitch_um for scan in scans}
-    write_comparator(project.comparator, frames, pitch_um, digest)
+    write_comparator(project.comparator, mark_rows(frames), pitch_um, digest)
 
 
 def one_scan_more(folder: Path) -> MeasuredScan:

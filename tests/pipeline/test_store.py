@@ -7,6 +7,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,27 @@ import pytest
 import tifffile
 from made_records import dump, failed, kept, record
 
-from pipeline.archive.identity import content_hash, file_state, parts_hash
-from pipeline.archive.judging import JudgedScan, drop_all_but, judge, judged_records, judging_of, latest
+from pipeline.archive.file_state import file_state
+from pipeline.archive.identity import content_hash, parts_hash
+from pipeline.archive.judging import (
+    JudgedScan,
+    Lot,
+    drop_all_but,
+    judge,
+    judge_lots,
+    judged_marks,
+    judged_records,
+    judging_of,
+    latest,
+)
 from pipeline.archive.key import fingerprint, options_hash, shard_of
 from pipeline.archive.merge import merge
 from pipeline.archive.schema import MIGRATIONS, VERSION, opened
 from pipeline.archive.store import Store
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict, verdict_of
 from pipeline.errors import InputError
+from pipeline.results.comparator_file import mark_rows
+from pipeline.results.measured_record import scan_of
 
 
 @pytest.fixture
@@ -81,6 +95,50 @@ def test_a_judging_changes_what_is_seen_and_not_what_was_measured(path: Path) ->
         seen = store.connection.execute("select image, status from mark_view where status = 'weak'").fetchall()
         assert seen == [("1", "weak")]
         assert store.connection.execute("select count(*) from judged").fetchone() == (8,)  # of the first alone
+
+
+def test_a_lot_whose_input_was_judged_is_not_judged_again(path: Path) -> None:
+    asked = list[str]()
+
+    def lot(input_hash: str, *seeds: int) -> Lot:
+        def frames() -> Iterator[JudgedScan]:
+            asked.append(input_hash)
+            for seed in seeds:
+                now = record(seed)
+                now["marks"][seed] |= {"status": "weak", "reason": f"by {input_hash}"}
+                yield JudgedScan(str(seed), store.keep(kept(seed), str(seed)), now)
+
+        return Lot(input_hash, frames)
+
+    with Store(path) as store:
+        first = judge_lots(store, {}, "1", [lot("a", 1, 2), lot("b", 3)])
+        second = judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
+        assert asked == ["a", "b", "c"]
+        assert first != second
+        drop_all_but(store, second)
+        judging = judging_of(store, second)
+        assert judging is not None
+        said = {name: [m["reason"] for m in r["marks"] if m["reason"]] for name, r in judged_records(store, judging)}
+        assert {name: reasons[-1] for name, reasons in said.items()} == {
+            "1": "by a",
+            "2": "by a",
+            "3": "by c",
+            "4": "by c",
+        }
+    other = path.parent / "other.db"
+    with Store(other) as store:  # the same, all of it judged anew
+        assert judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)]) == second
+        judging = judging_of(store, second)
+        assert judging is not None
+        anew = list(judged_records(store, judging))
+        rows = list(judged_marks(store, judging))
+    with Store(path) as store:
+        judging = judging_of(store, second)
+        assert judging is not None
+        assert list(judged_records(store, judging)) == anew
+        assert list(judged_marks(store, judging)) == rows
+        scans = [scan_of(name, {**one, "problem_codes": []}, Path()).frame for name, one in anew]
+        assert list(mark_rows(scans)) == rows
 
 
 def test_one_judging_takes_the_place_of_another(path: Path) -> None:

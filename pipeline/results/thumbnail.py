@@ -1,0 +1,111 @@
+"""Small pictures of a scan, cut from what is decoded when it is measured: a window about each mark, and the whole."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.results import MarkMeasurement
+from measure.scans.scan import Scan
+from pipeline.results.measured_scan import MeasuredScan
+
+_FIDUCIAL_PX, _TARGET_PX = 81, 41  # the least width of a window
+_SHOWN_PX = 96  # a larger window is reduced to about this many pixels
+_REACH_SIZES = 2.0  # a window's width in the mark's own
+_WHOLE_PX = 640  # the longer side of the whole scan, at most
+_WHOLE = ("", "frame")  # as a mark's name and kind
+_LOST_PER_MILLE = 1  # of a window's pixels, that may be darker or lighter than all that is told apart
+_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 85]
+
+
+@dataclass(frozen=True)
+class Thumbnail:
+    """A mark cut from its scan.
+
+    pixels (rows, columns): grey values on any scale; origin_px: column and row, in the scan, of the centre of its
+    top-left pixel; step_px: scan pixels to a thumbnail pixel, above 1 where it was reduced.
+    """
+
+    pixels: NDArray[np.generic]
+    origin_px: tuple[float, float]
+    step_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 2 or 0 in self.pixels.shape:
+            raise ValueError(f"a thumbnail has rows and columns of grey values, not the shape {self.pixels.shape}")
+        if not self.step_px > 0.0:
+            raise ValueError(f"step_px must be positive, not {self.step_px}")
+
+    @property
+    def jpeg(self) -> bytes:
+        """In 8 bits, from its darkest to its lightest but for a few."""
+        grey = self.pixels.astype(np.float64)
+        low, high = np.percentile(grey, [_LOST_PER_MILLE / 10, 100 - _LOST_PER_MILLE / 10])
+        stretched = np.rint(np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0) * 255.0)
+        return bytes(cv2.imencode(".jpg", stretched.astype(np.uint8), _QUALITY)[1])
+
+
+@dataclass(frozen=True)
+class StoredThumbnail:
+    """A thumbnail as a file's content. point, kind: of the mark; "" and "frame" of the whole scan."""
+
+    point: str
+    kind: str
+    origin_px: tuple[float, float]
+    step_px: float
+    jpeg: bytes
+
+    @classmethod
+    def of(cls, thumbnail: Thumbnail, point: str, kind: str) -> "StoredThumbnail":
+        return cls(point, kind, thumbnail.origin_px, thumbnail.step_px, thumbnail.jpeg)
+
+    @property
+    def thumbnail(self) -> Thumbnail:
+        pixels = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        return Thumbnail(np.asarray(pixels), self.origin_px, self.step_px)
+
+    @property
+    def is_whole(self) -> bool:
+        return (self.point, self.kind) == _WHOLE
+
+
+def stored_thumbnails(scan: Scan, measured: MeasuredScan) -> tuple[StoredThumbnail, ...]:
+    """All of a scan that was just measured: of its marks, and of the whole where measuring looked at it."""
+    marks = [(mark, cut(scan, mark)) for mark in measured.frame.marks]
+    whole = [StoredThumbnail.of(picture, *_WHOLE) for picture in _whole(scan)]
+    return (*whole, *(StoredThumbnail.of(picture, m.point, m.kind) for m, picture in marks if picture is not None))
+
+
+def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
+    """The window about a mark; None where it has no place in the scan. Raises MeasurementError as the scan does."""
+    if mark.center_px is None:
+        return None
+    half = _half_px(mark)
+    col0, row0 = (round(float(value)) - half for value in mark.center_px)
+    width = 2 * half + 1
+    if col0 >= scan.width_px or row0 >= scan.height_px or col0 + width <= 0 or row0 + width <= 0:
+        return None
+    window = scan.window(col0, row0, width, width)
+    step = max(1, width // _SHOWN_PX)
+    size = width // step
+    pixels = cv2.resize(window[: size * step, : size * step], (size, size), interpolation=cv2.INTER_AREA)
+    middle = (step - 1) / 2.0
+    return Thumbnail(np.asarray(pixels), (col0 + middle, row0 + middle), float(step))
+
+
+def _half_px(mark: MarkMeasurement) -> int:
+    """Half the width of the window about a mark."""
+    least = _FIDUCIAL_PX if mark.kind == "fiducial" else _TARGET_PX
+    return max(least // 2, int(np.ceil(_REACH_SIZES * mark.quality.get("size_px", 0.0) / 2.0)))
+
+
+def _whole(scan: Scan) -> Iterator[Thumbnail]:
+    seen = scan.seen_whole
+    if seen is not None:
+        factor, grey = seen
+        step = max(1, -(-max(grey.shape) // _WHOLE_PX))
+        size = grey.shape[1] // step, grey.shape[0] // step
+        pixels = cv2.resize(grey[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA)
+        yield Thumbnail(np.asarray(pixels), ((factor * step - 1) / 2.0,) * 2, float(factor * step))
