@@ -14,6 +14,7 @@ class Code(StrEnum):
     OUTSIDE = "outside"
     DAMAGED_FILE = "damaged-file"
     FAILED_SCAN = "failed-scan"
+    UNREACHABLE = "unreachable"
     NO_FRAME = "no-frame"
     NOT_FOUND = "not-found"
     GROUND = "ground"
@@ -57,6 +58,7 @@ MEANING = {
     Code.OUTSIDE: "Its place lies outside of the scan, or behind the camera.",
     Code.DAMAGED_FILE: "The scan's file does not give the pixels there.",
     Code.FAILED_SCAN: "The scan could not be measured at all: its failure says why.",
+    Code.UNREACHABLE: "It could not be looked at once more: the scan is gone, or the process that did it was ended.",
     Code.NO_FRAME: "No frame of the camera was found in the scan.",
     Code.NOT_FOUND: "Nothing near its place looks like it.",
     Code.GROUND: "The ground is as light or as dark as the mark: it cannot stand out there.",

@@ -63,7 +63,7 @@ def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = Non
     with unpublished(project) as new:
         scans = _measured_marks(project, new, reporter, work) if project.scans else ()
         try:
-            adjustment = _adjusted_marks(project, scans, new, reporter)
+            adjustment = _adjusted_marks(project, scans, new, reporter, work)
             if adjustment is None:
                 for path in (project.adjustment_path, covariance_path(project.adjustment_path), project.check_path):
                     new.remove(path)  # of an earlier run
@@ -191,16 +191,19 @@ def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkO
 
 
 def _adjusted_marks(
-    project: Project, scans: Sequence[MeasuredScan], new: Unpublished, reporter: Reporter
+    project: Project, scans: Sequence[MeasuredScan], new: Unpublished, reporter: Reporter, work: WorkOptions | None
 ) -> Adjustment | None:
     """The adjustment, after a second visit to the scans where that found more; None where nothing is to be adjusted."""
     marks = _given_marks(project, new)
     if scans and not anything_to_adjust(project, marks):
         return None
     adjustment = adjust_marks(project, marks)
+    if not scans:
+        return adjustment
     from pipeline.adjusting.second_visit import measure_again
+    from pipeline.archive.measure_archive import executor_of
 
-    again = measure_again(project, scans, adjustment, reporter)
+    again = measure_again(project, scans, adjustment, reporter, lambda: executor_of(project, work or WorkOptions()))
     if again is None:
         return adjustment
     _write_again(project, again, new)

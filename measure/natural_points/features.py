@@ -26,20 +26,24 @@ _STRETCH = (0.5, 99.5)  # percentiles of the grey values that become black and w
 @dataclass(frozen=True, eq=False)
 class Features:
     """places_px (n, 2): column and row in the scan; descriptors (n, 128); strengths (n,): SIFT's contrast.
-    textures (n,): how well the picture about them fixes a place, in any unit."""
+    textures (n,): how well the picture about them fixes a place, in any unit. size_px: width and height of the scan;
+    reduction: by which it was reduced before they were sought."""
 
     places_px: Array
     descriptors: NDArray[np.float32]
     strengths: Array
     textures: Array
+    size_px: tuple[int, int] = (0, 0)
+    reduction: int = 1
 
     def chosen(self, rows: Indices) -> "Features":
-        return Features(self.places_px[rows], self.descriptors[rows], self.strengths[rows], self.textures[rows])
-
-
-def reduction(scan: Scan) -> int:
-    """The factor by which a scan is reduced before features are sought in it."""
-    return -(-max(scan.width_px, scan.height_px) // _LONGEST_PX)
+        return replace(
+            self,
+            places_px=self.places_px[rows],
+            descriptors=self.descriptors[rows],
+            strengths=self.strengths[rows],
+            textures=self.textures[rows],
+        )
 
 
 def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, count: int) -> Features:
@@ -48,7 +52,8 @@ def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, c
     usable: which places (n, 2) in px may hold one. mirrored: whether the scan shows the field as a mirror does; a turn
     needs no word, for descriptors turn with the picture.
     """
-    factor = reduction(scan)
+    size_px = scan.width_px, scan.height_px
+    factor = -(-max(size_px) // _LONGEST_PX)
     picture = _eight_bit(scan.reduced(factor))
     if mirrored:
         picture = np.ascontiguousarray(picture[:, ::-1])
@@ -56,9 +61,9 @@ def find_features(scan: Scan, usable: Callable[[Array], Mask], mirrored: bool, c
     places = found.places_px
     if mirrored:
         places = np.array([picture.shape[1] - 1, 0]) + places * np.array([-1, 1])
-    found = replace(found, places_px=places * factor + (factor - 1) / 2)
+    found = replace(found, places_px=places * factor + (factor - 1) / 2, size_px=size_px, reduction=factor)
     found = found.chosen(np.flatnonzero(usable(found.places_px)))
-    return found.chosen(_spread(found, np.array([scan.width_px, scan.height_px]), count))
+    return found.chosen(_spread(found, np.array(size_px), count))
 
 
 def shared_features(first: Features, second: Features) -> Indices:

@@ -6,20 +6,23 @@ ordered so that the first of them, however many, spread evenly over the frames.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from measure.errors import MeasurementError
 from measure.natural_points.epipolar import agreeing
-from measure.natural_points.features import Features, find_features, in_turn, reduction, shared_features
+from measure.natural_points.features import Features, find_features, in_turn, shared_features
 from measure.natural_points.local_maps import LocalMaps
 from measure.natural_points.multi_image import RADIUS_PX
 from measure.natural_points.tie_frame import TieFrame
-from measure.scans.parallel import mapped
+from measure.reason import Code, Reason
+from measure.scans.parallel import mapped_or_lost
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -43,35 +46,44 @@ class TieCandidate:
     radius_px: int = RADIUS_PX
 
 
-def frame_features(wanted: int, frame: TieFrame) -> Features:
-    """The features of a scan from which so many natural points are to come."""
+def found_features(frames: Sequence[TieFrame], wanted: int, workers: Executor | None) -> Iterator[Features | Reason]:
+    """The features of every scan from which so many natural points are to come; or why it has none."""
+    return mapped_or_lost(workers, partial(_features, wanted), frames, lambda _, why: out_of_reach(why))
+
+
+def _features(wanted: int, frame: TieFrame) -> Features | Reason:
     count = max(_FEATURES * wanted, _LEAST_FEATURES)
-    with frame.open() as scan:
-        size = (scan.width_px, scan.height_px)
-        return find_features(scan, lambda places: frame.usable(places, size), frame.mirrored, count)
+    try:
+        with frame.open() as scan:
+            size = (scan.width_px, scan.height_px)
+            return find_features(scan, lambda places: frame.usable(places, size), frame.mirrored, count)
+    except MeasurementError as error:
+        return out_of_reach(str(error))
+
+
+def out_of_reach(why: str) -> Reason:
+    """Of a scan that could not be looked at once more."""
+    return Reason(f"No natural points are sought here: {why}", Code.UNREACHABLE)
 
 
 def verified(
     frames: Sequence[TieFrame], features: Sequence[Features], workers: Executor | None
 ) -> dict[tuple[int, int], Indices]:
-    """By pair of frames the features that they share, as far as one epipolar geometry explains them."""
+    """By pair of frames the features that they share, as far as one epipolar geometry explains them; none of a pair
+    over which its process was ended."""
     shared = {}
     both = list(combinations(range(len(frames)), 2))
-    found = mapped(workers, _shared, [(features[i], features[j]) for i, j in both])
+    pairs_of = [(features[i], features[j]) for i, j in both]
+    found = mapped_or_lost(workers, _shared, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
     for (i, j), pairs in zip(both, found, strict=True):
         first = frames[i].camera_px(features[i].places_px[pairs[:, 0]])
         second = frames[j].camera_px(features[j].places_px[pairs[:, 1]])
-        shared[i, j] = pairs[agreeing(first, second, _AGREE_PX * _reduction(frames[i]))]
+        shared[i, j] = pairs[agreeing(first, second, _AGREE_PX * features[i].reduction)]
     return shared
 
 
 def _shared(pair: tuple[Features, Features]) -> Indices:
     return shared_features(*pair)
-
-
-def _reduction(frame: TieFrame) -> int:
-    with frame.open() as scan:
-        return reduction(scan)
 
 
 def candidates(
@@ -83,15 +95,14 @@ def candidates(
     many a feature that the matching of the whole patch still finds.
     """
     maps = LocalMaps(features, shared)
-    sizes = [_size_px(frame) for frame in frames]
     found, cells, textures = [], [], []
     for track in join_tracks(shared):
         reference = _most_central(frames, features, track)
-        candidate = TieCandidate(reference, _maps(frames, features, sizes, maps, track, reference))
+        candidate = TieCandidate(reference, _maps(frames, features, maps, track, reference))
         if len(candidate.maps) < fewest:
             continue
         place = frames[reference].camera_px(candidate.maps[reference][None, :, 2])[0]
-        col, row = np.floor(place * _CELLS / _width_px(frames[reference], sizes[reference])).astype(int)
+        col, row = np.floor(place * _CELLS / _width_px(frames[reference], features[reference].size_px)).astype(int)
         found.append(candidate)
         cells.append((reference * 1000 + col) * 1000 + row)
         textures.append(min(features[frame].textures[feature] for frame, feature in track.items()))
@@ -99,7 +110,11 @@ def candidates(
 
 
 def widened(
-    candidates: Sequence[TieCandidate], radius_px: int, frames: Sequence[TieFrame], fewest: int
+    candidates: Sequence[TieCandidate],
+    radius_px: int,
+    frames: Sequence[TieFrame],
+    sizes_px: Sequence[tuple[int, int]],
+    fewest: int,
 ) -> list[TieCandidate]:
     """The candidates with patches of that radius, as far as at least `fewest` frames, the defining one among them, show
     these whole."""
@@ -107,7 +122,7 @@ def widened(
     for i, frame in enumerate(frames):
         own = [k for k, candidate in enumerate(candidates) if i in candidate.maps]
         places = np.array([candidates[k].maps[i][:, 2] for k in own]).reshape(-1, 2)
-        for k in np.array(own, int)[frame.usable(places, _size_px(frame), radius_px)]:
+        for k in np.array(own, int)[frame.usable(places, sizes_px[i], radius_px)]:
             shown[k][i] = candidates[k].maps[i]
     return [
         TieCandidate(candidate.reference, maps, radius_px)
@@ -119,7 +134,6 @@ def widened(
 def _maps(
     frames: Sequence[TieFrame],
     features: Sequence[Features],
-    sizes: Sequence[tuple[int, int]],
     maps: LocalMaps,
     track: Track,
     reference: int,
@@ -133,14 +147,9 @@ def _maps(
             continue
         if frame in track:
             local[:, 2] = features[frame].places_px[track[frame]]
-        if frame in track or frames[frame].usable(local[None, :, 2], sizes[frame])[0]:
+        if frame in track or frames[frame].usable(local[None, :, 2], features[frame].size_px)[0]:
             found[frame] = local
     return found
-
-
-def _size_px(frame: TieFrame) -> tuple[int, int]:
-    with frame.open() as scan:
-        return scan.width_px, scan.height_px
 
 
 def _width_px(frame: TieFrame, size_px: tuple[int, int]) -> float:

@@ -15,20 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from measure.errors import MeasurementError
 from measure.natural_points.bending import Bending, bending_variance
 from measure.natural_points.epipolar import contradicting
 from measure.natural_points.local_maps import outliers
 from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
-from measure.natural_points.tie_candidates import TieCandidate, widened
+from measure.natural_points.tie_candidates import TieCandidate, out_of_reach, widened
 from measure.natural_points.tie_frame import TieFrame
 from measure.noise.noise import robust_scale
 from measure.probabilities import POINT_REFUSED
 from measure.reason import Code, Reason
-from measure.scans.parallel import mapped
+from measure.scans.parallel import mapped_or_lost
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Windows = dict[int, tuple[NDArray[np.float32], tuple[int, int]]]
+Window = tuple[NDArray[np.float32], tuple[int, int]]
+Windows = dict[int, Window | Reason]  # by frame; or why there is none
 
 _RADII_PX = (RADIUS_PX, 21, 30)  # of patches: where the texture is too weak for one, of twice its area
 _WIDEST_PX = 2.0 * _RADII_PX[-1]
@@ -80,13 +82,15 @@ class TiePoint:
 
 def measured_points(
     frames: Sequence[TieFrame],
+    sizes_px: Sequence[tuple[int, int]],
     candidates: Sequence[TieCandidate],
     wanted: int,
     fewest: int,
     workers: Executor | None,
 ) -> list[TiePoint]:
-    """Candidates measured, the first of them first, until so many stand sharply in at least `fewest` scans; none behind
-    the last one wanted. Where too few do, those that are not sharp make room for wider patches.
+    """Candidates measured in scans of these sizes, the first of them first, until so many stand sharply in at least
+    `fewest` scans; none behind the last one wanted. Where too few do, those that are not sharp make room for wider
+    patches.
 
     No two patches overlap: the errors of neighbours would be correlated, and the adjustment takes them for independent.
     A candidate beside one that could not be matched still has its chance; not one beside a point that is refused by
@@ -94,7 +98,7 @@ def measured_points(
     """
     points, matched, sharp = list[TiePoint](), list[TiePoint](), np.zeros(0, dtype=bool)
     for radius_px in _RADII_PX:
-        left = widened(candidates, radius_px, frames, fewest)
+        left = widened(candidates, radius_px, frames, sizes_px, fewest)
         if not left or sharp.sum() >= wanted:
             break
         settled = [bool(own or point.refused) and bool(point.matched) for own, point in zip(sharp, points, strict=True)]
@@ -102,8 +106,9 @@ def measured_points(
         while left and sharp.sum() < wanted:
             missing = max(wanted - int(sharp.sum()), wanted // _LEAST_BATCH)
             chosen, left = _apart(left, [point.candidate for point in matched if point.matched], missing)
-            windows = _windows(frames, chosen)
-            matched += mapped(workers, partial(_point, fewest), list(zip(chosen, windows, strict=True)), _CHUNK)
+            windows = _windows(frames, chosen, workers)
+            with_windows = list(zip(chosen, windows, strict=True))
+            matched += mapped_or_lost(workers, partial(_point, fewest), with_windows, _lost_point, _CHUNK)
             points = _straightened(matched)
             _judge(frames, points)
             sharp = np.array([sum(map(point.is_sharp, point.standing)) >= fewest for point in points], dtype=bool)
@@ -154,39 +159,61 @@ class _Taken:
         return False
 
 
-def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate]) -> list[Windows]:
-    """The windows of every candidate by frame, one scan after the other: no more than one is open at a time."""
+def _windows(frames: Sequence[TieFrame], candidates: Sequence[TieCandidate], workers: Executor | None) -> list[Windows]:
+    """The windows of every candidate by frame; each scan is opened once, by one worker."""
     windows: list[Windows] = [{} for _ in candidates]
-    for i, frame in enumerate(frames):
-        with frame.open() as scan:
-            own = [k for k, candidate in enumerate(candidates) if i in candidate.maps]
-            for k in sorted(own, key=lambda k: candidates[k].maps[i][1, 2]):
-                matrix = candidates[k].maps[i]
-                half = int(np.ceil(candidates[k].radius_px * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
-                col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
-                windows[k][i] = (scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0))
+    shown = [[k for k, candidate in enumerate(candidates) if i in candidate.maps] for i in range(len(frames))]
+    sought = [
+        (frame, [(candidates[k].maps[i], candidates[k].radius_px) for k in own])
+        for i, (frame, own) in enumerate(zip(frames, shown, strict=True))
+    ]
+    for i, found in enumerate(mapped_or_lost(workers, _windows_of, sought, lambda _, why: out_of_reach(why))):
+        for number, k in enumerate(shown[i]):
+            windows[k][i] = found if isinstance(found, Reason) else found[number]
     return windows
+
+
+def _windows_of(sought: tuple[TieFrame, Sequence[tuple[Array, int]]]) -> list[Window] | Reason:
+    """About places in one scan, by their maps and radii, read from top to bottom."""
+    frame, patches = sought
+    windows: dict[int, Window] = {}
+    try:
+        with frame.open() as scan:
+            for k in sorted(range(len(patches)), key=lambda k: patches[k][0][1, 2]):
+                matrix, radius_px = patches[k]
+                half = int(np.ceil(radius_px * np.linalg.norm(matrix[:, :2], 2))) + SPARE_PX
+                col0, row0 = (int(value) - half for value in np.round(matrix[:, 2]))
+                windows[k] = (scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0))
+    except MeasurementError as error:
+        return out_of_reach(str(error))
+    return [windows[k] for k in range(len(patches))]
+
+
+def _lost_point(sought: tuple[TieCandidate, Windows], why: str) -> TiePoint:
+    return TiePoint(sought[0], {}, {i: out_of_reach(why) for i in sought[0].maps})
 
 
 def _point(fewest: int, sought: tuple[TieCandidate, Windows]) -> TiePoint:
     """The candidate measured; a frame that cannot be matched is left out where enough others remain."""
     candidate, windows = sought
+    failed = {i: window for i, window in windows.items() if isinstance(window, Reason)}
+    shown = {i: window for i, window in windows.items() if not isinstance(window, Reason)}
     members, unmatched = sorted(candidate.maps), dict[int, Reason]()
     while True:
-        pieces = [Piece(*windows[i], candidate.maps[i]) for i in members]
-        matched = dict(
-            zip(members, match_pieces(pieces, members.index(candidate.reference), candidate.radius_px), strict=True)
-        )
-        failed = {i: piece.reason for i, piece in matched.items() if piece.reason}
         if not failed:
-            return TiePoint(candidate, matched, unmatched)
+            pieces = [Piece(*shown[i], candidate.maps[i]) for i in members]
+            reference = members.index(candidate.reference)
+            matched = dict(zip(members, match_pieces(pieces, reference, candidate.radius_px), strict=True))
+            failed = {i: piece.reason for i, piece in matched.items() if piece.reason}
+            if not failed:
+                return TiePoint(candidate, matched, unmatched)
         unmatched |= failed
         left = [i for i in members if i not in failed]
         if candidate.reference in failed or len(left) < fewest:
             first = next(iter(failed.values()))
             alike = first.told(f"cannot be matched: {first} in another scan")
             return TiePoint(candidate, {}, {i: unmatched.get(i, alike) for i in candidate.maps})
-        members = left
+        members, failed = left, {}
 
 
 def _straightened(points: Sequence[TiePoint]) -> list[TiePoint]:

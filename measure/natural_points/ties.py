@@ -2,19 +2,18 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from measure.covariance import Covariance
 from measure.natural_points.epipolar import FEWEST_PAIRS
-from measure.natural_points.tie_candidates import Shared, candidates, frame_features, verified
+from measure.natural_points.features import Features
+from measure.natural_points.tie_candidates import Shared, candidates, found_features, verified
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.tie_points import TiePoint, measured_points
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
-from measure.scans.parallel import mapped
 from measure.status import Status
 
 Progress = Callable[[str, int, int], None]
@@ -38,10 +37,11 @@ class TieOptions:
 
 @dataclass(frozen=True, eq=False)
 class Ties:
-    """The natural points by image, and what the user should know, a sentence each."""
+    """The natural points by image, and by image what the user should know, a sentence each: of all scans together with
+    the first of them."""
 
     marks: Mapping[str, tuple[MarkMeasurement, ...]]
-    problems: tuple[Reason, ...] = ()
+    problems: Mapping[str, tuple[Reason, ...]]
 
 
 def measure_ties(
@@ -50,24 +50,31 @@ def measure_ties(
     progress: Progress | None = None,
     workers: Executor | None = None,
 ) -> Ties:
-    """Find and measure natural points. Never raises for what the pictures show; raises MeasurementError for scans that
-    cannot be read.
+    """Find and measure natural points. Raises nothing for what the pictures show, nor for a scan that cannot be read or
+    whose worker is ended: that one has none, and a problem says why.
 
     progress: called with what has been done, the steps done and their number. workers: processes that share the work;
     the result does not depend on their number.
     """
     options, tell = options or TieOptions(), progress or (lambda *_: None)
     steps = len(frames) + 2
-    features = []
-    for frame, found in zip(frames, mapped(workers, partial(frame_features, options.wanted), frames), strict=True):
-        features.append(found)
-        tell(frame.image, len(features), steps)
+    seen, unseen = list[tuple[TieFrame, Features]](), dict[str, tuple[Reason, ...]]()
+    found = found_features(frames, options.wanted, workers)
+    for done, (frame, features_or_reason) in enumerate(zip(frames, found, strict=True), 1):
+        if isinstance(features_or_reason, Reason):
+            unseen[frame.image] = (features_or_reason,)
+        else:
+            seen.append((frame, features_or_reason))
+        tell(frame.image, done, steps)
+    frames, features = [frame for frame, _ in seen], [each for _, each in seen]
     shared = verified(frames, features, workers)
-    tell("pairs of scans", len(frames) + 1, steps)
+    tell("pairs of scans", len(unseen) + len(frames) + 1, steps)
     sought = candidates(frames, features, shared, options.images)
-    points = measured_points(frames, sought, options.wanted, options.images, workers)
+    sizes_px = [each.size_px for each in features]
+    points = measured_points(frames, sizes_px, sought, options.wanted, options.images, workers)
     tell("all scans together", steps, steps)
-    return _result(frames, points, len(sought), shared, options)
+    found_all = _result(frames, points, len(sought), shared, options)
+    return replace(found_all, problems={**unseen, **found_all.problems})
 
 
 def _result(
@@ -82,9 +89,9 @@ def _result(
         for frame in point.candidate.maps:
             marks[frames[frame].image].append(_mark(f"tie{number:04d}", point, frame, options))
     found = sum(len(point.standing) >= options.images for point in points)
-    return Ties(
-        {image: tuple(own) for image, own in marks.items()}, _problems(frames, found, candidate_count, shared, options)
-    )
+    problems = _problems(frames, found, candidate_count, shared, options)
+    by_image = {frames[0].image: problems} if frames and problems else {}
+    return Ties({image: tuple(own) for image, own in marks.items()}, by_image)
 
 
 def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMeasurement:

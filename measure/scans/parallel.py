@@ -1,7 +1,7 @@
 """Work shared among processes or threads, or done here where there are none."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -16,6 +16,43 @@ def mapped(
 ) -> Iterator[Made]:
     """The function of every item, in their order. chunk: how many items a worker gets at a time."""
     return map(function, items) if workers is None else workers.map(function, items, chunksize=chunk)
+
+
+def mapped_or_lost(
+    workers: Executor | None,
+    function: Callable[[Item], Made],
+    items: Sequence[Item],
+    lost: Callable[[Item, str], Made],
+    chunk: int = 1,
+) -> Iterator[Made]:
+    """The same, but what a worker was ended over costs none of the others. lost: what is made of such an item, and of
+    why it is one."""
+    if workers is None:
+        yield from map(function, items)
+        return
+    parts = [items[first : first + chunk] for first in range(0, len(items), chunk)]
+    working = [_submitted(workers, function, part) for part in parts]
+    for part, future in zip(parts, working, strict=True):
+        try:
+            yield from future.result()
+        except BrokenExecutor as error:
+            if len(part) == 1:
+                yield lost(part[0], str(error))
+            else:  # one of them did it
+                yield from mapped_or_lost(workers, function, part, lost)
+
+
+def _submitted(workers: Executor, function: Callable[[Item], Made], part: Sequence[Item]) -> "Future[list[Made]]":
+    try:
+        return workers.submit(_each, function, part)
+    except BrokenExecutor as error:
+        future: Future[list[Made]] = Future()
+        future.set_exception(error)
+        return future
+
+
+def _each(function: Callable[[Item], Made], part: Sequence[Item]) -> list[Made]:
+    return [function(item) for item in part]
 
 
 def side_by_side(function: Callable[[Item], Made], items: Iterable[Item]) -> list[Made]:

@@ -1,21 +1,24 @@
 """The second visit to the scans: targets that were missed, sought where the adjustment says they are."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adjust.problem.images import adjusted_image
 from adjust.problem.result import Adjustment
 from measure.checks.lost_pixels import without_lost
-from measure.errors import MeasurementError
 from measure.reason import Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.addresses import scan_path
 from measure.scans.scan import open_scan
+from measure.single_targets.targets import TargetPrediction
 from measure.status import Status
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
+from pipeline.measuring.handed_out import results_of
 from pipeline.measuring.target_field import Field, measure_single_targets, target_field
 from pipeline.measuring.target_places import checked_places
 from pipeline.measuring.target_stage import with_targets
@@ -25,32 +28,59 @@ from pipeline.results.measured_scan import MeasuredScan
 _SEARCH_PX = 2.0  # an adjusted orientation predicts to far less than that
 
 
+@dataclass(frozen=True, eq=False)
+class Visit:
+    """A scan to be looked at again: the path or the address of its file, and what is sought in it."""
+
+    image: str
+    scan: str
+    sought: tuple[TargetPrediction, ...]
+    settings: TargetSettings
+    max_pixels: int | None
+
+
 def measure_again(
-    project: Project, scans: Sequence[MeasuredScan], adjustment: Adjustment, reporter: Reporter
+    project: Project,
+    scans: Sequence[MeasuredScan],
+    adjustment: Adjustment,
+    reporter: Reporter,
+    executor: Callable[[], AbstractContextManager[Executor]],
 ) -> tuple[MeasuredScan, ...] | None:
     """The scans with what was found on the second visit; None where there is nothing new.
 
-    Only targets that no mark was given to before are sought: what has been measured is not measured anew.
+    Only targets that no mark was given to before are sought: what has been measured is not measured anew. executor:
+    what the scans are shared among, asked for where any is to be looked at.
     """
     settings = project.targets
     if settings is None or settings.board is not None or not adjustment.converged:
         return None
     field = _with_adjusted_points(target_field(project), adjustment)
-    visited = []
-    with reporter.stage("looking again at") as count:
-        for done, scan in enumerate(scans):
-            count(scan.frame.image, done, len(scans))
-            visited.append(_visited(scan, lambda one: _visit(field, one, adjustment, settings, project.max_pixels)))
+    sought = {scan.frame.image: _missed(field, scan, adjustment, settings) for scan in scans}
+    visits = [
+        Visit(scan.frame.image, scan.scan, missed, settings, project.max_pixels)
+        for scan in scans
+        if (missed := sought[scan.frame.image])
+    ]
+    if not visits:
+        return None
+    found = dict[str, tuple[MarkMeasurement, ...] | str]()
+    with executor() as workers, reporter.stage("looking again at") as count:
+        for done, (visit, result) in enumerate(results_of(looked_again, visits, workers), 1):
+            found[visit.image] = str(result) if isinstance(result, Exception) else result
+            count(visit.image, done, len(visits))
+    visited = [_visited(scan, found.get(scan.frame.image, ()), field, adjustment) for scan in scans]
     return tuple(visited) if any(new is not old for new, old in zip(visited, scans, strict=True)) else None
 
 
-def _visited(scan: MeasuredScan, visit: Callable[[MeasuredScan], MeasuredScan]) -> MeasuredScan:
-    """What the first visit gave stays where a second one is not possible any more, and the frame says so."""
+def looked_again(visit: Visit) -> tuple[MarkMeasurement, ...] | str:
+    """What is seen there of what is sought, or why the scan cannot be looked at: this raises nothing but interrupts."""
     try:
-        return visit(scan)
-    except MeasurementError as error:
-        problem = Reason(f"It could not be looked at again: {error}", Code.DAMAGED_FILE)
-        return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
+        with open_scan(scan_path(visit.scan), visit.max_pixels) as opened:
+            grey = opened if visit.settings.code is None else opened.green()
+            marks = without_lost(opened, measure_single_targets(grey, visit.sought, visit.settings))
+    except Exception as error:
+        return " ".join(str(error).split()) or type(error).__name__
+    return tuple(mark for mark in marks if mark.status.is_observation)
 
 
 def _with_adjusted_points(field: Field, adjustment: Adjustment) -> Field:
@@ -62,28 +92,35 @@ def _with_adjusted_points(field: Field, adjustment: Adjustment) -> Field:
     return replace(field, xyz=xyz)
 
 
-def _visit(
-    field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings, max_pixels: int | None
-) -> MeasuredScan:
-    """The same object where the visit brought nothing."""
-    network = adjustment.network
-    if scan.frame.image not in network.image_by_name or scan.frame.image in network.unoriented:
-        return scan
+def _missed(
+    field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings
+) -> tuple[TargetPrediction, ...]:
+    """The targets that are to be sought once more in a scan, where they should be."""
+    network, image = adjustment.network, scan.frame.image
+    if image not in network.image_by_name or image in network.unoriented:
+        return ()
     targets = {mark.point: mark for mark in scan.frame.marks if mark.kind != "fiducial"}
-    model = adjusted_image(adjustment, scan.frame.image)
-    missed = [
+    return tuple(
         prediction
-        for prediction in field.predictions(model, scan, _SEARCH_PX)
+        for prediction in field.predictions(adjusted_image(adjustment, image), scan, _SEARCH_PX)
         if _is_inside(scan, prediction.center_px) and _is_missed(targets.get(prediction.point), settings)
-    ]
-    if not missed:
-        return scan
-    with open_scan(scan_path(scan.scan), max_pixels) as opened:
-        grey = opened if settings.code is None else opened.green()
-        marks = without_lost(opened, measure_single_targets(grey, missed, settings))
-    found = {mark.point: mark for mark in marks if mark.status.is_observation}
+    )
+
+
+def _visited(
+    scan: MeasuredScan, seen: Sequence[MarkMeasurement] | str, field: Field, adjustment: Adjustment
+) -> MeasuredScan:
+    """The scan with what was seen of it, the same object where that is nothing. What the first visit gave stays where a
+    second one was not possible any more, and the frame says so."""
+    if isinstance(seen, str):
+        problem = Reason(f"It could not be looked at again: {seen}", Code.UNREACHABLE)
+        return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
+    targets = {mark.point: mark for mark in scan.frame.marks if mark.kind != "fiducial"}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
-    fresh = {point: mark for point, mark in found.items() if _is_free(mark, np.array(taken).reshape(-1, 2))}
+    fresh = {mark.point: mark for mark in seen if _is_free(mark, np.array(taken).reshape(-1, 2))}
+    if not fresh:
+        return scan
+    model = adjusted_image(adjustment, scan.frame.image)
     checked = checked_places(tuple((targets | fresh).values()), field, model, scan)
     fresh = {mark.point: mark for mark in checked if mark.point in fresh and mark.status.is_observation}
     return with_targets(scan, tuple((targets | fresh).values())) if fresh else scan

@@ -54,7 +54,7 @@ def measure_archive(
     names = check_measurable(project)
     if options.retry:
         store.forget_failed()
-    with _executor(project, options) as executor, ThumbnailStore.beside(store.path) as thumbnails:
+    with executor_of(project, options) as executor, ThumbnailStore.beside(store.path) as thumbnails:
         work = Work(project, store, executor, options, thumbnails)
         learned = learn_marks(project, reporter, work.measure, executor, learned_folder, store)
         tasks = scan_tasks(learned, names, said_of_tones(learned, reporter, work.measure, store))
@@ -81,7 +81,8 @@ def measure_archive(
         return Done(judge_lots(store, made, told, lots), work.counts)
 
 
-def _executor(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:
+def executor_of(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:
+    """What works on the project's scans: processes here, or the workers of a cluster."""
     if options.cluster is not None:
         return cluster_executor(options.cluster, [str(path) for path in project.scans.values()], options.workers)
     return worker_pool(len(project.scans), options.workers)

@@ -6,8 +6,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from itertools import islice
 from typing import Any, Protocol, TypeVar
 
-from pipeline.measuring.scan_task import ScanTask
-
+Task = TypeVar("Task")
 Made = TypeVar("Made")
 
 TASKS_A_CORE = 4  # handed out ahead: enough that no process waits, few enough that little is lost
@@ -21,17 +20,17 @@ class Submits(Protocol):
 
 
 def results_of(
-    function: Callable[[ScanTask], Made],
-    tasks: Iterable[ScanTask],
+    function: Callable[[Task], Made],
+    tasks: Iterable[Task],
     executor: Submits | None = None,
     in_flight: int | None = None,
-) -> Iterator[tuple[ScanTask, Made | Exception]]:
+) -> Iterator[tuple[Task, Made | Exception]]:
     """Each task with what the function makes of it, or with why the executor has lost it. in_flight: as above."""
     if executor is None:
         yield from ((task, function(task)) for task in tasks)
         return
     window = in_flight or TASKS_A_CORE * (os.cpu_count() or 1)
-    left, running = iter(tasks), dict[Future[Made], ScanTask]()
+    left, running = iter(tasks), dict[Future[Made], Task]()
     try:
         while True:
             for task in islice(left, window - len(running)):
@@ -46,7 +45,7 @@ def results_of(
             future.cancel()
 
 
-def _submitted(executor: Submits, function: Callable[[ScanTask], Made], task: ScanTask) -> "Future[Made]":
+def _submitted(executor: Submits, function: Callable[[Task], Made], task: Task) -> "Future[Made]":
     try:
         return executor.submit(function, task)
     except BrokenExecutor as error:

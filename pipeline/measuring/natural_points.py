@@ -45,9 +45,7 @@ def with_ties(
     frames = {scan.frame.image: _tie_frame(project, scan) for scan in scans}
     placed = [frame for frame in frames.values() if frame is not None]
     ties = measure_ties(placed, settings.options, count, workers)
-    problems: dict[str, tuple[Reason, ...]] = {image: (_NO_FRAME,) for image, frame in frames.items() if frame is None}
-    if placed:
-        problems[placed[0].image] = ties.problems
+    problems = {**ties.problems, **{image: (_NO_FRAME,) for image, frame in frames.items() if frame is None}}
     return tuple(
         replace(
             scan,

@@ -1,14 +1,16 @@
 """Work shared among threads: in its order, by as many as OpenCV may use, and with the same result as by one."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from measure.scans.parallel import side_by_side
+from measure.scans.parallel import mapped_or_lost, side_by_side
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
@@ -62,3 +64,22 @@ def test_any_number_of_threads_finds_the_same_disks() -> None:
     one, other = (np.array([disk.center_px for disk in disks]) for disks in found)
     assert len(one) == len(places)
     np.testing.assert_array_equal(one, other)
+
+
+class EndedOver(ThreadPoolExecutor):
+    """Workers that are ended over one item, in whichever part it comes."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        if 5 in args[1]:
+            raise BrokenExecutor("its process was ended")
+        return super().submit(fn, *args, **kwargs)
+
+
+@pytest.mark.parametrize("chunk", [1, 4])
+def test_an_item_that_its_worker_is_ended_over_costs_none_of_the_others(chunk: int) -> None:
+    def lost(item: int, why: str) -> str:
+        return f"{item}: {why}"
+
+    with EndedOver(2) as workers:
+        found = list(mapped_or_lost(workers, str, range(9), lost, chunk))
+    assert found == ["0", "1", "2", "3", "4", "5: its process was ended", "6", "7", "8"]

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any
 
+from pipeline.workers import WorkerKilled
+
 
 class Here(Executor):
     """Does its work at once in this process, pickled on its way there and back as if there were another one."""
@@ -16,4 +18,18 @@ class Here(Executor):
             future.set_result(pickle.loads(pickle.dumps(work[0](*work[1], **work[2]))))
         except Exception as error:
             future.set_exception(pickle.loads(pickle.dumps(error)))
+        return future
+
+
+class Loses(Here):
+    """The same, but ends its process over what it is asked of, each time."""
+
+    def __init__(self, is_deadly: Callable[[Callable[..., Any], tuple[Any, ...]], bool]) -> None:
+        self._is_deadly = is_deadly
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        if not self._is_deadly(fn, args):
+            return super().submit(fn, *args, **kwargs)
+        future: Future[Any] = Future()
+        future.set_exception(WorkerKilled())
         return future

@@ -1,14 +1,19 @@
 """Natural points on rendered terrain, whose places in all frames the scene itself says."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from in_process import Loses
 from scipy.spatial.distance import pdist
 
 from adjust.problem.network import Prior
+from measure.natural_points.tie_candidates import TieCandidate
 from measure.natural_points.tie_frame import TieFrame
 from measure.natural_points.ties import TieOptions, measure_ties
+from measure.reason import Code
 from measure.status import Status
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
@@ -70,6 +75,38 @@ def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
     for own in marks.values():
         observed = [mark.center_px for mark in own.values() if mark.status in (Status.MEASURED, Status.WEAK)]
         assert pdist(np.array(observed)).min() > 26.0, "patches of 31 px overlap"
+
+
+def test_a_worker_that_is_ended_costs_its_scan_or_its_point_and_none_else(tmp_path: Path) -> None:
+    """One process is ended over scan d, another one over a point; and scan e is gone."""
+    images = (*SCENE.images, replace(SCENE.images[0], name="d"), replace(SCENE.images[0], name="e"))
+    truth = render_scene(replace(SCENE, images=images), tmp_path)
+    frames = [tie_frame(frame.geometry, tmp_path) for frame in truth.frames]
+    frames[4].scan.unlink()
+    points = list[TieCandidate]()
+
+    def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
+        """Of a scan and of a point that begins a chunk."""
+        item = args[1][0]
+        if isinstance(item, TieFrame):
+            return item.image == "d"
+        if isinstance(item, tuple) and isinstance(item[0], TieCandidate):
+            points.append(item[0])
+            return np.array_equal(item[0].maps[item[0].reference], points[0].maps[points[0].reference])
+        return False
+
+    ties = measure_ties(frames, TieOptions(wanted=6), workers=Loses(is_deadly))
+    assert {image: [reason.code for reason in own] for image, own in ties.problems.items()} == {
+        "d": [Code.UNREACHABLE],
+        "e": [Code.UNREACHABLE],
+    }
+    assert "its process was ended" in str(ties.problems["d"][0])
+    assert "e.tif" in str(ties.problems["e"][0])
+    marks = [mark for image in "abc" for mark in ties.marks[image]]
+    lost = [mark for mark in marks if Code.UNREACHABLE in mark.reason.codes]
+    assert len(lost) == 3
+    assert {mark.status for mark in lost} == {Status.REJECTED}
+    assert sum(mark.status is Status.MEASURED for mark in marks) >= 15
 
 
 PROJECT = """camera = "camera.toml"

@@ -5,12 +5,14 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from in_process import Loses
 from kept_scans import keep_scans
 from test_command_line import replaced, results, rewritten_scans
 
@@ -19,6 +21,7 @@ from adjust.problem.network import Prior
 from measure.errors import MeasurementError
 from measure.status import Status
 from pipeline import stages
+from pipeline.adjusting import second_visit
 from pipeline.archive.measurement import read_measurement
 from pipeline.cli import run
 from pipeline.files.project_file import read_project
@@ -247,6 +250,28 @@ def test_a_scan_that_vanishes_before_the_second_visit_keeps_what_the_first_gave(
     assert code == 1
     assert told["adjustment"] is not None
     assert "It could not be looked at again: frame2.tif: there is no scan any more." in said(told)
+
+
+def test_a_process_that_is_ended_on_the_second_visit_costs_nothing_that_the_first_gave(
+    project: Path, capsys: SAID, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The visits are shared among processes as the first ones are: one of them is ended over frame2."""
+
+    def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
+        asked.append(args[0])
+        return isinstance(args[0], second_visit.Visit) and args[0].image == "frame2"
+
+    asked = list[Any]()
+    monkeypatch.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: nullcontext(Loses(is_deadly)))
+    monkeypatch.setattr(second_visit, "_is_missed", lambda *_: True)
+    (project / "comparator.csv").unlink()  # what is shown is new
+    code, told = summary(project, capsys, "run")
+    assert code == 1
+    assert told["adjustment"] is not None
+    problems = [one for one in told["problems"] if "could not be looked at again" in one["what"]]
+    assert [one["what"].split(":")[0] for one in problems] == ["frame2"]
+    assert "its process was ended" in problems[0]["what"]
+    assert {visit.image for visit in asked if isinstance(visit, second_visit.Visit)} > {"frame1", "frame2"}
 
 
 def test_a_disk_that_fills_up_while_results_are_written_changes_none(
