@@ -173,7 +173,7 @@ def _in_spite_of_pitch(search: FrameSearch, hypotheses: Hypotheses, tried: int) 
     """The accepted frames under other pitches than the given one, those first that chance makes least, only marks
     without blemish counting. So much freedom finds false frames too."""
     found = search.anywhere(hypotheses)
-    frames = [_as_its_pictures_say(search, found, place) for place in _hopeful(search, found, len(hypotheses))]
+    frames = [_as_its_pictures_say(search, found, place) for place in _hardly_by_chance(search, found, len(hypotheses))]
     expected = [(tried * expected_as_good(search, frame), frame) for frame in frames if frame.accepted]
     return found, sorted(expected, key=_expected)
 
@@ -184,7 +184,7 @@ def _at_a_closer_look(search: FrameSearch, hypotheses: Hypotheses, tried: int) -
 
     The marks' pictures need not be clear: whether a frame is there is one question, which pose it has another."""
     found, seen = search.anywhere(hypotheses), list[tuple[float, Frame]]()
-    for place in _hopeful(search, found, tried):
+    for place in _hardly_by_chance(search, found, tried):
         frames = [frame for frame in _in_its_likeliest_poses(search, found, place) if frame.agrees]
         if frames:
             as_measured = min(expected_where_seen(search, frame, _seen_px(frame)) for frame in frames)
@@ -214,7 +214,7 @@ def _seen_px(frame: Frame) -> dict[int, Array]:
     return {index: fit.center_px for index, fit in enumerate(frame.fits) if fit}
 
 
-def _hopeful(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
+def _hardly_by_chance(search: FrameSearch, found: Sequence[Placement], tried: int) -> list[Placement]:
     """The best placement and its rivals elsewhere, without those of which chance makes many that answer as well."""
     places = (*found[:1], *_others(found))
     return [place for place in places if tried * search.expected_alike(place) <= PLACEMENTS_BY_CHANCE]

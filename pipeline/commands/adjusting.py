@@ -1,0 +1,121 @@
+"""Commands about cameras: adjusted, checked, chosen, compared, oriented without anything known, and planned."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.commands.shared import (
+    DONE,
+    LOOK,
+    AsJson,
+    MaxPixels,
+    OfCamera,
+    OutDir,
+    ProjectFile,
+    SceneFile,
+    finish,
+    pitch_option,
+    read,
+    say,
+    show,
+    with_project,
+)
+from pipeline.errors import InputError
+
+
+def adjust(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
+    """Comparator coordinates to the adjusted camera, in adjustment.json."""
+    from pipeline.stages import run_adjust
+
+    return with_project(project, run_adjust, as_json, max_pixels)
+
+
+def check(project: ProjectFile, as_json: AsJson = False) -> int:
+    """The adjustment against OpenCV's calibration, in check.json."""
+    from pipeline.stages import run_check
+
+    return with_project(project, run_check, as_json)
+
+
+def choose(project: ProjectFile, as_json: AsJson = False) -> int:
+    """Which transformation and distortion the observations ask for, in choose.json."""
+    from pipeline.adjusting.choose_stage import choice_json, print_choice, run_choose
+    from pipeline.progress import Reporter
+
+    settings = read(project)
+    choice = run_choose(settings, Reporter())
+    show(as_json, lambda: choice_json(choice), lambda console: print_choice(choice, console, settings.choice_path))
+    return DONE if choice.chosen and choice.chosen.model == choice.given else LOOK
+
+
+def block(
+    project: ProjectFile,
+    out_dir: OutDir,
+    pitch_um: Annotated[float | None, pitch_option("Of the pictures; by default the scans'.")] = None,
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """Overlapping frames without any orientation: oriented by COLMAP, then adjusted with films, lens and control."""
+    from pipeline.blocks.block_stage import block_lines, run_block
+    from pipeline.progress import Reporter
+    from pipeline.stages import run_adjust
+
+    reporter = Reporter()
+    oriented = run_block(read(project, max_pixels), out_dir, pitch_um, reporter)
+    summary = run_adjust(oriented.project, reporter)
+    if not as_json:
+        say(*block_lines(oriented))
+    code = finish(summary, as_json)
+    return max(code, LOOK) if oriented.left_out else code
+
+
+def compare(
+    adjustments: Annotated[
+        list[Path], typer.Argument(metavar="A/adjustment.json B/adjustment.json...", show_default=False)
+    ],
+    camera: OfCamera = None,
+    times: Annotated[str | None, typer.Option(metavar="T,T,...", help="When they were made: 1952,1958.5.")] = None,
+    flat: Annotated[
+        bool, typer.Option("--flat", help="For use over flat ground, where height and place take up c and the point.")
+    ] = False,
+    level: Annotated[
+        float, typer.Option(min=1e-12, max=0.5, help="Drift is said where chance makes as much more rarely than this.")
+    ] = 0.01,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write compare.json and compare.png there.")] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Calibrations of a camera: where and by how much they differ over the frame; `drift` or `no drift`."""
+    from pipeline.adjusting.compare_stage import DRIFT, comparison_json, print_comparison, run_compare, verdict
+
+    when = None if times is None else _numbers(times)
+    comparison, remarks = run_compare(adjustments, camera, when, "flat" if flat else "space", level, out)
+    show(
+        as_json,
+        lambda: comparison_json(comparison, remarks, level),
+        lambda console: print_comparison(comparison, remarks, level, console),
+    )
+    return LOOK if verdict(comparison, level) == DRIFT else DONE
+
+
+def design(
+    scene: SceneFile,
+    out_dir: Annotated[
+        Path | None, typer.Argument(metavar="[OUT_DIR]", help="Where design.json goes; SCENE-design by default.")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """The precision to be expected of a scene's photographs, without any picture, and what would improve it."""
+    from pipeline.design.run import run_design
+    from pipeline.progress import Reporter
+
+    planned = run_design(scene, out_dir, Reporter())
+    show(as_json, lambda: planned.content, planned.print)
+    return LOOK if planned.needs_a_look else DONE
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--times {text!r} are not numbers with commas between them, as in 1952,1958.5.") from None

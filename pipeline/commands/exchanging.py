@@ -1,0 +1,148 @@
+"""Commands that make files of other kinds: frames, other programs' files, other lenses' words, scenes, templates."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.commands.shared import (
+    DONE,
+    LOOK,
+    AsJson,
+    MaxPixels,
+    OfCamera,
+    OutDir,
+    ProjectFile,
+    SceneFile,
+    one_of,
+    pitch_option,
+    read,
+    say,
+    show,
+)
+from pipeline.errors import InputError
+from pipeline.exchange.convention import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
+from pipeline.text.wording import counted
+
+TEMPLATES = ("project", "camera", "scene")
+
+
+def resample(
+    project: ProjectFile,
+    out_dir: OutDir,
+    pitch_um: Annotated[float | None, pitch_option("The frames' pixel; by default the scan's.")] = None,
+    lens: Annotated[bool, typer.Option("--lens", help="Take the distortion out, too.")] = False,
+    fast: Annotated[bool, typer.Option("--fast", help="Splines of degree 3 in place of 5: a tenth as true.")] = False,
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """The scans in their camera's frame: film transformation and pose taken out."""
+    from pipeline.progress import Reporter
+    from pipeline.resampling.resample_stage import Resampled, resample, resampled_json
+
+    def line(result: Resampled) -> str:
+        told = result.problem or f"{result.width_px} x {result.height_px} px{', as it was' if result.kept else ''}"
+        clamped = f", {result.clamped} samples clamped to what can be stored" if result.clamped else ""
+        return f"{result.image}: {told}{clamped}"
+
+    results = resample(read(project, max_pixels), out_dir, pitch_um, lens, fast, Reporter())
+    show(as_json, lambda: resampled_json(results), lambda _: say(*map(line, results)))
+    return LOOK if any(result.problem for result in results) else DONE
+
+
+def export(
+    project: ProjectFile,
+    format: Annotated[str, typer.Argument(metavar="FORMAT", help=one_of(FORMATS), show_default=False)],
+    out_dir: OutDir,
+    pitch_um: Annotated[float | None, pitch_option("As given to `reseau resample`.")] = None,
+    lens: Annotated[bool, typer.Option("--lens", help="For frames of `reseau resample --lens`.")] = False,
+    misfit_px: Annotated[
+        float,
+        typer.Option("--misfit-px", metavar="PX", min=0.0, help="How far another program's lens may be off."),
+    ] = LARGEST_MISFIT_PX,
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """Marks, camera and poses as the files of another program."""
+    from pipeline.exchange.export_stage import run_export
+
+    done = run_export(read(project, max_pixels), format, out_dir, ExportOptions(pitch_um, lens, misfit_px))
+    show(
+        as_json,
+        lambda: {"folder": str(done.folder), "files": done.files, **asdict(replace(done.written, files={}))},
+        lambda _: say(done.told, f"{out_dir}: {counted(len(done.files), 'file')}"),
+    )
+    return LOOK if done.written.left_out else DONE
+
+
+def import_(
+    format: Annotated[str, typer.Argument(metavar="FORMAT", help=one_of(IMPORTED), show_default=False)],
+    paths: Annotated[list[Path], typer.Argument(metavar="FILE... OUT_DIR", show_default=False)],
+    pitch_um: Annotated[float | None, pitch_option("A pixel of the pictures.")] = None,
+    sigma_px: Annotated[
+        float | None, typer.Option("--sigma-px", metavar="PX", min=1e-6, help="Of marks that bring none.")
+    ] = None,
+    from_middle: Annotated[
+        bool, typer.Option("--from-middle", help="The principal point counts from the picture's middle.")
+    ] = False,
+    fiducials: Annotated[bool, typer.Option("--fiducials", help="The marks are fiducials.")] = False,
+) -> int:
+    """Marks, cameras, poses and certificates of other programs as files of this one."""
+    from pipeline.exchange.import_stage import run_import
+    from pipeline.exchange.incoming import ImportOptions
+
+    if len(paths) < 2:
+        raise InputError("name at least one FILE, and then OUT_DIR: reseau import FORMAT FILE... OUT_DIR")
+    *files, folder = paths
+    done = run_import(format, files, folder, ImportOptions(pitch_um, sigma_px, from_middle, fiducials))
+    say(done.told, f"{folder}: {counted(len(done.files), 'file')}")
+    return DONE
+
+
+def convert(
+    file: Annotated[Path, typer.Argument(metavar="CAMERA.toml|adjustment.json", show_default=False)],
+    family: Annotated[str, typer.Argument(metavar="FAMILY", help="See docs/distortion.md.", show_default=False)],
+    out_dir: OutDir,
+    r0_mm: Annotated[float, typer.Option("--r0-mm", metavar="MM", min=0.0, help="Of torlegard, aicon, juhl.")] = 0.0,
+    parameters: Annotated[
+        str,
+        typer.Option(metavar="A,B,...", help="Those of the other family that are fitted; by default the usual ones."),
+    ] = "",
+    camera: OfCamera = None,
+    misfit_um: Annotated[
+        float, typer.Option("--misfit-um", metavar="UM", min=0.0, help="How far the other family may be off.")
+    ] = 0.1,
+    as_json: AsJson = False,
+) -> int:
+    """A camera's lens in the words of another distortion family, with its covariance."""
+    from pipeline.exchange.convert_stage import ConvertOptions, conversion_json, conversion_lines, run_convert
+
+    named = tuple(name.strip() for name in parameters.split(",") if name.strip())
+    done = run_convert(file, out_dir, ConvertOptions(family, r0_mm, named, camera))
+    files = f"{out_dir}: {counted(len(done.files), 'file')}"
+    show(as_json, lambda: conversion_json(done), lambda _: say(*conversion_lines(done), files))
+    return LOOK if done.misfit_um > misfit_um else DONE
+
+
+def render(scene: SceneFile, out_dir: OutDir) -> int:
+    """Synthetic scans with their truth, as a project that can be run."""
+    from pipeline.progress import Reporter
+    from pipeline.rendered.scene_file import render_project
+
+    with Reporter().stage("rendering") as count:
+        render_project(scene, out_dir, count)
+    say(str(out_dir / "project.toml"))
+    return DONE
+
+
+def template(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help=one_of(TEMPLATES), show_default=False)],
+) -> int:
+    """Print a commented file to start from."""
+    if kind not in TEMPLATES:
+        raise InputError(f"there is no template {kind!r}; possible are {', '.join(TEMPLATES)}.")
+    from importlib import resources
+
+    typer.echo(resources.files("pipeline").joinpath("templates", f"{kind}.toml").read_text(encoding="utf-8"), nl=False)
+    return DONE

@@ -1,0 +1,244 @@
+"""Commands about scans: what they are of, their marks, and what needs a look."""
+
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline.archive.verdicts import Verdict
+from pipeline.commands.shared import (
+    DONE,
+    LOOK,
+    AsJson,
+    MaxPixels,
+    ProjectFile,
+    finish,
+    pitch_option,
+    read,
+    say,
+    show,
+    with_project,
+)
+from pipeline.errors import InputError
+from pipeline.terminal import PlainConsole, plain
+from pipeline.text.wording import counted
+
+if TYPE_CHECKING:
+    from pipeline.files.project_file import Project
+
+
+def demo(
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the demonstration goes.")] = Path(
+        "reseau-demo"
+    ),
+    as_json: AsJson = False,
+) -> int:
+    """Render a small scan folder with its truth, run everything on it, print the summary and the report's path."""
+    from pipeline.demo import run_demo
+    from pipeline.progress import Reporter
+
+    return finish(run_demo(folder, Reporter()), as_json)
+
+
+def init(
+    scans: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER...", help="Folders with scans, or scans.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where project.toml and images.csv go.")] = Path(),
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """Look at the scans; write a project of them, with each one's camera, and say what could not be told."""
+    from pipeline.archive.new_project import init_project, print_new_project
+    from pipeline.progress import Reporter
+
+    new = init_project(scans, out, Reporter(), max_pixels)
+    show(as_json, new.as_json, lambda console: print_new_project(new, console))
+    return LOOK if any(cases for _, cases in new.remarks()) else DONE
+
+
+def measuring(stage: str, told: str) -> Callable[..., int]:
+    """The command that does a stage of `pipeline.stages` which measures scans."""
+
+    def command(
+        project: ProjectFile,
+        shard: Annotated[
+            str | None, typer.Option(metavar="K/N", help="The K-th of N parts of the scans, into a store of its own.")
+        ] = None,
+        cluster: Annotated[
+            str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786, or `local`.")
+        ] = None,
+        retry: Annotated[bool, typer.Option("--retry", help="Measure again the scans that failed.")] = False,
+        moved: Annotated[
+            bool, typer.Option("--moved", help="Know moved or touched files by their content, which is read whole.")
+        ] = False,
+        workers: Annotated[
+            int | None,
+            typer.Option(metavar="N", min=1, max=1024, help="Processes that measure; by default one a core."),
+        ] = None,
+        as_json: AsJson = False,
+        max_pixels: MaxPixels = None,
+    ) -> int:
+        from pipeline import stages
+        from pipeline.archive.work_options import WorkOptions
+
+        work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
+        return with_project(project, partial(getattr(stages, stage), work=work), as_json, max_pixels)
+
+    command.__doc__ = told
+    return command
+
+
+run = measuring("run_all", "The whole chain: measure, adjust, check, report. What is measured already stays.")
+measure = measuring(
+    "run_measure",
+    "Scans to comparator coordinates. What is measured already stays: it goes on where an earlier call stopped.",
+)
+
+
+def status(
+    project: ProjectFile,
+    verdict: Annotated[
+        Verdict | None, typer.Option(metavar="V", help=f"Name the scans of one: {', '.join(Verdict)}.")
+    ] = None,
+    as_csv: Annotated[bool, typer.Option("--csv", help="A line a scan, on stdout.")] = False,
+    as_json: AsJson = False,
+) -> int:
+    """How many scans stand where, what that means, and what to do next."""
+    from pipeline.archive.status import archive_status, print_status, status_csv, status_json
+
+    def printed(console: PlainConsole) -> None:
+        if as_csv:
+            typer.echo(plain(status_csv(shown)), nl=False)
+        else:
+            print_status(shown, console, every=verdict is not None)
+
+    every = archive_status(read(project))
+    shown = every.of(verdict)
+    show(as_json, partial(status_json, shown), printed)
+    return DONE if every.all_good else LOOK
+
+
+def merge(
+    project: ProjectFile,
+    stores: Annotated[list[Path], typer.Argument(metavar="DB...", help="Stores of shards.", show_default=False)],
+    as_json: AsJson = False,
+) -> int:
+    """Join the measurement stores of shards into that of the project."""
+    from pipeline.progress import Reporter
+    from pipeline.stages import run_merge
+
+    taken, summary = run_merge(read(project), stores, Reporter())
+    if not as_json:
+        say(*(f"{one.path}: {counted(one.results, 'result')}, {one.new} of them new" for one in taken))
+    return finish(summary, as_json)
+
+
+def report(
+    project: ProjectFile,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="After --frames: more images.", show_default=False)
+    ] = None,
+    frames: Annotated[
+        list[str] | None,
+        typer.Option("--frames", metavar="NAME", help="Only pages of these images, in out/frames, with all marks."),
+    ] = None,
+    as_json: AsJson = False,
+    max_pixels: MaxPixels = None,
+) -> int:
+    """What the earlier stages found, in report.html; or all of some images, each in a page of its own."""
+    from pipeline.progress import Reporter
+    from pipeline.stages import run_frame_pages, run_report
+
+    if not frames:
+        if names:
+            raise InputError("images are named after --frames: reseau report PROJECT.toml --frames NAME...")
+        return with_project(project, run_report, as_json, max_pixels)
+    pages = run_frame_pages(read(project, max_pixels), list(dict.fromkeys([*frames, *(names or ())])), Reporter())
+    told = {image: str(path) for image, path in pages.items()}
+    show(as_json, lambda: {"frames": told}, lambda _: say(*(f"{image}: {path}" for image, path in told.items())))
+    return DONE
+
+
+def review(
+    project: ProjectFile,
+    port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Of this machine; 0 takes any.")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
+    who: Annotated[str | None, typer.Option(metavar="NAME", help="Who decides; by default who is logged in.")] = None,
+    max_pixels: MaxPixels = None,
+) -> int:
+    """A page on this machine to go through what needs a look; decisions stand in decisions.jsonl."""
+    try:
+        from pipeline.review.server import serve
+    except ModuleNotFoundError:
+        raise InputError("review needs starlette and uvicorn. Install them: pip install 'reseau[review]'.") from None
+    serve(read(project, max_pixels), port, who, not no_browser, typer.echo)
+    return DONE
+
+
+def cameras(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME]", help="Print this camera's file, to start from. After --scan: more scans."),
+    ] = None,
+    scan: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--scan", metavar="PATH", help="Try the cameras on a scan, or on some of a folder's, of each kind."
+        ),
+    ] = None,
+    own: Annotated[
+        Path | None,
+        typer.Option("--project", metavar="PROJECT.toml", help="Try its camera files, too; its scans without --scan."),
+    ] = None,
+    pitch_um: Annotated[float | None, pitch_option("The scan's pixel in um, if its file is mute.", "--pitch")] = None,
+    max_pixels: MaxPixels = None,
+    as_json: AsJson = False,
+) -> int:
+    """The camera library: its list, one of its files, or which of its cameras scans are of."""
+    if own is not None or scan is not None:
+        project = None if own is None else read(own)
+        given = [*(scan or ()), *(Path(name) for name in names or ())] or (project.scans.values() if project else ())
+        return _name_cameras(list(given), project, pitch_um, max_pixels, as_json)
+    if (names and (as_json or len(names) > 1)) or pitch_um is not None:
+        raise InputError("give NAME alone, or --scan with or without --pitch, or neither for the list.")
+    from pipeline.files.library import PREFIX, library_json, library_path, print_library
+
+    if names:
+        typer.echo(library_path(names[0].removeprefix(PREFIX)).read_text(encoding="utf-8"), nl=False)
+    else:
+        show(as_json, library_json, print_library)
+    return DONE
+
+
+def _name_cameras(
+    given: Sequence[Path], project: "Project | None", pitch_um: float | None, max_pixels: int | None, as_json: bool
+) -> int:
+    """One scan with all that was tried on it; of many some of each kind."""
+    from pipeline.files.library import PREFIX, read_library
+    from pipeline.measuring.camera_answer import print_identification
+    from pipeline.measuring.camera_trials import identify
+    from pipeline.measuring.scan_kinds import identify_kinds, print_kinds, scan_files
+    from pipeline.progress import Reporter
+
+    own = {name: camera for name, camera in project.cameras.items() if PREFIX not in name} if project else {}
+    tried, reporter = {**own, **read_library()}, Reporter()
+    if len(given) == 1 and not given[0].is_dir():
+        identification = identify(given[0], tried, pitch_um, reporter, max_pixels)
+        show(as_json, identification.as_json, lambda console: print_identification(identification, console))
+        return DONE if identification.best else LOOK
+    many = identify_kinds(scan_files(given), lambda path: identify(path, tried, pitch_um, reporter, max_pixels))
+    show(as_json, many.as_json, lambda console: print_kinds(many, console))
+    return DONE if many.all_named else LOOK
+
+
+def _shard(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise InputError(f"--shard {text!r} is not K/N, the K-th of N parts, as 3/8; K goes from 1 to N.")
+    return int(found[1]), int(found[2])

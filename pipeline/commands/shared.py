@@ -1,0 +1,85 @@
+"""What commands share: arguments and options that have one meaning everywhere, and how a result is told.
+
+Each command imports what it needs when it runs: numpy and what stands on it take longer than the help.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.files.pitch import FINEST_PITCH_UM
+from pipeline.terminal import PlainConsole, plain
+from pipeline.text.finite import without_nan
+
+if TYPE_CHECKING:
+    from pipeline.files.project_file import Project
+    from pipeline.progress import Reporter
+    from pipeline.summary import Summary
+
+DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
+
+ProjectFile = Annotated[Path, typer.Argument(metavar="PROJECT.toml", help="The project file.", show_default=False)]
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE.toml", help="The scene file.", show_default=False)]
+OutDir = Annotated[Path, typer.Argument(metavar="OUT_DIR", help="Where the results go.", show_default=False)]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")]
+MaxPixels = Annotated[
+    int | None,
+    typer.Option("--max-pixels", metavar="N", min=1, help="Read scans of up to N pixels, whatever their file's size."),
+]
+OfCamera = Annotated[
+    str | None, typer.Option("--camera", metavar="NAME", help="Which one, where a file holds several.")
+]
+
+
+def pitch_option(help: str, *names: str) -> Any:
+    """A pixel's size in um; what it is of, and what it is by default, differs from command to command."""
+    return typer.Option(*(names or ("--pitch-um",)), metavar="UM", min=FINEST_PITCH_UM, help=help)
+
+
+def read(path: Path, max_pixels: int | None = None) -> "Project":
+    """The project. Raises InputError for what is wrong in it."""
+    from pipeline.files.project_file import read_project
+
+    return replace(read_project(path), max_pixels=max_pixels)
+
+
+def with_project(
+    path: Path, stage: "Callable[[Project, Reporter], Summary]", as_json: bool, max_pixels: int | None = None
+) -> int:
+    """Run a stage on a project and tell its summary; the exit code."""
+    from pipeline.progress import Reporter
+
+    return finish(stage(read(path, max_pixels), Reporter()), as_json)
+
+
+def finish(summary: "Summary", as_json: bool) -> int:
+    """Tell a summary; its exit code."""
+    from pipeline.summary import print_summary
+
+    show(as_json, summary.as_json, lambda console: print_summary(summary, console))
+    return summary.verdict.exit_code
+
+
+def show(as_json: bool, content: Callable[[], Any], printed: Callable[[PlainConsole], None]) -> None:
+    """A result as JSON on stdout, or as it is printed for people."""
+    if not as_json:
+        printed(PlainConsole())
+        return
+    letters = (sys.stdout.encoding or "").lower().startswith("utf")  # others get them as JSON's own codes
+    typer.echo(json.dumps(without_nan(content()), indent=1, ensure_ascii=not letters, allow_nan=False))
+
+
+def say(*lines: str) -> None:
+    """Lines on stdout, without what a terminal would take for a command."""
+    for line in lines:
+        typer.echo(plain(line))
+
+
+def one_of(words: Mapping[str, Any] | tuple[str, ...]) -> str:
+    """The help of an argument that is one of several words."""
+    return f"One of {', '.join(words)}."
