@@ -1,0 +1,72 @@
+"""Zhang's five pictures with skew against his published result: 256 corners of 64 squares in each.
+
+    python benchmarks/zhang.py FOLDER
+
+FOLDER holds Model.txt and data1.txt to data5.txt of his page (Z. Zhang, A flexible new technique for camera
+calibration, PAMI 22, 2000), also in github.com/imagingbook/imagingbook-calibrate, beside his result. Nothing is
+given but the corners: c, principal point, orientations and the lens are found. Takes some seconds.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from adjust.initial_values.approximations import approximate
+from adjust.problem.network import Camera, Distortion, Image, Network, ObjectPoint, ObservationKind, Observations, Prior
+from adjust.solution.adjustment import adjust
+
+PIXEL_MM = 0.01
+MIDDLE_MM = (3.195, -2.395)  # of 640 x 480 pixels
+PUBLISHED = {
+    "alpha": 832.5,
+    "beta": 832.53,
+    "gamma": 0.204494,
+    "u0": 303.959,
+    "v0": 206.585,
+    "k1": -0.228601,
+    "k2": 0.190353,
+}
+
+
+def network_of(folder: Path) -> Network:
+    model = np.loadtxt(folder / "Model.txt").reshape(-1, 2)
+    pixels = [np.loadtxt(folder / f"data{i}.txt").reshape(-1, 2) for i in range(1, 6)]
+    free = {name: Prior(0.0, np.inf) for name in ("k1", "k2", "b1", "b2")}
+    kinds: list[ObservationKind] = ["target"] * (5 * len(model))
+    return Network(
+        (Camera("Z", None, None, None, Distortion("opencv", free), center_mm=MIDDLE_MM),),
+        tuple(Image(f"{i}", "Z", "none") for i in range(1, 6)),
+        tuple(ObjectPoint(f"{k}", Prior(x), Prior(y), Prior(0.0)) for k, (x, y) in enumerate(model.tolist())),
+        Observations(
+            tuple(f"{i}" for i in range(1, 6) for _ in model),
+            tuple(f"{k}" for _ in pixels for k in range(len(model))),
+            tuple(kinds),
+            np.concatenate(pixels) * [PIXEL_MM, -PIXEL_MM],
+            np.tile((0.25 * PIXEL_MM) ** 2 * np.eye(2), (len(kinds), 1, 1)),
+        ),
+    )
+
+
+def main() -> None:
+    network = network_of(Path(sys.argv[1]))
+    found = adjust(network, approximate(network))
+    names = [f"IO.Z.{name}" for name in ("c", "b1", "b2", "x0", "y0", "k1", "k2")]
+    c, b1, b2, x0, y0, k1, k2 = (found.value(name) for name in names)
+    values = [c * (1 + b1), c, c * b2, x0, -y0]
+    by_own = np.zeros((7, 7))
+    by_own[0, :2], by_own[1, 0], by_own[2, [0, 2]] = (1 + b1, c), 1.0, (b2, c)
+    by_own[3, 3], by_own[4, 4] = 1.0, -1.0
+    by_own[:5] /= PIXEL_MM
+    by_own[5, 5] = by_own[6, 6] = 1.0
+    sigmas = found.sigma0 * np.sqrt(np.diag(by_own @ found.cofactor_of(names) @ by_own.T))
+    rms_px = np.sqrt((found.residuals.v_mm**2).sum(axis=1).mean()) / PIXEL_MM
+    print(f"{network}: converged {found.converged}, {rms_px:.4f} px rms a point\n")
+    print("| | published | here | sigma | differs by, sigmas |\n|---|---|---|---|---|")
+    here = [*(np.array(values) / PIXEL_MM), k1, k2]
+    for (name, published), value, sigma in zip(PUBLISHED.items(), here, sigmas, strict=True):
+        print(f"| {name} | {published:.6g} | {value:.6g} | {sigma:.2g} | {(value - published) / sigma:.4f} |")
+
+
+if __name__ == "__main__":
+    main()
