@@ -24,6 +24,7 @@ def validate(network: Network) -> None:
     _check_unique("object point", (point.id for point in network.points))
     _check_cameras(network)
     _check_scanners(network)
+    _check_boards(network)
     _check_shapes(network.observations)
     _check_names(network)
     _check_distances(network)
@@ -86,6 +87,24 @@ def _check_scanners(network: Network) -> None:
             raise AdjustmentError(
                 f"image {image.name} is of the scanner {image.scanner}, which is not given; given: {known}."
             )
+
+
+def _check_boards(network: Network) -> None:
+    _check_unique("board", (board.name for board in network.boards))
+    seen: dict[str, str] = {}
+    for board in network.boards:
+        for id_ in board.places:
+            if seen.setdefault(id_, board.name) != board.name:
+                raise AdjustmentError(f"point {id_} is on the boards {seen[id_]} and {board.name}; it can be on one.")
+            point = network.point_by_id.get(id_)
+            known = point is not None and all(
+                p is not None and np.isfinite(p.sigma) for p in (point.X, point.Y, point.Z)
+            )
+            if point is not None and not known:
+                raise AdjustmentError(
+                    f"point {id_} of board {board.name} is not known: a bend is told from flat coordinates. Give X, Y "
+                    "and Z with standard deviations (0 fixes them), or leave the bend out."
+                )
 
 
 def _check_distances(network: Network) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from adjust.errors import AdjustmentError
 from adjust.functional_model.projection import ImageModel
 from adjust.initial_values.intersection import intersect
-from adjust.problem.images import approximate_image
+from adjust.problem.images import approximate_image, lifted
 from adjust.problem.network import Approximations, Network
 from adjust.problem.problem import number
 from adjust.problem.result import Adjustment
@@ -65,8 +65,8 @@ def cross_validate(
     """The prediction errors of an adjusted model over all folds; None where a fold has no solution or predicts nothing.
 
     Every fold is adjusted without its points, from the whole's values on. A point of which all coordinates are given is
-    projected as it is given. Any other is intersected from every second of its rays and predicted in the others, and
-    the other way round, where they locate it.
+    projected as it is given, that of a bent board from where the whole's bend puts it. Any other is intersected from
+    every second of its rays and predicted in the others, and the other way round, where they locate it.
     """
     network = adjustment.network
     errors, rows = np.empty((0, 2)), np.empty(0, dtype=np.intp)
@@ -74,7 +74,7 @@ def cross_validate(
         fitted = _fitted_without(adjustment, points, options)
         if fitted is None:
             return None
-        found = _errors(fitted, network, points)
+        found = _errors(fitted, adjustment, points)
         errors, rows = np.concatenate([errors, found[0]]), np.concatenate([rows, found[1]])
     if not len(rows):
         return None
@@ -152,9 +152,10 @@ def _fitted_without(
     }
 
 
-def _errors(models: Mapping[str, ImageModel], network: Network, points: frozenset[str]) -> tuple[Array, Array]:
+def _errors(models: Mapping[str, ImageModel], adjustment: Adjustment, points: frozenset[str]) -> tuple[Array, Array]:
     """Predicted less observed comparator coordinates (n, 2) of all rays that can be predicted, and their rows (n,)."""
-    rays = _rays(network, points)
+    network = adjustment.network
+    rays = _rays(adjustment, points)
     centers, directions = np.empty((len(rays.rows), 3)), np.empty((len(rays.rows), 3))
     for image, at in rays.by_image(network).items():
         centers[at] = models[image].station
@@ -196,8 +197,8 @@ class _Rays:
         return {str(image): np.flatnonzero(images == image) for image in np.unique(images)}
 
 
-def _rays(network: Network, points: frozenset[str]) -> _Rays:
-    observations = network.observations
+def _rays(adjustment: Adjustment, points: frozenset[str]) -> _Rays:
+    network, observations = adjustment.network, adjustment.network.observations
     ordered = sorted(
         (point, image, row)
         for row, (point, image, on_film) in enumerate(
@@ -212,7 +213,7 @@ def _rays(network: Network, points: frozenset[str]) -> _Rays:
         rows=np.array([row for _, _, row in ordered], dtype=np.intp),
         point=number,
         odd=(np.arange(len(number)) - first) % 2 == 1,
-        known=np.array([_known(network, name) for name in names]),
+        known=np.array([_known(network, name) for name in names]).reshape(-1, 3) + lifted(adjustment, names),
     )
 
 

@@ -101,6 +101,9 @@ def _seen(problem: Problem, state: State, camera: str, targets: Indices) -> Seen
     images = problem.image_numbers[rows]
     stations = state.values[problem.exterior[:, :3].T[:, images]].T
     points = state.values[problem.places.T[:, rows]].T
+    if problem.network.boards:
+        bends = state.values[problem.board_positions[rows]]  # of a point on none any values, which lift it by 0
+        points = points + (bends[:, :, None] * problem.lifted_by[rows]).sum(axis=1)
     sight = sight_vectors(problem.network.line_of_sight, stations, points)
     rotation = of_each(state.rotations, images)
     ray, in_camera = rays(rotation, sight.vector)
@@ -175,6 +178,9 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
         by_exterior = by_station, by_attitude
         _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
         _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
+        _fill(
+            by_unknowns, rows, parts.board, [applied(by_point, problem.lifted_by[rows, k]) for k in parts.board.members]
+        )
         _fill(by_unknowns, rows, parts.camera, [at.by_quantity(k) for k in parts.camera.members])
     for part, of_film, of_distorted in (
         (parts.film, film.by_parameters, at_distorted.by_parameters),

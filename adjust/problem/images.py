@@ -1,8 +1,11 @@
 """The images of a network as they were adjusted, or as they are known before: models that project points."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
@@ -37,6 +40,23 @@ def adjusted_image(adjustment: Adjustment, name: str) -> ImageModel:
         bend=bend,
         bend_parameters=values(f"SC.{image.scanner}", bend.terms),
     )
+
+
+def adjusted_places(adjustment: Adjustment, points: Sequence[str]) -> Array:
+    """(n, 3) where object points are, with the values of an adjustment: those of a bent board off its plane."""
+    places = np.array([[adjustment.value(f"PT.{point}.{axis}") for axis in "XYZ"] for point in points]).reshape(-1, 3)
+    return places + lifted(adjustment, points)
+
+
+def lifted(adjustment: Adjustment, points: Sequence[str]) -> Array:
+    """(n, 3) how far the bends of boards put object points beside their flat places."""
+    offsets = np.zeros((len(points), 3))
+    for board in adjustment.network.boards:
+        bends = np.array([adjustment.value(f"BD.{board.name}.{name}") for name in BOARD_NAMES])
+        for row, point in enumerate(points):
+            if point in board.places:
+                offsets[row] = bends @ board.lifted_by[point]
+    return offsets
 
 
 def bend_of(network: Network, image: Image) -> Bend:

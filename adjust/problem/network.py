@@ -12,6 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.board import board_form
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.line_of_sight import STRAIGHT as STRAIGHT
 from adjust.functional_model.line_of_sight import LineOfSight as LineOfSight
@@ -255,6 +256,28 @@ class Distance:
     sigma: float
 
 
+@dataclass(frozen=True, eq=False)
+class Board:
+    """A flat board that is bent: its points stand off their plane, see `functional_model.board`.
+
+    places: the flat coordinates (3,) of all its points by id, also of those that no image shows. bends: of bend_x and
+    bend_y, in object units, with their priors.
+    """
+
+    name: str
+    places: Mapping[str, Array]
+    bends: tuple[Prior, Prior] = (Prior(0.0, np.inf), Prior(0.0, np.inf))
+
+    def __post_init__(self) -> None:
+        board_form(np.array(list(self.places.values())))  # refuses what is no board
+
+    @cached_property
+    def lifted_by(self) -> dict[str, Array]:
+        """(2, 3) by id: where a bend of 1 along each axis moves a point."""
+        form = board_form(np.array(list(self.places.values())))
+        return {id_: shape[:, None] * form.normal for id_, shape in zip(self.places, form.shapes, strict=True)}
+
+
 @dataclass(frozen=True)
 class Calibration:
     """What an earlier adjustment found of a camera, "equal to image observations" (Juhl).
@@ -288,6 +311,7 @@ class Network:
     calibrations: tuple[Calibration, ...] = ()
     line_of_sight: LineOfSight = STRAIGHT
     scanners: tuple[Scanner, ...] = ()
+    boards: tuple[Board, ...] = ()
 
     @cached_property
     def scanner_by_name(self) -> dict[str, Scanner]:

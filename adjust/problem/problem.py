@@ -1,8 +1,9 @@
 """A network whose quantities are numbered, observation by observation, and the state of its unknowns."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from adjust.problem.unknowns import Unknowns, list_unknowns
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+Number = TypeVar("Number", np.float64, np.intp)
 
 _NOWHERE = np.full(3, -1, dtype=np.intp)
 ABSENT = -1  # stands for the unknown of a column that an observation does not have
@@ -82,7 +85,7 @@ class Scans:
 @dataclass(frozen=True)
 class Part:
     """Some columns of an observation's derivatives: by which members of an image's elements, a place's coordinates, a
-    film's parameters, a camera's or a scanner's, and where they stand.
+    film's parameters, a camera's, a scanner's or a board's, and where they stand.
     """
 
     members: Indices
@@ -97,11 +100,12 @@ class Parts(NamedTuple):
     film: Part
     camera: Part
     scanner: Part
+    board: Part
 
     @property
     def width(self) -> int:
         """Of all columns."""
-        return int(self.scanner.columns.stop)
+        return int(self.board.columns.stop)
 
 
 @dataclass(frozen=True)
@@ -190,6 +194,7 @@ class Problem:
             self._film_positions,
             self._camera_positions[shown],
             self._scanner_positions,
+            self.board_positions,
         )
         used = [np.flatnonzero(free[each].any(axis=0)) for each in positions]
         ends = np.cumsum([len(members) for members in used])
@@ -257,9 +262,28 @@ class Problem:
         return places
 
     @cached_property
+    def board_positions(self) -> Indices:
+        """(n, 2) positions of the bends of the board that each point is on, ABSENT where it is on none."""
+        of_point = {id_: self.unknowns.board[board.name] for board in self.network.boards for id_ in board.places}
+        return self._of_points(of_point, np.full(2, ABSENT, dtype=np.intp))
+
+    @cached_property
+    def lifted_by(self) -> Array:
+        """(n, 2, 3): where a bend of 1 along each of its board's axes moves the point; 0 where it is on none."""
+        of_point = {id_: lifted for board in self.network.boards for id_, lifted in board.lifted_by.items()}
+        return self._of_points(of_point, np.zeros((2, 3)))
+
+    def _of_points(self, of_point: Mapping[str, NDArray[Number]], of_others: NDArray[Number]) -> NDArray[Number]:
+        """What every observation's point has, or what others have."""
+        names, of_name = self.network.observations.numbered_points
+        rows = np.stack([of_point.get(name, of_others) for name in names])[of_name]
+        rows[self.is_fiducial] = of_others
+        return rows
+
+    @cached_property
     def columns(self) -> Indices:
         """(n, k) positions of the unknowns in an observation's derivatives, those of `parts`."""
-        exterior, place, film, camera, scanner = self.parts
+        exterior, place, film, camera, scanner, board = self.parts
         by_image = np.empty((len(self.network.images), self.parts.width), dtype=np.intp)
         of_images = (
             (exterior, self.exterior),
@@ -273,6 +297,7 @@ class Problem:
         for part in (exterior, camera):
             columns[self.is_fiducial, part.columns] = ABSENT
         columns[:, place.columns] = self.places[:, place.members]
+        columns[:, board.columns] = self.board_positions[:, board.members]
         return columns
 
 

@@ -11,7 +11,7 @@ from adjust.problem.problem import ABSENT, Problem
 
 Indices = NDArray[np.intp]
 
-PRIOR_GROUPS = ("datum", "control", "interior", "scanner", "exterior")
+PRIOR_GROUPS = ("datum", "control", "interior", "scanner", "board", "exterior")
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,9 @@ class Tested:
     """One image point, or one given quantity: what a gross error would be found in, and taken out with.
 
     group: target, tie, fiducial or join in an image; datum (the given place of a fiducial), control (a given object
-    coordinate), interior, scanner or exterior (a given element). owner: its image, camera or scanner, empty for object
-    points. point: its id, empty for the elements. coordinates: x and y where both are tested as one, else a single one.
+    coordinate), interior, scanner, board or exterior (a given element). owner: its image, camera, scanner or board,
+    empty for object points. point: its id, empty for the elements. coordinates: x and y where both are tested as one,
+    else a single one.
     """
 
     group: str
@@ -41,6 +42,8 @@ class Tested:
                 return f"given{alone} (camera {self.owner})"
             case "scanner":
                 return f"given{alone} (scanner {self.owner})"
+            case "board":
+                return f"given{alone} (board {self.owner})"
             case "exterior":
                 return f"given{alone} of image {self.owner}"
             case _:
@@ -83,7 +86,7 @@ class TestedUnits:
     @cached_property
     def groups(self) -> NDArray[np.str_]:
         """(N,) the group of each."""
-        kinds = {"FID": "datum", "PT": "control", "IO": "interior", "SC": "scanner", "EO": "exterior"}
+        kinds = {"FID": "datum", "PT": "control", "IO": "interior", "SC": "scanner", "BD": "board", "EO": "exterior"}
         names = self.problem.unknowns.names
         given = [kinds[names[position].split(".", 1)[0]] for position in self.positions[:, 0]]
         return np.array([*self.problem.network.observations.kind, *given], dtype=np.str_)
@@ -101,6 +104,7 @@ class TestedUnits:
         owner_of |= {int(i): ("control", "", id_) for id_, three in unknowns.point.items() for i in three}
         owner_of |= {int(i): ("interior", name, "") for name, some in unknowns.camera.items() for i in some}
         owner_of |= {int(i): ("scanner", name, "") for name, some in unknowns.scanner.items() for i in some}
+        owner_of |= {int(i): ("board", name, "") for name, two in unknowns.board.items() for i in two}
         owner_of |= {int(i): ("exterior", name, "") for name, six in unknowns.exterior.items() for i in six}
         named = []
         for pair in self.positions:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
+from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, Camera, Image, Network, ObjectPoint, Prior
@@ -23,8 +24,8 @@ class Unknowns:
 
     given (n,): nan where nothing is given. sigma (n,): 0 fixed, inf free. start (n,): where the iteration starts.
     Positions in these: camera by name (c, x0', y0', then the distortion parameters), fiducial by (camera, id),
-    scanner by name, point by id, transformation and exterior by image name, join by frame and point. Cameras, scanners
-    and points stand before the images. Parts of one frame have the same exterior orientation.
+    scanner and board by name, point by id, transformation and exterior by image name, join by frame and point. Cameras,
+    scanners, boards and points stand before the images. Parts of one frame have the same exterior orientation.
     """
 
     names: tuple[str, ...]
@@ -38,6 +39,7 @@ class Unknowns:
     transformation: dict[str, Indices]
     exterior: dict[str, Indices]
     join: dict[tuple[str, str], Indices]
+    board: dict[str, Indices]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -98,6 +100,12 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
         each.name: listing.add(f"SC.{each.name}", [(name, prior, None) for name, prior in each.terms.items()])
         for each in network.scanners
     }
+    board = {
+        each.name: listing.add(
+            f"BD.{each.name}", [(name, prior, None) for name, prior in zip(BOARD_NAMES, each.bends, strict=True)]
+        )
+        for each in network.boards
+    }
     point = {
         each.id: listing.add(f"PT.{each.id}", _point_quantities(each, approximations))
         for each in network.points
@@ -118,7 +126,7 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
         place: list[Quantity] = [("x", None, float(x_mm)), ("y", None, float(y_mm))]
         join[frame, id_] = listing.add(f"JOIN.{frame}.{id_}", place)
     given, sigma, start = np.array(listing.rows, dtype=np.float64).T
-    owned = camera, fiducial, scanner, point, transformation, exterior, join
+    owned = camera, fiducial, scanner, point, transformation, exterior, join, board
     return Unknowns(tuple(listing.names), given, sigma, start, *owned)
 
 

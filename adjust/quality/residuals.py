@@ -71,7 +71,7 @@ def groups(
     """
     units = TestedUnits(problem)
     result = {}
-    for name in ("target", "tie", "fiducial", "join", "control", "datum", "interior", "scanner", "exterior"):
+    for name in ("target", "tie", "fiducial", "join", "control", "datum", "interior", "scanner", "board", "exterior"):
         members = (units.groups == name) & weighting.used
         if not members.any() and name not in ("target", "fiducial", "control"):
             continue

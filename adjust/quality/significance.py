@@ -10,15 +10,16 @@ quantity: the difference from its given value, -v of that observation, has the c
 estimation and hypothesis testing in linear models, 1999, chapters 4.2 and 4.3).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
+from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family
-from adjust.problem.network import Camera, Prior, Scanner
+from adjust.problem.network import Board, Camera, Prior, Scanner
 from adjust.problem.result import Adjustment
 
 Array = NDArray[np.float64]
@@ -69,12 +70,21 @@ def group_tests(adjustment: Adjustment, camera: Camera) -> tuple[SignificanceTes
 
 def scanner_tests(adjustment: Adjustment, scanner: Scanner) -> tuple[SignificanceTest, ...]:
     """Of every term of a scanner's bend that was estimated, and of all of them together."""
-    estimated = tuple(name for name, prior in scanner.terms.items() if prior.sigma > 0.0)
+    return _of_terms(adjustment, f"SC.{scanner.name}", scanner.terms)
+
+
+def board_tests(adjustment: Adjustment, board: Board) -> tuple[SignificanceTest, ...]:
+    """Of the bends of a board along each axis that were estimated, and of both together."""
+    return _of_terms(adjustment, f"BD.{board.name}", dict(zip(BOARD_NAMES, board.bends, strict=True)))
+
+
+def _of_terms(adjustment: Adjustment, owner: str, terms: Mapping[str, Prior]) -> tuple[SignificanceTest, ...]:
+    estimated = tuple(name for name, prior in terms.items() if prior.sigma > 0.0)
     if not adjustment.converged or not estimated:
         return ()
     several = {"all": estimated} if len(estimated) > 1 else {}
     tested = {name: (name,) for name in estimated} | several
-    return tuple(_against_zero(adjustment, f"SC.{scanner.name}", name, members) for name, members in tested.items())
+    return tuple(_against_zero(adjustment, owner, name, members) for name, members in tested.items())
 
 
 def _has_tests(adjustment: Adjustment, camera: Camera) -> bool:

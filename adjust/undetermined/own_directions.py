@@ -127,6 +127,11 @@ def unnamed_sentence(name: str, followers: str) -> tuple[str, str]:
                 f"The term {quantity} of the bend of scanner {owner} can change{followers}.",
                 f"Give {quantity} a standard deviation, or leave it out.",
             )
+        case "BD":
+            return (
+                f"The {quantity} of board {owner} can change{followers}: no image sees the board at a slant.",
+                "Take images that are tilted against the board, or give its bend a standard deviation.",
+            )
         case _:
             return (
                 f"The quantity {quantity} of camera {owner} can change{followers}.",

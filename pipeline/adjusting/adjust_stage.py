@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.problem.images import adjusted_image
+from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import Network
 from adjust.problem.result import Adjustment
 from adjust.solution.adjustment import Options, adjust
@@ -80,7 +80,7 @@ def _eccentricities(project: Project, adjustment: Adjustment) -> tuple[Array, Ar
     network = adjustment.network
     observations = network.observations
     ids = [point.id for point in network.points]
-    coordinates = np.array([[adjustment.value(f"PT.{id}.{axis}") for axis in "XYZ"] for id in ids]).reshape(-1, 3)
+    coordinates = adjusted_places(adjustment, ids)
     row_of = {id: row for row, id in enumerate(ids)}
     given = project.given_points.normals if project.given_points else {}
     plane = plane_normal(coordinates)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.transformation import marks_needed
 from adjust.problem.network import (
+    Board,
     Calibration,
     Camera,
     Distance,
@@ -16,6 +17,7 @@ from adjust.problem.network import (
     Network,
     ObjectPoint,
     Observations,
+    Prior,
     Transformation,
 )
 from pipeline.adjusting.fiducial_check import check_fiducials
@@ -30,6 +32,7 @@ from pipeline.text.wording import listed
 Array = NDArray[np.float64]
 
 
+BOARD = "board"
 FEWEST_TARGETS = 3  # in an image whose exterior orientation nobody has observed
 
 
@@ -57,6 +60,7 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         points=_points(project, used),
         observations=_observations(project.adjust, used),
         distances=distances,
+        boards=_boards(project),
         calibrations=calibrations,
         line_of_sight=LineOfSight(
             project.adjust.earth_curvature, project.adjust.refraction, project.unit_mm / UNITS_MM["m"]
@@ -213,6 +217,24 @@ def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectP
             continue
         points[mark.point] = given.get(mark.point) or _unnamed(project, mark)
     return tuple(points.values())
+
+
+def _boards(project: Project) -> tuple[Board, ...]:
+    """All given points as one board, where its bend is to be found. Raises InputError where they are none."""
+    sigma = project.board_bend_sigma
+    if sigma == 0.0:
+        return ()
+    flat = {
+        point.id: np.array([prior.value for prior in (point.X, point.Y, point.Z) if prior is not None])
+        for point in project.object_points.values()
+    }
+    try:
+        return (Board(BOARD, {id_: xyz for id_, xyz in flat.items() if len(xyz) == 3}, (Prior(0.0, sigma),) * 2),)
+    except ValueError as error:
+        raise InputError(
+            f"{project.path}: board_bend is given, but the object points are no board: {error}. Leave it out, or give "
+            "the flat coordinates of the board's points."
+        ) from None
 
 
 def _unnamed(project: Project, mark: ComparatorPoint) -> ObjectPoint:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.problem.images import adjusted_image
+from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.result import Adjustment
 from measure.checks.lost_pixels import without_lost
 from measure.reason import Code, Reason
@@ -86,9 +86,8 @@ def looked_again(visit: Visit) -> tuple[MarkMeasurement, ...] | str:
 def _with_adjusted_points(field: Field, adjustment: Adjustment) -> Field:
     """The field at its adjusted coordinates."""
     xyz = field.xyz.copy()
-    for row, id in enumerate(field.ids):
-        if id in adjustment.network.point_by_id:
-            xyz[row] = [adjustment.value(f"PT.{id}.{axis}") for axis in "XYZ"]
+    known = [row for row, id in enumerate(field.ids) if id in adjustment.network.point_by_id]
+    xyz[known] = adjusted_places(adjustment, [field.ids[row] for row in known])
     return replace(field, xyz=xyz)
 
 

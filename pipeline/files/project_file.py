@@ -46,6 +46,8 @@ class Project:
     tone: the curve of the scans: auto, one of TONES, or the power of the grey value that light grows as.
     unit_mm: how many mm the user's unit of object coordinates has. max_pixels: of a scan, if the user says it.
     decisions: that a person made about marks and poses, the oldest first.
+    board_bend_sigma: of how far the middle of the board, which is all object points, stands off its plane, in the
+    user's unit; 0 flat, inf unknown.
     crs: what the object coordinates are, as "EPSG:25832"; empty where nobody says it.
     writing: in which scans is read what is written about the frame, as in `FiducialOptions`.
     """
@@ -70,6 +72,7 @@ class Project:
     images_path: Path | None = None
     left_out: frozenset[str] = frozenset()
     crs: str = ""
+    board_bend_sigma: float = 0.0
     decisions: tuple[Decision, ...] = ()
 
     def open_scan(self, name: str) -> "Scan":
@@ -215,6 +218,7 @@ def read_project(path: Path) -> Project:
         adjust=read_adjust(table.table("adjust")),
         writing=cast(Reads, measure.text("writing", "pose", get_args(Reads))),
         crs=objects.text("crs", ""),
+        board_bend_sigma=objects.sigma("board_bend", 0.0),
     )
     for each in (table, measure, objects):
         each.done()

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.images import adjusted_image
+from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.network import (
     EXTERIOR_NAMES,
     Approximations,
@@ -91,7 +91,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
                 for frame in [adjustment.network.image_by_name[name].frame]
             },
             transformation={name: np.zeros(0) for name in usable},
-            points={point: np.array([adjustment.value(f"PT.{point}.{axis}") for axis in "XYZ"]) for point in points},
+            points=dict(zip(points, adjusted_places(adjustment, points), strict=True)),
         ),
         images=tuple(shown[name][0] for name in usable),
         freedom=_freedom(camera, free),
@@ -169,7 +169,7 @@ def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Arra
     ]
     points = [observations.point[row] for row in rows]
     model = adjusted_image(adjustment, image)
-    xyz = np.array([[adjustment.value(f"PT.{point}.{axis}") for axis in "XYZ"] for point in points]).reshape(-1, 3)
+    xyz = adjusted_places(adjustment, points)
     gradient = model.camera_by_comparator(observations.xy_mm[rows])
     covariance = gradient @ observations.covariance_mm2[rows] @ gradient.swapaxes(1, 2)
     sigmas = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
@@ -177,7 +177,7 @@ def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Arra
 
 
 def _fixed_point(adjustment: Adjustment, point: str) -> ObjectPoint:
-    return ObjectPoint(point, *(Prior(adjustment.value(f"PT.{point}.{axis}"), 0.0) for axis in "XYZ"))
+    return ObjectPoint(point, *(Prior(float(value), 0.0) for value in adjusted_places(adjustment, [point])[0]))
 
 
 def _is_fixed(point: ObjectPoint) -> bool:

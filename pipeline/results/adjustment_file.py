@@ -3,7 +3,7 @@
 import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.board import BOARD_NAMES
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.images import adjusted_image
-from adjust.problem.network import EXTERIOR_NAMES, Camera, Distortion, Image, ObjectPoint, Prior, Scanner
+from adjust.problem.network import EXTERIOR_NAMES, Board, Camera, Distortion, Image, ObjectPoint, Prior, Scanner
 from adjust.problem.result import Adjustment, FurtherResidual
 from adjust.quality.correlation import correlations
-from adjust.quality.significance import SignificanceTest, group_tests, parameter_tests, scanner_tests
+from adjust.quality.significance import SignificanceTest, board_tests, group_tests, parameter_tests, scanner_tests
 from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.results.covariance_arrays import covariance_arrays, covariance_note
 from pipeline.results.fingerprints import of_content
@@ -86,6 +87,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "reliability": reliability_json(adjustment),
         "cameras": {camera.name: _camera(adjustment, camera) for camera in network.cameras if camera.name in used},
         "scanners": {scanner.name: _scanner(adjustment, scanner) for scanner in network.scanners},
+        "boards": {board.name: _board(adjustment, board) for board in network.boards},
         "images": {image.name: _image(adjustment, image) for image in network.images},
         "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
         "residuals": _residuals(adjustment),
@@ -152,18 +154,30 @@ def distortion_settings(distortion: Distortion) -> Json:
 
 def _scanner(adjustment: Adjustment, scanner: Scanner) -> Json:
     """How far the scanner puts a point beside its place, in mm, as products of Legendre polynomials over an extent."""
-    tests = {test.name: test for test in scanner_tests(adjustment, scanner)}
+    terms, together = _terms(adjustment, f"SC.{scanner.name}", scanner.terms, scanner_tests(adjustment, scanner))
+    extent = {"center_mm": list(scanner.center_mm), "half_mm": list(scanner.half_mm)}
+    return {**extent, "terms": terms, "significance": together}
+
+
+def _board(adjustment: Adjustment, board: Board) -> Json:
+    """How far the board's middle stands off its plane, in object units, along each axis; points: how many it has."""
+    bends = dict(zip(BOARD_NAMES, board.bends, strict=True))
+    terms, together = _terms(adjustment, f"BD.{board.name}", bends, board_tests(adjustment, board))
+    return {"points": len(board.places), **terms, "significance": together}
+
+
+def _terms(
+    adjustment: Adjustment, owner: str, terms: Mapping[str, Prior], of_terms: Sequence[SignificanceTest]
+) -> tuple[Json, list[Json]]:
+    """Every term with its test, and the test of all together."""
+    tests = {test.name: test for test in of_terms}
     together = tests.pop("all", None)
-    return {
-        "center_mm": list(scanner.center_mm),
-        "half_mm": list(scanner.half_mm),
-        "terms": {
-            name: _quantity(adjustment, f"SC.{scanner.name}.{name}", prior)
-            | ({"t": tests[name].statistic, "p": tests[name].p} if name in tests else {})
-            for name, prior in scanner.terms.items()
-        },
-        "significance": [_group_test(together)] if together else [],
+    quantities = {
+        name: _quantity(adjustment, f"{owner}.{name}", prior)
+        | ({"t": tests[name].statistic, "p": tests[name].p} if name in tests else {})
+        for name, prior in terms.items()
     }
+    return quantities, [_group_test(together)] if together else []
 
 
 def _group_test(test: SignificanceTest) -> Json:
@@ -191,8 +205,19 @@ def _image(adjustment: Adjustment, image: Image) -> Json:
 
 
 def _point(adjustment: Adjustment, point: ObjectPoint) -> Json:
+    """Where it is, and what was given of it; a point of a bent board is off the place that is given."""
     given = {"X": point.X, "Y": point.Y, "Z": point.Z}
-    return {axis: _quantity(adjustment, f"PT.{point.id}.{axis}", prior) for axis, prior in given.items()}
+    place = {axis: _quantity(adjustment, f"PT.{point.id}.{axis}", prior) for axis, prior in given.items()}
+    for board in adjustment.network.boards:
+        if point.id in board.places:
+            names = [*(f"PT.{point.id}.{axis}" for axis in "XYZ"), *(f"BD.{board.name}.{each}" for each in BOARD_NAMES)]
+            by_names = np.hstack([np.eye(3), board.lifted_by[point.id].T])
+            values = by_names @ [adjustment.value(name) for name in names]
+            variances = np.diag(by_names @ adjustment.cofactor_of(names) @ by_names.T)
+            for axis, value, variance in zip("XYZ", values, variances, strict=True):
+                sigma = adjustment.sigma0 * math.sqrt(variance) if _has_solution(adjustment) else math.nan
+                place[axis] |= {"value": float(value), "sigma": sigma}
+    return place
 
 
 def _quantity(adjustment: Adjustment, name: str, given: Prior | None = None, scale: float = 1.0) -> Json:

@@ -1,0 +1,179 @@
+"""A board whose two bends are unknown: found with honest standard deviations, and said where they cannot be."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from adjust.choices.model_choice import choose
+from adjust.errors import AdjustmentError
+from adjust.functional_model.board import board_form
+from adjust.initial_values.approximations import approximate
+from adjust.problem.functions import compute, computed_observations, derivatives
+from adjust.problem.images import adjusted_places
+from adjust.problem.network import (
+    Board,
+    Camera,
+    Distortion,
+    Image,
+    Network,
+    ObjectPoint,
+    ObservationKind,
+    Observations,
+    Prior,
+)
+from adjust.problem.problem import number
+from adjust.problem.result import Adjustment
+from adjust.solution.adjustment import adjust
+
+Array = NDArray[np.float64]
+
+COLUMNS, ROWS, SPACING_MM = 10, 7, 30.0
+BENDS_MM = np.array([0.9, -0.5])
+SIGMA_MM = 0.0005
+C_MM, K1 = 20.0, -0.08
+TURNS = [(0.0, 0.0, 0.0), (0.5, 0.0, 0.3), (-0.5, 0.1, 1.2), (0.1, 0.55, -0.7), (0.0, -0.5, 2.0), (0.4, -0.4, -2.1)]
+
+
+def flat_board() -> Array:
+    x, y = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS))
+    return np.stack([SPACING_MM * x.ravel(), SPACING_MM * y.ravel(), np.zeros(x.size)], axis=1)
+
+
+def bent_board() -> Array:
+    """4 k (t - t²) along each axis, t from 0 to 1, as mrcal's ref_calibration_object says."""
+    board = flat_board()
+    t = board[:, :2] / (SPACING_MM * np.array([COLUMNS - 1, ROWS - 1]))
+    board[:, 2] = 4.0 * (t - t**2) @ BENDS_MM
+    return board
+
+
+def network_of(rng: np.random.Generator | None, turned: Array | None = None, bent: bool = True) -> Network:
+    """Six views by OpenCV of the bent board; turned (3, 3): how the board lies in the object's axes."""
+    turn = np.eye(3) if turned is None else turned
+    flat, real = flat_board(), bent_board()
+    middle = flat.mean(axis=0)
+    places = []
+    for angles in TURNS:
+        rotation = Rotation.from_euler("xyz", angles).as_matrix()
+        shift = np.array([0.0, 0.0, 420.0]) - rotation @ middle
+        matrix = np.array([[C_MM, 0.0, 0.1], [0.0, C_MM, 0.05], [0.0, 0.0, 1.0]])
+        seen, _ = cv2.projectPoints(real, cv2.Rodrigues(rotation)[0], shift, matrix, np.array([K1, 0.0, 0.0, 0.0]))
+        places.append(np.reshape(seen, (-1, 2)) * [1.0, -1.0])
+    xy = np.concatenate(places)
+    xy = xy if rng is None else xy + rng.normal(0.0, SIGMA_MM, xy.shape)
+    names = [f"p{k}" for k in range(len(flat))]
+    kinds: list[ObservationKind] = ["target"] * len(xy)
+    points = {name: turn @ place for name, place in zip(names, flat, strict=True)}
+    camera = Camera("C", None, None, None, Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
+    return Network(
+        (camera,),
+        tuple(Image(f"i{i}", "C", "none") for i in range(len(TURNS))),
+        tuple(ObjectPoint(name, *(Prior(float(v)) for v in place)) for name, place in points.items()),
+        Observations(
+            tuple(f"i{i}" for i in range(len(TURNS)) for _ in names),
+            tuple(name for _ in TURNS for name in names),
+            tuple(kinds),
+            xy,
+            np.tile(SIGMA_MM**2 * np.eye(2), (len(xy), 1, 1)),
+        ),
+        boards=(Board("board", points),) if bent else (),
+    )
+
+
+def bends(found: Adjustment) -> Array:
+    return np.array([found.value("BD.board.bend_x"), found.value("BD.board.bend_y")])
+
+
+def test_the_bends_of_exact_views_are_found() -> None:
+    network = network_of(None)
+    found = adjust(network, approximate(network))
+    assert found.converged
+    np.testing.assert_allclose(bends(found), BENDS_MM, atol=1e-7)
+    assert found.value("IO.C.c") == pytest.approx(C_MM, abs=1e-7)
+    np.testing.assert_allclose(adjusted_places(found, [f"p{k}" for k in range(70)]), bent_board(), atol=1e-6)
+    flat = adjust(network_of(None, bent=False), approximate(network))
+    assert flat.sigma0 > 5.0  # without them the board does not fit
+
+
+def test_claimed_sigmas_of_bends_are_realised() -> None:
+    """Sixty sets of errors: chi-square per degree of freedom of both bends, c and k1 within three sigmas of 1."""
+    rng = np.random.default_rng(8)
+    start = approximate(network_of(None))
+    names = ["BD.board.bend_x", "BD.board.bend_y", "IO.C.c", "IO.C.k1"]
+    squares = []
+    for _ in range(60):
+        found = adjust(network_of(rng), start)
+        errors = np.array([found.value(name) for name in names]) - [*BENDS_MM, C_MM, K1]
+        squares.append(errors @ np.linalg.solve(found.cofactor_of(names), errors))
+    assert abs(np.mean(squares) / 4.0 - 1.0) < 3.0 * np.sqrt(2.0 / (4.0 * len(squares)))
+
+
+@pytest.mark.parametrize("turn", [(0.0, 90.0, 0.0), (40.0, -25.0, 70.0), (10.0, 20.0, -30.0)])
+def test_a_board_lies_anyhow_in_the_object(turn: tuple[float, float, float]) -> None:
+    """The same images, the board on another plane and turned in it: the same places but for that turn."""
+    turned = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    found = adjust(network_of(None, turned), approximate(network_of(None, turned)))
+    places = adjusted_places(found, [f"p{k}" for k in range(70)])
+    np.testing.assert_allclose(places, bent_board() @ turned.T, atol=1e-6)
+    assert found.vpv < 1e-10
+
+
+def test_derivatives_by_the_bends_are_differences_of_the_functions() -> None:
+    network = network_of(None)
+    problem = number(network, approximate(network))
+    state = problem.start()
+    at = derivatives(problem, state, compute(problem, state))  # type: ignore[arg-type]
+    for name in ("bend_x", "bend_y"):
+        position = problem.unknowns.names.index(f"BD.board.{name}")
+        step = np.zeros(len(problem.unknowns))
+        step[position] = 1e-3
+        numeric = computed_observations(problem, problem.moved(state, step))
+        below = computed_observations(problem, problem.moved(state, -step))
+        assert numeric is not None
+        assert below is not None
+        by_bend = -(at.by_unknowns * (problem.columns == position)[:, None, :]).sum(axis=2)
+        np.testing.assert_allclose(by_bend, (numeric - below) / 2e-3, atol=1e-8)
+
+
+def test_the_form_is_1_in_the_middle_and_0_at_the_corners() -> None:
+    form = board_form(flat_board())
+    assert form.normal == pytest.approx([0.0, 0.0, 1.0])
+    assert form.shapes[0] == pytest.approx([0.0, 0.0])
+    assert form.shapes[3 * COLUMNS + 4] == pytest.approx([1.0 - (1.0 / 9.0) ** 2, 1.0])
+    facing_x = board_form(flat_board()[:, [2, 0, 1]])
+    assert facing_x.normal == pytest.approx([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(facing_x.shapes, form.shapes, atol=1e-12)
+
+
+def test_what_is_no_board_is_refused() -> None:
+    line = {str(k): np.array([float(k), 0.0, 0.0]) for k in range(5)}
+    with pytest.raises(ValueError, match="at least four points about in a plane"):
+        Board("b", line)
+    network = network_of(None)
+    unknown = replace(network, points=(ObjectPoint("p0", None, None, None), *network.points[1:]))
+    with pytest.raises(AdjustmentError, match="point p0 of board board is not known"):
+        adjust(unknown, approximate(network))
+    twice = replace(network, boards=(*network.boards, Board("other", dict(network.boards[0].places))))
+    with pytest.raises(AdjustmentError, match="is on the boards board and other"):
+        adjust(twice, approximate(network))
+
+
+def test_bends_that_heights_can_take_are_named() -> None:
+    """Where every height is free to 100 m, the bends are the heights' own."""
+    network = network_of(None)
+    vague = tuple(replace(point, Z=Prior(0.0, 1e5)) for point in network.points)
+    found = adjust(replace(network, points=vague), approximate(network))
+    assert found.singular or found.sigma("BD.board.bend_x") / found.sigma0 > 10.0
+
+
+def test_a_choice_of_models_knows_the_bend() -> None:
+    """k1 is chosen, and left-out points are predicted where the bent board has them."""
+    own = adjust(network_of(np.random.default_rng(3)), approximate(network_of(None)))
+    chosen = choose(own).chosen
+    assert chosen.model.parameters == ("k1",)
+    assert chosen.cross_validation is not None
+    assert 0.9 < chosen.cross_validation.sigmas < 1.15
