@@ -55,7 +55,8 @@ def network_of(folder: Path, family: str) -> tuple[Network, Approximations]:
     points = sorted({row[1] for row in rows})
     values = {"a1": a1, "a2": a2, "a3": a3, "b1": b1, "b2": b2, "c1": c1, "c2": c2}
     given = {name: Prior(value, np.inf if name in PUBLISHED else 0.0) for name, value in values.items()}
-    camera = Camera("C", *(Prior(v, np.inf) for v in (-minus_c, x0, y0)), Distortion(family, given, r0_mm=r0))
+    interior = Prior(-minus_c, np.inf), Prior(x0, np.inf), Prior(y0, np.inf)
+    camera = Camera("C", *interior, Distortion(family, given, r0_mm=r0))
     kinds: list[ObservationKind] = ["target"] * len(rows)
     network = Network(
         (camera,),

@@ -174,6 +174,7 @@ def test_a_choice_of_models_knows_the_bend() -> None:
     """k1 is chosen, and left-out points are predicted where the bent board has them."""
     own = adjust(network_of(np.random.default_rng(3)), approximate(network_of(None)))
     chosen = choose(own).chosen
+    assert chosen is not None
     assert chosen.model.parameters == ("k1",)
     assert chosen.cross_validation is not None
     assert 0.9 < chosen.cross_validation.sigmas < 1.15

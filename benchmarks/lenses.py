@@ -1,0 +1,217 @@
+"""Lens families and bent boards: claimed against realised standard deviations, and projections beside mrcal's.
+
+    python benchmarks/lenses.py [SETS]          # sets of errors a case, 200 by default; about a minute for 40
+    python benchmarks/lenses.py mrcal           # the bend of a board beside mrcal 2.2 (Debian's package)
+
+The images are those of the renderer, which has its own formulas, or OpenCV's; a board is bent as mrcal bends it.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from adjust.functional_model.rotation import rotation_from_angles
+from adjust.initial_values.approximations import approximate
+from adjust.problem.network import (
+    Board,
+    Camera,
+    Distortion,
+    Image,
+    Network,
+    ObjectPoint,
+    ObservationKind,
+    Observations,
+    Prior,
+)
+from adjust.solution.adjustment import adjust
+from synthetic_images.projection import camera_from_object
+from synthetic_images.scene import Distortion as SceneDistortion
+from synthetic_images.scene import Family, SceneCamera
+
+Array = NDArray[np.float64]
+Drawn = Callable[[np.random.Generator | None], Network]
+
+SEED = 20
+SIGMA_MM = 0.0004
+R0_MM = 13.0
+POINT_MM = (0.12, -0.07)
+LENSES: dict[Family, tuple[float, dict[str, float]]] = {
+    "aicon": (28.8, {"a1": -1.1e-4, "a2": 1.5e-7, "b1": 5.8e-6, "b2": -8.6e-6, "c1": -7e-5, "c2": -3.1e-5}),
+    "australis": (28.8, {"k1": 1.1e-4, "k2": -1.2e-7, "p1": 5.8e-6, "p2": -8.6e-6, "b1": -7e-5, "b2": -3.1e-5}),
+    "opencv": (28.8, {"k1": -0.09, "k2": 0.1, "p1": 2e-4, "p2": -1e-4, "b1": 4e-4, "b2": -3e-4}),
+    "opencv_fisheye": (11.0, {"k1": 0.03, "k2": -0.01, "k3": 0.002, "b1": 4e-4, "b2": -3e-4}),
+}
+ATTITUDES = [(0.0, 0.0, 0.1), (0.5, 0.1, 1.6), (-0.5, 0.2, 3.1), (0.1, 0.5, -1.5), (-0.1, -0.5, 0.8), (0.3, -0.3, 2.3)]
+COLUMNS, ROWS, SPACING_MM = 10, 7, 30.0
+BENDS_MM = (0.9, -0.5)
+TURNS = [(0.0, 0.0, 0.0), (0.5, 0.0, 0.3), (-0.5, 0.1, 1.2), (0.1, 0.55, -0.7), (0.0, -0.5, 2.0), (0.4, -0.4, -2.1)]
+MRCAL = """
+import json, sys, numpy as np, mrcal
+task = json.load(sys.stdin)
+xy = np.array(task["pixels"])
+views, rows, columns = xy.shape[:3]
+observations = np.concatenate([xy, np.ones((views, rows, columns, 1))], axis=-1)
+indices = np.stack([np.arange(views), np.zeros(views), -np.ones(views)], axis=1).astype(np.int32)
+inputs = dict(
+    intrinsics=np.array([task["start"]]), extrinsics_rt_fromref=np.zeros((0, 6)),
+    frames_rt_toref=np.array(task["frames"]),
+    points=None, observations_board=observations, indices_frame_camintrinsics_camextrinsics=indices,
+    observations_point=None, indices_point_camintrinsics_camextrinsics=None,
+    lensmodel="LENSMODEL_OPENCV4", imagersizes=np.array([[4000, 3000]], dtype=np.int32),
+    calobject_warp=np.zeros(2), calibration_object_spacing=task["spacing"], do_optimize_intrinsics_core=True,
+    do_optimize_intrinsics_distortions=True, do_optimize_extrinsics=False, do_optimize_frames=True,
+    do_optimize_calobject_warp=True, do_apply_regularization=False, do_apply_outlier_rejection=False, verbose=False)
+for _ in range(3):
+    stats = mrcal.optimize(**inputs)
+print(json.dumps({"warp": inputs["calobject_warp"].tolist(), "intrinsics": inputs["intrinsics"][0].tolist(),
+                  "rms": stats["rms_reproj_error__pixels"]}))
+"""
+
+
+def main() -> None:
+    if sys.argv[1:] == ["mrcal"]:
+        beside_mrcal()
+        return
+    sets = int(sys.argv[1]) if len(sys.argv) > 1 else 200
+    print(
+        "| case | parameters | sets | rms error over sigma, least, largest | chi-square a degree of freedom | within |"
+    )
+    print("|---|---|---|---|---|---|")
+    for name, (c, values) in LENSES.items():
+        true = {
+            f"IO.C.{each}": value for each, value in (values | dict(zip(("x0", "y0"), POINT_MM, strict=True))).items()
+        }
+        simulate(name, lambda rng, name=name: lens_network(name, rng), true | {"IO.C.c": c}, sets)  # type: ignore[misc]
+    bends = dict(zip(("BD.board.bend_x", "BD.board.bend_y"), BENDS_MM, strict=True))
+    simulate("bent board", lambda rng: board_network(rng)[0], bends | {"IO.C.c": 20.0, "IO.C.k1": -0.08}, sets)
+
+
+def simulate(name: str, drawn: Drawn, true: dict[str, float], sets: int) -> None:
+    """Adjusted from one start with errors drawn anew: errors against their covariance, two-sided at 1 %."""
+    rng = np.random.default_rng(SEED)
+    start = approximate(drawn(None))
+    errors, total = [], 0.0
+    for _ in range(sets):
+        found = adjust(drawn(rng), start)
+        error = np.array([found.value(each) for each in true]) - list(true.values())
+        cofactor = found.cofactor_of(list(true))
+        errors.append(error / np.sqrt(np.diag(cofactor)))
+        total += float(error @ np.linalg.solve(cofactor, error))
+    rms, freedom = np.sqrt(np.mean(np.square(errors), axis=0)), sets * len(true)
+    low, high = (float(chi2.ppf(share, freedom)) / freedom for share in (0.005, 0.995))
+    spread = f"{rms.min():.3f} {rms.max():.3f} | {total / freedom:.3f} | {low:.3f} {high:.3f}"
+    print(f"| {name} | {len(true)} | {sets} | {spread} |", flush=True)
+
+
+def lens_network(name: Family, rng: np.random.Generator | None) -> Network:
+    """Six views of a deep field, 36 mm x 24 mm, known points; c given roughly, the lens not at all."""
+    c, values = LENSES[name]
+    camera = SceneCamera("C", (80.0, 80.0), c, POINT_MM, SceneDistortion(name, values, R0_MM))
+    half = np.array([18.0, 12.0])
+    reach = 4.0 if name == "opencv_fisheye" else half.max() / c
+    field = np.random.default_rng(1).uniform(-1.0, 1.0, (120, 3)) * [reach, reach, 0.4]
+    rows: list[tuple[int, int, Array]] = []
+    for i, angles in enumerate(ATTITUDES):
+        station = rotation_from_angles(np.array(angles)).T @ np.array([0.0, 0.0, 1.3])
+        seen = camera_from_object(camera, (*station, *angles), field)
+        rows += [(i, int(k), seen[k]) for k in np.flatnonzero((np.abs(seen) < half).all(axis=1))]
+    free = dict.fromkeys(values, Prior(0.0, np.inf))
+    return network_of(
+        Camera("C", Prior(c * 1.03, np.inf), None, None, Distortion(name, free, r0_mm=R0_MM)), field, rows, rng
+    )
+
+
+def board_network(rng: np.random.Generator | None) -> tuple[Network, Array, Array]:
+    """Six views of a bent board by OpenCV; the board's poses as mrcal has them (v, 6), and the places (v, n, 2)."""
+    t, u = np.meshgrid(np.linspace(0.0, 1.0, COLUMNS), np.linspace(0.0, 1.0, ROWS))
+    flat = np.stack([t.ravel() * (COLUMNS - 1), u.ravel() * (ROWS - 1), 0.0 * t.ravel()], axis=1) * SPACING_MM
+    real = flat.copy()
+    real[:, 2] = (4.0 * (t - t**2) * BENDS_MM[0] + 4.0 * (u - u**2) * BENDS_MM[1]).ravel()
+    rows: list[tuple[int, int, Array]] = []
+    poses = []
+    for i, angles in enumerate(TURNS):
+        rotation = Rotation.from_euler("xyz", angles)
+        shift = np.array([0.0, 0.0, 420.0]) - rotation.as_matrix() @ flat.mean(axis=0)
+        matrix, lens = (
+            np.array([[20.0, 0.0, 0.1], [0.0, 20.0, 0.05], [0.0, 0.0, 1.0]]),
+            np.array([-0.08, 0.0, 0.0, 0.0]),
+        )
+        seen, _ = cv2.projectPoints(real, rotation.as_rotvec(), shift, matrix, lens)
+        rows += [(i, k, place) for k, place in enumerate(np.reshape(seen, (-1, 2)) * [1.0, -1.0])]
+        poses.append(np.concatenate([rotation.as_rotvec(), shift]))
+    camera = Camera("C", None, None, None, Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
+    board = Board("board", {f"t{k}": place for k, place in enumerate(flat)})
+    network = network_of(camera, flat, rows, rng, (board,))
+    return network, np.array(poses), network.observations.xy_mm.reshape(len(TURNS), -1, 2)
+
+
+def network_of(
+    camera: Camera,
+    points: Array,
+    rows: list[tuple[int, int, Array]],
+    rng: np.random.Generator | None,
+    boards: tuple[Board, ...] = (),
+) -> Network:
+    """Rows: image, point, place."""
+    places = np.array([row[2] for row in rows])
+    kinds: list[ObservationKind] = ["target"] * len(rows)
+    return Network(
+        (camera,),
+        tuple(Image(f"i{i}", "C", "none") for i in sorted({row[0] for row in rows})),
+        tuple(ObjectPoint(f"t{k}", *(Prior(float(v)) for v in xyz)) for k, xyz in enumerate(points)),
+        Observations(
+            tuple(f"i{row[0]}" for row in rows),
+            tuple(f"t{row[1]}" for row in rows),
+            tuple(kinds),
+            places if rng is None else places + rng.normal(0.0, SIGMA_MM, places.shape),
+            np.tile(SIGMA_MM**2 * np.eye(2), (len(rows), 1, 1)),
+        ),
+        boards=boards,
+    )
+
+
+def beside_mrcal() -> None:
+    """The same noisy views through both, with one lens: fx, fy, cx, cy, k1, k2, p1, p2 and the bends."""
+    pixel_mm = 0.005
+    network, poses, places = board_network(np.random.default_rng(SEED))
+    free = dict.fromkeys(("k1", "k2", "p1", "p2", "b1"), Prior(0.0, np.inf))
+    network = Network(
+        (Camera("C", None, None, None, Distortion("opencv", free)),),
+        network.images,
+        network.points,
+        network.observations,
+        boards=network.boards,
+    )
+    found = adjust(network, approximate(network))
+    middle = np.array([2000.0, 1500.0])
+    pixels = places * [1.0, -1.0] / pixel_mm + middle
+    start = [20.0 / pixel_mm, 20.0 / pixel_mm, *middle, -0.08, 0.0, 0.0, 0.0]
+    task = {"pixels": pixels.reshape(len(TURNS), ROWS, COLUMNS, 2).tolist(), "start": start, "frames": poses.tolist()}
+    text = json.dumps(task | {"spacing": SPACING_MM})
+    done = subprocess.run(["/usr/bin/python3", "-c", MRCAL], input=text, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout)
+    fx, fy, cx, cy, *lens = told["intrinsics"]
+    theirs = {
+        "BD.board.bend_x": told["warp"][0],
+        "BD.board.bend_y": told["warp"][1],
+        "IO.C.c": fy * pixel_mm,
+        "IO.C.b1": fx / fy - 1.0,
+        "IO.C.x0": (cx - middle[0]) * pixel_mm,
+        "IO.C.y0": (middle[1] - cy) * pixel_mm,
+        **dict(zip((f"IO.C.{name}" for name in ("k1", "k2", "p1", "p2")), lens, strict=True)),
+    }
+    print("| | mrcal | here | sigma | differs by, sigmas |\n|---|---|---|---|---|")
+    for name, value in theirs.items():
+        here, sigma = found.value(name), found.sigma(name)
+        print(f"| {name} | {value:.8g} | {here:.8g} | {sigma:.2g} | {(value - here) / sigma:.1e} |")
+
+
+if __name__ == "__main__":
+    main()
