@@ -41,7 +41,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
     """
     start = first_bytes(path)
     if start[:4] in TIFF_STARTS:
-        segments, pitch, notes = open_tiff(path, max_pixels)
+        segments, pitch, notes, _ = open_tiff(path, max_pixels)
         segments.close()
         bits = int(segments.full_scale_dn + 1).bit_length() - 1
         return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, pitch, notes)

@@ -34,6 +34,7 @@ _PART_PX = 512  # of the scan, that a thread reduces at a time, along a side, ab
 _LARGEST_PART_PX = 2048  # the side of a part in whole segments: beyond it segments are divided
 _COMPRESSION_PX = 256  # the side of the part in the middle that tells of an earlier compression: 1000 blocks
 _PLAINLY_COARSER = 1.5  # than what the file itself rounds to, which shows as well
+_OF_A_PX = 0.01  # that an overview is smaller by than a whole part of the scan, where its last pixel is a part of one
 _NAMED = 3  # damaged parts of a file: more are counted
 _LEAST_UNIT_DN = 16  # of 8 bits in a file of 16: as 12 bits stored from the top have it
 
@@ -54,7 +55,10 @@ class Scan:
         segments: Segments,
         pitch: Pitch,
         notes: tuple[str, ...] = (),
+        overviews: Sequence[Segments] = (),
     ) -> None:
+        """overviews: the same picture made small, which the file has too, and which stand in for it where it is looked
+        at small."""
         self.path = path
         self.name = path.stem
         self.width_px = segments.width_px
@@ -69,6 +73,7 @@ class Scan:
         self._cache = SegmentCache(segments)
         self._source = segments if isinstance(segments, RawRows) else self._cache
         self._reduced: dict[int, Array] = {}
+        self._overviews = [Scan(path, own, pitch) for own in overviews]
         self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
     @property
@@ -257,6 +262,8 @@ class Scan:
 
     def _reduced_channels(self, factor: int, width: int, height: int) -> Array:
         """(height, width, channels): every segment is decoded once."""
+        if overview := self._overview(factor):
+            return overview._enlarged_to(self, factor, width, height)
         result = np.empty((height, width, self.channels), np.float32)
         tall, wide = self.segment_px
         cols = width if wide >= self.width_px else _reduced_side(wide, factor, _PART_PX)
@@ -270,6 +277,24 @@ class Scan:
 
         side_by_side(fill, product(range(0, height, rows), range(0, width, cols)))
         return result
+
+    def _overview(self, factor: int) -> "Scan | None":
+        """The smallest that is as large as the scan reduced by a factor, or larger."""
+        fine = [one for one in self._overviews if one.width_px * factor >= self.width_px]
+        return min(fine, key=lambda one: one.width_px, default=None)
+
+    def _enlarged_to(self, scan: "Scan", factor: int, width: int, height: int) -> Array:
+        """This overview of a scan as the scan is reduced by a factor: averaged as far as whole pixels go, and then
+        interpolated."""
+        px = np.array([scan.width_px / self.width_px, scan.height_px / self.height_px])  # of the scan to one of these
+        whole = max(int(factor / px.max() + _OF_A_PX), 1)
+        means_ = self._reduced_channels(whole, self.width_px // whole, self.height_px // whole)
+        scale = factor / (whole * px)
+        matrix = np.column_stack([np.diag(scale), scale / 2 - 0.5])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return np.asarray(
+            cv2.warpAffine(means_, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE), np.float32
+        ).reshape(height, width, self.channels)
 
     def _weights(self, weights: Sequence[float] | None) -> Sequence[float]:
         if weights is None:
@@ -319,13 +344,13 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     path = scan_path(path)
     start = first_bytes(path)
     if start[:4] in TIFF_STARTS:
-        segments, pitch, notes = open_tiff(path, max_pixels)
+        segments, pitch, notes, overviews = open_tiff(path, max_pixels)
     else:
-        segments, pitch, notes = open_picture(path, start, max_pixels)
+        (segments, pitch, notes), overviews = open_picture(path, start, max_pixels), ()
     is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
     if isinstance(path, Address) and is_one:
         notes = *notes, "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
-    return Scan(path, segments, pitch, notes)
+    return Scan(path, segments, pitch, notes, overviews)
 
 
 def first_bytes(path: Path) -> bytes:

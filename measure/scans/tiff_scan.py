@@ -8,7 +8,7 @@ import numpy as np
 from tifffile import TiffFile, TiffPage
 
 from measure.errors import MeasurementError
-from measure.scans.addresses import tiff_file
+from measure.scans.addresses import Address, tiff_file
 from measure.scans.broken import DECODING_ERRORS, broken, unsupported
 from measure.scans.compression import rounding_step_dn
 from measure.scans.radiometry import Radiometry
@@ -28,8 +28,11 @@ _JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
 _REDUCED_IMAGE, _TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
 
 
-def open_tiff(path: Path, max_pixels: int | None = None) -> tuple[Segments, Pitch, tuple[str, ...]]:
-    """The first full-resolution picture of a TIFF file, its pitch, and notes. max_pixels: as `check_size` takes it.
+def open_tiff(
+    path: Path, max_pixels: int | None = None
+) -> tuple[Segments, Pitch, tuple[str, ...], tuple[Segments, ...]]:
+    """The first full-resolution picture of a TIFF file, its pitch, notes, and of an address its overviews: a file is
+    read sooner than their makers' ways of averaging are known. max_pixels: as `check_size` takes it.
 
     Raises MeasurementError for a truncated file, for pictures that are no grey, palette or colour scan of up to
     16 bits a sample, and for those that claim more than such a file can hold.
@@ -47,7 +50,8 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> tuple[Segments, Pitc
         _check_extent(page, path, taken)
         kind = RawRows if _is_raw(page) else TiffSegments
         segments: Segments = kind(file, page, path, radiometry, _page_rounding_step_dn(file, page))
-        return segments, tag_pitch(page), notes
+        overviews = _overviews(file, page, path) if isinstance(path, Address) else ()
+        return segments, tag_pitch(page), notes, overviews
     except DECODING_ERRORS as error:
         file.close()
         raise broken(path, str(error)) from error
@@ -67,6 +71,25 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
     if len(full) > 1:
         notes.append(f"the file holds {len(full)} pictures: the first was taken")
     return full[0], (*notes, *orientation_notes(full[0]))
+
+
+def _overviews(file: TiffFile, full: TiffPage, path: Path) -> tuple[Segments, ...]:
+    """The same picture made small, of the same form and samples: further pages, or below the page itself."""
+    below = full.pages if full.subifds and full.pages is not None else ()
+    pages = [page.aspage() for page in (*file.pages, *below)]
+    small = [page for page in pages if int(page.subfiletype) & (_REDUCED_IMAGE | _TRANSPARENCY_MASK) == _REDUCED_IMAGE]
+    alike = [page for page in small if _is_overview(page, full)]
+    return tuple(TiffSegments(file, page, path, _page_radiometry(page, path), 0.0) for page in alike)
+
+
+def _is_overview(page: TiffPage, full: TiffPage) -> bool:
+    """Whether it has the full picture's samples, and its sides but for a factor and what is left of a pixel."""
+    if (page.bitspersample, page.samplesperpixel) != (full.bitspersample, full.samplesperpixel):
+        return False
+    if page.photometric != full.photometric or page.imagewidth < 1 or page.imagelength < 1:
+        return False
+    factor = full.imagewidth / page.imagewidth
+    return factor > 1.5 and abs(full.imagelength / factor - page.imagelength) <= 1.5
 
 
 def _check_original(page: TiffPage, path: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -67,6 +68,62 @@ def test_eight_windows_take_few_requests_and_bytes(tmp_path: Path, server: Range
     assert head_bytes <= 3 * (1 << 16)
     assert server.gets - opening <= 8 * 4
     assert server.sent_bytes - head_bytes <= 8 * 4 * 1.01 * TILE_PX**2
+
+
+def spotted() -> Any:
+    """Ground with a few round spots, and where their middles are."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform(200, SIDE_PX - 200, (12, 2))
+    col, row = np.meshgrid(np.arange(SIDE_PX), np.arange(SIDE_PX))
+    grey = np.full((SIDE_PX, SIDE_PX), 60.0)
+    for x, y in places:
+        near = np.s_[int(y) - 100 : int(y) + 100, int(x) - 100 : int(x) + 100]
+        grey[near] += 150 * np.exp(-((col[near] - x) ** 2 + (row[near] - y) ** 2) / 2 / 25.0**2)
+    return np.rint(grey + rng.normal(0, 3, grey.shape)).clip(0, 255).astype(np.uint8), places
+
+
+def with_overviews(path: Path, picture: Any, below: bool = False) -> None:
+    """Tiles, and the same picture at a half, a quarter and an eighth, as further pages or below its own."""
+    small = [cv2.resize(picture, None, fx=1 / f, fy=1 / f, interpolation=cv2.INTER_AREA) for f in (2, 4, 8)]
+    tiles: dict[str, Any] = {"tile": (TILE_PX, TILE_PX), "compression": "zlib", "metadata": None}
+    with tifffile.TiffWriter(path) as file:
+        file.write(picture, subifds=3 if below else 0, **tiles)
+        for one in small:
+            file.write(one, subfiletype=1, **tiles)
+
+
+@pytest.mark.parametrize("below", [False, True])
+@pytest.mark.parametrize("factor", [3, 4, 5, 8, 20])
+def test_a_scan_is_looked_at_small_by_its_overviews(
+    tmp_path: Path, server: RangeServer, factor: int, below: bool
+) -> None:
+    picture, places = spotted()
+    with_overviews(tmp_path / "s.tif", picture, below)
+    with open_scan(tmp_path / "s.tif") as local, open_scan(f"{server.url}/s.tif") as remote:
+        opening = server.sent_bytes
+        seen, exact = remote.reduced(factor), local.reduced(factor)
+        fetched = server.sent_bytes - opening
+        assert np.array_equal(remote.samples(9, 9, 50, 50), local.samples(9, 9, 50, 50))
+    assert seen.shape == exact.shape
+    assert np.abs(seen - exact)[2:-2, 2:-2].max() < 6 + 0.3 * factor  # what is interpolated
+    most = {3: 0.25, 4: 0.07, 5: 0.07, 8: 0.02, 20: 0.02}[factor]  # of the area, and so of what is stored
+    assert fetched < 1.3 * most * SIDE_PX**2 + (1 << 17)
+    col, row = np.meshgrid(np.arange(seen.shape[1]), np.arange(seen.shape[0]))
+    for place in (places - (factor - 1) / 2) / factor:
+        near = np.hypot(col - place[0], row - place[1]) < 60 / factor
+        weights = np.clip(seen[near] - 70.0, 0, None)
+        middle = np.array([np.average(axis[near], weights=weights) for axis in (col, row)])
+        assert np.abs(middle - place).max() * factor < 0.1 * factor + 1.0
+
+
+def test_a_thumbnail_of_another_form_is_no_overview(tmp_path: Path, server: RangeServer) -> None:
+    picture, _ = spotted()
+    with tifffile.TiffWriter(tmp_path / "s.tif") as file:
+        file.write(picture, tile=(TILE_PX, TILE_PX), metadata=None)
+        file.write(picture[:300, :200].copy(), subfiletype=1, metadata=None)
+        file.write(cv2.merge([picture[::4, ::4]] * 3), subfiletype=1, photometric="rgb", metadata=None)
+    with open_scan(tmp_path / "s.tif") as local, open_scan(f"{server.url}/s.tif") as remote:
+        np.testing.assert_array_equal(remote.reduced(4), local.reduced(4))
 
 
 def test_tiles_of_a_window_are_asked_for_together(

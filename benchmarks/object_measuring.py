@@ -1,0 +1,109 @@
+"""What measuring a whole scan takes of a tiled TIFF file with overviews on a server: requests, bytes and their share.
+
+    python benchmarks/object_measuring.py [--side 11500] [--seed 1]
+
+The frame has the eight ring-crosses of an aerial camera on grainy film, in the scan's middle or off it, so that they are
+not where the middle has them; the server counts what is asked for.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+from range_server import range_server
+
+from measure.marks.rendering import extent_px, picture
+from pipeline.archive.witness import Witnessed, witnessed_scan
+from pipeline.files.project_file import read_project
+from pipeline.measuring.scan_task import scan_tasks
+
+_PITCH_UM, _GROUND_DN, _GRAIN_DN, _MARK_DN = 20.0, 110.0, 5.0, 90.0
+_EDGE_MM = 106.0
+_PLACES = [(x, y) for x in (-_EDGE_MM, 0.0, _EDGE_MM) for y in (-_EDGE_MM, 0.0, _EDGE_MM) if (x, y) != (0.0, 0.0)]
+_CAMERA = (
+    'name = "K"\nframe_mm = [228.0, 228.0]\nprincipal_distance_mm = 153.0\n'
+    + "".join(
+        f'[[fiducial]]\nid = "{number}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0.01\nmark = "m"\n'
+        for number, (x, y) in enumerate(_PLACES, 1)
+    )
+    + '[mark.m]\nkind = "ring-cross"\nring_mm = 0.8\nring_line_mm = 0.1\narm_mm = 1.2\nline_mm = 0.1\n'
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--side", type=int, default=11_500, help="of the scan, px")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        (folder / "camera.toml").write_text(_CAMERA, encoding="utf-8")
+        print("| tiles, px | overviews | off, px | marks | requests | bytes | share of the file | CPU, s |")
+        print("|---" * 8 + "|")
+        for tile_px, overviews, off_px in ((256, True, 0), (512, True, 0), (256, True, 350), (256, False, 350)):
+            name = f"{tile_px}-{off_px}{'-with' if overviews else ''}.tif"
+            _write(folder / name, _frame(folder, options.side, options.seed, off_px), tile_px, overviews)
+            with range_server(folder) as server:
+                start_s = time.process_time()
+                seen = _measured(folder, f"{server.url}/{name}")
+                cpu_s = time.process_time() - start_s
+                share = server.sent_bytes / (folder / name).stat().st_size
+                marks = seen.scan.frame.marks
+                told = f"{sum(mark.status == 'measured' for mark in marks)} of {len(marks)}"
+                kind = f"{tile_px} | {'yes' if overviews else 'no'} | {off_px}"
+                took = f"{server.gets} | {server.sent_bytes:,} | {100 * share:.1f} % | {cpu_s:.1f}"
+                print(f"| {kind} | {told} | {took} |", flush=True)
+
+
+def _measured(folder: Path, address: str) -> Witnessed:
+    """As `reseau measure` does it."""
+    text = f'camera = "camera.toml"\nscans = ["{address}"]\npitch_um = {_PITCH_UM}\n[measure]\npose = "0"\n'
+    (folder / "project.toml").write_text(text, encoding="utf-8")
+    project = read_project(folder / "project.toml")
+    (task,) = scan_tasks(project, tuple(project.scans))
+    return witnessed_scan(task)
+
+
+def _frame(folder: Path, side: int, seed: int, off_px: int) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(seed)
+    grey = np.full((side, side), _GROUND_DN, np.float32)
+    text = 'camera = "camera.toml"\ncomparator = "camera.toml"\n'
+    (folder / "project.toml").write_text(text, encoding="utf-8")
+    layout = read_project(folder / "project.toml").default_camera.layout()
+    scale, middle = 1000.0 / _PITCH_UM, side / 2 + off_px + rng.uniform(-20, 20, 2)
+    for mark in layout.marks:
+        x, y = mark.xy_mm
+        linear = scale * np.array([[1.0, 0.0], [0.0, -1.0]])
+        center = middle + scale * np.array([x, -y])
+        least, greatest = extent_px(mark.mark, np.column_stack([linear, center]))
+        low, size = np.floor(least).astype(int) - 4, np.ceil(greatest - least).astype(int) + 8
+        drawn = picture(mark.mark, np.column_stack([linear, center - low]), *size.tolist(), 1.0)
+        grey[low[1] : low[1] + size[1], low[0] : low[0] + size[0]] += _MARK_DN * drawn
+    for row in range(0, side, 500):
+        rows = grey[row : row + 500]
+        rows += cv2.GaussianBlur(rng.normal(0, 2 * _GRAIN_DN, rows.shape).astype(np.float32), (0, 0), 0.6)
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def _write(path: Path, grey: NDArray[np.uint8], tile_px: int, overviews: bool) -> None:
+    """Like a cloud-optimised file: tiles, and below the picture itself smaller ones by twos."""
+    smaller = [grey]
+    while overviews and max(smaller[-1].shape) > tile_px:
+        size = [-(-side // 2) for side in smaller[-1].shape[::-1]]
+        smaller.append(cv2.resize(smaller[-1], size, interpolation=cv2.INTER_AREA))
+    with tifffile.TiffWriter(path) as file:
+        for number, one in enumerate(smaller):
+            file.write(one, tile=(tile_px, tile_px), compression="zlib", subfiletype=int(number > 0), metadata=None)
+
+
+if __name__ == "__main__":
+    main()
