@@ -21,7 +21,7 @@ from measure.results import MarkMeasurement
 from measure.status import Status
 from pipeline.archive.file_state import Identity, file_state
 from pipeline.archive.identity import parts_hash
-from pipeline.archive.judging import JudgedScan, judge, judged_marks, judging_of
+from pipeline.archive.judging import JudgedScan, judge, judged_marks, judging_of, tell_written
 from pipeline.archive.measurement import pitches, tell_place
 from pipeline.archive.store import Kept, Store
 from pipeline.files.project_file import Project, read_project
@@ -58,6 +58,7 @@ def _keep(project: Project) -> None:
         judging = judging_of(store, digest)
         assert judging is not None
         write_comparator(project.comparator, judged_marks(store, judging), pitches(store, digest), digest)
+        tell_written(store, digest, project.comparator)
 
 
 def _frames(project: Project, store: Store, home: Path) -> Iterator[JudgedScan]:

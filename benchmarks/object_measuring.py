@@ -2,8 +2,8 @@
 
     python benchmarks/object_measuring.py [--side 11500] [--seed 1]
 
-The frame has the eight ring-crosses of an aerial camera on grainy film, in the scan's middle or off it, so that they are
-not where the middle has them; the server counts what is asked for.
+The frame has the eight ring-crosses of an aerial camera on grainy film, in the scan's middle or so far off it that they
+are sought in the whole; the server counts what is asked for.
 """
 
 import argparse

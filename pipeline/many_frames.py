@@ -2,11 +2,13 @@
 
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from measure.status import Status
+from pipeline.archive.stored_marks import MarkColumns, StoredFrame, StoredMarks
 from pipeline.archive.verdicts import Verdict, verdict_of
 from pipeline.report.data import FrameTotals, Problem, ReportData
 from pipeline.report.fractions import centers_px, places_apart
@@ -48,6 +50,24 @@ class _Totals:
             if mark.status.is_observation and mark.sigma_um is not None:
                 self.sigmas_um.extend(mark.sigma_um.tolist())
 
+    def add_plain(self, plain: Sequence[StoredFrame], columns: MarkColumns, camera_of: Callable[[str], str]) -> None:
+        """Frames of which only totals are told."""
+        for frame in plain:
+            self.verdicts[camera_of(frame.image), _ending(frame.scan)][Verdict.GOOD] += 1
+        counts = np.zeros((len(plain), len(columns.statuses)), dtype=np.int64)
+        np.add.at(counts, (columns.frame, columns.status), 1)
+        rows = list(map(tuple, counts.tolist()))
+        alike = {row: Counter(dict(zip(columns.statuses, row, strict=True))) for row in set(rows)}
+        self.marks |= {frame.image: alike[row] for frame, row in zip(plain, rows, strict=True)}
+        for kind, name in enumerate(columns.kinds):
+            for status, word in enumerate(columns.statuses):
+                if name != "fiducial":
+                    here = (columns.kind == kind) & (columns.status == status)
+                    self.of_targets[name, word] += int(here.sum())
+        used = np.array([Status(word).is_observation for word in columns.statuses], dtype=bool)[columns.status]
+        for kept, values in ((self.centers_px, columns.center_px), (self.sigmas_um, columns.sigma_um)):
+            kept.frombytes(values[used & np.isfinite(values).all(axis=1)].tobytes())
+
     def result(self, needs_look: int) -> FrameTotals:
         x_um, y_um = np.array(self.sigmas_um).reshape(-1, 2).T
         return FrameTotals(
@@ -61,18 +81,26 @@ class _Totals:
         )
 
 
-def reduced(data: ReportData, scans: Iterable[MeasuredScan], camera_of: Callable[[str], str]) -> ReportData:
+def reduced(
+    data: ReportData,
+    scans: Iterable[MeasuredScan],
+    camera_of: Callable[[str], str],
+    stored: StoredMarks | None = None,
+) -> ReportData:
     """The data with the totals of all frames, and of single frames only the worst of those that need a look.
 
-    scans: of the images of data.comparator, read once, one after the other.
+    scans: of the images of data.comparator, read once, one after the other. stored: of whose plain frames only columns
+    are read, the images of data.comparator being all others.
     """
     totals, worst, needs_look = _Totals(), _Worst(), 0
+    if stored is not None:
+        totals.add_plain(stored.plain, stored.columns(), camera_of)
     with_pose = not is_film_alone(data)
     suspect = {row["image"] for row in suspect_rows(data.adjustment)} if data.adjustment else set[str]()
     for one in _one_by_one(data, scans):
         (frame,) = frames(one)
         verdict, problems = _verdict(frame, with_pose), list(problems_of(frame, with_pose))
-        kind = camera_of(frame.image), frame.scan.scan.rpartition(".")[2].lower() if frame.scan else "given"
+        kind = camera_of(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
         totals.add(frame, kind, verdict, problems)
         if problems or verdict.needs_look or frame.image in suspect:
             needs_look += 1
@@ -86,6 +114,10 @@ def reduced(data: ReportData, scans: Iterable[MeasuredScan], camera_of: Callable
         measurement={name: scan for one in shown for name, scan in (one.measurement or {}).items()},
         totals=totals.result(needs_look),
     )
+
+
+def _ending(scan: str) -> str:
+    return scan.rpartition(".")[2].lower()
 
 
 class _Worst:

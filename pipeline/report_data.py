@@ -1,11 +1,13 @@
 """What the stages left, as far as it is of what there is now: what was made from something else is named, not shown."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pipeline.archive.measurement import made_from_of, measured_scans
+from pipeline.archive.stored_marks import StoredMarks
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.many_frames import MOST_FRAMES, reduced
@@ -22,7 +24,13 @@ from pipeline.publishing.made_from import (
 from pipeline.publishing.publishing import outside_note
 from pipeline.report.data import Problem, ReportData
 from pipeline.results.adjustment_reader import read_adjustment, read_covariance
-from pipeline.results.comparator_file import decisions_of, decisions_told, measurement_of, read_comparator
+from pipeline.results.comparator_file import (
+    ComparatorPoint,
+    decisions_of,
+    decisions_told,
+    measurement_of,
+    read_comparator,
+)
 from pipeline.results.fingerprints import of_file
 from pipeline.results.measured_scan import MeasuredScan
 from pipeline.text.spelling import did_you_mean
@@ -33,15 +41,18 @@ Json = dict[str, Any]
 At = Callable[[Path], Path]
 
 
-def measured(project: Project, at: At, most_frames: int | None = None) -> ReportData:
+def measured(
+    project: Project, at: At, most_frames: int | None = None, rows: Sequence[ComparatorPoint] | None = None
+) -> ReportData:
     """The marks, and what measurement.db says of them where it is theirs. at: where each result stands now.
 
-    most_frames: of more than these the scans are not read; `scans_of` gives them one by one.
+    most_frames: of more than these the scans are not read; `scans_of` gives them one by one. rows: some of the marks,
+    where not all are to be read; then no scans are.
     """
     comparator = at(project.comparator)
     data = ReportData(
         project=_title(project),
-        comparator=read_comparator(comparator),
+        comparator=read_comparator(comparator) if rows is None else rows,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
         notes=tuple(filter(None, [outside_note(project), decisions_told(decisions_of(comparator))])),
@@ -59,7 +70,7 @@ def measured(project: Project, at: At, most_frames: int | None = None) -> Report
             f"{path.name} is of other marks than {project.comparator.name}: it is not shown.",
             "Run `reseau measure`.",
         )
-    many = most_frames is not None and frames_of(data) > most_frames
+    many = rows is not None or (most_frames is not None and frames_of(data) > most_frames)
     scans = {} if many else {scan.frame.image: scan for scan in measured_scans(path, digest)}
     now = measured_from(project) if project.scans else {}
     data = replace(data, measurement=scans, made_from={**data.made_from, path.name: digest})
@@ -83,21 +94,38 @@ def scans_of(data: ReportData, project: Project, images: Collection[str] | None 
 
 def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> ReportData:
     """All that a report shows: of more frames than these, totals and those that need a look."""
+    camera_of = partial(_camera_name, project)
+    stored = _stored(project, at)
+    if stored is not None and len(stored.names) > most_frames:
+        look = stored.names - {frame.image for frame in stored.plain}
+        return reduced(measured(project, at, rows=stored.rows(look)), stored.scans(look), camera_of, stored)
     data = adjusted(project, at, most_frames)
     if frames_of(data) <= most_frames:
         return data
-    return reduced(data, scans_of(data, project), lambda image: project.camera_of(image).name)
+    return reduced(data, scans_of(data, project), camera_of)
 
 
 def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     """All that is known of some images. Raises InputError for one that there is not."""
-    data = adjusted(project, at, 0)
-    known = {row.image for row in data.comparator}
+    stored = _stored(project, at)
+    data = adjusted(project, at, 0) if stored is None else measured(project, at, rows=stored.rows(images))
+    known = {row.image for row in data.comparator} if stored is None else stored.names
     for image in images:
         if image not in known:
             raise InputError(f"{project.comparator}: has no image {image!r}.{did_you_mean(image, known)}")
     scans = {scan.frame.image: scan for scan in scans_of(data, project, images)}
     return replace(data, comparator=[row for row in data.comparator if row.image in images], measurement=scans)
+
+
+def _stored(project: Project, at: At) -> StoredMarks | None:
+    """The marks where they need not be read all: comparator.csv is as it was written, and nothing is adjusted."""
+    if not project.scans or at(project.adjustment_path).exists():
+        return None
+    return StoredMarks.of(project.measurement_path, at(project.comparator))
+
+
+def _camera_name(project: Project, image: str) -> str:
+    return project.camera_of(image).name
 
 
 def adjusted(project: Project, at: At, most_frames: int | None = None) -> ReportData:

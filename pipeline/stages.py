@@ -14,7 +14,7 @@ from adjust.problem.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.archive.archive_summary import archive_summary, shard_summary
-from pipeline.archive.judging import drop_all_but, judged_marks, judging_of, rejudge
+from pipeline.archive.judging import drop_all_but, judged_marks, judging_of, marks_as_written, rejudge, tell_written
 from pipeline.archive.measurement import (
     decisions_by,
     fingerprints_of,
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from pipeline.thumbnails import Thumbnails
 
 _ONE_BY_ONE = 2000  # scans: of more the summary tells totals and what needs a look, from the store
-_WRITTEN = "comparator.csv"
 
 
 def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Summary:
@@ -138,7 +137,7 @@ def run_check(project: Project, reporter: Reporter) -> Summary:
 def run_report(project: Project, reporter: Reporter) -> Summary:
     """What the earlier stages left, in report.html."""
     with unpublished(project) as new:
-        _given_marks(project, new)
+        _comparator(project, new)
         with reporter.stage("reporting") as count:
             count(project.report_path.name, 0, 1)
             summary = _reported(project, new)
@@ -150,7 +149,7 @@ def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter)
     """Everything about some images, each in a page of its own; where these stand, by image. Raises InputError for an
     image that there is not."""
     with unpublished(project) as new, reporter.stage("reporting") as count:
-        _given_marks(project, new)
+        _comparator(project, new)
         data = frame_data(project, new.at, frozenset(images))
         pages = {image: project.frame_page_path(image) for image in images}
         with _thumbnails(project, data) as pictures:
@@ -185,7 +184,7 @@ def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkO
         done = measure_archive(
             project, store, lambda: measured_from(project), new.place(project.output / "learned"), reporter, work
         )
-        if store.told(_WRITTEN) != _written(project, done.digest):
+        if not marks_as_written(store, done.digest, project.comparator):
             _write_marks(project, store, done.digest, new)
         return done.digest
 
@@ -212,12 +211,17 @@ def _adjusted_marks(
 
 def _given_marks(project: Project, new: Unpublished) -> tuple[ComparatorPoint, ...]:
     """The marks that this command, an earlier one or the user has left. Raises InputError where there are none."""
+    return read_comparator(_comparator(project, new))
+
+
+def _comparator(project: Project, new: Unpublished) -> Path:
+    """The file that these stand in."""
     path = new.at(project.comparator)
     if not path.exists():
         raise InputError(
             f"{project.comparator}: there is no such file. Run `reseau measure` first, or put the coordinates there."
         )
-    return read_comparator(path)
+    return path
 
 
 def _write_again(project: Project, scans: Sequence[MeasuredScan], new: Unpublished) -> None:
@@ -253,12 +257,7 @@ def _publish(project: Project, new: Unpublished) -> None:
     with Store(project.measurement_path) as store:
         if judging_of(store, digest) is not None:
             drop_all_but(store, digest)
-            store.tell(_WRITTEN, _written(project, digest))
-
-
-def _written(project: Project, digest: str) -> dict[str, str]:
-    """Which marks stand in which file: where both are as they were, neither is written again."""
-    return {"digest": digest, "file": of_file(project.comparator) if project.comparator.exists() else ""}
+            tell_written(store, digest, project.comparator)
 
 
 def _fill_images(project: Project, scans: Iterable[MeasuredScan]) -> None:

@@ -10,13 +10,16 @@ import sqlite3
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 from pipeline.archive.store import MARK_COLUMNS, Json, Store, mark_of, places, row_of
 from pipeline.archive.verdicts import Verdict, verdict_of
 from pipeline.results.comparator_file import MarkRow
+from pipeline.results.fingerprints import of_file
 
 _AT_A_TIME = 500  # frames in a transaction
+_WRITTEN = "comparator.csv"
 _UNFINISHED = "digest like 'unfinished%'"  # the process that made it was ended
 
 
@@ -163,8 +166,22 @@ def judged_records(store: Store, judging: Judging, images: Collection[str] | Non
         yield name, {**record, "scan": uri}
 
 
-def judged_marks(store: Store, judging: Judging) -> Iterator[MarkRow]:
-    """Every mark of every frame, by the frames' names, as all scans together show it."""
+def tell_written(store: Store, digest: str, comparator: Path) -> None:
+    """The file has the marks of that judging now."""
+    store.tell(_WRITTEN, _written(digest, comparator))
+
+
+def marks_as_written(store: Store, digest: str, comparator: Path) -> bool:
+    """Whether the file has the marks of that judging, and nobody has changed it since."""
+    return store.told(_WRITTEN) == _written(digest, comparator)
+
+
+def _written(digest: str, comparator: Path) -> dict[str, Any]:
+    return {"digest": digest, "file": of_file(comparator) if comparator.exists() else ""}
+
+
+def judged_marks(store: Store, judging: Judging, images: Collection[str] | None = None) -> Iterator[MarkRow]:
+    """Every mark of every frame, by the frames' names, as all scans together show it. images: of these alone."""
     db = store.connection
     columns = (
         "point, kind, col_px, row_px, var_col, var_row, cov, case when var_col is null then causes end, status, reason"
@@ -175,6 +192,8 @@ def judged_marks(store: Store, judging: Judging) -> Iterator[MarkRow]:
         "select name, result, own_marks from judged_frame where judging = ? order by name", (judging.row,)
     )
     for name, result, own_marks in frames:
+        if images is not None and name not in images:
+            continue
         for point, kind, col, row, *spread, causes, status, reason in db.execute(
             own if own_marks else as_measured, (judging.row, result)
         ):

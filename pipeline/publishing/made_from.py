@@ -11,7 +11,7 @@ from pipeline.archive.store import known_identities
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.results.fingerprints import fingerprint
+from pipeline.results.fingerprints import fingerprint, of_content
 
 MadeFrom = dict[str, str]
 
@@ -55,15 +55,17 @@ def measured_from(project: Project) -> MadeFrom:
         {camera.name: {name: _of(camera)[name] for name in _LENS} for camera in project.cameras.values()},
         project.film_sigma_mm,
     ]
+
+    def scan_hash(image: str, path: Path) -> str:
+        told = f"{_parts(path, project, known, files)} {project.camera_of(image).name}"
+        return of_content(told.encode("utf-8", "surrogateescape"))
+
     return {
         SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
         PLACES: fingerprint(places),
         **({DECISIONS: fingerprint(project.decisions)} if project.decisions else {}),
         **{f"{CAMERA}{camera.name}": fingerprint(_sought(camera)) for camera in project.cameras.values()},
-        **{
-            f"{SCAN}{image}": fingerprint([*_parts(path, project, known, files), project.camera_of(image).name])
-            for image, path in project.scans.items()
-        },
+        **{f"{SCAN}{image}": scan_hash(image, path) for image, path in project.scans.items()},
     }
 
 

@@ -163,6 +163,24 @@ def _start(image: str, point: str, kind: str) -> str:
     return csv_line([image, point, kind])
 
 
+def comparator_points(
+    marks: Iterable[MarkRow], pitch_um: Mapping[str, tuple[float, float]]
+) -> Iterator[ComparatorPoint]:
+    """What `read_comparator` reads of the marks that were written, but for the last digits and the lines."""
+    for mark in marks:
+        x_mm, y_mm = pitch_um[mark.image][0] / 1000.0, -pitch_um[mark.image][1] / 1000.0
+        xy = sigma = None
+        rho = 0.0
+        if mark.center_px is not None:
+            xy = np.array([mark.center_px[0] * x_mm, mark.center_px[1] * y_mm])
+        if mark.covariance_px2 is not None:
+            of_col, of_row, both = mark.covariance_px2
+            sigma = np.array([math.sqrt(of_col) * x_mm, -math.sqrt(of_row) * y_mm])
+            rho = both * x_mm * y_mm / float(sigma[0] * sigma[1])
+        kind, status = _KINDS[mark.kind], Status(mark.status)
+        yield ComparatorPoint(mark.image, mark.point, kind, xy, sigma, rho, status, mark.reason)
+
+
 def measurement_of(path: Path) -> str:
     """The fingerprint of the measurement that a comparator file was written from; "" of one that does not say so, as
     one that a user made."""

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +15,15 @@ from measure.covariance import Cause, Covariance
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.status import Status
+from pipeline.archive.judging import tell_written
+from pipeline.archive.store import Store
 from pipeline.cli import run
+from pipeline.files.project_file import read_project
 from pipeline.many_frames import MOST_FRAMES, reduced
 from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.page import render_frame_page
-from pipeline.results.comparator_file import ComparatorPoint, mark_rows, write_comparator
+from pipeline.report_data import report_data
+from pipeline.results.comparator_file import ComparatorPoint, mark_rows, measurement_of, write_comparator
 from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 
 FRAMES, MARKS = 3000, 8
@@ -178,23 +183,83 @@ def test_few_frames_are_shown_one_by_one(tmp_path: Path) -> None:
     assert report.count("<details id=") == 3
 
 
-def test_scans_come_from_the_store_one_after_the_other(tmp_path: Path) -> None:
-    project, scans = given(tmp_path, 1), []
+def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
+    """A project whose many scans were measured; of every tenth no target was seen."""
+    project, scans = given(folder, 1), []
     project.write_text('camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = 20.0\n', encoding="utf-8")
-    (tmp_path / "scans").mkdir()
+    (folder / "scans").mkdir()
     for number in range(MOST_FRAMES + 11):
-        file = tmp_path / "scans" / f"{number:04d}.tif"
+        file = folder / "scans" / f"{number:04d}.tif"
         file.write_bytes(f"scan {number}".encode())
         one = scan(number)
-        scans.append(replace(one, scan=str(file), frame=replace(one.frame, image=file.stem)))
-    digest = keep_scans(tmp_path / "out" / "measurement.db", scans)
+        seen = (
+            (Status.PREDICTED, Reason("it is faint", Code.COVERED)) if number % 10 == 3 else (Status.MEASURED, Reason())
+        )
+        targets = [MarkMeasurement(f"t{i}", "target", np.full(2, 7.0 * i), KNOWN, *seen) for i in (1, 2)]
+        marks = (*one.frame.marks, *(targets if number not in FAILED else ()))
+        scans.append(replace(one, scan=str(file), frame=replace(one.frame, image=file.stem, marks=marks)))
+    digest = keep_scans(folder / "out" / "measurement.db", scans)
     pitches = {each.frame.image: each.pitch_um for each in scans}
-    write_comparator(tmp_path / "comparator.csv", mark_rows([each.frame for each in scans]), pitches, digest)
+    write_comparator(folder / "comparator.csv", mark_rows([each.frame for each in scans]), pitches, digest)
+    return project, scans
+
+
+def as_written(folder: Path) -> None:
+    """As `reseau measure` says it at its end."""
+    with Store(folder / "out" / "measurement.db") as store:
+        tell_written(store, measurement_of(folder / "comparator.csv"), folder / "comparator.csv")
+
+
+@pytest.mark.parametrize("is_written", [False, True])
+def test_scans_come_from_the_store_one_after_the_other(tmp_path: Path, is_written: bool) -> None:
+    project, scans = stored(tmp_path)
+    if is_written:
+        as_written(tmp_path)
     assert run(["report", str(project), "--frames", "0001", "0010"]) == 0
     assert "12000 × 12000 px" in (tmp_path / "out" / "frames" / "0010.html").read_text(encoding="utf-8")
+    assert run(["report", str(project), "--frames", "1"]) == 2
     assert run(["report", str(project)]) == 1
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    bad, lost = (sum(number < len(scans) for number in each) for each in (BAD, FAILED))
-    assert f"Of {len(scans)} frames {bad + lost} need a look. They are shown below." in report
-    assert report.count("<details id=") == bad + lost
+    bad, lost, blind = (sum(map(n, range(len(scans)))) for n in (BAD.__contains__, FAILED.__contains__, is_blind))
+    assert f"Of {len(scans)} frames {bad + lost + blind} need a look. They are shown below." in report
+    assert report.count("<details id=") == bad + lost + blind
     assert "scan 5 is damaged" in report
+
+
+def is_blind(number: int) -> bool:
+    return number % 10 == 3 and number not in BAD and number not in FAILED
+
+
+def test_frames_that_need_no_look_are_counted_as_if_each_were_read(tmp_path: Path, monkeypatch: Any) -> None:
+    project = read_project(stored(tmp_path)[0])
+    every = report_data(project, lambda path: path)
+    as_written(tmp_path)
+    monkeypatch.setattr("pipeline.report_data.read_comparator", None)  # nobody reads all of it
+    few = report_data(project, lambda path: path)
+    assert every.totals is not None
+    assert few.totals is not None
+    assert few.totals.needs_look == every.totals.needs_look
+    assert {n: +Counter(c) for n, c in few.totals.marks.items()} == {
+        n: +Counter(c) for n, c in every.totals.marks.items()
+    }
+    assert +Counter(few.totals.of_targets) == +Counter(every.totals.of_targets)
+    assert few.totals.verdicts == every.totals.verdicts
+    assert few.totals.problems == every.totals.problems
+    for axis in ("column", "row"):
+        np.testing.assert_array_equal(few.totals.places_px[axis], every.totals.places_px[axis])
+    for axis in "xy":
+        sigmas = [np.sort(data.totals.sigmas_um[axis]) for data in (few, every) if data.totals]
+        np.testing.assert_allclose(*sigmas, rtol=2e-5)  # comparator.csv has seven digits
+    assert set(few.measurement or {}) == set(every.measurement or {})
+
+
+def test_marks_that_somebody_has_changed_are_read_from_the_file(tmp_path: Path) -> None:
+    project = stored(tmp_path)[0]
+    as_written(tmp_path)
+    file = tmp_path / "comparator.csv"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    place = next(number for number, line in enumerate(lines) if line.startswith("0001,m0,"))
+    lines[place] = lines[place].replace(",measured,", ",rejected,it is a hair")
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    assert run(["report", str(project)]) == 1
+    assert "it is a hair" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
