@@ -85,9 +85,10 @@ def _frame(folder: Path, side: int, seed: int, off_px: int) -> NDArray[np.uint8]
         linear = scale * np.array([[1.0, 0.0], [0.0, -1.0]])
         center = middle + scale * np.array([x, -y])
         least, greatest = extent_px(mark.mark, np.column_stack([linear, center]))
-        low, size = np.floor(least).astype(int) - 4, np.ceil(greatest - least).astype(int) + 8
-        drawn = picture(mark.mark, np.column_stack([linear, center - low]), *size.tolist(), 1.0)
-        grey[low[1] : low[1] + size[1], low[0] : low[0] + size[0]] += _MARK_DN * drawn
+        low = np.floor(least).astype(int) - 4
+        width, height = (np.ceil(greatest - least).astype(int) + 8).tolist()
+        drawn = picture(mark.mark, np.column_stack([linear, center - low]), width, height, 1.0)
+        grey[low[1] : low[1] + height, low[0] : low[0] + width] += _MARK_DN * drawn
     for row in range(0, side, 500):
         rows = grey[row : row + 500]
         rows += cv2.GaussianBlur(rng.normal(0, 2 * _GRAIN_DN, rows.shape).astype(np.float32), (0, 0), 0.6)
@@ -99,7 +100,7 @@ def _write(path: Path, grey: NDArray[np.uint8], tile_px: int, overviews: bool) -
     smaller = [grey]
     while overviews and max(smaller[-1].shape) > tile_px:
         size = [-(-side // 2) for side in smaller[-1].shape[::-1]]
-        smaller.append(cv2.resize(smaller[-1], size, interpolation=cv2.INTER_AREA))
+        smaller.append(np.asarray(cv2.resize(smaller[-1], size, interpolation=cv2.INTER_AREA), np.uint8))
     with tifffile.TiffWriter(path) as file:
         for number, one in enumerate(smaller):
             file.write(one, tile=(tile_px, tile_px), compression="zlib", subfiletype=int(number > 0), metadata=None)

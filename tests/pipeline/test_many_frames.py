@@ -248,8 +248,8 @@ def test_frames_that_need_no_look_are_counted_as_if_each_were_read(tmp_path: Pat
     for axis in ("column", "row"):
         np.testing.assert_array_equal(few.totals.places_px[axis], every.totals.places_px[axis])
     for axis in "xy":
-        sigmas = [np.sort(data.totals.sigmas_um[axis]) for data in (few, every) if data.totals]
-        np.testing.assert_allclose(*sigmas, rtol=2e-5)  # comparator.csv has seven digits
+        own, read = (np.sort(totals.sigmas_um[axis]) for totals in (few.totals, every.totals))
+        np.testing.assert_allclose(own, read, rtol=2e-5)  # comparator.csv has seven digits
     assert set(few.measurement or {}) == set(every.measurement or {})
 
 
