@@ -87,7 +87,7 @@ def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera
     differences = prior_differences(numbering.problem, at.state)[numbering.free]
     system = len(numbering.free), weights, weights * differences
     # Without these priors the factor tells what is weak: nothing is solved with it.
-    return eliminate(at.rows, *system, damping, at.rows.sums, camera_priors, numbering.fronts)
+    return eliminate(at.rows, *system, damping, at.rows.sparse, camera_priors, numbering.fronts)
 
 
 def iterate(numbering: Numbering, covariance_mm2: Array, start: Linearised, limit: int) -> Solution:

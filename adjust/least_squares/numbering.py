@@ -1,7 +1,7 @@
 """The free unknowns of a problem, numbered, and what the blocks of its observations touch of them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from adjust.linear_algebra.fronts import Fronts, band_order, fronts_of
-from adjust.linear_algebra.normal_equations import Groups
+from adjust.linear_algebra.sparse_blocks import Pattern
 from adjust.problem.problem import ABSENT, Problem, side_by_side
 
 Indices = NDArray[np.intp]
@@ -69,19 +69,40 @@ class Numbering:
         return numbers
 
     @cached_property
-    def summed(self) -> list[Touched]:
-        """What the observations touch of the shared unknowns, by frame where points are blocks, by point otherwise."""
-        numbers = self.numbers[self.problem.columns]
-        blocks = replace(self._others, owned=np.empty((len(self._others.owned), 0), dtype=np.intp))
-        return list(_arranged(np.where(numbers < self._shared_count, numbers, ABSENT), blocks, self.numbers))
-
-    @cached_property
-    def groups(self) -> Groups:
-        """The shared unknowns of every frame, or of every point."""
-        group = self._group[self._shared.positions]
-        first = np.flatnonzero(np.diff(group, prepend=-2))  # those of a group stand together
-        place = np.arange(len(group)) - np.repeat(first, np.diff(first, append=len(group)))
-        return Groups(group, np.where(group >= 0, place, 0))
+    def pattern(self) -> Pattern | None:
+        """What every observation touches, without blocks being laid out; None where no images or points are shared, and
+        where the frames that own unknowns are parts put together.
+        """
+        problem, unknowns = self.problem, self.problem.unknowns
+        exterior, place, film, *_ = problem.parts
+        every = np.arange(problem.parts.width)
+        image_columns, place_columns = (
+            np.concatenate([every[exterior.columns], every[film.columns]]),
+            every[place.columns],
+        )
+        of_images = np.hstack([problem.exterior[:, exterior.members], problem.film_positions[:, film.members]])
+        of_points = self._of_points[:, place.members]
+        place_of = np.full(len(unknowns) + 1, len(of_points), dtype=np.intp)  # the last stands for ABSENT
+        place_of[self._of_points[:, :1]] = np.arange(len(of_points))[:, None]
+        images = image_columns, of_images, problem.image_numbers
+        points = place_columns, of_points, place_of[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
+        if not self._points_own and (unknowns.join or len(self._of_frames) < len(of_images)):
+            return None
+        owning, grouped = (points, images) if self._points_own else (images, points)
+        own, members = (
+            np.pad(self.numbers[of], ((0, 1), (0, 0)), constant_values=ABSENT) for _, of, _ in (owning, grouped)
+        )
+        own[own < self._shared_count] = ABSENT
+        members[members >= self._shared_count] = ABSENT
+        block = np.where((own[owning[2]] >= 0).any(axis=1), owning[2], len(own) - 1)
+        group = np.where((members[grouped[2]] >= 0).any(axis=1), grouped[2], len(members) - 1)
+        if not (members >= 0).any() or not (own[block] >= 0).any():
+            return None
+        single = self.numbers[problem.columns]
+        for columns, taken in ((owning[0], own[block]), (grouped[0], members[group])):
+            single[:, columns] = np.where(taken >= 0, ABSENT, single[:, columns])
+        used = np.flatnonzero((single >= 0).any(axis=0))
+        return Pattern((owning[0], grouped[0], used), block, group, own, members, single[:, used], self._shared_count)
 
     @property
     def _shared_count(self) -> int:
@@ -136,10 +157,6 @@ class Numbering:
     @property
     def _blocks(self) -> "_Blocks":
         return self._by_point if self._points_own else self._by_frame
-
-    @property
-    def _others(self) -> "_Blocks":
-        return self._by_frame if self._points_own else self._by_point
 
     @cached_property
     def _points_own(self) -> bool:

@@ -2,14 +2,15 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.least_squares.numbering import Numbering, Touched
-from adjust.linear_algebra.elimination import Sums
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
+from adjust.linear_algebra.sparse_blocks import SparseRows
 from adjust.problem.functions import Derivatives
 from adjust.problem.further_observations import FurtherObservation
 from adjust.problem.problem import ABSENT, Problem, State
@@ -47,22 +48,18 @@ class WhitenedRows:
         along = applied(self.root, np.einsum("nij,nj->ni", self.matrix, by_column))
         return -applied(inverse(by_observation), along)
 
-    @property
-    def sums(self) -> Sums:
-        """How these rows are summed up where there are too many to be factorised."""
-        return Sums(_Summed(self), self.numbering.groups)
+    @cached_property
+    def sparse(self) -> SparseRows | None:
+        """The same where blocks share more than a few unknowns."""
+        pattern = self.numbering.pattern
+        if pattern is None:
+            return None
+        return SparseRows(pattern, self.matrix, self.right, self.further, self._arranged)
 
-
-@dataclass(frozen=True)
-class _Summed:
-    """The rows arranged as in `Numbering.summed`, and the further observations."""
-
-    rows: WhitenedRows
-
-    def __iter__(self) -> Iterator[Blocks]:
-        for touched in self.rows.numbering.summed:
-            yield _blocks(touched, self.rows.matrix, self.rows.right)
-        yield from self.rows.further
+    def _arranged(self) -> Iterator[tuple[Indices, Blocks]]:
+        nothing = np.empty((1, 0), dtype=np.intp)
+        rows = [touched.rows for touched in self.numbering.touched] + [nothing] * len(self.further)
+        return zip(rows, self, strict=True)
 
 
 def whitened_rows(

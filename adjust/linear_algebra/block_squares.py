@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from adjust.linear_algebra.factor import BlockFactors, Blocks, Factor
+from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.triangle import Triangle
 
@@ -52,9 +52,9 @@ def normal_of(blocks: Blocks) -> Normal:
     return Normal(blocks.own, blocks.shared, transposed @ blocks.matrix, right)
 
 
-def by_squares(normals: Sequence[Normal], scale: Array, priors: tuple[Array, Array], fronts: Fronts) -> Factor | None:
+def by_squares(normals: Sequence[Normal], scale: Array, priors: tuple[Array, Array]) -> Factor | None:
     """The factor from normal equations of the blocks; None where a triangle is not well conditioned."""
-    count = fronts.count
+    count = len(scale) - sum(each.own.size for each in normals)
     root_weight, prior_right = priors
     square, right = np.diag(root_weight[:count] ** 2), (root_weight * prior_right)[:count]
     factors = []
@@ -69,8 +69,8 @@ def by_squares(normals: Sequence[Normal], scale: Array, priors: tuple[Array, Arr
         return None
     if _norm_of_inverse(root[None]) > STEADY:
         return None
-    triangle = Triangle(fronts, (root.T,), (np.zeros((count, 0)),))
-    return Factor(tuple(factors), triangle, solve_triangular(root, right, lower=True), scale, steady=True)
+    triangle = Triangle(Fronts.single(count), (root.T,), (np.zeros((count, 0)),))
+    return Factor(DenseBlocks(tuple(factors)), triangle, solve_triangular(root, right, lower=True), scale, steady=True)
 
 
 def _own_factors(normal: Normal, scale: Array, priors: tuple[Array, Array]) -> BlockFactors:

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import cached_property
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,47 @@ class BlockFactors:
     right: Array
 
 
+class Eliminated(Protocol):
+    """All blocks, their own unknowns eliminated."""
+
+    @property
+    def blocks(self) -> tuple[BlockFactors, ...]:
+        """In the order of the blocks, those of equal shape together."""
+
+    def substitute(self, solution: Array) -> None:
+        """Put own unknowns into a solution (n,), scaled, whose shared ones are found."""
+
+    def square_sum(self) -> float:
+        """Of the right sides."""
+
+    def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
+        """Own unknowns (b, o), -1 for none, and their cofactor matrices (b, o, o), scaled; triangle: of what is shared.
+
+        For shared unknowns held fixed, and what these add.
+        """
+
+
+@dataclass(frozen=True)
+class DenseBlocks:
+    """Blocks that were eliminated as they stand here."""
+
+    blocks: tuple[BlockFactors, ...]
+
+    def substitute(self, solution: Array) -> None:
+        for block in self.blocks:
+            through = (block.border @ solution[block.shared][..., None])[..., 0]
+            solution[block.own] = np.linalg.solve(block.triangle, (block.right - through)[..., None])[..., 0]
+
+    def square_sum(self) -> float:
+        return float(sum((block.right**2).sum() for block in self.blocks))
+
+    def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
+        for block in self.blocks:
+            own = np.asarray(np.linalg.inv(block.triangle), dtype=np.float64)
+            inner = triangle.through(block.border, block.shared) + np.eye(block.own.shape[1])
+            yield block.own, own @ inner @ own.swapaxes(1, 2)
+
+
 @dataclass(frozen=True)
 class ReducedRows:
     """Rows of b blocks as own (b, m, o) times quantities of unit covariance plus through (b, m, s) times the scaled
@@ -61,7 +103,7 @@ class Factor:
     value of the rows is near 0.
     """
 
-    blocks: tuple[BlockFactors, ...]
+    eliminated: Eliminated
     triangle: Triangle
     right: Array
     scale: Array
@@ -71,44 +113,43 @@ class Factor:
     def shared_count(self) -> int:
         return len(self.right)
 
+    @property
+    def blocks(self) -> tuple[BlockFactors, ...]:
+        return self.eliminated.blocks
+
     def solution(self) -> Array:
         """The unknowns (n,). Raises numpy.linalg.LinAlgError where a triangle is singular."""
         solution = np.empty(len(self.scale))
-        shared = self.triangle.solve(self.right)
-        solution[: self.shared_count] = shared
-        for block in self.blocks:
-            through = (block.border @ shared[block.shared][..., None])[..., 0]
-            solution[block.own] = np.linalg.solve(block.triangle, (block.right - through)[..., None])[..., 0]
+        solution[: self.shared_count] = self.triangle.solve(self.right)
+        self.eliminated.substitute(solution)
         return solution / self.scale
 
     def length(self) -> float:
         """Of the solution, in standard deviations: what that function of the unknowns moves which moves most."""
-        squares = [(block.right**2).sum() for block in self.blocks]
-        return float(np.sqrt((self.right**2).sum() + sum(squares)))
+        return float(np.sqrt((self.right**2).sum() + self.eliminated.square_sum()))
 
     def variances(self) -> Array:
         """The diagonal (n,) of the cofactor matrix."""
-        variances = np.empty(len(self.scale))
+        variances = np.empty(len(self.scale) + 1)
+        for own, cofactors in self._own_cofactors:
+            variances[own] = np.einsum("bii->bi", cofactors)
         variances[: self.shared_count] = self.triangle.variances
-        for block in self.blocks:
-            own, through = self._roots(block)
-            variances[block.own] = (own**2).sum(axis=2) + (through**2).sum(axis=2)
-        return variances / self.scale**2
+        return variances[:-1] / self.scale**2
 
     def cofactors(self, groups: Indices) -> Array:
         """The cofactor matrices (g, k, k) of groups of unknowns (g, k), each of one block's own or of shared ones."""
         cofactors = np.empty((*groups.shape, groups.shape[1]))
         shared = groups[:, 0] < self.shared_count
         cofactors[shared] = self.triangle.cofactors_of(groups[shared])
-        row = np.full(len(self.scale), -1, dtype=np.intp)
-        for block in self.blocks:
-            row[block.own] = np.arange(block.own.size).reshape(block.own.shape)
-            members = np.flatnonzero(row[groups[:, 0]] >= 0)
+        place = np.full(len(self.scale) + 1, -1, dtype=np.intp)
+        for own, of_own in self._own_cofactors:
+            place[own] = np.arange(own.size).reshape(own.shape)
+            place[-1] = -1
+            members = np.flatnonzero(place[groups[:, 0]] >= 0)
             if len(members):
-                root = np.concatenate(self._roots(block), axis=2)
-                root = root.reshape(block.own.size, root.shape[2])[row[groups[members]]]
-                cofactors[members] = root @ root.swapaxes(1, 2)
-            row[block.own] = -1
+                block, at = np.divmod(place[groups[members]], own.shape[1])
+                cofactors[members] = of_own[block[:, :, None], at[:, :, None], at[:, None, :]]
+            place[own] = -1
         scale = self.scale[groups]
         return cofactors / (scale[:, :, None] * scale[:, None, :])
 
@@ -118,7 +159,7 @@ class Factor:
         shared = np.asarray(columns[:, : self.shared_count].toarray(), dtype=np.float64)
         used = np.diff(columns.indptr) > 0
         cofactor = np.zeros((len(shared), len(shared)))
-        for block in self.blocks:
+        for block in self.blocks if used[self.shared_count :].any() else ():
             for i in np.flatnonzero(used[block.own].any(axis=1)):
                 own = columns[:, block.own[i]].toarray()
                 rows = np.flatnonzero(own.any(axis=1))
@@ -151,10 +192,9 @@ class Factor:
             own = matrix[..., :count] @ np.linalg.inv(block.triangle)
             yield ReducedRows(own, rows.shared, matrix[..., count:] - own @ block.border)
 
-    def _roots(self, block: BlockFactors) -> tuple[Array, Array]:
-        """Roots of the own unknowns' cofactor matrix: for shared unknowns held fixed, and what these add."""
-        own = np.asarray(np.linalg.inv(block.triangle), dtype=np.float64)
-        return own, -own @ (block.border @ self.triangle.root_of(block.shared))
+    @cached_property
+    def _own_cofactors(self) -> tuple[tuple[Indices, Array], ...]:
+        return tuple(self.eliminated.own_cofactors(self.triangle))
 
 
 def of_columns(values: NDArray[Number], blocks: Blocks) -> NDArray[Number]:

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 Indices = NDArray[np.intp]
 
-FRONT_COST = 3e5  # of handling a front, in unknowns times columns squared: what dense algebra does in that time
+FRONT_COST = 1e6  # of handling a front, in unknowns times columns squared: what dense algebra does in that time
 
 
 @dataclass(frozen=True)
@@ -101,18 +101,24 @@ def fronts_of(met: csr_array, sizes: Indices, border: int) -> Fronts:
     """The fronts of groups of some unknowns each (g,), in their order, and of a border of unknowns that all may meet.
 
     met as in `band_order`. Neighbours are put together as long as that makes the elimination of an unknown cheaper.
+    What a run of them leaves is handed on, all of it, to the first group that it meets later.
     """
-    size = np.append(sizes, border)
+    size, count = np.append(sizes, border), len(sizes)
+    meeting = csr_array(met.T @ met)
+    handed_on: list[set[int]] = [set() for _ in range(count + 1)]
     runs: list[_Run] = []
-    for group, later in enumerate(_met_later(met)):
-        alone = _Run(group, group + 1, later)
+    for group in range(count + 1):
+        neighbours = meeting.indices[slice(*meeting.indptr[group : group + 2])] if group < count else ()
+        later = {int(i) for i in neighbours if i > group} | handed_on[group] | {count}
         if runs:
             last = runs[-1]
             together = _Run(last.first, group + 1, (last.later | later) - {group})
             if together.cost(size) <= last.cost(size):
                 runs[-1] = together
                 continue
-        runs.append(alone)
+            handed_on[min(last.later)] |= last.later
+            later |= handed_on[group]
+        runs.append(_Run(group, group + 1, later - {group}))
     stops = np.cumsum(size)
     starts = stops - size
     fronts = [
@@ -140,21 +146,3 @@ class _Run:
         own = int(size[self.first : self.stop].sum())
         width = own + int(size[list(self.later)].sum())
         return width**2 + FRONT_COST / max(own, 1)
-
-
-def _met_later(met: csr_array) -> Iterator[set[int]]:
-    """What every group, in order, meets of those after it when those before it are eliminated; then the border.
-
-    The border stands for one group more, which all others meet.
-    """
-    meeting = csr_array(met.T @ met)
-    count = met.shape[1]
-    handed_on: list[set[int]] = [set() for _ in range(count)]
-    for group in range(count):
-        neighbours = meeting.indices[meeting.indptr[group] : meeting.indptr[group + 1]]
-        later = {int(i) for i in neighbours if i > group} | handed_on[group]
-        later.discard(group)
-        if later:
-            handed_on[min(later)] |= later
-        yield later | {count}
-    yield set()

@@ -86,13 +86,11 @@ def of_normal_equations(fronts: Fronts, normal: csr_array, right: Array) -> tupl
     return Triangle(fronts, tuple(own), tuple(borders)), right
 
 
-def reflections_cost(fronts: Fronts, rows: Iterable[tuple[Indices, int]]) -> float:
-    """Rows times columns squared, of all fronts; rows: unknowns (b, s) and how many rows each block has in them."""
-    heights = np.zeros(len(fronts))
-    for unknowns, height in rows:
-        home = fronts.home(unknowns)
-        heights += height * np.bincount(home, minlength=len(fronts))
-    return float((heights * np.array([front.width for front in fronts]) ** 2).sum())
+def reflections_cost(fronts: Fronts, first: Indices, heights: Indices) -> float:
+    """Rows times columns squared, of all fronts; heights (b,): the rows of blocks whose first unknown is that."""
+    home = fronts.home(first[heights > 0, None])
+    of_front = np.bincount(home, heights[heights > 0], len(fronts))
+    return float((of_front * np.array([front.width for front in fronts]) ** 2).sum())
 
 
 def _distributed(fronts: Fronts, rows: Iterable[Rows]) -> Iterator[tuple[int, Rows]]:

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import rq, solve_triangular
-from scipy.linalg.lapack import dtrcon
+from scipy.linalg.lapack import dtrcon, dtrtrs
 
 from adjust.linear_algebra.fronts import Front, Fronts
 
@@ -20,7 +20,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 WIDE = 500  # unknowns of a front up to which roots of cofactors run over all of them
-SAFE = 1e-6  # reciprocal condition of a root down to which its square will do
+SAFE = 1e-6  # reciprocal condition of a root down to which its square will do in a large network
+TEN_DIGITS = 1e-3  # and in a small one: variances keep them
+ELEMENTS_AT_ONCE = 2_000_000  # of roots that are handled together
 POWERS = 20  # steps of power iterations
 
 
@@ -50,14 +52,14 @@ class Triangle:
         """The inverse times right sides (s,) or (s, d). Raises numpy.linalg.LinAlgError where it is singular."""
         result = np.array(right, dtype=np.float64)
         for front, own, border in reversed(list(self.parts)):
-            result[front.own] = solve_triangular(own, result[front.own] - border @ result[front.after])
+            result[front.own] = _solved(own, result[front.own] - border @ result[front.after])
         return result
 
     def solve_transposed(self, right: Array) -> Array:
         """The inverse of the transpose times right sides (s,) or (s, d)."""
         result = np.array(right, dtype=np.float64)
         for front, own, border in self.parts:
-            result[front.own] = solve_triangular(own, result[front.own], trans="T")
+            result[front.own] = _solved(own, result[front.own], transposed=True)
             result[front.after] -= border.T @ result[front.own]
         return result
 
@@ -88,7 +90,7 @@ class Triangle:
         """By power iteration, to a few percent."""
         return self._singular(lambda vector: self.transposed_times(self.times(vector)))
 
-    @property
+    @cached_property
     def reciprocal_condition(self) -> float:
         """The smallest singular value over the largest, to some tens of percent; 0 where it is singular."""
         if not all(np.diag(own).all() for own in self.own):
@@ -138,13 +140,37 @@ class Triangle:
         result = np.empty((*groups.shape, groups.shape[1]))
         home = self.fronts.home(groups)
         for i in np.unique(home):
-            rows = self.roots[i][self.fronts[i].places(groups[home == i])]
-            result[home == i] = rows @ rows.swapaxes(1, 2)
+            result[home == i] = self._local_cofactors(int(i), self.fronts[i].places(groups[home == i]))
         return result
+
+    def through(self, rows: Array, groups: Indices) -> Array:
+        """The cofactor matrices (b, r, r) of rows (b, r, s') of functions of groups (b, s') of unknowns."""
+        result = np.zeros((*rows.shape[:2], rows.shape[1]))
+        home = self.fronts.home(groups) if groups.size else np.empty(0, dtype=np.intp)
+        for i in np.unique(home):
+            members = np.flatnonzero(home == i)
+            if self._conditions[i] > (TEN_DIGITS if self._is_narrow else SAFE):
+                cofactors = self._local_cofactors(int(i), self.fronts[i].places(groups[members]))
+                result[members] = rows[members] @ cofactors @ rows[members].swapaxes(1, 2)
+                continue
+            at_once = max(1, ELEMENTS_AT_ONCE // (groups.shape[1] * len(self)))
+            for some in np.split(members, range(at_once, len(members), at_once)):
+                roots = rows[some] @ self.root_of(groups[some])
+                result[some] = roots @ roots.swapaxes(1, 2)
+        return result
+
+    @property
+    def _is_narrow(self) -> bool:
+        return len(self.fronts) == 1 and len(self) <= WIDE
+
+    @cached_property
+    def _conditions(self) -> list[float]:
+        """The reciprocal conditions of the fronts' roots."""
+        return [float(dtrcon(root)[0]) for root in self.roots]
 
     def root_of(self, groups: Indices) -> Array:
         """Roots (b, s', k) of the cofactor matrices of groups (b, s') of unknowns that some front touches."""
-        if len(self.fronts) == 1 and len(self) <= WIDE:
+        if self._is_narrow:
             return self.roots[0][groups]
         different, which = np.unique(groups, axis=0, return_inverse=True)
         result = np.empty((*different.shape, different.shape[1]))
@@ -156,15 +182,28 @@ class Triangle:
 
     def _local_roots(self, i: int, places: Indices) -> Array:
         """Roots (b, s', s') of the cofactor matrices of some of what a front touches, by their places (b, s') in it."""
-        if dtrcon(self.roots[i])[0] > SAFE:
+        if self._conditions[i] > SAFE:
             try:
-                width = self.fronts[i].width
-                cofactors = self._squares[i].take(places[:, :, None] * width + places[:, None, :])
-                return np.asarray(np.linalg.cholesky(cofactors), dtype=np.float64)
+                return np.asarray(np.linalg.cholesky(self._local_cofactors(i, places)), dtype=np.float64)
             except np.linalg.LinAlgError:  # the condition of the cofactor matrix is the square of that of its root
                 pass
         rows = self.roots[i][places].swapaxes(1, 2)
         return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64).swapaxes(1, 2)
+
+    def _local_cofactors(self, i: int, places: Indices) -> Array:
+        """The cofactor matrices (b, s', s') themselves."""
+        width = self.fronts[i].width
+        return self._squares[i].take(places[:, :, None] * width + places[:, None, :])
+
+
+def _solved(triangle: Array, right: Array, transposed: bool = False) -> Array:
+    """An upper triangle's inverse, or that of its transpose, times right sides, without what SciPy checks besides."""
+    if not len(triangle):
+        return right
+    solved, singular = dtrtrs(triangle, right, trans=transposed)
+    if singular:
+        raise np.linalg.LinAlgError("a triangle is singular")
+    return np.asarray(solved)
 
 
 def _lifted(triangle: Array, least: float) -> Array:

@@ -191,7 +191,7 @@ class Problem:
         positions = (
             self.exterior[shown],
             self.places,
-            self._film_positions,
+            self.film_positions,
             self._camera_positions[shown],
             self._scanner_positions,
             self.board_positions,
@@ -201,7 +201,7 @@ class Problem:
         return Parts(*(Part(members, slice(end - len(members), end)) for members, end in zip(used, ends, strict=True)))
 
     @cached_property
-    def _film_positions(self) -> Indices:
+    def film_positions(self) -> Indices:
         """(images, k) positions of the film parameters, ABSENT behind those of films that have less."""
         return side_by_side([self.unknowns.transformation[image.name] for image in self.network.images])
 
@@ -287,7 +287,7 @@ class Problem:
         by_image = np.empty((len(self.network.images), self.parts.width), dtype=np.intp)
         of_images = (
             (exterior, self.exterior),
-            (film, self._film_positions),
+            (film, self.film_positions),
             (camera, self._camera_positions),
             (scanner, self._scanner_positions),
         )

@@ -1,6 +1,6 @@
 """The list of all quantities of a network: what is given of each, and where the iteration starts."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -125,7 +125,7 @@ def list_unknowns(network: Network, approximations: Approximations, observed: fr
     for (frame, id_), (x_mm, y_mm) in approximations.joins.items():
         place: list[Quantity] = [("x", None, float(x_mm)), ("y", None, float(y_mm))]
         join[frame, id_] = listing.add(f"JOIN.{frame}.{id_}", place)
-    given, sigma, start = np.array(listing.rows, dtype=np.float64).T
+    given, sigma, start = listing.values()
     owned = camera, fiducial, scanner, point, transformation, exterior, join, board
     return Unknowns(tuple(listing.names), given, sigma, start, *owned)
 
@@ -135,28 +135,28 @@ class _Listing:
 
     def __init__(self) -> None:
         self.names: list[str] = []
-        self.rows: list[tuple[float, float, float]] = []
+        self.quantities: list[Quantity] = []
 
-    def add(self, owner: str, quantities: Iterable[Quantity]) -> Indices:
+    def add(self, owner: str, quantities: Sequence[Quantity]) -> Indices:
         first = len(self.names)
-        for name, prior, approximation in quantities:
-            self.names.append(f"{owner}.{name}")
-            self.rows.append(_row(self.names[-1], prior, approximation))
+        self.names += [f"{owner}.{quantity[0]}" for quantity in quantities]
+        self.quantities += quantities
         return np.arange(first, len(self.names))
 
-
-def _row(name: str, prior: Prior | None, approximation: float | None) -> tuple[float, float, float]:
-    """What is given, its standard deviation, and where to start: what is fixed stays at its value."""
-    if prior is None:
-        if approximation is None or not np.isfinite(approximation):
+    def values(self) -> tuple[Array, Array, Array]:
+        """What is given, its standard deviation, and where to start (n,): what is fixed stays at its value."""
+        _, priors, starts = zip(*self.quantities, strict=True)
+        given = np.array([np.nan if prior is None else prior.value for prior in priors])
+        sigma = np.array([np.inf if prior is None else prior.sigma for prior in priors])
+        start = np.array(starts, dtype=np.float64)
+        start = np.where(np.isfinite(start) & (sigma > 0.0), start, given)
+        missing = np.flatnonzero(np.isnan(start))
+        if len(missing):
             raise AdjustmentError(
-                f"{name} has neither a value nor an approximation. Give one of them, or observe it in images whose "
-                f"orientation can be found."
+                f"{self.names[missing[0]]} has neither a value nor an approximation. Give one of them, or observe "
+                f"it in images whose orientation can be found."
             )
-        return np.nan, np.inf, approximation
-    if approximation is None or prior.sigma == 0.0:
-        return prior.value, prior.sigma, prior.value
-    return prior.value, prior.sigma, approximation
+        return given, sigma, start
 
 
 def _held(prior: Prior) -> Prior:
@@ -187,8 +187,8 @@ def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Q
 
 def _point_quantities(point: ObjectPoint, approximations: Approximations) -> list[Quantity]:
     start = approximations.points.get(point.id)
-    starts = (None, None, None) if start is None else tuple(float(value) for value in start)
-    return list(zip("XYZ", (point.X, point.Y, point.Z), starts, strict=True))
+    x, y, z = (None, None, None) if start is None else start.tolist()
+    return [("X", point.X, x), ("Y", point.Y, y), ("Z", point.Z, z)]
 
 
 def _exterior_quantities(image: Image, approximations: Approximations) -> list[Quantity]:

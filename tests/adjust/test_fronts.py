@@ -189,6 +189,23 @@ def test_fronts_hold_all_that_is_met_in_elimination() -> None:
         assert 502 in front.columns
 
 
+@pytest.mark.parametrize("cost", [0.0, 30.0, 300.0, 3000.0])
+def test_what_a_front_leaves_is_held_by_the_next_one_that_it_meets(
+    cost: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where neighbours in the order that do not meet are put together."""
+    monkeypatch.setattr(fronts, "FRONT_COST", cost)
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        met = csr_array((rng.random((60, 25)) < 0.12).astype(float))
+        order = fronts.band_order(met)
+        of_network = fronts_of(met[:, order], rng.integers(1, 4, 25), 2)
+        for front in of_network:
+            if len(front.after):
+                next_one = of_network[int(of_network.home(front.after))]
+                assert np.isin(front.after, next_one.columns).all()
+
+
 @pytest.mark.usefixtures("finely")
 def test_the_many_ways_in_which_a_strip_can_bend_are_told_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is known well stands at one end: the other end is weak in as many ways as one cares to count."""

@@ -6,7 +6,7 @@ from null_directions import AXES, DEFORMATIONS, DISTANCE, POINT
 from setups import UNKNOWN, Array, Setup, vertical
 from simulated import field_points
 
-from adjust.linear_algebra.factor import BlockFactors, Factor
+from adjust.linear_algebra.factor import BlockFactors, DenseBlocks, Factor
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.triangle import Triangle
 from adjust.solution.adjustment import Options, adjust
@@ -23,7 +23,7 @@ def triangle(rng: np.random.Generator, singular: Array) -> Array:
 def factor_of(shared: Array, *blocks: BlockFactors) -> Factor:
     count = len(shared) + sum(block.own.size for block in blocks)
     dense = Triangle(Fronts.single(len(shared)), (shared,), (np.zeros((len(shared), 0)),))
-    return Factor(blocks, dense, np.zeros(len(shared)), np.ones(count))
+    return Factor(DenseBlocks(blocks), dense, np.zeros(len(shared)), np.ones(count))
 
 
 @pytest.mark.parametrize("below", [null_space.SINGULAR, 1e-4])

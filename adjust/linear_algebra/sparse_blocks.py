@@ -1,0 +1,360 @@
+"""Least squares with many small blocks, of points say, each row of which touches few of the unknowns that they share.
+
+Own unknowns are eliminated for all blocks at once: their columns are made orthonormal by Gram and Schmidt's method,
+twice, which is as good as reflections (Giraud, Langou and Rozloznik 2005, The loss of orthogonality in the Gram-Schmidt
+orthogonalization process). Nothing is laid out in dense blocks. What they leave in the shared unknowns is a difference
+of squares, the rows' and the borders': products of sparse matrices of dense parts.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import bsr_array, coo_array, csr_array
+
+from adjust.linear_algebra.block_squares import TALL
+from adjust.linear_algebra.factor import BlockFactors, Blocks
+from adjust.linear_algebra.triangle import Triangle
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+Arranged = Callable[[], Iterable[tuple[Indices, Blocks]]]  # pairs of rows (b, m) of blocks of equal shape, laid out
+ROWS_AT_ONCE = 20_000  # pairs of rows that are handled together, so that they stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """What n pairs of rows touch: own unknowns of one of b blocks, those of one of g groups, and single ones.
+
+    columns (own (o,), group (w,), single (c,)): which of the derivatives are by these. block (n,), group (n,): whose, b
+    and g for none. own (b + 1, o), members (g + 1, w), single (n, c): the unknowns' numbers, -1 for none. Those of
+    groups and single ones, `count` in all, are shared.
+    """
+
+    columns: tuple[Indices, Indices, Indices]
+    block: Indices
+    group: Indices
+    own: Indices
+    members: Indices
+    single: Indices
+    count: int
+
+    @cached_property
+    def singles(self) -> Indices:
+        """(t,) the numbers of the single unknowns that rows with own unknowns touch."""
+        return np.unique(self.single[self.order])[int((self.single[self.order] < 0).any()) :]
+
+    @cached_property
+    def order(self) -> Indices:
+        """(m,) the pairs of rows that touch own unknowns, block by block."""
+        order = np.argsort(self.block, kind="stable")
+        return order[: np.searchsorted(self.block[order], len(self.own) - 1)]
+
+    @cached_property
+    def of(self) -> Indices:
+        """(m,) their blocks."""
+        return self.block[self.order]
+
+    @cached_property
+    def first(self) -> Indices:
+        """(b + 1,) where each block's begin among them, and where they end."""
+        return np.searchsorted(self.of, np.arange(len(self.own)))
+
+    @cached_property
+    def cells(self) -> tuple[Indices, Indices, Indices]:
+        """What touches the same shared unknowns: order (n,) by cell, first (p + 1,) of each, unknowns (p, w + c)."""
+        touched = np.column_stack([self.group, self.single])
+        begins = np.append(True, (touched[1:] != touched[:-1]).any(axis=1))  # most do as the one before
+        kinds, kind = np.unique(touched[begins], axis=0, return_inverse=True)
+        cell = kind[np.cumsum(begins) - 1]
+        order = np.argsort(cell, kind="stable")
+        unknowns = np.concatenate([self.members[kinds[:, 0]], kinds[:, 1:]], axis=1)
+        return order, np.searchsorted(cell[order], np.arange(len(kinds) + 1)), unknowns
+
+    @cached_property
+    def place_in_border(self) -> Indices:
+        """(o, c, m) where the products of own and single columns are summed up in borders (b, o, t + 1)."""
+        place = np.full(self.count + 1, len(self.singles), dtype=np.intp)
+        place[self.singles] = np.arange(len(self.singles))
+        rows = self.of * self.own.shape[1] + np.arange(self.own.shape[1])[:, None]
+        return np.asarray(rows[:, None] * (len(self.singles) + 1) + place[self.single[self.order]].T)
+
+    @property
+    def is_tall(self) -> bool:
+        """Whether all blocks have so many more rows than columns that it is quicker to square them as dense ones."""
+        rows = np.bincount(self.block, minlength=len(self.own))
+        grouped = np.bincount(self.block[self.group < len(self.members) - 1], minlength=len(self.own))
+        widths = self.own.shape[1] + self.members.shape[1] * grouped + len(self.singles)
+        return bool((2 * rows >= TALL * widths)[:-1].all())
+
+    @cached_property
+    def left_over(self) -> tuple[Indices, Indices]:
+        """(b + 1,) the first shared unknown of every block, and the rows it leaves in these; at last those of none."""
+        lowest = np.where(self.members >= 0, self.members, self.count).min(axis=1, initial=self.count)
+        first = np.full(len(self.own), self.count)
+        np.minimum.at(first, self.block, lowest[self.group])
+        first = np.where(first < self.count, first, self.singles.min(initial=self.count))
+        rows = 2 * np.bincount(self.block, minlength=len(self.own)) - (self.own >= 0).sum(axis=1)
+        return first, np.where(first < self.count, np.maximum(rows, 0), 0)
+
+
+@dataclass(frozen=True)
+class Border:
+    """Rows (r,) in the shared unknowns: as parts in the groups, and dense (r, t) in the single ones."""
+
+    pattern: Pattern
+    parts: bsr_array
+    alone: Array
+
+    def times(self, shared: Array) -> Array:
+        """Their products (r,) with shared unknowns (s,)."""
+        of_groups = np.append(shared, 0.0)[self.pattern.members.ravel()]
+        return np.asarray(self.parts @ of_groups + self.alone @ shared[self.pattern.singles])
+
+    def transposed_times(self, rows: Array) -> Array:
+        """(s,) of rows (r,)."""
+        result = np.zeros(self.pattern.count + 1)
+        np.add.at(result, self.pattern.members.ravel(), self.parts.T @ rows)
+        result[self.pattern.singles] += self.alone.T @ rows
+        return result[:-1]
+
+    def square(self) -> csr_array:
+        """(s, s)."""
+        groups, singles, transposed = self.pattern.members.ravel(), self.pattern.singles, self.parts.T
+        within = bsr_array(transposed @ self.parts).tocoo()
+        across = coo_array(transposed @ self.alone)
+        alone = coo_array(self.alone.T @ self.alone)
+        rows = np.concatenate([groups[within.row], groups[across.row], singles[across.col], singles[alone.row]])
+        columns = np.concatenate([groups[within.col], singles[across.col], groups[across.row], singles[alone.col]])
+        data = np.concatenate([within.data, across.data, across.data, alone.data])
+        there = (rows >= 0) & (columns >= 0)
+        shape = self.pattern.count, self.pattern.count
+        return csr_array(coo_array((data[there], (rows[there], columns[there])), shape=shape))
+
+
+@dataclass(frozen=True)
+class SparseRows:
+    """Pairs of rows of unit weight: matrix (n, 2, k) times the unknowns that a pattern tells = right (n, 2).
+
+    further: rows in shared unknowns alone, besides. arranged: all of these as dense blocks, for what is asked for once.
+    """
+
+    pattern: Pattern
+    matrix: Array
+    right: Array
+    further: tuple[Blocks, ...]
+    arranged: Arranged
+
+    def column_squares(self, count: int) -> Array:
+        """(n,) the sums of the squares in the columns of all unknowns."""
+        squares = np.zeros(count + 1)
+        for column, unknowns in zip(self.pattern.columns[0], self.pattern.own.T, strict=True):
+            of_rows = self.matrix[:, 0, column] ** 2 + self.matrix[:, 1, column] ** 2
+            squares[unknowns] = np.bincount(self.pattern.block, of_rows, len(unknowns))
+        squares[: self.pattern.count] = self.square[0].diagonal()
+        return squares[:-1]
+
+    @cached_property
+    def square(self) -> tuple[csr_array, Array]:
+        """The normal equations (s, s) of all rows in the shared unknowns, own ones left out, and their right side."""
+        pattern, (order, first, unknowns) = self.pattern, self.pattern.cells
+        width = unknowns.shape[1]
+        squares = np.empty((len(unknowns), width + 1, width + 1))
+        for cells in _at_once(first):
+            rows = order[first[cells.start] : first[cells.stop]]
+            columns = np.concatenate(
+                [_taken(self.matrix, np.concatenate(pattern.columns[1:]), rows), self.right[rows].T[None]]
+            )
+            starts = first[cells] - first[cells.start]
+            for i, (x, y) in enumerate(columns):
+                sums = np.add.reduceat(x * columns[i:, 0] + y * columns[i:, 1], starts, axis=1).T
+                squares[cells, i, i:] = squares[cells, i:, i] = sums
+        right = np.zeros(pattern.count + 1)
+        np.add.at(right, unknowns, squares[:, :-1, -1])
+        normal = spread_squares(unknowns, squares[:, :-1, :-1], pattern.count)
+        for block in self.further:
+            normal = normal + spread_squares(block.shared, block.matrix.swapaxes(1, 2) @ block.matrix, pattern.count)
+            np.add.at(right, block.shared, (block.matrix.swapaxes(1, 2) @ block.right[..., None])[..., 0])
+        return normal, right[:-1]
+
+
+def _at_once(first: Indices) -> Iterator[slice]:
+    """Runs of sets of rows, the i-th from first[i] up to the next, as many as the processor's cache holds."""
+    start = 0
+    while start < len(first) - 1:
+        stop = max(start + 1, int(np.searchsorted(first, first[start] + ROWS_AT_ONCE, side="right")) - 1)
+        yield slice(start, stop)
+        start = stop
+
+
+def _taken(matrix: Array, columns: Indices, order: Indices) -> Array:
+    """Some columns (c, 2, m) of pairs of rows (n, 2, k), these in some order (m,)."""
+    taken = np.empty((len(columns), 2, len(order)))
+    for into, i in zip(taken, columns, strict=True):
+        for axis in range(2):
+            into[axis] = matrix[:, axis, i][order]
+    return taken
+
+
+def spread_squares(unknowns: Indices, squares: Array, count: int) -> csr_array:
+    """The sum (n, n) of squares (b, s, s) of some unknowns (b, s) each, -1 for none."""
+    rows, columns = (np.broadcast_to(at, squares.shape) for at in (unknowns[:, :, None], unknowns[:, None, :]))
+    there = (rows >= 0) & (columns >= 0)
+    return csr_array(coo_array((squares[there], (rows[there], columns[there])), shape=(count, count)))
+
+
+def eliminated(rows: SparseRows, root_weight: Array, prior_right: Array, scale: Array) -> "SparseBlocks":
+    """Eliminate all own unknowns; scale (n,) as in `Factor`.
+
+    A row an unknown (n,), scaled, holds its prior: root_weight times the unknown = prior_right.
+    """
+    pattern, own = rows.pattern, rows.pattern.own[:-1]
+    weight = np.where(own >= 0, (root_weight * scale)[own], 1.0)
+    prior = np.where(own >= 0, prior_right[own], 0.0)
+    triangle, right = np.empty((*own.shape, own.shape[1])), np.empty(own.shape)
+    orthonormal = np.empty((own.shape[1], 2, len(pattern.order)))
+    parts = np.empty((len(pattern.order), own.shape[1], pattern.members.shape[1]))
+    alone = np.empty((*own.shape, len(pattern.singles) + 1))
+    for blocks in _at_once(pattern.first):
+        some = slice(pattern.first[blocks.start], pattern.first[blocks.stop])
+        order, of = pattern.order[some], pattern.of[some] - blocks.start
+        by_block = csr_array(
+            (np.ones(len(of)), np.arange(len(of)), pattern.first[blocks.start : blocks.stop + 1] - some.start),
+            shape=(blocks.stop - blocks.start, len(of)),
+        )
+        by_own, by_group, by_single = (_taken(rows.matrix, columns, order) for columns in pattern.columns)
+        by_own.swapaxes(1, 2)[(own[blocks][of] < 0).T] = 0.0
+        by_prior = weight[blocks].T[..., None] * np.eye(own.shape[1])[:, None, :]
+        first = _orthonormal(by_block, of, by_own, by_prior)
+        triangle[blocks] = _orthonormal(by_block, of, by_own, by_prior) @ first
+        x, y = rows.right[order].T
+        right[blocks] = by_block @ (by_own[:, 0] * x + by_own[:, 1] * y).T + (by_prior * prior[blocks]).sum(axis=2).T
+        by_group, by_single = (
+            by_own[:, None, 0] * by[:, 0] + by_own[:, None, 1] * by[:, 1] for by in (by_group, by_single)
+        )
+        parts[some] = by_group.transpose(2, 0, 1)
+        place = pattern.place_in_border[..., some] - blocks.start * alone[0].size
+        of_alone = np.bincount(place.ravel(), by_single.ravel(), alone[blocks].size)
+        alone[blocks] = of_alone.reshape(alone[blocks].shape)
+        orthonormal[..., some] = by_own
+    shape = len(own) * own.shape[1], len(pattern.members) * parts.shape[2]
+    sparse = bsr_array((parts, pattern.group[pattern.order], pattern.first), shape=shape)
+    border = Border(pattern, sparse, alone[..., :-1].reshape(shape[0], -1))
+    return SparseBlocks(rows, triangle, border, right, orthonormal, scale)
+
+
+def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Array) -> Array:
+    """Make columns (o, 2, m) with rows (o, b, o) of priors below orthonormal, where they are; the triangles (b, o, o).
+
+    by_block (b, m): the sums over every block; of (m,): their blocks.
+    """
+    count = len(columns)
+    triangle = np.zeros((by_prior.shape[1], count, count))
+    for i in range(count):
+        along = by_block @ (columns[i, 0] * columns[i:, 0] + columns[i, 1] * columns[i:, 1]).T
+        along += (by_prior[i] * by_prior[i:]).sum(axis=2).T
+        length = np.sqrt(along[:, 0])
+        over = 1.0 / np.where(length > 0.0, length, np.inf)
+        columns[i] *= over[of]
+        by_prior[i] *= over[:, None]
+        triangle[:, i, i:] = along * over[:, None]
+        rest = triangle[:, i, i + 1 :].T
+        columns[i + 1 :] -= rest.take(of, axis=1)[:, None] * columns[i]
+        by_prior[i + 1 :] -= rest[..., None] * by_prior[i]
+    return triangle
+
+
+@dataclass(frozen=True)
+class SparseBlocks:
+    """Blocks eliminated: triangle (b, o, o) own + border shared = right (b, o), of the unknowns as they are.
+
+    orthonormal (o, 2, m): the own unknowns' columns made orthonormal, as in `Pattern.order`. scale (n,) as in `Factor`.
+    """
+
+    rows: SparseRows
+    triangle: Array
+    border: Border
+    right: Array
+    orthonormal: Array
+    scale: Array
+
+    @property
+    def own(self) -> Indices:
+        """(b, o) numbers, -1 for none."""
+        return self.rows.pattern.own[:-1]
+
+    def substitute(self, solution: Array) -> None:
+        """Put the blocks' own unknowns into a solution (n,), scaled, whose shared ones are found."""
+        count, diagonal = self.rows.pattern.count, np.einsum("bii->bi", self.triangle)
+        if not diagonal.all():
+            raise np.linalg.LinAlgError("a block is singular")
+        rest = self.right - self.border.times(solution[:count] / self.scale[:count]).reshape(self.right.shape)
+        own = np.zeros_like(rest)
+        for i in reversed(range(rest.shape[1])):
+            own[:, i] = (rest[:, i] - (self.triangle[:, i] * own).sum(axis=1)) / diagonal[:, i]
+        there = self.own >= 0
+        solution[self.own[there]] = own[there] * self.scale[self.own[there]]
+
+    def square_sum(self) -> float:
+        """Of the right sides."""
+        return float((self.right**2).sum())
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """Of the triangles (b, o, o), scaled."""
+        scaled = self.triangle / np.where(self.own >= 0, self.scale[self.own], 1.0)[:, None, :]
+        inverse = np.zeros_like(scaled)
+        for i in reversed(range(scaled.shape[1])):
+            inverse[:, i, i] = 1.0
+            inverse[:, i] -= (scaled[:, i, i + 1 :, None] * inverse[:, i + 1 :]).sum(axis=1)
+            inverse[:, i] /= scaled[:, i, i, None]
+        return inverse
+
+    def norm_of_inverse(self) -> float:
+        """The largest of the triangles, scaled, by Frobenius; inf where one is singular."""
+        if not np.einsum("bii->bi", self.triangle).all():
+            return np.inf
+        return float(np.sqrt((self._inverse**2).sum(axis=(1, 2)).max(initial=0.0)))
+
+    def own_cofactors(self, triangle: Triangle) -> Iterator[tuple[Indices, Array]]:
+        pattern = self.rows.pattern
+        counts, parts, count = np.diff(pattern.first), self.border.parts, pattern.count
+        shared_scale, inverse = np.append(self.scale[:count], 1.0), self._inverse
+        alone = self.border.alone.reshape(*self.right.shape, len(pattern.singles))
+        for each in np.unique(counts):
+            some = np.flatnonzero(counts == each)
+            at = pattern.first[some][:, None] + np.arange(each)
+            border = parts.data[at].swapaxes(1, 2).reshape(*self.right[some].shape, -1)
+            border = np.concatenate([border, alone[some]], axis=2)
+            members = pattern.members[parts.indices[at]].reshape(len(some), -1)
+            unknowns = np.concatenate([members, np.broadcast_to(pattern.singles, (len(some), alone.shape[2]))], axis=1)
+            border *= np.where(unknowns >= 0, 1.0 / shared_scale[unknowns], 0.0)[:, None]
+            some_of_each = np.where(unknowns >= 0, unknowns, unknowns.max(axis=1, keepdims=True))
+            inner = triangle.through(border, some_of_each) + np.eye(self.right.shape[1])
+            yield self.own[some], inverse[some] @ inner @ inverse[some].swapaxes(1, 2)
+
+    @cached_property
+    def blocks(self) -> tuple[BlockFactors, ...]:
+        """The same as dense blocks of equal shape, scaled."""
+        pattern = self.rows.pattern
+        place = np.zeros(len(pattern.block), dtype=np.intp)
+        place[pattern.order] = np.arange(len(pattern.order))
+        block_of = np.zeros(len(self.scale), dtype=np.intp)
+        some, _ = there = np.nonzero(self.own >= 0)
+        block_of[self.own[there]] = some
+        present = np.argsort(self.own < 0, axis=1, kind="stable")
+        found = []
+        for rows, block in self.rows.arranged():
+            count = block.own.shape[1]
+            at = block_of[block.own.min(axis=1, initial=len(block_of) - 1)]
+            columns = present[at, :count]
+            turned = self.orthonormal[columns[..., None, None], np.arange(2), place[rows][:, None, :, None]]
+            shared = block.matrix[..., count:] / self.scale[block.shared][:, None, :]
+            border = turned.reshape(len(at), count, shared.shape[1]) @ shared
+            triangle = self.triangle[at[:, None, None], columns[..., None], columns[:, None]]
+            triangle = triangle / self.scale[block.own][:, None, :]
+            found.append(BlockFactors(block.own, block.shared, triangle, border, self.right[at[:, None], columns]))
+        return tuple(found)
