@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family
@@ -12,6 +13,7 @@ from adjust.functional_model.transformation import fewest_marks, marks_needed
 from adjust.problem.network import Camera, Image, Network, Observations, Prior
 
 TARGETS_NEEDED = 3
+SHOWN_AS = {"fiducial": 1, "join": 2}  # all others are object points
 DEFINITE = 1e-13  # least eigenvalue of an earlier calibration's correlation matrix
 
 
@@ -33,9 +35,9 @@ def validate(network: Network) -> None:
     _check_duplicate_observations(network)
     _check_values(network.observations)
     _check_parts(network)
-    targets, fiducials = _shown(network)
-    for frame, image in {image.frame: image for image in network.images}.items():
-        _check_image(replace(image, name=frame), targets[frame], fiducials[frame])
+    frames = {image.frame: image for image in network.images}
+    for (frame, image), shown in zip(frames.items(), _shown(network).tolist()[: len(frames)], strict=True):
+        _check_image(replace(image, name=frame), *shown)
 
 
 def _check_not_empty(network: Network) -> None:
@@ -277,14 +279,13 @@ def _check_parts(network: Network) -> None:
             )
 
 
-def _shown(network: Network) -> tuple[Counter[str], Counter[str]]:
-    """How many object points, and how many fiducials, every frame shows, those in several of its parts once."""
-    observations = network.observations
-    frame = [network.images[i].frame for i in network.image_numbers]
-    marks = set(zip(frame, observations.kind, observations.point, strict=True))
-    of_kind = [Counter(frame for frame, kind, _ in marks if (kind == "fiducial") == told) for told in (False, True)]
-    joins = Counter(frame for frame, kind, _ in marks if kind == "join")
-    return of_kind[0] - joins, of_kind[1]
+def _shown(network: Network) -> NDArray[np.intp]:
+    """(frames, 2) how many object points, and how many fiducials, every frame shows, those in several parts once."""
+    observations, frames = network.observations, network.frame_numbers[network.image_numbers]
+    names, points = observations.numbered_points
+    kinds = np.array([SHOWN_AS.get(kind, 0) for kind in observations.kind], dtype=np.intp)
+    marks = np.unique((frames * 3 + kinds) * len(names) + points) // len(names)
+    return np.bincount(marks, minlength=3 * len(network.images)).reshape(-1, 3)[:, :2]
 
 
 def _check_image(image: Image, targets: int, fiducials: int) -> None:
