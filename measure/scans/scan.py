@@ -115,6 +115,12 @@ class Scan:
         """Height and width of what the file has in one piece."""
         return self._segments.segment_height_px, self._segments.segment_width_px
 
+    def named(self, name: str) -> "Scan":
+        """The same under the name that a project has for it: files of several folders may be called alike."""
+        scan = copy(self)
+        scan.name = name
+        return scan
+
     def seen_through(self, tone: Tone) -> "Scan":
         """The same scan with another belief about its tone curve."""
         scan = copy(self)

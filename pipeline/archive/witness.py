@@ -10,7 +10,7 @@ from pipeline.archive.identity import parts_hash
 from pipeline.measuring.measured import measured_scan
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
-from pipeline.results.thumbnail import StoredThumbnail, stored_thumbnails
+from pipeline.results.thumbnail import StoredThumbnail, TakenThumbnails
 
 _COUNTED = Path("/proc/self/io")
 
@@ -29,8 +29,8 @@ class Witnessed:
 def witnessed_scan(task: ScanTask) -> Witnessed:
     """Measure a scan. Raises nothing but interrupts, as `measured_scan` does."""
     before = _bytes_read()
-    thumbnails = list[StoredThumbnail]()
-    scan = measured_scan(task, lambda *seen: thumbnails.extend(stored_thumbnails(*seen)))
+    thumbnails = TakenThumbnails()
+    scan = measured_scan(task, thumbnails.take)
     bytes_read = _bytes_read() - before if before >= 0 else -1
     parts = parts_hash(scan_path(task.scan), task.max_pixels) if task.scan else ""
     return Witnessed(scan, parts, bytes_read, tuple(thumbnails))

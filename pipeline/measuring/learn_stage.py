@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from measure.marks.shapes import MarkTemplate
+from measure.marks.shapes import LearnedMark, Mark, MarkTemplate
 from measure.results import FrameMeasurement
 from measure.revision import MEASURE_REVISION
 from measure.scans.parallel import mapped
@@ -97,11 +97,19 @@ def _file_names(cameras: Sequence[Path], learned: Path) -> Mapping[Path, str]:
 
 def _known(project: Project, camera: CameraFile) -> CameraFile:
     """A camera whose marks were learned before, or drawn. Another scan may have the name of the one they were learned
-    from: then that tells nothing of how this project's scans lie."""
+    from: then that tells nothing of how this project's scans lie, and none of these has a share in the marks."""
     learned = camera.learned_from
     if learned is None or (learned.scan in project.scans and digest(project.scans[learned.scan]) == learned.sha256):
         return camera
-    return replace(camera, learned_from=None)
+    fiducials = tuple(replace(one, mark=_of_other_scans(one.mark)) for one in camera.fiducials)
+    return replace(camera, fiducials=fiducials, learned_from=None)
+
+
+def _of_other_scans(mark: Mark | LearnedMark | None) -> Mark | LearnedMark | None:
+    """A learned mark whose shares are those of no image: a name never holds a line's end."""
+    if not isinstance(mark, MarkTemplate):
+        return mark
+    return replace(mark, shares={f"{scan}\n": share for scan, share in mark.shares.items()})
 
 
 def _learned(

@@ -74,7 +74,7 @@ class ScanTask:
         """The scan. Raises MeasurementError where it cannot be read."""
         if not self.scan:
             raise MissingError(_NO_SCAN)
-        return open_scan(scan_path(self.scan), self.max_pixels)
+        return open_scan(scan_path(self.scan), self.max_pixels).named(self.name)
 
     def posed(self, pose: str) -> "ScanTask":
         """The same scan in a pose that is known, nothing read in it."""

@@ -78,6 +78,13 @@ def stored_thumbnails(scan: Scan, measured: MeasuredScan) -> tuple[StoredThumbna
     return (*whole, *(StoredThumbnail.of(picture, m.point, m.kind) for m, picture in marks if picture is not None))
 
 
+class TakenThumbnails(list[StoredThumbnail]):
+    """What is cut of scans while they are open."""
+
+    def take(self, scan: Scan, measured: MeasuredScan) -> None:
+        self.extend(stored_thumbnails(scan, measured))
+
+
 def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
     """The window about a mark; None where it has no place in the scan. Raises MeasurementError as the scan does."""
     if mark.center_px is None:

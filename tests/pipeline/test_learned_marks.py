@@ -4,7 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from shutil import copy
+from shutil import copy, copytree
 
 import numpy as np
 import pytest
@@ -219,6 +219,44 @@ def test_cameras_whose_files_are_named_alike_are_stored_apart(
         for camera in (known.camera_of(image), read_camera(tmp_path / "out" / "learned" / file)):
             assert camera.learned_from is not None
             assert camera.learned_from.scan == image
+
+
+def shares_of(project: Project) -> set[frozenset[str]]:
+    """The scans that each mark of the project's camera says it was learned from."""
+    marks = [fiducial.mark for camera in project.cameras.values() for fiducial in camera.fiducials]
+    assert all(isinstance(mark, MarkTemplate) for mark in marks)
+    return {frozenset(mark.shares) for mark in marks if isinstance(mark, MarkTemplate)}
+
+
+def test_scans_of_several_folders_that_are_called_alike_have_a_share_each(
+    shown: tuple[Project, Project], rendered: Path, tmp_path: Path
+) -> None:
+    for number in range(3):
+        (tmp_path / f"box{number}").mkdir()
+        copy(rendered / "scans" / f"f{number}.tif", tmp_path / f"box{number}" / "0001.tif")
+    clicked = clicks(rendered).replace("f1.tif", "box1/0001.tif")
+    project = project_of(tmp_path, LEARNED + clicked, '"box*/0001.tif"')
+    known = learned(project)
+    assert shares_of(known) == {frozenset({"box0/0001", "box1/0001", "box2/0001"})}
+    for of_folder, of_name in ((0, "box0/0001"), (2, "box2/0001")):
+        frame, same = measure_scan(known, of_name).frame, measure_scan(shown[1], f"f{of_folder}").frame
+        for mark, other in zip(frame.marks, same.marks, strict=True):
+            np.testing.assert_allclose(np.array(mark.covariance_px2), np.array(other.covariance_px2), rtol=0.05)
+
+
+def test_marks_learned_in_one_project_hold_nothing_of_the_scans_of_another(
+    shown: tuple[Project, Project], rendered: Path, tmp_path: Path
+) -> None:
+    """There f1 is another scan than the one that they were clicked in."""
+    for name, other in (("f1", "f0"), ("f2", "f2")):
+        copy(rendered / "scans" / f"{other}.tif", tmp_path / f"{name}.tif")
+    stored = shown[0].output / "learned"
+    copytree(stored, tmp_path / "cameras")
+    project_of(tmp_path, LEARNED, '"*.tif"')
+    text = (tmp_path / "project.toml").read_text().replace('"camera.toml"', '"cameras/camera.toml"')
+    (tmp_path / "project.toml").write_text(text)
+    known = learned(read_project(tmp_path / "project.toml"))
+    assert all(shares.isdisjoint(known.scans) for shares in shares_of(known))
 
 
 def test_what_was_learned_is_stored_whole_and_read_without_it_too(shown: tuple[Project, Project]) -> None:
