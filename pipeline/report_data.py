@@ -51,7 +51,7 @@ def measured(
     """
     comparator = at(project.comparator)
     data = ReportData(
-        project=_title(project),
+        project=project.title,
         comparator=read_comparator(comparator) if rows is None else rows,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
@@ -184,13 +184,6 @@ def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem
 
 def _with_problem(data: ReportData, what: str, next_step: str) -> ReportData:
     return replace(data, problems=(*data.problems, Problem(what, next_step)))
-
-
-def _title(project: Project) -> str:
-    """The project's folder, unless the project file has a name of its own."""
-    stem = project.path.stem
-    name = project.path.resolve().parent.name if stem == "project" else stem
-    return name.encode("utf-8", "replace").decode("utf-8")
 
 
 def _json(path: Path) -> Json | None:

@@ -93,6 +93,12 @@ class Project:
         return self.adjust.film_sigma_um / 1000.0 or SCATTER_MM
 
     @property
+    def title(self) -> str:
+        """The project's folder, unless the project file has a name of its own."""
+        name = self.path.resolve().parent.name if self.path.stem == "project" else self.path.stem
+        return name.encode("utf-8", "replace").decode("utf-8")
+
+    @property
     def decisions_path(self) -> Path:
         return self.path.parent / DECISIONS
 

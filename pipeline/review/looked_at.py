@@ -118,7 +118,7 @@ class LookedAt:
             if pose is None
             else {"name": pose.name, "decided": pose.decided, "evidence": list(pose.evidence), "roll": pose.roll},
             "marks": marks,
-            "fiducials": list(self.drawn),
+            "fiducials": {id: mark.xy_mm for id, mark in self.drawn.items()},
             "writing": [{"text": line.text, "outline": line.outline_px} for line in frame.writing or ()],
         }
 

@@ -122,7 +122,7 @@ class _Answers:
     def start(self, query: "_Query", body: Any) -> Any:
         session = self._session
         return {
-            "project": session.project.path.stem,
+            "project": session.project.title,
             "who": session.who,
             "poses": list(POSES),
             "choices": session.choices(),
@@ -160,7 +160,7 @@ class _Answers:
         camera = self._session.project.camera_of(entry.images[0])
         return {
             "camera": camera.name,
-            "fiducials": [one.id for one in camera.learned],
+            "fiducials": {one.id: one.xy_mm for one in camera.learned},
             "images": few_of(entry.images, _OFFERED),
             "tried": few_of(entry.images, _TRIED),
         }

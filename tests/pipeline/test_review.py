@@ -307,3 +307,37 @@ def check_measured_again(folder: Path, before: Mapping[tuple[str, str], Mapping[
         assert row["status"] == "measured", row
         place = np.array([float(row["col_px"]), float(row["row_px"])])
         np.testing.assert_allclose(place, mark_px(TURNED, point), atol=0.1)
+
+
+@needs_browser
+def test_a_marks_frame_shows_how_it_lies_and_takes_another_pose_and_that_back(page: Page, measured: Path) -> None:
+    open_entry(page, SCRATCHED)
+    page.keyboard.press("f")
+    expect(page.locator("#whole-view")).to_be_visible()
+    expect(page.locator('#poses button[aria-pressed="true"]')).to_contain_text("0")
+    page.keyboard.press("2")
+    expect(page.locator("#pose-view")).to_be_hidden()
+    page.keyboard.press("f")
+    expect(page.locator('#poses button[aria-pressed="true"]')).to_contain_text("90")
+    page.keyboard.press("2")
+    expect(page.locator("#pose-view")).to_be_hidden()
+    told = [(one["image"], one["decision"], one.get("pose")) for one in decisions(measured)]
+    assert told == [(SCRATCHED, "pose", "90"), (SCRATCHED, "undo", None)]
+
+
+@needs_browser
+def test_filters_and_search_show_only_what_they_let_through(page: Page) -> None:
+    page.locator("summary").click()
+    for name, value, shown in (
+        ("question", "mark", {BARE, SCRATCHED}),
+        ("status", "weak", {SCRATCHED}),
+        ("code", "covered", {SCRATCHED}),
+        ("verdict", "poor", {TURNED}),
+        ("camera", "camera.toml", {BARE, SCRATCHED, TURNED}),
+    ):
+        page.locator(f"#{name}").select_option(value)
+        expect(page.locator("#queue button")).to_have_count(len(shown))
+        assert {text.rpartition(":")[0] for text in page.locator("#queue button").all_inner_texts()} == shown
+        page.locator(f"#{name}").select_option("")
+    page.locator("#search").fill("SCRAT")
+    expect(page.locator("#queue button")).to_have_count(1)

@@ -241,6 +241,7 @@ async function open(index) {
     if (entry.question === "pose") await openPose(entry, state.generation);
     if (entry.question === "camera") await openCamera(entry, state.generation);
     if (entry.question === "frame") await openFrame(entry, state.generation);
+    if (entry.question !== "mark") prefetch(index);
   });
 }
 
@@ -255,6 +256,8 @@ function prefetch(index) {
   const ahead = state.entries.slice(index + 1, index + 4).filter((entry) => entry.question === "mark");
   const kept = ahead.map((entry) => [entry.key, state.ahead.get(entry.key) ?? fetched(entry)]);
   state.ahead = new Map(kept);
+  const next = state.entries[index + 1];
+  if (next && ["pose", "frame"].includes(next.question)) ask("/api/frame.png", { image: next.image }).catch(() => {}); // is kept there
 }
 
 // A mark and its picture, as they are shown first.
@@ -318,7 +321,9 @@ function decideMark(decision, rest = {}) {
 function decidePose(pose) {
   const entry = state.entries[state.at];
   const { image, fingerprint } = entry;
-  return decide([{ image, decision: "pose", pose, fingerprint }], true, wholeRoll(entry));
+  if (entry.question === "pose") return decide([{ image, decision: "pose", pose, fingerprint }], true, wholeRoll(entry));
+  const again = state.frame.decided.some((one) => one.decision === "pose" && one.pose === pose);
+  return decide([again ? { image, decision: "undo" } : { image, decision: "pose", pose, fingerprint }], false);
 }
 
 const wholeRoll = (entry) => (entry.question === "pose" && by("roll").checked ? entry.key : "");
@@ -444,7 +449,8 @@ async function smallPicture(image, place, half, caption, label, marks = () => {}
 // --- a pose
 
 async function openPose(entry, generation) {
-  by("pose-view").hidden = false;
+  by("pose-view").hidden = by("pose-row").hidden = false;
+  by("pose-told").textContent = "How does the scan lie? Choose the picture that is upright and not mirrored.";
   by("roll-label").hidden = entry.count === 1;
   by("roll-told").textContent = `The same for all ${entry.count} frames of the roll`;
   const frame = await json("/api/frame", { image: entry.image });
@@ -460,6 +466,7 @@ async function showFrame() {
   if (entry?.question !== "mark") return;
   if (!by("whole-view").hidden) {
     by("whole-view").hidden = by("pose-view").hidden = true;
+    state.frame = null;
     return;
   }
   await guarded(async () => {
@@ -467,7 +474,8 @@ async function showFrame() {
     if (generation !== state.generation) return;
     state.frame = frame;
     by("pose-view").hidden = false;
-    by("roll-label").hidden = true;
+    by("roll-label").hidden = by("pose-row").hidden = true;
+    by("pose-told").textContent = "How the scan lies. Choose another picture only if that one is upright and not mirrored; once more takes it back.";
     showPoses(entry, frame);
     await showWhole(frame, generation);
     by("whole-view").scrollIntoView({ block: "nearest" });
@@ -529,7 +537,7 @@ async function openFrame(entry, generation) {
   for (const { decision, point, col_px: col, row_px: row } of frame.decided) {
     if (decision === "place") state.clicks.set(point, [col, row]);
   }
-  state.click = { points: frame.fiducials, least: 3, half: CLICK_HALF_PX, tries: tryFrame, kept: keptFrame };
+  state.click = { points: Object.keys(frame.fiducials), places: frame.fiducials, least: 3, half: CLICK_HALF_PX, tries: tryFrame, kept: keptFrame };
   by("click-told").textContent = "Choose a mark, click near it in the scan, then exactly in the window beside it. Three marks find the frame.";
   by("scan-label").hidden = true;
   await clickIn(frame, generation);
@@ -540,7 +548,8 @@ async function openCamera(entry, generation) {
   if (generation !== state.generation) return;
   const shown = entry.answer?.image ?? camera.images[0];
   state.clicks = new Map(Object.entries(entry.answer?.px ?? {}));
-  state.click = { points: camera.fiducials, least: camera.fiducials.length, tried: camera.tried, half: CLICK_HALF_PX, tries: tryCamera, kept: keptCamera };
+  const points = Object.keys(camera.fiducials);
+  state.click = { points, places: camera.fiducials, least: points.length, tried: camera.tried, half: CLICK_HALF_PX, tries: tryCamera, kept: keptCamera };
   by("click-told").textContent = "Choose a scan that shows the marks well, and click every one of them: near it in the scan, then exactly in the window beside it.";
   by("scan-label").hidden = false;
   options("scan", [...new Set([shown, ...camera.images])], false);
@@ -593,12 +602,38 @@ function showNames() {
   );
   by("measure").disabled = by("keep").disabled = state.clicks.size < least;
   by("forget").disabled = state.clicks.size === 0;
+  drawSketch();
+}
+
+// Which mark is which: where they are in the camera's frame, seen upright.
+function drawSketch() {
+  const [canvas, places] = [by("sketch"), state.click.places];
+  const [pen, half] = [canvas.getContext("2d"), canvas.width / 2];
+  const middle = [0, 1].map((axis) => {
+    const all = Object.values(places).map((place) => place[axis]);
+    return (Math.min(...all) + Math.max(...all)) / 2;
+  });
+  const reach = Math.max(1e-6, ...Object.values(places).flatMap((place) => place.map((mm, axis) => Math.abs(mm - middle[axis]))));
+  pen.clearRect(0, 0, canvas.width, canvas.height);
+  pen.font = "14px system-ui, sans-serif";
+  pen.textAlign = "center";
+  pen.textBaseline = "middle";
+  for (const [point, [x, y]] of Object.entries(places)) {
+    pen.fillStyle = point === state.named ? "#facc15" : "#fff";
+    pen.fillText(point, half + ((x - middle[0]) / reach) * half * 0.84, half - ((y - middle[1]) / reach) * half * 0.84);
+  }
 }
 
 function nameMark(point) {
   state.named = point;
   showNames();
-  by("whole").focus({ preventScroll: true });
+  lookAt("whole");
+}
+
+// On a small screen it may stand below what is seen.
+function lookAt(id) {
+  by(id).focus({ preventScroll: true });
+  by(id).scrollIntoView({ block: "nearest" });
 }
 
 function clickedWhole(col, row) {
@@ -613,7 +648,7 @@ function clickedWhole(col, row) {
     await view.load(state.frame.image);
     showNames();
     views.whole.draw();
-    by("near").focus({ preventScroll: true });
+    lookAt("near");
   });
 }
 
@@ -625,7 +660,7 @@ function clickedNear(col, row) {
   if (next) state.named = next;
   showNames();
   views.whole.draw();
-  by("whole").focus({ preventScroll: true });
+  lookAt("whole");
 }
 
 function measureClicks() {
@@ -736,7 +771,7 @@ const KEYS = {
 
 function number(index) {
   const entry = state.entries[state.at];
-  if (entry?.question === "pose" && index < state.poses.length) decidePose(state.poses[index]);
+  if (entry && !by("pose-view").hidden && index < state.poses.length) decidePose(state.poses[index]);
   if (state.click?.points[index]) nameMark(state.click.points[index]);
 }
 

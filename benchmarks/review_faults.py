@@ -1,0 +1,359 @@
+"""A person who sees what is there goes through forty frames with twenty faults, by keys alone in a real browser. Do the
+decisions lead to the right marks? Are the rows that change those decided about, and no others? How many keys does it
+take, and how long?
+
+    python benchmarks/review_faults.py [SEED] [FOLDER]
+
+The person is a rule: shown a mark, it accepts what lies where the mark was drawn, places a mark that is seen elsewhere,
+rejects what was measured where none is seen, and else says that it is not there. Truth is the renderer's. FOLDER: where
+the project is left to be looked at. Needs Chromium.
+"""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from playwright.sync_api import Page, sync_playwright
+from review_load import START
+
+from measure.marks.poses import POSES
+from synthetic_images import areas, scene
+from synthetic_images.render import render_scene
+
+Array = NDArray[np.float64]
+Rows = Mapping[tuple[str, str], Mapping[str, str]]
+
+FRAMES = 40
+PITCH_UM, PX_PER_MM = 50.0, 20.0
+CORNERS = ((6.0, -6.0), (-6.0, -6.0), (-6.0, 6.0), (6.0, 6.0))
+PLACES = dict(enumerate((*CORNERS, (6.0, 0.0), (0.0, -6.0), (-6.0, 0.0), (0.0, 6.0)), 1))
+TELLS = 1  # the mark that tells the pose: two dots stand beside it
+OFF_MM = (0.18, 0.1)  # of a false mark, where the true one is hidden
+ASKEW_RAD = 0.35  # no search looks for a frame that lies so
+SEEN_PX = 1.5  # how far off a person sees that a cross is beside its mark
+RIGHT_PX = 0.5  # of a mark that counts as measured
+ROUNDS = 4  # of deciding and measuring again, at most
+
+RING, BARS = (
+    areas.ring((0.0, 0.0), 0.5, 0.1),
+    (areas.bar((-0.8, 0), (0.8, 0), 0.1), areas.bar((0, -0.8), (0, 0.8), 0.1)),
+)
+DOTS = tuple(areas.disk((1.05, y), 0.12) for y in (-0.3, 0.3))
+CAMERA = (
+    'name = "K"\nframe_mm = [16.0, 16.0]\nprincipal_distance_mm = 30.0\n'
+    + "".join(
+        f'[[fiducial]]\nid = "{n}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0.01\nmark = "{"one" if n == TELLS else "m"}"\n'
+        for n, (x, y) in PLACES.items()
+    )
+    + '[mark.m]\nkind = "ring-cross"\nring_mm = 0.5\nring_line_mm = 0.1\narm_mm = 0.8\nline_mm = 0.1\n'
+    + '[mark.one]\nkind = "parts"\n'
+    + '[[mark.one.part]]\nshape = "ring"\ncenter_mm = [0, 0]\nradius_mm = 0.5\nline_mm = 0.1\n'
+    + '[[mark.one.part]]\nshape = "bar"\nfrom_mm = [-0.8, 0]\nto_mm = [0.8, 0]\nline_mm = 0.1\n'
+    + '[[mark.one.part]]\nshape = "bar"\nfrom_mm = [0, -0.8]\nto_mm = [0, 0.8]\nline_mm = 0.1\n'
+    + "".join(f'[[mark.one.part]]\nshape = "disk"\ncenter_mm = [1.05, {y}]\nradius_mm = 0.12\n' for y in (-0.3, 0.3))
+)
+PROJECT = f'camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = {PITCH_UM}\n'
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a frame. mark: with which of its marks."""
+
+    kind: str
+    pose: str = "0"
+    mark: int = 0
+    turn_rad: float = 0.004
+
+
+FAULTS = (
+    Fault("pose hidden", "90"), Fault("pose hidden", "180m"), Fault("pose hidden", "0"),
+    Fault("not found", turn_rad=ASKEW_RAD), Fault("not found", "90m", turn_rad=-ASKEW_RAD),
+    Fault("hidden", mark=2), Fault("hidden", mark=5), Fault("hidden", "270", mark=3),
+    Fault("false mark", mark=4), Fault("false mark", mark=7),
+    Fault("stamp", mark=3), Fault("stamp", mark=6), Fault("stamp", mark=8),
+    Fault("missing", mark=2), Fault("missing", mark=8),
+    Fault("turned", "90"), Fault("mirrored", "180m"), Fault("mirrored", "0m"),
+    Fault("doubtful", mark=4), Fault("doubtful", mark=5),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Truth:
+    """px: where each mark was drawn, by its name; seen: which a person sees there."""
+
+    pose: str
+    px: Mapping[str, Array]
+    seen: frozenset[str]
+
+
+@dataclass
+class Session:
+    """What a person did. marks: about how many of these single keys decided, and how many keys that took."""
+
+    keys: int = 0
+    marks: int = 0
+    keys_of_marks: int = 0
+    clock_s: float = 0.0
+    decisions: Counter[str] = field(default_factory=Counter)
+
+
+def main(seed: int, folder: Path) -> int:
+    truths = planted(folder, np.random.default_rng(seed))
+    project = folder / "project.toml"
+    measured(project)
+    before, session = rows(folder), Session()
+    for _ in range(ROUNDS):
+        if reviewed(project, truths, session) == 0:
+            break
+        measured(project)
+    return told(seed, truths, before, rows(folder), decisions(folder), session)
+
+
+def told(
+    seed: int, truths: Mapping[str, Truth], before: Rows, after: Rows, made: list[dict[str, Any]], session: Session
+) -> int:
+    """Print what came of it; 1 where a mark is not right, or a row changed that nobody decided about."""
+    kinds = Counter(fault.kind for fault in FAULTS)
+    print(f"{FRAMES} frames of {len(PLACES)} marks, seed {seed}; faults: "
+          f"{', '.join(f'{count} {kind}' for kind, count in kinds.items())}")  # fmt: skip
+    print(f"decided: {', '.join(f'{count} {what}' for what, count in session.decisions.items())}")
+    print(f"{session.keys} keys, {session.clock_s:.0f} s in the browser; of these {session.keys_of_marks} keys "
+          f"for {session.marks} marks")  # fmt: skip
+    expected = {(one["image"], one["point"]) for one in made if one.get("point")}
+    whole = {one["image"] for one in made if one["decision"] == "pose"}
+    whole |= {image for image, truth in truths.items() if sum(key[0] == image for key in expected) >= 3}
+    expected |= {key for key in before if key[0] in whole}
+    changed = {key for key in before if before[key] != after[key]}
+    wrong = [key for key, row in after.items() if not is_right(row, truths[key[0]])]
+    first = [key for key, row in before.items() if not is_right(row, truths[key[0]])]
+    print(f"marks that are right: {len(before) - len(first)} of {len(before)} before, {len(after) - len(wrong)} after")
+    print(f"rows that changed: {len(changed)}; decided about, or of a frame found or turned: {len(changed & expected)}")
+    for key in wrong:
+        print(f"wrong: {key}: {after[key]['status']}: {after[key]['reason']}")
+    for key in sorted(changed - expected):
+        print(f"changed, undecided: {key}: {before[key]} -> {after[key]}")
+    return int(bool(wrong) or bool(changed - expected))
+
+
+def is_right(row: Mapping[str, str], truth: Truth) -> bool:
+    """A mark that is seen is measured where it is; one that is not is no observation."""
+    is_observation = row["status"] in ("measured", "weak")
+    if row["point"] not in truth.seen or not is_observation:
+        return is_observation == (row["point"] in truth.seen)
+    off_px = float(np.hypot(*(np.array([float(row["col_px"]), float(row["row_px"])]) - truth.px[row["point"]])))
+    sigma_px = 1000.0 / PITCH_UM * max(float(row["sx_mm"]), float(row["sy_mm"]))
+    return off_px < (RIGHT_PX if row["status"] == "measured" else max(RIGHT_PX, 4 * sigma_px))
+
+
+# --- the frames
+
+
+def planted(folder: Path, rng: np.random.Generator) -> dict[str, Truth]:
+    """Render the project, its faults in frames by chance, and tell what is right."""
+    at = dict(zip(rng.permutation(FRAMES)[: len(FAULTS)].tolist(), FAULTS, strict=True))
+    faults = {f"f{k:02}": at.get(k, Fault("none", turn_rad=float(rng.uniform(-0.01, 0.01)))) for k in range(FRAMES)}
+    images = tuple(
+        scene.SceneImage(
+            name, (40.0 * k, 10.0 * k, 100.0, 0.0, 0.0, 0.5 * k), pose=fault.pose, turn_rad=fault.turn_rad,
+            covered=(str(fault.mark),) if fault.kind == "hidden" else (),
+        )
+        for k, (name, fault) in enumerate(faults.items())
+    )  # fmt: skip
+    fiducials = tuple(
+        scene.SceneFiducial(str(n), xy, scene.DrawnMark((RING, *BARS, *(DOTS if n == TELLS else ()))))
+        for n, xy in PLACES.items()
+    )
+    camera = scene.SceneCamera("K", (16.0, 16.0), 30.0, fiducials=fiducials)
+    scanner = scene.Scanner((PITCH_UM, PITCH_UM), margin_mm=3.5, noise=0.004)
+    field_ = scene.DiskField((), 1.0)
+    made = scene.Scene("faults", 3, camera, field_, images, scanner, background="terrain", pad_mm=1.6)
+    render_scene(made, folder)
+    (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
+    (folder / "project.toml").write_text(PROJECT, encoding="utf-8")
+    for left in ("images.csv", "points.csv"):
+        (folder / left).unlink(missing_ok=True)
+    told = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["images"]
+    truths = {}
+    for name, fault in faults.items():
+        px = {id: np.array([one["col_px"], one["row_px"]]) for id, one in told[name]["fiducials"].items()}
+        plant(folder / "scans" / f"{name}.tif", fault, px, rng)
+        gone = {str(fault.mark)} if fault.kind in ("hidden", "false mark", "missing") else set()
+        truths[name] = Truth(fault.pose, px, frozenset(px.keys() - gone))
+    return truths
+
+
+def plant(path: Path, fault: Fault, px: Mapping[str, Array], rng: np.random.Generator) -> None:
+    """Paint into a scan what is wrong with it."""
+    grey = tifffile.imread(path).astype(np.float64)
+    design = np.column_stack([np.array(list(PLACES.values())), np.ones(len(PLACES))])
+    matrix = np.linalg.lstsq(design, np.array([px[str(n)] for n in PLACES]), rcond=None)[0].T
+    x, y = PLACES[fault.mark or TELLS]
+    around = matrix @ (x, y + 1.3, 1.0)  # its pad
+    dark = float(np.median(grey[tuple(slice(round(v) - 2, round(v) + 3) for v in around[::-1])]))
+    light = float(grey.max())
+
+    def paint(value: float, *drawn: areas.Area, off: tuple[float, float] = (0.0, 0.0)) -> None:
+        place = np.array([x + off[0], y + off[1]])
+        in_px = tuple(tuple((o + place) @ matrix[:, :2].T + matrix[:, 2] for o in area) for area in drawn)
+        col0, row0, width, height = areas.bounds(in_px)
+        share = np.abs(areas.coverage(in_px, col0, row0, width, height))
+        own = grey[row0 : row0 + height, col0 : col0 + width]
+        own += share * (value + rng.normal(0, 0.004 * 65535, own.shape) - own)
+
+    match fault.kind:
+        case "pose hidden":
+            paint(dark, areas.polygon(((0.86, -0.5), (1.3, -0.5), (1.3, 0.5), (0.86, 0.5))))
+        case "missing":
+            paint(dark, areas.disk((0.0, 0.0), 1.3))
+        case "false mark":
+            paint(dark, areas.disk((0.0, 0.0), 1.3))
+            paint(light, RING, off=OFF_MM)
+            paint(light, *BARS, off=OFF_MM)
+        case "stamp":
+            for k in range(3):
+                paint(light, areas.bar((-1.2, 0.25 + 0.35 * k), (1.2, 0.45 + 0.35 * k), 0.15))
+        case "doubtful":
+            paint(light, areas.bar((0.12, -1.4), (0.3, 1.4), 0.16))
+    tifffile.imwrite(path, np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
+
+
+# --- the person
+
+
+def reviewed(project: Path, truths: Mapping[str, Truth], session: Session) -> int:
+    """Answer what is asked, until nothing is left; how many answers that took."""
+    command = [sys.executable, "-c", START, "review", str(project), "--no-browser", "--who", "ann"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        try:
+            with sync_playwright() as playwright:
+                found = shutil.which("chromium") or shutil.which("chromium-browser")
+                browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+                page = browser.new_context(viewport={"width": 1300, "height": 900}, bypass_csp=True).new_page()
+                page.goto(server.stdout.readline().strip())
+                page.wait_for_function("document.getElementById('left').textContent !== '…'")
+                began, answers = time.monotonic(), 0
+                while (left := page.inner_text("#left"))[0].isdigit():
+                    Person(page, truths, session).answers()
+                    page.wait_for_function("left => document.getElementById('left').textContent !== left", arg=left)
+                    answers += 1
+                session.clock_s += time.monotonic() - began
+                browser.close()
+        finally:
+            server.kill()
+    return answers
+
+
+@dataclass
+class Person:
+    """Looks at what the page shows, knows a mark when it sees one, and has a keyboard."""
+
+    page: Page
+    truths: Mapping[str, Truth]
+    session: Session
+
+    def answers(self) -> None:
+        self.page.wait_for_function(_READY)
+        image, _, asked = self.page.inner_text("#title").partition(": ")
+        truth = self.truths[image.split(" and ")[0]]
+        if asked == "how it lies":
+            self.press(str(POSES.index(truth.pose) + 1), "pose")
+        elif asked == "no mark was found":
+            self.shows_frame(truth)
+        else:
+            before = self.session.keys
+            self.judges(asked.split()[-1], truth)
+            self.session.marks += 1
+            self.session.keys_of_marks += self.session.keys - before
+
+    def judges(self, point: str, truth: Truth) -> None:
+        measured, place = self.page.evaluate(_SHOWN), truth.px[point]
+        if measured and point in truth.seen and np.hypot(*(np.array(measured) - place)) < SEEN_PX:
+            self.press("a", "accept")
+        elif point in truth.seen:
+            self.steers("mark", place)
+            self.press("Enter", "place")
+        else:
+            self.press("n" if self.page.is_disabled("#reject") else "r", "reject or not there")
+
+    def shows_frame(self, truth: Truth) -> None:
+        for number in ("1", "2", "4"):
+            self.press(number)
+            for view in ("whole", "near"):
+                self.page.wait_for_selector(f"#{view}:focus")
+                self.steers(view, truth.px[number])
+                self.press("Enter")
+        self.press("m")
+        self.page.wait_for_selector("#keep:focus", timeout=120_000)
+        self.press("Enter", "frame")
+
+    def steers(self, view: str, place_px: Array) -> None:
+        """By arrow keys to a step of them."""
+        self.press("ArrowRight")
+        first = self.cursor(view)
+        self.press("ArrowRight")
+        step = self.cursor(view)[0] - first[0]
+        for axis, (less, more) in enumerate((("ArrowLeft", "ArrowRight"), ("ArrowUp", "ArrowDown"))):
+            left = float((place_px - self.cursor(view))[axis])
+            for _ in range(round(abs(left) / step)):
+                self.press(more if left > 0 else less)
+
+    def cursor(self, view: str) -> Array:
+        return np.array(json.loads(self.page.get_attribute(f"#{view}", "data-cursor") or "null"), dtype=float)
+
+    def press(self, key: str, decision: str = "") -> None:
+        self.page.keyboard.press(key)
+        self.session.keys += 1
+        if decision:
+            self.session.decisions[decision] += 1
+
+
+_READY = """() => {
+  const shown = (id) => !document.getElementById(id).hidden;
+  if (shown('mark-view')) return document.activeElement.id === 'mark';
+  return shown('whole-view') && (shown('pose-view') || document.activeElement.id === 'whole');
+}"""
+
+# Where the page says that the mark was measured.
+_SHOWN = """() => {
+  const terms = [...document.querySelectorAll('#facts dt')];
+  const place = terms.find((term) => term.textContent === 'column, row')?.nextElementSibling.textContent;
+  return place ? place.split(', ').map(Number) : null;
+}"""
+
+
+# --- files
+
+
+def measured(project: Path) -> None:
+    subprocess.run([sys.executable, "-c", START, "measure", str(project)], check=False, capture_output=True)
+
+
+def rows(folder: Path) -> Rows:
+    lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    table = csv.DictReader(line for line in lines if not line.startswith("#"))
+    return {(row["image"], row["point"]): row for row in table}
+
+
+def decisions(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "decisions.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+if __name__ == "__main__":
+    given = sys.argv[1:]
+    with tempfile.TemporaryDirectory() as temporary:
+        kept = Path(given[1]) if len(given) > 1 else Path(temporary) / "faults"
+        kept.mkdir(parents=True)
+        sys.exit(main(int(given[0]) if given else 1, kept))
