@@ -7,8 +7,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.codes_and_boards.board_specs import ArucoSpec, CharucoSpec, ChessboardSpec, aruco_dictionary
+from measure.codes_and_boards.board_specs import (
+    ArucoSpec,
+    CharucoSpec,
+    ChessboardSpec,
+    SquareGridSpec,
+    aruco_dictionary,
+)
 from measure.codes_and_boards.marker_reading import ReadMarkers, read_markers
+from measure.codes_and_boards.square_grids import NoSquareGridError, find_squares
 from measure.reason import NO_REASON, Code, Reason
 from measure.scans.scan import Scan
 
@@ -33,15 +40,16 @@ class FoundCorner:
 @dataclass(frozen=True)
 class FoundBoard:
     """The corners found, by id; none, and the reason why; refused: the markers that were read and are not used, by
-    number, and why; others_px: the middles of further boards that look the same."""
+    number, and why; others_px: the middles of further boards that look the same; notes: what the user should know."""
 
     corners: dict[str, FoundCorner]
     reason: Reason = NO_REASON
     refused: Mapping[int, Reason] = field(default_factory=dict)
     others_px: tuple[Array, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
-def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> FoundBoard:
+def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec) -> FoundBoard:
     """Search a board at a size that shows it whole, then finer: small boards in large scans need it."""
     for factor in _search_factors(scan):
         picture, reason = _searchable(scan, factor)
@@ -51,6 +59,8 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec) -> Fo
             found = _find_chessboard(picture, spec)
         elif isinstance(spec, CharucoSpec):
             found = _find_charuco(picture, spec)
+        elif isinstance(spec, SquareGridSpec):
+            found = _find_squares(picture, spec)
         else:
             found = _find_aruco(picture, spec)
         if found.corners:
@@ -203,15 +213,32 @@ def _find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
     wanted = range(spec.first_marker, spec.first_marker + spec.columns * spec.rows)
     on_board = {number: np.array([points[f"{number}.{index}"][:2] for index in range(4)]) for number in wanted}
     read = read_markers(picture, aruco_dictionary(spec.dictionary), on_board)
-    found = {}
+    found: dict[str, FoundCorner] = {}
     for number, corners in read.corners_px.items():
-        for index, corner in enumerate(corners):
-            sides = np.stack([corners[(index + 1) % 4] - corner, corners[(index - 1) % 4] - corner], axis=-1)
-            found[f"{number}.{index}"] = FoundCorner(corner, sides)
+        found |= _corners_of(f"{number}", corners)
     if found:
         return FoundBoard(found, NO_REASON, read.refused)
     reason = Reason(f"no marker {wanted[0]} to {wanted[-1]} of {spec.dictionary} was read", Code.NO_BOARD)
     return FoundBoard(found, _with_refused(reason, read), read.refused)
+
+
+def _find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
+    """The corners of separate squares; steps are the square's sides that leave the corner."""
+    try:
+        squares, notes, others = find_squares(picture, spec)
+    except NoSquareGridError as error:
+        return FoundBoard({}, Reason(str(error), Code.NO_BOARD))
+    corners = {id: corner for name, four in squares.items() for id, corner in _corners_of(name, four).items()}
+    return FoundBoard(corners, others_px=others, notes=notes)
+
+
+def _corners_of(name: str, corners: Array) -> dict[str, FoundCorner]:
+    """The four corners (4, 2) of a square or marker, with its sides that leave them."""
+    found = {}
+    for index, corner in enumerate(corners):
+        sides = np.stack([corners[(index + 1) % 4] - corner, corners[(index - 1) % 4] - corner], axis=-1)
+        found[f"{name}.{index}"] = FoundCorner(corner, sides)
+    return found
 
 
 def _with_refused(reason: Reason, read: ReadMarkers) -> Reason:

@@ -114,15 +114,45 @@ class ArucoSpec:
 
     def object_points(self) -> dict[str, Point3]:
         """Id to (X, Y, 0) in mm."""
-        step, points = self.marker_mm + self.gap_mm, {}
-        top = (self.rows - 1) * step + self.marker_mm
-        corners = ((0.0, 0.0), (self.marker_mm, 0.0), (self.marker_mm, self.marker_mm), (0.0, self.marker_mm))
-        for row in range(self.rows):
-            for column in range(self.columns):
-                marker = self.first_marker + row * self.columns + column
-                for corner, (right, down) in enumerate(corners):
-                    points[f"{marker}.{corner}"] = (column * step + right, top - row * step - down, 0.0)
-        return points
+        corners = _corners(self.columns, self.rows, self.marker_mm, self.gap_mm)
+        return {
+            f"{self.first_marker + row * self.columns + column}.{corner}": point
+            for (row, column, corner), point in corners.items()
+        }
+
+
+@dataclass(frozen=True)
+class SquareGridSpec:
+    """A grid of columns x rows separate dark squares, as Zhang's pattern.
+
+    A point's id is r{row}c{column}.{corner}, row 0 the upper one, the corner 0 being the square's upper left one, then
+    clockwise.
+    """
+
+    columns: int
+    rows: int
+    square_mm: float
+    gap_mm: float
+
+    def __post_init__(self) -> None:
+        _check_count(self, "columns", 3)
+        _check_count(self, "rows", 3)
+        _check_length(self, "square_mm")
+        _check_length(self, "gap_mm")
+
+    def places(self) -> list[tuple[int, int]]:
+        """(row, column) of every square."""
+        return [(row, column) for row in range(self.rows) for column in range(self.columns)]
+
+    @staticmethod
+    def name_of(place: tuple[int, int]) -> str:
+        """Of a square by its row and column."""
+        return f"r{place[0]}c{place[1]}"
+
+    def object_points(self) -> dict[str, Point3]:
+        """Id to (X, Y, 0) in mm."""
+        corners = _corners(self.columns, self.rows, self.square_mm, self.gap_mm)
+        return {f"{self.name_of((row, column))}.{corner}": at for (row, column, corner), at in corners.items()}
 
 
 @dataclass(frozen=True)
@@ -157,7 +187,20 @@ class CharucoSpec:
         }
 
 
-BoardSpec = ChessboardSpec | CircleGridSpec | ArucoSpec | CharucoSpec
+BoardSpec = ChessboardSpec | CircleGridSpec | ArucoSpec | CharucoSpec | SquareGridSpec
+
+
+def _corners(columns: int, rows: int, side_mm: float, gap_mm: float) -> dict[tuple[int, int, int], Point3]:
+    """By row, column and corner: those of squares side by side, clockwise from the upper left one of each."""
+    step = side_mm + gap_mm
+    top = (rows - 1) * step + side_mm
+    corners = ((0.0, 0.0), (side_mm, 0.0), (side_mm, side_mm), (0.0, side_mm))
+    return {
+        (row, column, corner): (column * step + right, top - row * step - down, 0.0)
+        for row in range(rows)
+        for column in range(columns)
+        for corner, (right, down) in enumerate(corners)
+    }
 
 
 def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:

@@ -13,6 +13,7 @@ from measure.codes_and_boards.board_specs import (
     CharucoSpec,
     ChessboardSpec,
     CircleGridSpec,
+    SquareGridSpec,
     aruco_dictionary,
 )
 from measure.codes_and_boards.circle_grids import measure_circle_grid
@@ -31,6 +32,7 @@ _REACH = 0.3  # light, lens and paper change little over it
 _SHORTEST_REACH_PX = 5.0  # less shows too little of the edges...
 _FARTHEST_REACH = 0.6  # ...but beyond this share the neighbouring crossing begins to show
 _LONGEST_REACH_PX = 15.0  # enough for a few thousandths of a pixel, whatever the square
+_HALF_SIDE, _FREE_GAP = 0.5, 0.8  # of a square that stands alone, and of the gap beside it
 _MARKER_REACH = 0.8  # of a marker's module: its black border is one module wide
 _WEAK_DAMAGE = 0.25  # of the pixels about a corner: with more of them left out it is weak
 
@@ -49,7 +51,7 @@ class BoardMeasurement:
 
 
 def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
-    """Measure a chessboard, circle grid, ArUco or ChArUco board. A board that is not there is no error."""
+    """Measure a chessboard, grid of dots or squares, ArUco or ChArUco board. A board that is not there is no error."""
     if isinstance(spec, CircleGridSpec):
         grid = measure_circle_grid(scan, spec)
         kind = f"grids of {spec.columns} x {spec.rows} dots"
@@ -57,14 +59,16 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     board = find_board(scan, spec)
     reach = _common_reach_px(board.corners.values()) if board.corners else 0.0
     fitted = {name: _fit_found(scan, found, spec, reach) for name, found in board.corners.items()}
-    notes: tuple[str, ...] = ()
+    notes = board.notes
     if isinstance(spec, ChessboardSpec) and fitted:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
-    unseen = board.reason or Reason("not seen: its markers were not read", Code.UNNAMED)
+    hidden = "its square was not seen" if isinstance(spec, SquareGridSpec) else "not seen: its markers were not read"
+    unseen = board.reason or Reason(hidden, Code.UNNAMED)
     why = {name: _refused(name, board, spec) or unseen for name in spec.object_points()}
     marks = tuple(_as_mark(name, fitted.get(name), missing) for name, missing in why.items())
     measured = BoardMeasurement(marks, board.reason, notes, tuple(board.refused.values()))
-    return _unless_alone(measured, f"boards of {spec.columns} x {spec.rows} inner corners", board.others_px)
+    what = "squares" if isinstance(spec, SquareGridSpec) else "inner corners"
+    return _unless_alone(measured, f"boards of {spec.columns} x {spec.rows} {what}", board.others_px)
 
 
 def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Array]) -> BoardMeasurement:
@@ -96,12 +100,17 @@ class FittedCorner:
 
 
 def _fit_found(
-    scan: Scan, found: FoundCorner, spec: ChessboardSpec | ArucoSpec | CharucoSpec, board_reach_px: float
+    scan: Scan,
+    found: FoundCorner,
+    spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec,
+    board_reach_px: float,
 ) -> FittedCorner:
     """Least-squares matching about a corner that was found."""
-    surface: Surface = quarter if isinstance(spec, ArucoSpec) else crossing
+    surface: Surface = quarter if isinstance(spec, ArucoSpec | SquareGridSpec) else crossing
     if isinstance(spec, ArucoSpec):
         reach = _marker_reach_px(found.steps_px, spec)
+    elif isinstance(spec, SquareGridSpec):
+        reach = _square_reach_px(found.steps_px, spec)
     else:
         reach = _reach_px(found.steps_px, board_reach_px, spec)
     half = np.ceil(np.abs(found.steps_px / np.hypot(*found.steps_px)) @ reach).astype(int) + 2
@@ -135,6 +144,12 @@ def _marker_reach_px(sides_px: Array, spec: ArucoSpec) -> Array:
     return np.asarray(
         np.minimum(_MARKER_REACH * min(1.0, gap_modules) * np.hypot(*sides_px) / modules, _LONGEST_REACH_PX)
     )
+
+
+def _square_reach_px(sides_px: Array, spec: SquareGridSpec) -> Array:
+    """(2,) the same along the sides of a square that stands alone: to neither its next corner nor the next square."""
+    free = min(_HALF_SIDE, _FREE_GAP * spec.gap_mm / spec.square_mm)
+    return np.asarray(np.minimum(free * np.hypot(*sides_px), _LONGEST_REACH_PX))
 
 
 def _named_by_colour(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.codes_and_boards.board_specs import CircleGridSpec
-from measure.codes_and_boards.lattices import Place, grid_places, is_whole
+from measure.codes_and_boards.lattices import Place, grid_places, is_whole, other_grids, upright
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
@@ -47,7 +47,7 @@ def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> CircleGridMeasureme
         reason = Reason(told, Code.NO_BOARD)
         absent = (MarkMeasurement(name, "target", None, None, Status.ABSENT, reason) for name in names.values())
         return CircleGridMeasurement(tuple(absent), reason)
-    assignment = max(assignments, key=lambda found: _upright(found, centers))
+    assignment = max(assignments, key=lambda found: upright(found, centers))
     notes = (
         ("the grid looks the same when turned: it was taken as upright in the scan",) if len(assignments) > 1 else ()
     )
@@ -58,22 +58,8 @@ def measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> CircleGridMeasureme
         center, shape = seen[place] if place in seen else _predicted(place, seen)
         margin = gap / (1 - gap) * 2 * float(np.linalg.svd(shape, compute_uv=False)[1])
         marks.append(_as_mark(name, fit_disk(scan, center, shape, longest_margin_px=margin), place in seen))
-    others = _other_grids(centers, looks, assignment, spec.places())
+    others = other_grids(centers, looks, assignment, spec.places())
     return CircleGridMeasurement(tuple(marks), NO_REASON, notes, others)
-
-
-def _other_grids(centers: Array, looks: Array, assignment: dict[Place, int], places: list[Place]) -> tuple[Array, ...]:
-    """The middles of the grids that the points make beside the one that was found."""
-    others: list[Array] = []
-    left = np.arange(len(centers))
-    found = list(assignment.values())
-    while True:
-        left = np.delete(left, found)
-        further = grid_places(centers[left], looks[left], places)
-        if not is_whole(further):
-            return tuple(others)
-        found = list(further[0].values())
-        others.append(centers[left[found]].mean(axis=0))
 
 
 def _looks(patches: list[Candidate]) -> Array:
@@ -88,13 +74,6 @@ def _largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
     places = min(spec.columns, spec.rows)
     share = spec.diameter_mm / spec.spacing_mm
     return max(2 * _SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
-
-
-def _upright(assignment: dict[Place, int], centers: Array) -> float:
-    """How far to the right in the scan the grid's columns follow one another."""
-    columns = np.array([column for _, column in assignment], float)
-    right = np.array([centers[index][0] for index in assignment.values()])
-    return float(np.cov(columns, right)[0, 1])
 
 
 def _predicted(place: Place, seen: dict[Place, tuple[Array, Array]]) -> tuple[Array, Array]:

@@ -46,6 +46,27 @@ def is_whole(assignments: list[dict[Place, int]]) -> bool:
     return len({frozenset(assignment.values()) for assignment in assignments}) == 1
 
 
+def other_grids(centers: Array, looks: Array, assignment: dict[Place, int], places: list[Place]) -> tuple[Array, ...]:
+    """The middles of the grids that the points make beside the one that was found."""
+    others: list[Array] = []
+    left = np.arange(len(centers))
+    found = list(assignment.values())
+    while True:
+        left = np.delete(left, found)
+        further = grid_places(centers[left], looks[left], places)
+        if not is_whole(further):
+            return tuple(others)
+        found = list(further[0].values())
+        others.append(centers[left[found]].mean(axis=0))
+
+
+def upright(assignment: dict[Place, int], centers: Array) -> float:
+    """How far to the right in the scan the grid's columns follow one another."""
+    columns = np.array([column for _, column in assignment], float)
+    right = np.array([centers[index][0] for index in assignment.values()])
+    return float(np.cov(columns, right)[0, 1])
+
+
 def _lattices(points_px: Array, looks: Array) -> list[dict[Place, int]]:
     """Lattices that the points form, {(i, j): index}, the largest first; i to j turns as column to row of a scan."""
     if len(points_px) < 4:

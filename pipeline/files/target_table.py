@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from measure.codes_and_boards.board_specs import BoardSpec
     from measure.codes_and_boards.ring_codes import RingCode
 
-KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco")
+KINDS = ("disk", "cross", "coded-ring", "chessboard", "circle-grid", "aruco", "charuco", "squares")
 
 _MOST_OF_A_BOARD = 500  # columns, and rows
 
@@ -96,7 +96,13 @@ def _polarity(table: Table) -> Polarity:
 
 
 def _board(kind: str, table: Table) -> "BoardSpec":
-    from measure.codes_and_boards.board_specs import ArucoSpec, CharucoSpec, ChessboardSpec, CircleGridSpec
+    from measure.codes_and_boards.board_specs import (
+        ArucoSpec,
+        CharucoSpec,
+        ChessboardSpec,
+        CircleGridSpec,
+        SquareGridSpec,
+    )
 
     columns, rows = (table.whole(key, least=1, most=_MOST_OF_A_BOARD) for key in ("columns", "rows"))
     if kind == "chessboard":
@@ -105,6 +111,8 @@ def _board(kind: str, table: Table) -> "BoardSpec":
         spacing, diameter = table.number("spacing_mm", above=0.0), table.number("diameter_mm", above=0.0)
         row_spacing = table.number("row_spacing_mm", above=0.0) if "row_spacing_mm" in table else None
         return CircleGridSpec(columns, rows, spacing, diameter, table.flag("asymmetric", False), row_spacing)
+    if kind == "squares":
+        return SquareGridSpec(columns, rows, table.number("square_mm", above=0.0), table.number("gap_mm", above=0.0))
     dictionary, marker = table.text("dictionary"), table.number("marker_mm", above=0.0)
     if kind == "charuco":
         return CharucoSpec(dictionary, columns, rows, table.number("square_mm", above=0.0), marker)

@@ -19,6 +19,7 @@ from measure.codes_and_boards.board_specs import (
     CharucoSpec,
     ChessboardSpec,
     CircleGridSpec,
+    SquareGridSpec,
     aruco_dictionary,
 )
 from measure.codes_and_boards.boards import BoardMeasurement, measure_board
@@ -188,6 +189,47 @@ def test_aruco_and_apriltag_corners(dictionary: str) -> None:
     assert np.sqrt(np.mean(errors**2)) < 0.03
 
 
+def squares_dark(spec: SquareGridSpec) -> Any:
+    """Dark where both coordinates, from the lower left square's corner, lie in a square."""
+    step = spec.square_mm + spec.gap_mm
+
+    def dark(x: Array, y: Array) -> Array:
+        inside = (x > 0) & (x < spec.columns * step) & (y > 0) & (y < spec.rows * step)
+        return np.asarray(inside & (x % step < spec.square_mm) & (y % step < spec.square_mm))
+
+    return dark
+
+
+@pytest.mark.parametrize(("turn_deg", "gap_mm"), [(4.0, 18.0), (-25.0, 18.0), (7.0, 9.0)])
+def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
+    """Named by row, column and corner, to some hundredths of a pixel, their standard deviations honest."""
+    spec = SquareGridSpec(5, 4, 45.0 - gap_mm, gap_mm)
+    homography = board_from_pixel(turn_deg, 2e-4)
+    board = measure_board(scan_of(picture_of(spec, homography, squares_dark(spec))), spec)
+    assert board.notes == ("the grid looks the same when turned: it was taken as upright in the scan",)
+    errors = errors_px(board, truth_of(spec, homography))
+    assert len(errors) >= 78
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+    assert np.abs(errors.mean(axis=0)).max() < 0.006
+    known = [mark.covariance for mark in board.marks if mark.covariance is not None]
+    squares = [e @ np.linalg.solve(c.px2, e) for e, c in zip(errors, known, strict=True)]
+    assert 0.6 < np.mean(squares) / 2.0 < 1.6
+
+
+def test_a_grid_of_squares_with_some_hidden_keeps_its_names() -> None:
+    """A square that is covered is absent, with the reason; the others are what they are."""
+    spec = SquareGridSpec(5, 4, 27.0, 18.0)
+    homography = board_from_pixel(3.0, 1e-4)
+    picture, truth = picture_of(spec, homography, squares_dark(spec)), truth_of(spec, homography)
+    col, row = np.mean([truth[f"r1c2.{i}"] for i in range(4)], axis=0).astype(int)
+    picture[row - 22 : row + 22, col - 22 : col + 22] = 38000.0
+    board = measure_board(scan_of(picture), spec)
+    hidden = [mark for mark in board.marks if not mark.status.is_observation]
+    assert {mark.point for mark in hidden} == {f"r1c2.{i}" for i in range(4)}
+    assert {str(mark.reason) for mark in hidden} == {"its square was not seen"}
+    assert np.abs(errors_px(board, truth)).max() < 0.15
+
+
 @pytest.mark.parametrize("name", ["aruco", "charuco"])
 def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> None:
     """A stray copy of one marker is passed over; of two like boards none is measured, and the reason says why."""
@@ -234,13 +276,16 @@ def beside_each_other(spec: BoardSpec, is_dark: Any, shown: tuple[float, ...], f
     return 8000 + 30000 * clean + np.random.default_rng(4).normal(0, 300, clean.shape)
 
 
-@pytest.mark.parametrize("kind", ["chessboard", "circle-grid"])
+@pytest.mark.parametrize("kind", ["chessboard", "circle-grid", "squares"])
 def test_of_boards_that_look_the_same_none_is_observed(kind: str) -> None:
     """Neither by their size, for nobody knows how far away they are; the reason says how many, and where."""
-    spec: ChessboardSpec | CircleGridSpec
+    spec: ChessboardSpec | CircleGridSpec | SquareGridSpec
     if kind == "chessboard":
         spec = ChessboardSpec(6, 5, 24.0)
         dark, words = chessboard_dark(spec), "3 boards of 6 x 5 inner corners"
+    elif kind == "squares":
+        spec = SquareGridSpec(6, 5, 16.0, 12.0)
+        dark, words = squares_dark(spec), "3 boards of 6 x 5 squares"
     else:
         spec = CircleGridSpec(6, 5, 28.0, 13.0)
         dark, words = circles_dark(spec), "3 grids of 6 x 5 dots"
@@ -299,6 +344,7 @@ def test_markers_of_two_boards_are_not_those_of_one(gap: float) -> None:
         CircleGridSpec(6, 5, 30.0, 14.0),
         ArucoSpec("4X4_50", 3, 2, 30.0, 10.0),
         CharucoSpec("4X4_50", 6, 5, 32.0, 24.0),
+        SquareGridSpec(6, 5, 25.0, 15.0),
     ],
 )
 @pytest.mark.parametrize("level", [0.0, 30.0])
@@ -317,6 +363,7 @@ def test_why_a_board_was_not_found(spec: BoardSpec, level: float) -> None:
         (lambda: ChessboardSpec(9, 6, 0.0), "square_mm"),
         (lambda: CircleGridSpec(6, 5, 10.0, 12.0), "dots less than"),
         (lambda: CharucoSpec("4X4_50", 6, 5, 20.0, 24.0), "less than the square's"),
+        (lambda: SquareGridSpec(6, 5, 25.0, 0.0), "gap_mm"),
         (lambda: ArucoSpec("4X4_49", 3, 2, 30.0, 10.0), "one of"),
         (lambda: ArucoSpec("4X4_50", 3, 2, 30.0, 10.0, first_marker=47), "0 to 49"),
     ],
