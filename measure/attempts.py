@@ -103,7 +103,8 @@ def _attempts(wide: FrameSearch, hypotheses: Sequence[Hypotheses], is_given: boo
     given, *others = hypotheses
     close = FrameSearch(wide.scan, wide.layout, wide.options, CLOSE)
     closer = slightly_longer(given[0], _STRETCH) if is_given else given
-    is_centred = is_given and is_worth_a_look(wide.scan, wide.layout, given[0].mm)
+    is_whole = not wide.options.part
+    is_centred = is_whole and is_given and is_worth_a_look(wide.scan, wide.layout, given[0].mm)
     return [
         *([Attempt(wide, given, _in_the_middle, lambda _: False, True)] if is_centred else []),
         Attempt(wide, given, _anywhere, lambda found: found.is_complete, True),

@@ -37,8 +37,9 @@ class FiducialOptions:
     where the others put it. film_sigma_mm: scatter of marks by film and scanner. match: of the fit at full resolution;
     a polygon is matched with the rotation and scale of the frame. writing: what is written about the frame is read in
     "none", where nothing else decides the "pose", or in "all". known_lines: of the same roll; where one of them is read
-    at its place, the pose asks for no more. clicks: where a person sees marks: they are matched from there, and three
-    or more say where the frame is. Raises ValueError, naming the option, for a value that is none.
+    at its place, the pose asks for no more. part: the scan shows a part of its frame, that about the scan's middle: two
+    marks are enough then, for the other parts check them. clicks: where a person sees marks: they are matched from
+    there, and three or more say where the frame is. Raises ValueError, naming the option, for a value that is none.
     """
 
     pose: str = "auto"
@@ -52,6 +53,7 @@ class FiducialOptions:
     match: MatchOptions = field(default_factory=lambda: MatchOptions(linear_sigma=0.05))
     writing: Reads = "none"
     known_lines: tuple[KnownLine, ...] = ()
+    part: bool = False
     clicks: tuple[Click, ...] = ()
 
     def __post_init__(self) -> None:

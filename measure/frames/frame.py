@@ -37,7 +37,7 @@ _SAME_MARK_PX = 5.0  # two fits of one mark lie nearer to one another, two marks
 class Frame:
     """camera_mm: (n, 2) given. belongs: (n,) marks that were found and agree. misfit_mm: (n,) how far each mark found
     is from where the frame puts it, nan without one; scatter_mm: the median of those that belong. pixel_from_camera:
-    (2, 3), the placement's own where fewer than two marks belong."""
+    (2, 3), the placement's own where fewer than two marks belong. part: whether the scan shows a part of it only."""
 
     placement: Placement
     camera_mm: Array
@@ -48,6 +48,7 @@ class Frame:
     pixel_from_camera: Array
     weights: tuple[float, ...] | None
     tone: FrameTone = field(default_factory=lambda: FrameTone(LINEAR))
+    part: bool = False
 
     @property
     def fits(self) -> list[Match | None]:
@@ -111,7 +112,7 @@ class Frame:
 
     @property
     def _least(self) -> int:
-        return max(min(_AGREEING, len(self.sightings)), 2)
+        return 2 if self.part else max(min(_AGREEING, len(self.sightings)), 2)
 
     def has_all_of(self, other: "Frame") -> bool:
         """Whether the marks of the other frame are some of this one's, under other names: a frame moved on by the

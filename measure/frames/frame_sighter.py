@@ -198,6 +198,7 @@ class FrameSighter:
             self.pixel_from_camera,
             self.weights,
             self.tone,
+            self.options.part,
         )
 
     def misfit_mm(self) -> Array:

@@ -223,7 +223,17 @@ class FrameSearch:
             for searched in tried.values():
                 searched.try_pose(pose, own)
         self._searched |= tried
-        return [placement for searched in tried.values() for found in searched.found.values() for placement in found]
+        every = [placement for searched in tried.values() for found in searched.found.values() for placement in found]
+        return [placement for placement in every if self._may_be(placement)]
+
+    def _may_be(self, placement: Placement) -> bool:
+        """Whether the scan's middle is in the frame, where it shows a part of it: two marks fit others as well, whose
+        frame would lie beside the scan."""
+        if not self.options.part:
+            return True
+        linear, shift = placement.pixel_from_camera[:, :2], placement.pixel_from_camera[:, 2]
+        middle_mm = np.linalg.solve(linear, np.array([self.scan.width_px, self.scan.height_px]) / 2 - shift)
+        return bool((np.abs(middle_mm) < np.array(self.layout.frame_mm) / 2).all())
 
 
 def _drawn_mm(hypothesis: PitchHypothesis) -> Pair:

@@ -42,7 +42,7 @@ def pitch_hypotheses(
     pair = (pitch_um[0] / 1000, pitch_um[1] / 1000)
     given = PitchHypothesis(pair, options.scale_tolerance, pair)
     as_given: list[Sequence[PitchHypothesis]] = [[given], [_longer(given, stretch) for stretch in _STRETCHES]]
-    return as_given if options.pitch_is_right else [*as_given, filling]
+    return as_given if options.pitch_is_right or options.part else [*as_given, filling]
 
 
 def slightly_longer(given: PitchHypothesis, tolerance: float) -> list[PitchHypothesis]:

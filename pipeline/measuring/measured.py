@@ -128,6 +128,11 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
     if all(fiducial.passed_over for fiducial in options.camera.fiducials):
         return FrameMeasurement(scan.name, ())
     pitch, layout = options.pitch_um or scan.pitch_um, options.camera.layout()
+    if pitch is None and options.fiducials.part:
+        raise InputError(
+            f"pitch_um is missing in the project, and {scan.path.name} does not say it ({scan.pitch_note}). A scan of a "
+            "part of a frame needs it, for its size says nothing of the pitch."
+        )
     measured = measure_fiducials(scan, layout, pitch, options.fiducials)
     if pitch is not None:
         source = "the project" if options.pitch_um is not None else "the scan's file"

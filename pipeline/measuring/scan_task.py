@@ -106,9 +106,10 @@ def scan_tasks(
         pose, known = _pose(project, given, name)
         told = (said or {}).get(name, ())
         exterior = project.given_images.exterior.get(name) if project.given_images and targets else None
-        key = (key_of[id(given)], pose, known is None, *map(id, told), id(exterior))
+        part = bool(project.part_of(name))
+        key = (key_of[id(given)], pose, known is None, part, *map(id, told), id(exterior))
         if key not in shared:
-            options = FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm, writing=project.reads)
+            options = FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm, writing=project.reads, part=part)
             camera = cameras[key_of[id(given)]]
             shared[key] = ScanOptions(camera, project.pitch_um, options, known, project.tone, told, targets, exterior)
         scan = project.scans.get(name)
