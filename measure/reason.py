@@ -49,6 +49,7 @@ class Code(StrEnum):
     NO_BOARD = "no-board"
     PLATE = "plate"
     FEW_TIES = "few-ties"
+    OTHER_PART = "other-part"
     COPY = "copy"
     CLICKED = "clicked"
     DECIDED = "decided"
@@ -93,6 +94,7 @@ MEANING = {
     Code.NO_BOARD: "The board, or a part of its markers, was not found.",
     Code.PLATE: "The plate in the picture contradicts the camera.",
     Code.FEW_TIES: "Fewer natural points were found than wanted.",
+    Code.OTHER_PART: "Another scan of its frame shows it, for that was scanned in parts.",
     Code.COPY: "The scan's file is a copy of another one, whose marks count.",
     Code.CLICKED: "A person pointed at it, and nothing could be matched there.",
     Code.DECIDED: "A person decided so.",

@@ -16,6 +16,7 @@ from measure.status import Status
 from measure.writing.line import Line
 
 Kind = Literal["fiducial", "target", "tie", "join"]
+ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # what is a place of the film, and no point of the object
 Array = NDArray[np.float64]
 
 

@@ -15,7 +15,7 @@ mirrored by their own parameters. conformal(1) is a similarity, and polynomial(1
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -145,6 +145,12 @@ class Film:
     def comparator_from_camera(self, xy_mm: Array) -> tuple[Array, Mask]:
         """Comparator coordinates (n, 2) of camera coordinates (n, 2), mm; which lie where nothing folds over."""
         return self._kind.inverse(self.parameters, xy_mm, self.center_mm)
+
+    def moved(self, parameter: int, by: float) -> "Film":
+        """The same with one parameter, by number, changed."""
+        parameters = self.parameters.copy()
+        parameters[parameter] += by
+        return replace(self, parameters=parameters)
 
     @property
     def _kind(self) -> FilmKind:

@@ -1,12 +1,14 @@
 """From the user's files and the comparator coordinates to the network that is adjusted."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adjust.functional_model.transformation import marks_needed
+from adjust.initial_values.joined_frames import FEWEST_COMMON
 from adjust.problem.network import (
     Board,
     Calibration,
@@ -20,6 +22,7 @@ from adjust.problem.network import (
     Prior,
     Transformation,
 )
+from measure.results import ON_FILM
 from pipeline.adjusting.fiducial_check import check_fiducials
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings
@@ -49,9 +52,13 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
         )
     check_fiducials(project, used)
     _check_points(project, used)
+    used, unjoined = _joinable(project, _with_whole_joins(project, used))
     used, lonely = _locatable(project, used)
     used, left_out = _orientable(project, used)
-    images = tuple(_image(project, name) for name in dict.fromkeys(mark.image for mark in used))
+    names = dict.fromkeys(mark.image for mark in used)
+    of_frame = {name: rank for rank, name in enumerate(dict.fromkeys(_frame(project, name) for name in names))}
+    names_by_frame = sorted(names, key=lambda name: of_frame[_frame(project, name)])
+    images = tuple(_image(project, name) for name in names_by_frame)
     distances, without_end = _distances(project, used)
     cameras, calibrations = _cameras(project, images, used)
     network = Network(
@@ -66,14 +73,19 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
             project.adjust.earth_curvature, project.adjust.refraction, project.unit_mm / UNITS_MM["m"]
         ),
     )
-    return network, (*lonely, *left_out, *without_end)
+    return network, (*unjoined, *lonely, *left_out, *without_end)
 
 
 def anything_to_adjust(project: Project, marks: Sequence[ComparatorPoint]) -> bool:
     """Whether an adjustment is asked for: of object points, or at least of the film where fiducials suffice for it."""
-    fiducials = Counter(mark.image for mark in marks if mark.kind == "fiducial" and mark.status.is_observation)
+    observed = (mark for mark in marks if mark.kind == "fiducial" and mark.status.is_observation)
+    fiducials = {(_frame(project, mark.image), mark.point): mark.image for mark in observed}
+    counts, image_of = (
+        Counter(frame for frame, _ in fiducials),
+        {frame: image for (frame, _), image in fiducials.items()},
+    )
     return _expects_targets(project) or any(
-        _has_film_transformation(_image(project, name), count) for name, count in fiducials.items()
+        _has_film_transformation(_image(project, image_of[frame]), count) for frame, count in counts.items()
     )
 
 
@@ -90,16 +102,34 @@ def unmeasured_points(project: Project, network: Network) -> tuple[str, ...]:
     return tuple(point.id for point in project.given_points.points if point.id not in network.point_by_id)
 
 
+def _frame(project: Project, image: str) -> str:
+    """The name of the frame that an image is a scan of."""
+    return project.part_of(image) or image
+
+
+def _with_whole_joins(project: Project, marks: Sequence[ComparatorPoint]) -> list[ComparatorPoint]:
+    """The marks without the joins that only one scan of their frame shows."""
+    shown = Counter((_frame(project, mark.image), mark.point) for mark in marks if mark.kind == "join")
+    for mark in marks:
+        if mark.kind == "join" and not project.part_of(mark.image):
+            raise InputError(
+                f"{project.comparator}, line {mark.line}: image {mark.image!r} shows the join {mark.point!r}, but is "
+                "no part of a frame. Name the frame in the column part_of of images.csv, for all of its scans."
+            )
+    return [mark for mark in marks if mark.kind != "join" or shown[_frame(project, mark.image), mark.point] > 1]
+
+
 def _locatable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
     """The marks of the points that can be located: of which something is given, or which two images show."""
     given = {id for id, point in project.object_points.items() if any((point.X, point.Y, point.Z))}
-    images = Counter(mark.point for mark in marks if mark.kind != "fiducial")
+    seen = {(mark.point, _frame(project, mark.image)) for mark in marks if mark.kind not in ON_FILM}
+    images = Counter(point for point, _ in seen)
     lonely = {point for point, count in images.items() if count < 2 and point not in given}
     sentence = (
         f"Unknown and shown by one image only, and so left out: {listed(sorted(lonely))}. Measure each such point in a "
         "second image, or give its coordinates."
     )
-    kept = [mark for mark in marks if mark.kind == "fiducial" or mark.point not in lonely]
+    kept = [mark for mark in marks if mark.kind in ON_FILM or mark.point not in lonely]
     return kept, (sentence,) if lonely else ()
 
 
@@ -108,9 +138,11 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
 
     Of an image with too few targets the fiducials remain, where they suffice for its film transformation.
     """
-    targets = Counter(mark.image for mark in marks if mark.kind != "fiducial")
-    fiducials = Counter(mark.image for mark in marks if mark.kind == "fiducial")
-    images = [_image(project, name) for name in dict.fromkeys(mark.image for mark in marks)]
+    shown = {(_frame(project, mark.image), mark.kind, mark.point) for mark in marks}  # in several parts once
+    targets = Counter(frame for frame, kind, _ in shown if kind not in ON_FILM)
+    fiducials = Counter(frame for frame, kind, _ in shown if kind == "fiducial")
+    first = {_frame(project, mark.image): mark.image for mark in reversed(marks)}
+    images = [replace(_image(project, image), name=frame) for frame, image in reversed(first.items())]
     few = [image for image in images if targets[image.name] < FEWEST_TARGETS and not image.is_observed]
     lost = [image for image in few if not _has_film_transformation(image, fiducials[image.name])]
     if len(lost) == len(images):
@@ -129,8 +161,40 @@ def _orientable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[lis
     ]
     dropped = {image.name for image in lost}
     bare = {image.name for image in few}
-    kept = [mark for mark in marks if mark.image not in (dropped if mark.kind == "fiducial" else bare)]
+    kept = [mark for mark in marks if _frame(project, mark.image) not in (dropped if mark.kind in ON_FILM else bare)]
     return kept, tuple(sentences)
+
+
+def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
+    """The marks of scans that hang together with the other parts of their frames, and a sentence on every other one.
+
+    Of a frame in pieces the one that shows most fiducials remains.
+    """
+    seen: dict[str, dict[str, set[tuple[str, str]]]] = {}
+    for mark in marks:
+        if frame := project.part_of(mark.image):
+            seen.setdefault(frame, {}).setdefault(mark.image, set()).add((mark.kind, mark.point))
+    lost = dict[str, str]()
+    for frame, parts in seen.items():
+        kept = max(
+            _pieces(parts), key=lambda piece: sum(kind == "fiducial" for part in piece for kind, _ in parts[part])
+        )
+        lost |= {part: frame for part in parts if part not in kept}
+    sentences = tuple(
+        f"Image {image!r} has no part in the adjustment: it has fewer than {FEWEST_COMMON} points in common with the "
+        f"other scans of frame {frame!r}, so that nothing joins it to them. See what is said of its measurement."
+        for image, frame in sorted(lost.items())
+    )
+    return [mark for mark in marks if mark.image not in lost], sentences
+
+
+def _pieces(parts: Mapping[str, set[tuple[str, str]]]) -> list[set[str]]:
+    """Which scans of a frame hang together."""
+    pieces: list[set[str]] = []
+    for part in sorted(parts):
+        own = [piece for piece in pieces if any(len(parts[part] & parts[other]) >= FEWEST_COMMON for other in piece)]
+        pieces = [piece for piece in pieces if piece not in own] + [{part}.union(*own)]
+    return pieces
 
 
 def _expects_targets(project: Project) -> bool:
@@ -162,7 +226,8 @@ def _image(project: Project, name: str) -> Image:
     exterior = project.given_images.exterior.get(name) if project.given_images else None
     transformation = _transformation(project, camera)
     bends = project.adjust.scanner != "none" and transformation != "none"
-    return Image(name, camera.name, transformation, exterior, project.scanner_of(name) if bends else "")
+    scanner = project.scanner_of(name) if bends else ""
+    return Image(name, camera.name, transformation, exterior, scanner, project.part_of(name))
 
 
 def _transformation(project: Project, camera: CameraFile) -> Transformation:
@@ -213,7 +278,7 @@ def _points(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[ObjectP
     given = project.object_points
     points = {}
     for mark in marks:
-        if mark.kind == "fiducial" or mark.point in points:
+        if mark.kind in ON_FILM or mark.point in points:
             continue
         points[mark.point] = given.get(mark.point) or _unnamed(project, mark)
     return tuple(points.values())
@@ -246,7 +311,7 @@ def _unnamed(project: Project, mark: ComparatorPoint) -> ObjectPoint:
 
 def _distances(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[tuple[Distance, ...], tuple[str, ...]]:
     """The distances between points and stations that take part, and a sentence on the others."""
-    taking_part = {mark.point for mark in marks if mark.kind != "fiducial"} | {mark.image for mark in marks}
+    taking_part = {mark.point for mark in marks if mark.kind not in ON_FILM} | {mark.image for mark in marks}
     known = taking_part | set(project.object_points) | set(project.given_images.camera if project.given_images else ())
     known |= set(project.scans)
     lost = []

@@ -11,7 +11,7 @@ from adjust.problem.images import adjusted_image, adjusted_places
 from adjust.problem.result import Adjustment
 from measure.checks.lost_pixels import without_lost
 from measure.reason import Code, Reason
-from measure.results import MarkMeasurement
+from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.addresses import scan_path
 from measure.scans.scan import open_scan
 from measure.single_targets.targets import TargetPrediction
@@ -98,7 +98,7 @@ def _missed(
     network, image = adjustment.network, scan.frame.image
     if image not in network.image_by_name or image in network.unoriented:
         return ()
-    targets = {mark.point: mark for mark in scan.frame.marks if mark.kind != "fiducial"}
+    targets = {mark.point: mark for mark in scan.frame.marks if mark.kind not in ON_FILM}
     return tuple(
         prediction
         for prediction in field.predictions(adjusted_image(adjustment, image), scan, _SEARCH_PX)
@@ -114,7 +114,7 @@ def _visited(
     if isinstance(seen, str):
         problem = Reason(f"It could not be looked at again: {seen}", Code.UNREACHABLE)
         return replace(scan, frame=replace(scan.frame, problems=(*scan.frame.problems, problem)))
-    targets = {mark.point: mark for mark in scan.frame.marks if mark.kind != "fiducial"}
+    targets = {mark.point: mark for mark in scan.frame.marks if mark.kind not in ON_FILM}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
     fresh = {mark.point: mark for mark in seen if _is_free(mark, np.array(taken).reshape(-1, 2))}
     if not fresh:

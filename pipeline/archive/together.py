@@ -56,7 +56,7 @@ def judged_lots(
             fingerprint([results, depends_on, made_by]), lambda: (_judged(scan, work, project) for scan in scans())
         )
 
-    if project.ties is not None or project.targets is not None:
+    if project.ties is not None or project.targets is not None or project.has_parts:
         yield lot(own, told, lambda: share([scan for each in lots for scan in _checked_beside(project, *each, work)]))
     else:
         said = _said_by_writing(project, own, work)
@@ -139,7 +139,7 @@ def _said_by_writing(project: Project, tasks: Sequence[ScanTask], work: Work) ->
     for camera in project.cameras.values():
         own = [work.read_writing(name) for name in names if project.camera_of(name) is camera]
         bare |= {scan.frame.image: scan for scan in with_plates(camera, own, project.cameras)}
-    seen = with_same_frames([bare[name] for name in names])
+    seen = with_same_frames([bare[name] for name in names], project.part_of)
     return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in seen if scan.frame.problems or scan.notes}
 
 

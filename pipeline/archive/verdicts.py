@@ -60,7 +60,7 @@ def verdict_of(record: Mapping[str, Any]) -> Verdict:
     if record["failure"]:
         return Verdict.FAILED
     marks = record["marks"]
-    fiducials = [mark for mark in marks if mark["kind"] == "fiducial"]
+    fiducials = [mark for mark in marks if mark["kind"] == "fiducial" and not _is_elsewhere(mark)]
     observed = [mark for mark in marks if Status(mark["status"]).is_observation]
     seen = sum(mark["kind"] == "fiducial" for mark in observed)
     too_few = seen < min(_LEAST_FIDUCIALS, len(fiducials))
@@ -79,10 +79,17 @@ def is_answered(reason_code: str) -> bool:
     return not _ANSWERED.isdisjoint(reason_code.split())
 
 
+def _is_elsewhere(mark: Mapping[str, Any]) -> bool:
+    """Whether another scan of the same frame shows it."""
+    return Code.OTHER_PART in mark["reason_code"].split()
+
+
 def _of_mark(mark: Mapping[str, Any]) -> Verdict:
     """A target that was not seen costs the others nothing; a fiducial is in every frame of its camera. What a person
     has said of a mark is not asked again."""
     if is_answered(mark["reason_code"]):
         return Verdict.DECIDED
+    if _is_elsewhere(mark):
+        return Verdict.GOOD
     status = Status(mark["status"])
     return Verdict.GOOD if status is Status.PREDICTED and mark["kind"] != "fiducial" else _OF_MARK[status]

@@ -44,7 +44,7 @@ class OutFrame:
 
     def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
         """Its fiducials, or its points."""
-        return tuple(mark for mark in self.marks if (mark.kind == "fiducial") == fiducials)
+        return tuple(mark for mark in self.marks if mark.kind != "join" and (mark.kind == "fiducial") == fiducials)
 
     def pixels(self, marks: tuple[ComparatorPoint, ...]) -> Array:
         """Column and row (n, 2) of marks in the scan. Raises InputError where the pitch is not known."""

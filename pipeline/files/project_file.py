@@ -189,6 +189,11 @@ class Project:
         """The frame of which an image is one of several scans, "" where it is the only one."""
         return self.given_images.part_of.get(image, "") if self.given_images else ""
 
+    @property
+    def has_parts(self) -> bool:
+        """Whether a frame was scanned in several parts."""
+        return self.given_images is not None and any(self.given_images.part_of.values())
+
     def scanner_of(self, image: str) -> str:
         """The name of the scanner of an image; all images that name none are of one."""
         return (self.given_images.scanner.get(image, "") if self.given_images else "") or DEFAULT_SCANNER

@@ -130,8 +130,8 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
     pitch, layout = options.pitch_um or scan.pitch_um, options.camera.layout()
     if pitch is None and options.fiducials.part:
         raise InputError(
-            f"pitch_um is missing in the project, and {scan.path.name} does not say it ({scan.pitch_note}). A scan of a "
-            "part of a frame needs it, for its size says nothing of the pitch."
+            f"pitch_um is missing in the project, and {scan.path.name} does not say it ({scan.pitch_note}). A scan of "
+            "a part of a frame needs it, for its size says nothing of the pitch."
         )
     measured = measure_fiducials(scan, layout, pitch, options.fiducials)
     if pitch is not None:

@@ -1,6 +1,6 @@
 """Scans that say, in writing, that they are of one frame."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from measure.reason import Code, Reason
@@ -11,14 +11,15 @@ from pipeline.results.measured_scan import MeasuredScan
 _SAME = ("run", "frames", "date")  # that name a frame together with its number
 
 
-def with_same_frames(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
-    """The scans, with a problem where another one says that it is the same frame."""
+def with_same_frames(scans: Sequence[MeasuredScan], part_of: Callable[[str], str]) -> list[MeasuredScan]:
+    """The scans, with a problem where another one says that it is the same frame. part_of: the frame of which an image
+    is one of several scans, which are meant to be of one frame."""
     named: dict[tuple[tuple[str, str], ...], list[str]] = {}
     names = {scan.frame.image: _name(scan.frame) for scan in scans}
     for image, name in names.items():
         if name:
             named.setdefault(name, []).append(image)
-    return [_told(scan, names[scan.frame.image], named) for scan in scans]
+    return [_told(scan, names[scan.frame.image], named, part_of) for scan in scans]
 
 
 def _name(frame: FrameMeasurement) -> tuple[tuple[str, str], ...]:
@@ -28,9 +29,15 @@ def _name(frame: FrameMeasurement) -> tuple[tuple[str, str], ...]:
 
 
 def _told(
-    scan: MeasuredScan, name: tuple[tuple[str, str], ...], named: Mapping[tuple[tuple[str, str], ...], list[str]]
+    scan: MeasuredScan,
+    name: tuple[tuple[str, str], ...],
+    named: Mapping[tuple[tuple[str, str], ...], list[str]],
+    part_of: Callable[[str], str],
 ) -> MeasuredScan:
-    others = [image for image in named.get(name, ()) if image != scan.frame.image]
+    own = scan.frame.image
+    others = [
+        image for image in named.get(name, ()) if image != own and not (part_of(own) and part_of(image) == part_of(own))
+    ]
     if not name or not others:
         return scan
     told = ", ".join(f"{field} {value}" for field, value in name)

@@ -11,7 +11,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.initial_values.resection import resect
 from measure.codes_and_boards.boards import measure_board
 from measure.reason import Code, Reason
-from measure.results import MarkMeasurement
+from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.single_targets.targets import TargetPrediction
 from measure.status import Status
@@ -84,7 +84,7 @@ def with_targets(
 ) -> MeasuredScan:
     """The scan with these targets instead of the ones it has; code: of the problems."""
     frame = measured.frame
-    fiducials = tuple(mark for mark in frame.marks if mark.kind == "fiducial")
+    fiducials = tuple(mark for mark in frame.marks if mark.kind in ON_FILM)
     told = (Reason(problem, code) for problem in problems)
     return replace(measured, frame=replace(frame, marks=(*fiducials, *targets), problems=(*frame.problems, *told)))
 

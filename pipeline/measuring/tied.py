@@ -7,6 +7,7 @@ from typing import NewType
 from pipeline.files.project_file import Project
 from pipeline.measuring.camera_plate import with_plates
 from pipeline.measuring.checked import CheckedScan
+from pipeline.measuring.joins import with_joins
 from pipeline.measuring.natural_points import with_ties
 from pipeline.measuring.same_frames import with_same_frames
 from pipeline.measuring.sheet_check import with_checked_sheet
@@ -20,9 +21,13 @@ def tied(
     project: Project, checked: Sequence[CheckedScan], reporter: Reporter, executor: Executor | None = None
 ) -> tuple[TiedScan, ...]:
     """The scans as all of the project together show them, in their order: what plates say of the cameras, frames that
-    were scanned twice, points of a sheet or board that contradict its other pictures, and natural points."""
+    were scanned twice, points of a sheet or board that contradict its other pictures, what joins the parts of frames,
+    and natural points."""
     seen = _with_plates(project, [scan for scan in checked if not scan.failure])
-    seen = with_checked_sheet(project, with_same_frames(seen))
+    seen = with_checked_sheet(project, with_same_frames(seen, project.part_of))
+    if project.has_parts:
+        with reporter.stage("parts joined of") as count:
+            seen = with_joins(project, seen, count, executor)
     if project.ties is not None:
         with reporter.stage("natural points sought in") as count:
             seen = with_ties(project, project.ties, seen, count, executor)

@@ -164,8 +164,8 @@ def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Arra
     weights = adjustment.weights if len(adjustment.weights) else np.ones(len(observations))
     rows = [
         row
-        for row, (name, kind) in enumerate(zip(observations.image, observations.kind, strict=True))
-        if name == image and kind != "fiducial" and weights[row] >= GROSS_WEIGHT
+        for row, (name, on_film) in enumerate(zip(observations.image, observations.is_fiducial, strict=True))
+        if name == image and not on_film and weights[row] >= GROSS_WEIGHT
     ]
     points = [observations.point[row] for row in rows]
     model = adjusted_image(adjustment, image)

@@ -75,6 +75,8 @@ def _frame(scan: MeasuredScan, truth: Json) -> FrameComparison:
     for mark in scan.frame.marks:
         if not Status(mark.status).is_observation or mark.center_px is None or mark.covariance_px2 is None:
             continue
+        if mark.kind not in places:  # a join, whose place in the scene is nobody's
+            continue
         observed[mark.kind] += 1
         place = places[mark.kind].get(mark.point)
         error = np.full(2, np.inf) if place is None else mark.center_px - _seen(place)

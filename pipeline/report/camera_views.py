@@ -129,7 +129,7 @@ def _view(data: ReportData, name: str, camera: Json) -> CameraView:
 
 def _observed_radius_mm(camera: Json, rows: list[Json]) -> float:
     """From the principal point to the outermost target."""
-    targets = [row for row in rows if row["kind"] != "fiducial"]
+    targets = [row for row in rows if row["kind"] not in ("fiducial", "join")]
     if not targets:
         return 0.0
     point = camera["principal_point_mm"]

@@ -200,4 +200,4 @@ def _quantities(entries: Json) -> tuple[tuple[str, str, str], ...]:
 
 
 def _lost_fiducial(frame: Frame) -> bool:
-    return any(mark.is_fiducial and not mark.status.is_observation for mark in frame.marks)
+    return any(mark.is_fiducial and mark.is_open for mark in frame.marks)

@@ -50,8 +50,8 @@ class Mark:
 
     @property
     def is_open(self) -> bool:
-        """Whether it is no observation, and nobody has decided that it is none."""
-        return not self.status.is_observation and Code.DECIDED not in self.codes
+        """Whether it is no observation, and neither has somebody decided so nor has another scan of its frame it."""
+        return not self.status.is_observation and not {Code.DECIDED, Code.OTHER_PART} & set(self.codes)
 
     @property
     def w(self) -> float | None:

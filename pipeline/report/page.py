@@ -16,6 +16,7 @@ from pipeline.report.charts import fraction_plot
 from pipeline.report.data import Json, ReportData
 from pipeline.report.fractions import LEAST_MARKS, Array, FractionTest, fraction_test, places_px
 from pipeline.report.frame_views import frame_views, thumbnail_scale
+from pipeline.report.joined_views import joined_views
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.parameters import spoken_name
@@ -84,6 +85,7 @@ def _context(data: ReportData) -> dict[str, Any]:
         "measured": bool(data.measurement),
         "cameras": cameras,
         "scanners": scanner_views(data),
+        "joined": joined_views(data),
         "fractions": list(_fractions(places)),
         "least_marks": LEAST_MARKS,
         "sigma0_bounds": sigma0_bounds(adjustment["redundancy"]) if adjustment and adjustment["redundancy"] else None,

@@ -22,6 +22,7 @@ from adjust.quality.significance import SignificanceTest, board_tests, group_tes
 from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.results.covariance_arrays import covariance_arrays, covariance_note
 from pipeline.results.fingerprints import of_content
+from pipeline.results.joined_frames import frames_json
 from pipeline.results.reliability_json import point_tests, reliability_json, suspect_json
 from pipeline.text.atomic import atomic_path
 from pipeline.text.finite import without_nan
@@ -89,6 +90,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "scanners": {scanner.name: _scanner(adjustment, scanner) for scanner in network.scanners},
         "boards": {board.name: _board(adjustment, board) for board in network.boards},
         "images": {image.name: _image(adjustment, image) for image in network.images},
+        "frames": frames_json(adjustment),
         "points": {point.id: _point(adjustment, point) for point in network.points if f"PT.{point.id}.X" in names},
         "residuals": _residuals(adjustment),
         "refraction": network.line_of_sight.refraction,
@@ -201,7 +203,14 @@ def _image(adjustment: Adjustment, image: Image) -> Json:
             exterior[element] = _quantity(adjustment, name, given)
     if image.name in adjustment.network.unoriented:
         exterior = {key: quantity | {"sigma": math.nan} for key, quantity in exterior.items()}
-    return {"camera": image.camera, "scanner": image.scanner, "transformation": transformation, "exterior": exterior}
+    part = {"part_of": image.part_of} if image.part_of else {}
+    return {
+        "camera": image.camera,
+        "scanner": image.scanner,
+        **part,
+        "transformation": transformation,
+        "exterior": exterior,
+    }
 
 
 def _point(adjustment: Adjustment, point: ObjectPoint) -> Json:

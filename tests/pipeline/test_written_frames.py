@@ -80,11 +80,19 @@ def test_empty_columns_of_images_csv_are_filled_and_nothing_else_is_touched(tmp_
 
 def test_two_scans_that_say_the_same_frame_are_told() -> None:
     lines = [line(text) for text in TITLES]
-    first, second, other = with_same_frames([scan("a", lines), scan("b", lines), scan("c", lines[:-2])])
+    first, second, other = with_same_frames(
+        [scan("a", lines), scan("b", lines), scan("c", lines[:-2])], lambda image: ""
+    )
     assert "frame 8617, run 7, frames 8601-8639, date 1968-05-16" in first.frame.problems[0]
     assert "that of b" in first.frame.problems[0]
     assert "that of a" in second.frame.problems[0]
     assert other.frame.problems == ()
+
+
+def test_scans_of_parts_of_one_frame_are_meant_to_say_the_same() -> None:
+    lines = [line(text) for text in TITLES]
+    halves = with_same_frames([scan("a", lines), scan("b", lines)], lambda image: "8617")
+    assert all(half.frame.problems == () for half in halves)
 
 
 def test_what_was_read_is_kept_in_the_measurement(tmp_path: Path) -> None:

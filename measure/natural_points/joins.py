@@ -1,0 +1,226 @@
+"""What joins the scans of one frame that overlap: the same places of the film in two of them.
+
+Both scans show the same photograph, so that one similarity puts all of the overlap from scan to scan but for what film
+and scanner bend. It is found by features; then places with good texture, spread over the overlap, are matched at full
+resolution. No relief is between them, and what moves unlike its neighbours is dust on the scanner's glass, or chance.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import combinations, compress
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.covariance import Covariance
+from measure.natural_points.features import Features, find_features, in_turn, reduction, shared_features
+from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
+from measure.natural_points.neighbours import outliers
+from measure.natural_points.tie_frame import TieFrame
+from measure.probabilities import POINT_REFUSED
+from measure.reason import NO_REASON, Code, Reason
+from measure.results import MarkMeasurement
+from measure.scans.parallel import mapped
+from measure.status import Status
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WANTED = 60  # joins of two scans
+_FEW = 12  # joins: from fewer on they are told
+_FEATURES = 6000  # of a scan: the overlap may be a tenth of it
+_TRIED = 3  # places, for every join that is wanted
+_AGREE_PX = 3.0  # in the reduced scan: what a feature's place, film and scanner leave
+_FEWEST = 12  # features that one similarity explains: chance makes three or four of some hundreds
+_TRIALS, _CONFIDENCE = 5000, 0.9999  # of RANSAC
+_APART_PX = 2 * RADIUS_PX + 2  # of joins: patches that overlap have correlated errors
+_SHARP_PX = 0.5  # rms length of an error: with less texture a join is weak
+_CHUNK = 16  # places that a worker gets at a time
+_UNEVEN = Reason("parts of the picture about the place move unlike each other", Code.OTHER_SCANS)
+_UNLIKE = Reason("the places about it map elsewhere from scan to scan: dust on the glass, or chance", Code.OTHER_SCANS)
+
+_Sought = tuple[Piece, Piece]
+_Measured = tuple[Matched, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Joins:
+    """The joins by image; and by image, of a scan that few or none join to the others, why."""
+
+    marks: Mapping[str, tuple[MarkMeasurement, ...]]
+    problems: Mapping[str, Reason]
+
+
+def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Executor | None = None) -> Joins:
+    """The joins of one frame's scans, so many wanted of every two that overlap.
+
+    Raises MeasurementError for a scan that cannot be read. The result does not depend on the number of workers.
+    """
+    features = list(mapped(workers, _features, parts))
+    marks: dict[str, list[MarkMeasurement]] = {part.image: [] for part in parts}
+    shared: dict[tuple[int, int], _Shared] = {}
+    number, problems = 0, dict[str, Reason]()
+    for i, j in combinations(range(len(parts)), 2):
+        shared[i, j] = _shared(parts[i], parts[j], features[i], features[j])
+        if shared[i, j].second_from_first is None:
+            continue
+        found, refused = _joined(parts[i], parts[j], features[i], shared[i, j], wanted, workers)
+        for pair in found:
+            number += 1
+            for part, matched in zip((parts[i], parts[j]), pair, strict=True):
+                marks[part.image].append(_mark(f"join{number:04d}", matched))
+        if len(found) < _FEW:
+            problems |= {part.image: _few(parts[i], parts[j], len(found), refused) for part in (parts[i], parts[j])}
+    unjoined = dict(_unjoined(parts, shared, marks))
+    return Joins({image: tuple(own) for image, own in marks.items()}, problems | unjoined)
+
+
+def _features(part: TieFrame) -> Features:
+    with part.open() as scan:
+        size = scan.width_px, scan.height_px
+        return find_features(scan, lambda places: part.usable(places, size), False, _FEATURES)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """alike: how many features two scans share; agree: how many of them one similarity explains. second_from_first:
+    (2, 3) affine map of pixels through these; None where too few agree."""
+
+    alike: int
+    agree: int
+    second_from_first: Array | None
+
+
+def _shared(one: TieFrame, other: TieFrame, first: Features, second: Features) -> _Shared:
+    pairs = shared_features(first, second)
+    if len(pairs) < _FEWEST:
+        return _Shared(len(pairs), 0, None)
+    here, there = first.places_px[pairs[:, 0]], second.places_px[pairs[:, 1]]
+    with one.open() as scan, other.open() as another:
+        within_px = _AGREE_PX * max(reduction(scan), reduction(another))
+    cv2.setRNGSeed(0)
+    _, inside = cv2.estimateAffinePartial2D(
+        here, there, method=cv2.RANSAC, ransacReprojThreshold=within_px, maxIters=_TRIALS, confidence=_CONFIDENCE
+    )
+    agree = np.zeros(len(pairs), dtype=bool) if inside is None else inside.ravel() > 0
+    if agree.sum() < _FEWEST:
+        return _Shared(len(pairs), int(agree.sum()), None)
+    return _Shared(len(pairs), int(agree.sum()), _affine(here[agree], there[agree]))
+
+
+def _affine(here: Array, there: Array) -> Array:
+    """(2, 3) of places (n, 2) to places, by least squares."""
+    design = np.column_stack([here, np.ones(len(here))])
+    return np.asarray(np.linalg.lstsq(design, there, rcond=None)[0].T)
+
+
+def _joined(
+    one: TieFrame, other: TieFrame, features: Features, shared: _Shared, wanted: int, workers: Executor | None
+) -> tuple[list[_Measured], Counter[str]]:
+    """Both places of every join, so many at most, and why other places are none."""
+    assert shared.second_from_first is not None
+    places = _places(other, features, shared.second_from_first, wanted)
+    pieces = list(zip(*(_pieces(part, of) for part, of in zip((one, other), places, strict=True)), strict=True))
+    matched = list(mapped(workers, _match, pieces, _CHUNK))
+    refused = Counter(str(_refused(pair)) for pair in matched if _refused(pair))
+    good = [pair for pair in matched if not _refused(pair)]
+    if good:
+        unlike = outliers(*(np.array([pair[of].center_px for pair in good]) for of in (0, 1)))
+        refused[_UNLIKE] += int(unlike.sum())
+        good = list(compress(good, ~unlike))
+    return good[:wanted], refused
+
+
+def _places(other: TieFrame, features: Features, second_from_first: Array, wanted: int) -> tuple[list[Array], ...]:
+    """Maps (2, 3) from patches to both scans, the best textured of every part of the overlap first, none touching
+    another."""
+    there = features.places_px @ second_from_first[:, :2].T + second_from_first[:, 2]
+    with other.open() as scan:
+        common = np.flatnonzero(other.usable(there, (scan.width_px, scan.height_px)))
+    here = features.places_px[common]
+    cell_px = max(float(np.sqrt(np.prod(np.ptp(here, axis=0) + 1.0) / wanted)), float(_APART_PX))
+    cell = np.floor((here - here.min(axis=0)) / cell_px).astype(np.intp) @ np.array([1, 10000])
+    chosen = list[int]()
+    for k in in_turn(cell, features.textures[common]).tolist():
+        if all(np.hypot(*(here[k] - here[other_k])) >= _APART_PX for other_k in chosen):
+            chosen.append(k)
+        if len(chosen) == _TRIED * wanted:
+            break
+    linear = second_from_first[:, :2]
+    return (
+        [np.column_stack([np.eye(2), here[k]]) for k in chosen],
+        [np.column_stack([linear, there[common[k]]]) for k in chosen],
+    )
+
+
+def _pieces(part: TieFrame, maps: Sequence[Array]) -> list[Piece]:
+    """The windows about the places, read from the top of the scan down."""
+    pieces: dict[int, Piece] = {}
+    with part.open() as scan:
+        for k in sorted(range(len(maps)), key=lambda k: float(maps[k][1, 2])):
+            half = int(np.ceil(RADIUS_PX * np.linalg.norm(maps[k][:, :2], 2))) + SPARE_PX
+            col0, row0 = (int(value) - half for value in np.round(maps[k][:, 2]))
+            pieces[k] = Piece(scan.window(col0, row0, 2 * half + 1, 2 * half + 1), (col0, row0), maps[k])
+    return [pieces[k] for k in range(len(maps))]
+
+
+def _match(pieces: _Sought) -> _Measured:
+    return match_pieces(pieces, 0)
+
+
+def _refused(pair: _Measured) -> Reason:
+    """Why its own pictures are no join; empty where they are."""
+    for matched in pair:
+        if matched.reason:
+            return matched.reason
+    return _UNEVEN if pair[1].unevenness < POINT_REFUSED else NO_REASON
+
+
+def _mark(name: str, matched: Matched) -> MarkMeasurement:
+    quality = {"correlation": matched.correlation, "gain": matched.gain, "size_px": 2.0 * RADIUS_PX + 1.0}
+    error_px = float(np.sqrt(2.0 * np.trace(matched.covariance_px2)))
+    status, reason = Status.MEASURED, NO_REASON
+    if error_px > _SHARP_PX:
+        status = Status.WEAK
+        reason = Reason(f"the texture fixes it to {error_px:.2f} px only", Code.IMPRECISE)
+    return MarkMeasurement(
+        name, "join", matched.center_px, Covariance.of_noise(matched.covariance_px2), status, reason, quality
+    )
+
+
+def _few(one: TieFrame, other: TieFrame, found: int, refused: Counter[str]) -> Reason:
+    most = refused.most_common(1)
+    why = f", most of the others because {most[0][0]}" if most else ""
+    return Reason(
+        f"Only {found} of {found + refused.total()} places join {one.image} and {other.image}{why}. Scans that overlap "
+        "by more, of ground with texture, would have some tens; the standard deviations say what these are worth.",
+        Code.FEW_TIES,
+    )
+
+
+def _unjoined(
+    parts: Sequence[TieFrame],
+    shared: Mapping[tuple[int, int], _Shared],
+    marks: Mapping[str, Sequence[MarkMeasurement]],
+) -> Iterator[tuple[str, Reason]]:
+    """Every scan that nothing joins to the others, and why."""
+    for number, part in enumerate(parts):
+        if any(mark.status.is_observation for mark in marks[part.image]):
+            continue
+        told = "; ".join(
+            f"with {parts[i].image if j == number else parts[j].image} {each.agree} of {each.alike} features that look "
+            "alike agree on one movement"
+            for (i, j), each in shared.items()
+            if number in (i, j)
+        )
+        yield (
+            part.image,
+            Reason(
+                f"Nothing joins it to the other scans of its frame: {told}; at least {_FEWEST} would show that they "
+                "overlap. Look whether it is a scan of that frame, and whether the scans overlap.",
+                Code.FEW_TIES,
+            ),
+        )

@@ -1,0 +1,180 @@
+"""Frames that were scanned in overlapping parts: what joins their scans, and whether the fiducials agree with it."""
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measure.natural_points.joins import measure_joins
+from measure.natural_points.tie_frame import TieFrame
+from measure.reason import Code, Reason
+from measure.results import MarkMeasurement
+from measure.scans.addresses import scan_path
+from measure.status import Status
+from pipeline.files.project_file import Project
+from pipeline.progress import Count
+from pipeline.results.measured_scan import MeasuredScan
+
+Array = NDArray[np.float64]
+
+_LEAST_MARK_PX = 20.0  # about a mark whose size nobody has noted
+_CHECKED = 3  # fiducials that agree by themselves: fewer fit any frame
+_GATE_MM, _GATE_SHARE = 0.3, 0.003  # of fiducials beside where the other scan puts them: film, and a share of the way
+_FEWEST = 3  # joins that tell how two scans lie to one another
+
+
+def with_joins(
+    project: Project, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
+) -> tuple[MeasuredScan, ...]:
+    """The scans, those of one frame with the joins that they share; where their fiducials contradict these, with a
+    problem, and then those of the scan that shows fewer are rejected."""
+    by_frame: dict[str, list[MeasuredScan]] = {}
+    for scan in scans:
+        if frame := project.part_of(scan.frame.image):
+            by_frame.setdefault(frame, []).append(scan)
+    told: dict[str, MeasuredScan] = {}
+    for done, (frame, parts) in enumerate(sorted(by_frame.items()), 1):
+        told |= {scan.frame.image: scan for scan in _joined(project, frame, parts, workers)}
+        count(frame, done, len(by_frame))
+    return tuple(told.get(scan.frame.image, scan) for scan in scans)
+
+
+def _joined(
+    project: Project, frame: str, parts: Sequence[MeasuredScan], workers: Executor | None
+) -> list[MeasuredScan]:
+    if len(parts) < 2:
+        lacking = Reason(
+            f"It is a part of frame {frame}, of which no other scan could be measured: nothing joins it.", Code.FEW_TIES
+        )
+        return [_with(scan, (), (lacking,)) for scan in parts]
+    parts = sorted(parts, key=lambda scan: scan.frame.image)
+    joins = measure_joins([_tie_frame(project, scan) for scan in parts], workers=workers)
+    problems = {image: (problem,) for image, problem in joins.problems.items()}
+    return _agreed([_with(scan, joins.marks[scan.frame.image], problems.get(scan.frame.image, ())) for scan in parts])
+
+
+def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame:
+    taken = [
+        (*mark.center_px, max(mark.quality.get("size_px", 0.0), _LEAST_MARK_PX))
+        for mark in scan.frame.marks
+        if mark.center_px is not None and mark.kind == "fiducial"
+    ]
+    marks = np.array(taken).reshape(-1, 3)
+    return TieFrame(scan.frame.image, scan_path(scan.scan), np.eye(2, 3), None, marks, project.max_pixels)
+
+
+def _with(scan: MeasuredScan, marks: Sequence[MarkMeasurement], problems: Sequence[Reason]) -> MeasuredScan:
+    frame = scan.frame
+    return replace(scan, frame=replace(frame, marks=(*frame.marks, *marks), problems=(*frame.problems, *problems)))
+
+
+def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
+    """The scans, their fiducials held against those of the others through the joins."""
+    result = {scan.frame.image: scan for scan in scans}
+    checked = set[str]()
+    for i, first in enumerate(scans):
+        for second in scans[i + 1 :]:
+            second_from_first = _movement(first, second)
+            off_mm = None if second_from_first is None else _discrepancy_mm(first, second, second_from_first)
+            if off_mm is None:
+                continue
+            span_mm = _span_mm(first, second)
+            if off_mm <= _GATE_MM + _GATE_SHARE * span_mm:
+                checked |= {first.frame.image, second.frame.image}
+                continue
+            for scan, other in ((first, second), (second, first)):
+                result[scan.frame.image] = _contradicted(result[scan.frame.image], other, off_mm)
+    told = [_unchecked(result[scan.frame.image], scan.frame.image in checked) for scan in scans]
+    return [_with_others(scan, told) for scan in told]
+
+
+def _with_others(scan: MeasuredScan, parts: Sequence[MeasuredScan]) -> MeasuredScan:
+    """Fiducials outside of a scan that another part shows are not missed."""
+    shown = {point: part.frame.image for part in reversed(parts) for point in _fiducials(part)}
+    marks = [
+        replace(mark, reason=Reason(f"it lies in {shown[mark.point]}, another scan of its frame", Code.OTHER_PART))
+        if mark.kind == "fiducial" and Code.OUTSIDE in mark.reason.codes and mark.point in shown
+        else mark
+        for mark in scan.frame.marks
+    ]
+    return replace(scan, frame=replace(scan.frame, marks=tuple(marks)))
+
+
+def _fiducials(scan: MeasuredScan) -> dict[str, Array]:
+    return {
+        mark.point: np.asarray(mark.center_px)
+        for mark in scan.frame.marks
+        if mark.kind == "fiducial" and mark.status.is_observation
+    }
+
+
+def _movement(first: MeasuredScan, second: MeasuredScan) -> Array | None:
+    """(2, 3) from pixels of the first scan to those of the second, by their joins; None where these are too few."""
+    places = [
+        {mark.point: mark.center_px for mark in scan.frame.marks if mark.kind == "join" and mark.status.is_observation}
+        for scan in (first, second)
+    ]
+    common = sorted(places[0].keys() & places[1].keys())
+    if len(common) < _FEWEST:
+        return None
+    here, there = (np.array([of[point] for point in common]) @ (1.0, 1.0j) for of in places)
+    scale = np.vdot(here - here.mean(), there - there.mean()) / np.vdot(here - here.mean(), here - here.mean())
+    shift = there.mean() - scale * here.mean()
+    return np.array([[scale.real, -scale.imag, shift.real], [scale.imag, scale.real, shift.imag]])
+
+
+def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan, second_from_first: Array) -> float | None:
+    """How far, rms, the fiducials of the second lie from where the frame of the first puts them, through the joins."""
+    frame, seen = first.frame.pixel_from_camera, second.frame.pixel_from_camera
+    if frame is None or seen is None or not _fiducials(second):
+        return None
+    there = np.array(list(_fiducials(second).values()))
+    camera = (there - seen[:, 2]) @ np.linalg.inv(seen[:, :2]).T
+    here = camera @ frame[:, :2].T + frame[:, 2]
+    predicted = here @ second_from_first[:, :2].T + second_from_first[:, 2]
+    off_px = np.hypot(*(predicted - there).T)
+    return float(np.sqrt(np.mean(off_px**2))) / (second.frame.px_per_mm or 1.0)
+
+
+def _span_mm(first: MeasuredScan, second: MeasuredScan) -> float:
+    sides = [np.hypot(scan.width_px, scan.height_px) / (scan.frame.px_per_mm or np.inf) for scan in (first, second)]
+    return float(sum(sides))
+
+
+def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> MeasuredScan:
+    """With a problem; the fiducials of the scan that shows no more of them are rejected."""
+    told = (
+        f"the fiducial marks contradict those of {other.frame.image}, another part of this frame: what joins both puts "
+        f"them {off_mm:.1f} mm apart"
+    )
+    problem = Reason(
+        f"{told[0].upper()}{told[1:]}. One of the frames lies elsewhere than it was found, or in another pose: look at "
+        "both, and place the marks or set the pose in a review.",
+        Code.AMBIGUOUS,
+    )
+    marks: Sequence[MarkMeasurement] = scan.frame.marks
+    if len(_fiducials(scan)) <= len(_fiducials(other)):
+        marks = _changed(scan, Status.REJECTED, Reason(told, Code.AMBIGUOUS))
+    return replace(scan, frame=replace(scan.frame, marks=tuple(marks), problems=(*scan.frame.problems, problem)))
+
+
+def _unchecked(scan: MeasuredScan, is_checked: bool) -> MeasuredScan:
+    """Few fiducials that nothing checks are weak; what the joins check needs no word on its few fiducials."""
+    if is_checked:
+        problems = tuple(problem for problem in scan.frame.problems if problem.codes != (Code.NO_CHECK,))
+        return replace(scan, frame=replace(scan.frame, problems=problems))
+    if 0 < len(_fiducials(scan)) < _CHECKED:
+        reason = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
+        marks = _changed(scan, Status.WEAK, reason)
+        return replace(scan, frame=replace(scan.frame, marks=tuple(marks)))
+    return scan
+
+
+def _changed(scan: MeasuredScan, status: Status, reason: Reason) -> list[MarkMeasurement]:
+    """The marks, those fiducials that are observations with another status."""
+    return [
+        replace(mark, status=status, reason=reason) if mark.kind == "fiducial" and mark.status.is_observation else mark
+        for mark in scan.frame.marks
+    ]

@@ -1,0 +1,133 @@
+"""Frames that were scanned in parts, as `adjustment.json` holds them: how well they are joined, and every mark of all
+scans in the one camera frame."""
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.transformation import film_parameter_names
+from adjust.problem.images import adjusted_image
+from adjust.problem.network import Image, Network
+from adjust.problem.result import Adjustment
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Json = dict[str, Any]
+
+_UM_PER_MM = 1000.0
+_STEP = 1e-6  # of a parameter, for derivatives by it: films are linear in theirs, or nearly
+
+
+def frames_json(adjustment: Adjustment) -> Json:
+    """By frame: its scans (parts), each with the standard deviation of its film transformation at its corners; joins,
+    where they differ between the scans; marks, where each was measured. All in mm of the camera frame, sigmas a
+    posteriori. Empty where no frame was scanned in parts, or without a solution.
+    """
+    if not adjustment.converged:
+        return {}
+    parts = defaultdict[str, list[Image]](list)
+    for image in adjustment.network.images:
+        if image.part_of:
+            parts[image.part_of].append(image)
+    return {frame: _frame(adjustment, frame, own) for frame, own in parts.items()}
+
+
+def _frame(adjustment: Adjustment, frame: str, parts: list[Image]) -> Json:
+    network = adjustment.network
+    scans = {part.name: _Part(adjustment, part) for part in parts}
+    marks = [row for scan in scans.values() for row in scan.marks()]
+    joins = []
+    for (owner, point), rows in network.joins.items():
+        if owner == frame:
+            names = [network.observations.image[row] for row in rows]
+            places = [scans[name].camera_mm([row])[0] for name, row in zip(names, rows.tolist(), strict=True)]
+            apart_um = _UM_PER_MM * (places[1] - places[0])
+            middle = np.mean(places, axis=0)
+            joins.append(
+                {
+                    "point": point,
+                    "images": names,
+                    "x_mm": float(middle[0]),
+                    "y_mm": float(middle[1]),
+                    "dx_um": float(apart_um[0]),
+                    "dy_um": float(apart_um[1]),
+                }
+            )
+    return {
+        "parts": {name: {"corner_sigma_um": scan.corner_sigma_um()} for name, scan in scans.items()},
+        "joins": joins,
+        "marks": marks,
+    }
+
+
+class _Part:
+    """One scan of a frame, as adjusted."""
+
+    def __init__(self, adjustment: Adjustment, image: Image) -> None:
+        self.adjustment, self.image = adjustment, image
+        self.model = adjusted_image(adjustment, image.name)
+        names = [f"T.{image.name}.{name}" for name in film_parameter_names(image.transformation)]
+        self.film_covariance = adjustment.sigma0**2 * adjustment.cofactor_of(names)
+
+    def camera_mm(self, rows: list[int] | Indices) -> Array:
+        """(n, 2) where the film transformation puts observations."""
+        return np.asarray(self.model.camera_from_comparator(self.adjustment.network.observations.xy_mm[rows]))
+
+    def marks(self) -> list[Json]:
+        """Every mark that is an observation. A join's place and a fiducial's is the adjusted one. A target's is the
+        measured one, with its own covariance and that of the film transformation, taken as independent."""
+        network = self.adjustment.network
+        rows = np.flatnonzero(network.image_numbers == network.images.index(self.image))
+        observations = network.observations
+        measured, film = self.camera_mm(rows), self._film_covariances(observations.xy_mm[rows])
+        gradient = self.model.camera_by_comparator(observations.xy_mm[rows])
+        noise = gradient @ observations.covariance_mm2[rows] @ gradient.swapaxes(1, 2)
+        found = []
+        for k, row in enumerate(rows.tolist()):
+            place, covariance = measured[k], self.adjustment.sigma0**2 * noise[k] + film[k]
+            if owner := _own_unknown(network, self.image, row):
+                names = [f"{owner}.x", f"{owner}.y"]
+                place = np.array([self.adjustment.value(name) for name in names])
+                covariance = self.adjustment.sigma0**2 * self.adjustment.cofactor_of(names)
+            sx, sy = np.sqrt(np.diag(covariance))
+            found.append(
+                {
+                    "image": self.image.name,
+                    "point": observations.point[row],
+                    "kind": observations.kind[row],
+                    "x_mm": float(place[0]),
+                    "y_mm": float(place[1]),
+                    "sx_mm": float(sx),
+                    "sy_mm": float(sy),
+                    "rho": float(covariance[0, 1] / (sx * sy)) if sx * sy > 0.0 else 0.0,
+                }
+            )
+        return found
+
+    def corner_sigma_um(self) -> float:
+        """The largest standard deviation that the film transformation has at a corner of what was measured."""
+        xy_mm = self.adjustment.network.observations.xy_mm
+        rows = self.adjustment.network.image_numbers == self.adjustment.network.images.index(self.image)
+        low, high = xy_mm[rows].min(axis=0), xy_mm[rows].max(axis=0)
+        corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+        return float(_UM_PER_MM * np.sqrt(np.linalg.eigvalsh(self._film_covariances(corners))[:, -1].max()))
+
+    def _film_covariances(self, xy_mm: Array) -> Array:
+        """(n, 2, 2) of camera coordinates of places (n, 2), for what is not known of the film transformation."""
+        film = self.model.film
+        by_parameters = np.empty((len(xy_mm), 2, len(film.parameters)))
+        for k, value in enumerate(film.parameters.tolist()):
+            step = _STEP * max(abs(value), _STEP)
+            ends = [film.moved(k, way * step).camera_from_comparator(xy_mm) for way in (1.0, -1.0)]
+            by_parameters[:, :, k] = (ends[0] - ends[1]) / (2.0 * step)
+        return np.asarray(by_parameters @ self.film_covariance @ by_parameters.swapaxes(1, 2))
+
+
+def _own_unknown(network: Network, image: Image, row: int) -> str:
+    """The name of the unknown that is the camera coordinates of an observation, "" where there is none."""
+    kind, point = network.observations.kind[row], network.observations.point[row]
+    if kind == "join":
+        return f"JOIN.{image.frame}.{point}"
+    return f"FID.{image.camera}.{point}" if kind == "fiducial" else ""
