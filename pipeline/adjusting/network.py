@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.transformation import marks_needed
+from adjust.functional_model.transformation import fewest_marks, marks_needed
 from adjust.initial_values.joined_frames import FEWEST_COMMON
 from adjust.problem.network import (
     Board,
@@ -185,7 +185,27 @@ def _joinable(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[list[
         f"other scans of frame {frame!r}, so that nothing joins it to them. See what is said of its measurement."
         for image, frame in sorted(lost.items())
     )
-    return [mark for mark in marks if mark.image not in lost], sentences
+    bare = {frame: _few_fiducials(project, frame, parts, lost) for frame, parts in seen.items()}
+    sentences += tuple(sentence for sentence in bare.values() if sentence)
+    kept_marks = [mark for mark in marks if mark.image not in lost and not bare.get(project.part_of(mark.image))]
+    if not kept_marks:
+        raise InputError(f"{project.comparator}: {' '.join(sentences)}")
+    return kept_marks, sentences
+
+
+def _few_fiducials(
+    project: Project, frame: str, parts: Mapping[str, set[tuple[str, str]]], lost: Mapping[str, str]
+) -> str:
+    """Why the scans of a frame that hang together have no part either; empty where they have."""
+    left = [part for part in parts if part not in lost]
+    transformation = _transformation(project, project.camera_of(left[0]))
+    shown = {point for part in left for kind, point in parts[part] if kind == "fiducial"}
+    if len(shown) >= fewest_marks(transformation):
+        return ""
+    return (
+        f"Frame {frame!r} has no part in the adjustment: {listed(left)} {'shows' if len(left) == 1 else 'show'} "
+        f"{len(shown)} fiducial marks, and the transformation {transformation} needs {fewest_marks(transformation)}."
+    )
 
 
 def _pieces(parts: Mapping[str, set[tuple[str, str]]]) -> list[set[str]]:

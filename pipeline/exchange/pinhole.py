@@ -183,7 +183,7 @@ def sight_misfit_mm(block: Block, frame: OutFrame) -> float:
 def _pinhole(block: Block, frame: OutFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
     """Raises MeasurementError where the lens folds within the scan."""
     pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
-    canvas = canvas_of(frame.chain(options.with_lens), *block.size_px(frame), pitch_um / 1000.0)
+    canvas = canvas_of([(frame.chain(options.with_lens), *block.size_px(frame))], pitch_um / 1000.0)
     misfit_mm = lens.largest_mm + sight_misfit_mm(block, frame)
     return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens)
 

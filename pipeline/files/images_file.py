@@ -69,7 +69,7 @@ def _join(
                 f"{path}: image {parts[0]!r} is the only part of {frame!r} (column part_of). Give the same name to the "
                 "other scans of that frame, or leave the cell blank."
             )
-        if frame in part_of and frame not in parts:
+        if frame in part_of:
             raise InputError(f"{path}: part_of {frame!r} is an image itself. Name the frame otherwise than its scans.")
         given = [image for image in parts if exterior[image] is not None]
         if len(given) > 1 and len({str(exterior[image]) for image in given}) > 1:

@@ -1,5 +1,6 @@
 """The lattice that a scan is resampled to: camera coordinates of its pixels, and where the scan is asked for them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, floor
 
@@ -36,13 +37,22 @@ class Canvas:
         return np.stack([x, y], axis=-1)
 
 
-def canvas_of(chain: FrameChain, width_px: int, height_px: int, pitch_mm: float) -> Canvas:
-    """The canvas that holds the whole outline of a scan, its pixels at whole multiples of the pitch.
+def canvas_of(scans: Sequence[tuple[FrameChain, int, int]], pitch_mm: float) -> Canvas:
+    """The canvas that holds the whole outlines of scans, each with its width and height, its pixels at whole multiples
+    of the pitch.
 
     A fisheye's ideal picture has no end: it is cut off where it would be stretched five times over (63 degrees).
 
     Raises MeasurementError where the lens or the film folds within the scan.
     """
+    outline = np.concatenate([_outline_mm(*scan) for scan in scans])
+    (left, bottom), (right, top) = outline.min(axis=0) / pitch_mm, outline.max(axis=0) / pitch_mm
+    first, last = (ceil(left), floor(top)), (floor(right), ceil(bottom))
+    return Canvas(first[0] * pitch_mm, first[1] * pitch_mm, pitch_mm, last[0] - first[0] + 1, first[1] - last[1] + 1)
+
+
+def _outline_mm(chain: FrameChain, width_px: int, height_px: int) -> Array:
+    """(n, 2) places along a scan's edge in the camera frame."""
     across, down = np.linspace(-0.5, width_px - 0.5, _EDGE_POINTS), np.linspace(-0.5, height_px - 0.5, _EDGE_POINTS)
     sides = [(across, np.full_like(across, row)) for row in (down[0], down[-1])]
     sides += [(np.full_like(down, col), down) for col in (across[0], across[-1])]
@@ -52,9 +62,7 @@ def canvas_of(chain: FrameChain, width_px: int, height_px: int, pitch_mm: float)
         outline = np.clip(outline, *corners_mm) if found.all() else corners_mm
     elif not found.all():
         raise MeasurementError("its distortion folds the image over within the scan: resample without --lens.")
-    (left, bottom), (right, top) = outline.min(axis=0) / pitch_mm, outline.max(axis=0) / pitch_mm
-    first, last = (ceil(left), floor(top)), (floor(right), ceil(bottom))
-    return Canvas(first[0] * pitch_mm, first[1] * pitch_mm, pitch_mm, last[0] - first[0] + 1, first[1] - last[1] + 1)
+    return outline
 
 
 def scan_places(chain: FrameChain, canvas: Canvas, col0: int, row0: int, side: int) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
 """A resampled frame as a TIFF file: tiles, reduced pages, a mask, and a description of where its pixels lie."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,8 @@ _REDUCED, _MASK = 1, 4  # TIFF 6.0, NewSubfileType
 
 @dataclass(frozen=True)
 class Description:
-    """What the file says of itself; `pose` and `lens` are those taken out."""
+    """What the file says of itself; `pose` and `lens` are those taken out. parts: the scans that it was put together
+    of, seams_mm: the lines in the camera frame where it passes from one to another; both empty of one scan alone."""
 
     image: str
     camera: str
@@ -35,6 +36,8 @@ class Description:
     pose: str
     lens: bool
     fingerprint: str
+    parts: Sequence[str] = ()
+    seams_mm: Sequence[Sequence[tuple[float, float]]] = ()
 
     def text(self) -> str:
         """One JSON object: x_mm, y_mm are camera coordinates of the centre of the first pixel."""
@@ -48,6 +51,7 @@ class Description:
             "pose": self.pose,
             "lens": self.lens,
             "fingerprint": self.fingerprint,
+            **({"parts": list(self.parts), "seams_mm": self.seams_mm} if self.parts else {}),
         }
         return json.dumps(content, ensure_ascii=True)
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from concurrent.futures import as_completed
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,11 @@ from pipeline.archive.measurement import read_measurement
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
-from pipeline.resampling.canvas import canvas_of, scan_places
+from pipeline.resampling.canvas import canvas_of
 from pipeline.resampling.frame_chain import FrameChain, adjusted_chain, measured_chain
 from pipeline.resampling.frame_file import TILE_PX, Description, read_description, write_frame
-from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile, interpolated
+from pipeline.resampling.interpolation import MARGIN_PX, Degree, Tile
+from pipeline.resampling.seam import Part, beside_one_another, joined_tile, seams_mm
 from pipeline.resampling.source import source_of
 from pipeline.results.adjustment_reader import read_adjustment
 from pipeline.results.measured_scan import MeasuredScan
@@ -33,8 +35,18 @@ FAST: Degree = 3
 
 
 @dataclass(frozen=True)
+class OtherScan:
+    """A further scan of the same frame, for that was scanned in parts."""
+
+    image: str
+    scan: Path
+    chain: FrameChain
+
+
+@dataclass(frozen=True)
 class ResampleTask:
-    """All that the resampling of one scan depends on. pitch_mm: of the result; max_pixels: as `open_scan` takes it."""
+    """All that the resampling of one frame depends on. pitch_mm: of the result; max_pixels: as `open_scan` takes it;
+    part, others: of a frame that was scanned in parts the name of this scan, and the other ones."""
 
     image: str
     camera: str
@@ -45,18 +57,24 @@ class ResampleTask:
     degree: Degree
     max_pixels: int | None
     target: Path
+    part: str = ""
+    others: tuple[OtherScan, ...] = ()
 
     @property
     def fingerprint(self) -> str:
-        """Of the scan's file and everything that the result depends on: what has it need not be made again."""
-        chain = self.chain
+        """Of the scans' files and everything that the result depends on: what has it need not be made again."""
+        own = self._fingerprint_of(self.scan, self.chain)
+        others = [self._fingerprint_of(other.scan, other.chain) for other in self.others]
+        return hashlib.sha256("".join([own, *others]).encode()).hexdigest() if others else own
+
+    def _fingerprint_of(self, scan: Path, chain: FrameChain) -> str:
         numbers = [*chain.film.parameters, *chain.bend_parameters, *chain.pitch_um, self.pitch_mm, float(self.degree)]
         words: list[Any] = [self.image, self.camera, self.pose, chain.film.transformation, chain.film.mirrored]
         words += [chain.bend.terms, chain.bend.center_mm, chain.bend.half_mm]
         if chain.lens is not None:
             numbers += [*chain.lens.interior, *chain.lens.parameters]
             words += [chain.lens.distortion.family, chain.lens.distortion.decentering, chain.lens.distortion.r0_mm]
-        file = file_state(self.scan, Path())
+        file = file_state(scan, Path())
         words += [file.bytes, file.mtime_ns, file.etag, [float(number).hex() for number in numbers]]
         return hashlib.sha256(json.dumps(words).encode()).hexdigest()
 
@@ -101,36 +119,48 @@ def resample_tasks(
     adjustment = read_adjustment(project.adjustment_path) if project.adjustment_path.exists() else None
     if with_lens and (adjustment is None or not adjustment["converged"]):
         raise InputError("--lens needs an adjusted lens. Run `reseau adjust` first, or resample without it.")
-    tasks, failed = [], []
+    tasks: dict[str, ResampleTask] = {}
+    failed = []
     for measured in read_measurement(project.measurement_path):
         image = measured.frame.image
-        chain = _chain(measured, adjustment, with_lens)
+        frame = project.part_of(image) or image
+        chain = _chain(measured, adjustment, with_lens, is_part=frame != image)
         if isinstance(chain, str):
             failed.append(Resampled(image, None, problem=chain))
             continue
+        if frame in tasks:
+            other = OtherScan(image, scan_path(measured.scan), chain)
+            tasks[frame] = replace(tasks[frame], others=(*tasks[frame].others, other))
+            continue
         pitch_mm = (pitch_um or float(np.sqrt(np.prod(measured.pitch_um)))) / 1000.0
-        tasks.append(
-            ResampleTask(
-                image=image,
-                camera=project.camera_of(image).name,
-                scan=scan_path(measured.scan),
-                chain=chain,
-                pose=measured.frame.pose.name if measured.frame.pose else "0",
-                pitch_mm=pitch_mm,
-                degree=degree,
-                max_pixels=project.max_pixels,
-                target=folder / f"{image}.tif",
-            )
+        tasks[frame] = ResampleTask(
+            image=frame,
+            camera=project.camera_of(image).name,
+            scan=scan_path(measured.scan),
+            chain=chain,
+            pose=measured.frame.pose.name if measured.frame.pose else "0",
+            pitch_mm=pitch_mm,
+            degree=degree,
+            max_pixels=project.max_pixels,
+            target=folder / f"{frame}.tif",
+            part=image if frame != image else "",
         )
-    return tasks, failed
+    return list(tasks.values()), failed
 
 
-def _chain(measured: MeasuredScan, adjustment: dict[str, Any] | None, with_lens: bool) -> FrameChain | str:
+def _chain(
+    measured: MeasuredScan, adjustment: dict[str, Any] | None, with_lens: bool, is_part: bool
+) -> FrameChain | str:
     """The adjusted chain of an image, or that of its fiducials; else why there is none."""
     if adjustment is not None and adjustment["converged"] and measured.frame.image in adjustment["images"]:
         return adjusted_chain(measured, adjustment, with_lens)
     if with_lens:
         return "it has no part in the adjustment, so its lens is not known: resample it without --lens"
+    if is_part:
+        return (
+            "it is a part of a frame, and no adjustment says how it lies to the other scans: run `reseau adjust`, and "
+            "see what it says of this one"
+        )
     return measured_chain(measured) or "too few of its fiducial marks were found to say where its frame lies"
 
 
@@ -144,30 +174,37 @@ def resampled(task: ResampleTask) -> Resampled:
 
 def _resampled(task: ResampleTask) -> Resampled:
     before = read_description(task.target)
-    with open_scan(task.scan, task.max_pixels) as scan:
-        canvas = canvas_of(task.chain, scan.width_px, scan.height_px, task.pitch_mm)
+    given = [(task.scan, task.chain), *((other.scan, other.chain) for other in task.others)]
+    with ExitStack() as opened:
+        scans = [(opened.enter_context(open_scan(path, task.max_pixels)), chain) for path, chain in given]
+        canvas = canvas_of([(chain, scan.width_px, scan.height_px) for scan, chain in scans], task.pitch_mm)
         done = Resampled(task.image, task.target, canvas.width_px, canvas.height_px)
         fingerprint = task.fingerprint
         if before is not None and before.get("fingerprint") == fingerprint:
             return replace(done, kept=True)
         task.target.parent.mkdir(parents=True, exist_ok=True)
-        with source_of(scan, _rows_at_a_time(task, canvas.width_px), task.target.parent) as source:
+        parts = []
+        for scan, chain in scans:
+            rows = _rows_at_a_time(chain, task.pitch_mm, canvas.width_px)
+            parts.append(Part(opened.enter_context(source_of(scan, rows, task.target.parent)), chain))
+        parts = beside_one_another(parts)
+        names = (task.part, *(other.image for other in task.others)) if task.part else ()
+        has_lens = task.chain.lens is not None
+        seams = seams_mm(parts, canvas) if task.others else ()
+        described = Description(task.image, task.camera, canvas, task.pose, has_lens, fingerprint, names, seams)
 
-            def tile_at(col0: int, row0: int) -> Tile:
-                places = scan_places(task.chain, canvas, col0, row0, TILE_PX)
-                return interpolated(source, *places, task.degree)
+        def tile_at(col0: int, row0: int) -> Tile:
+            return joined_tile(parts, canvas, col0, row0, TILE_PX, task.degree)
 
-            described = Description(
-                task.image, task.camera, canvas, task.pose, task.chain.lens is not None, fingerprint
-            )
-            clamped = write_frame(task.target, described, source.channels, source.dtype, tile_at)
+        source = parts[0].source
+        clamped = write_frame(task.target, described, source.channels, source.dtype, tile_at)
     return replace(done, clamped=clamped)
 
 
-def _rows_at_a_time(task: ResampleTask, width_px: int) -> int:
-    """How many rows of the scan a row of tiles runs through."""
-    ends = np.array([(0.0, 0.0), (width_px, 0.0), (0.0, -TILE_PX), (width_px, -TILE_PX)]) * task.pitch_mm
-    pixels, _ = task.chain.scan_from_frame(ends)
+def _rows_at_a_time(chain: FrameChain, pitch_mm: float, width_px: int) -> int:
+    """How many rows of a scan a row of tiles runs through."""
+    ends = np.array([(0.0, 0.0), (width_px, 0.0), (0.0, -TILE_PX), (width_px, -TILE_PX)]) * pitch_mm
+    pixels, _ = chain.scan_from_frame(ends)
     return int(np.ptp(pixels[:, 1])) + 2 * MARGIN_PX
 
 

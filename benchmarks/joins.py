@@ -1,0 +1,209 @@
+"""Frames scanned in halves: claimed against realised standard deviations of what joins them, by many adjustments.
+
+    python benchmarks/joins.py [--runs 200] [--pictures]
+
+Four frames of known points, each in two halves with films of their own, errors drawn anew in every run (seeds 0, 1, ...).
+--pictures: rendered frames instead, whose joins are measured: their errors beside their standard deviations.
+"""
+
+import argparse
+import json
+import sys
+from collections import Counter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust import Adjustment, adjust
+from measure.natural_points.joins import measure_joins
+from measure.natural_points.tie_frame import TieFrame
+from pipeline.cli import run
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
+from halves import Halves, halves
+
+Array = NDArray[np.float64]
+
+CASES = (  # joins, overlap in mm of 228, how the right halves lie
+    (6, 40.0, False),
+    (12, 40.0, False),
+    (40, 40.0, False),
+    (40, 40.0, True),
+    (12, 15.0, False),
+    (40, 15.0, True),
+    (40, 5.0, False),
+)
+CORNERS = np.array([[-110.0, -110.0], [-110.0, 110.0], [110.0, -110.0], [110.0, 110.0]])
+ELEMENTS = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--pictures", action="store_true")
+    options = parser.parse_args()
+    if options.pictures:
+        pictures()
+        return
+    print(f"{options.runs} networks a line; errors over standard deviations, rms")
+    print("| joins a frame | overlap, mm | right halves | joins | films | orientations | c | far corner, um | sigma0 |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for count, overlap_mm, turned in CASES:
+        found = [_errors(count, overlap_mm, turned, seed) for seed in range(options.runs)]
+        rms = {name: np.sqrt(np.mean(np.concatenate([each[name] for each in found]) ** 2)) for name in found[0]}
+        lies = "turned by 180 degrees" if turned else "as the left ones"
+        cells = [f"{rms[name]:.3f}" for name in ("joins", "films", "orientations", "c")]
+        print(
+            f"| {count} | {overlap_mm:g} | {lies} | {' | '.join(cells)} | {rms['corner']:.1f} | {rms['sigma0']:.3f} |"
+        )
+
+
+def _errors(count: int, overlap_mm: float, turned: bool, seed: int) -> dict[str, Array]:
+    simulated = halves(np.random.default_rng(seed), count, overlap_mm, turned=turned)
+    adjustment = adjust(simulated.network)
+    joins = [
+        _in_sigmas(adjustment, f"JOIN.{frame}.{point}.{axis}", true)
+        for (frame, point), xy in simulated.joins.items()
+        for axis, true in zip("xy", xy, strict=True)
+    ]
+    films = [
+        _in_sigmas(adjustment, f"T.{name}.{parameter}", true)
+        for name, film in simulated.films.items()
+        for parameter, true in zip(("a1", "a2", "a3", "b1", "b2", "b3"), film, strict=True)
+    ]
+    orientations = [
+        _in_sigmas(adjustment, f"EO.f{i}.{element}", true)
+        for i in range(4)
+        for element, true in zip(ELEMENTS, [*simulated.truth.stations[i], *simulated.truth.attitudes[i]], strict=True)
+    ]
+    return {
+        "joins": np.array(joins),
+        "films": np.array(films),
+        "orientations": np.array(orientations),
+        "c": np.array([_in_sigmas(adjustment, "IO.K.c", simulated.truth.c)]),
+        "corner": _at_corners_um(simulated, adjustment),
+        "sigma0": np.array([adjustment.sigma0]),
+    }
+
+
+def _in_sigmas(adjustment: Adjustment, name: str, true: float) -> float:
+    return (adjustment.value(name) - true) / adjustment.sigma(name)
+
+
+def _at_corners_um(simulated: Halves, adjustment: Adjustment) -> Array:
+    """How far each half's film puts the frame's outer corners beside their places."""
+    off = []
+    for name, true in simulated.films.items():
+        found = np.array([adjustment.value(f"T.{name}.{each}") for each in ("a1", "a2", "a3", "b1", "b2", "b3")])
+        for corner in CORNERS:
+            if (corner[0] > 0.0) == name.endswith("right"):
+                place = np.linalg.solve(np.array([true[1:3], true[4:]]), corner - true[[0, 3]])
+                off.append(np.array([found[1:3], found[4:]]) @ place + found[[0, 3]] - corner)
+    return 1000.0 * np.array(off).ravel()
+
+
+SCENE = """
+name = "halves"
+seed = {seed}
+[camera]
+name = "K"
+frame_mm = [55.0, 55.0]
+principal_distance_mm = 60.0
+[[camera.fiducial]]
+id = "1"
+xy_mm = [25.0, 25.0]
+mark = "m"
+[[camera.fiducial]]
+id = "2"
+xy_mm = [-25.0, -25.0]
+mark = "m"
+[camera.mark.m]
+kind = "ring-cross"
+polarity = "light"
+ring_mm = 0.5
+ring_line_mm = 0.1
+arm_mm = 0.36
+line_mm = 0.1
+[field]
+kind = "natural"
+unit = "m"
+[picture]
+background = "terrain"
+relief = 20.0
+[picture.tones]
+contrast = 0.1
+[film]
+scale_sigma_ppm = 300.0
+shear_sigma_urad = 100.0
+grain = {grain}
+deformation_um = 5.0
+dust = 40
+[scan]
+pitch_um = 20.0
+turn_sigma_deg = 0.3
+noise = 0.005
+"""
+IMAGE = """
+[[image]]
+name = "f{half}"
+position = [0.0, 0.0, 1500.0]
+angles_deg = [1.0, -1.0, 5.0]
+part_of = "f"
+part = [{first}, {end}]
+pose = "{pose}"
+"""
+
+
+def pictures() -> None:
+    """The right half of every other frame lies turned by half a turn."""
+    print("| grain | overlap, mm | scans | measured | weak | difference, rms px | over sigma |")
+    print("|---|---|---|---|---|---|---|")
+    for grain in (0.0, 0.01, 0.03):
+        for share in (0.6, 0.54):
+            for seed in (1, 2):
+                print(_pictured(grain, share, seed), flush=True)
+
+
+def _pictured(grain: float, share: float, seed: int) -> str:
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        turned = seed % 2 == 0
+        halves_text = IMAGE.format(half="a", first=0.0, end=share, pose="0")
+        # A scan that lies turned shows the other end of the frame at its left.
+        first, end = (0.0, share) if turned else (1.0 - share, 1.0)
+        halves_text += IMAGE.format(half="b", first=first, end=end, pose="180" if turned else "0")
+        scene = folder / "scene.toml"
+        scene.write_text(SCENE.format(seed=seed, grain=grain) + halves_text, encoding="utf-8")
+        run(["render", str(scene), str(folder)])
+        truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["images"]
+        parts = [
+            TieFrame(each, folder / "scans" / f"{each}.tif", np.eye(2, 3), None, np.zeros((0, 3))) for each in truth
+        ]
+        joins = measure_joins(parts)
+        first_marks, second_marks = (joins.marks[part.image] for part in parts)
+        places, sigmas = [], []
+        for image, marks in zip(truth, (first_marks, second_marks), strict=True):
+            places.append(_camera_mm(truth[image], np.array([mark.center_px for mark in marks]).reshape(-1, 2)))
+            sigmas.append([np.trace(mark.covariance_px2) / 2 for mark in marks if mark.covariance_px2 is not None])
+        off = (places[0] - places[1]) / 0.02
+        sigma = np.sqrt(np.sum(sigmas, axis=0))[:, None]
+        counts = Counter(str(mark.status) for mark in first_marks)
+        lies = "turned against one another" if turned else "alike"
+        overlap_mm = (2 * share - 1) * 65.0
+        return (
+            f"| {grain} | {overlap_mm:.0f} | {lies} | {counts['measured']} | {counts['weak']} | "
+            f"{np.sqrt(np.mean(off**2)):.4f} | {np.sqrt(np.mean((off / sigma) ** 2)):.3f} |"
+        )
+
+
+def _camera_mm(image: dict[str, dict[str, dict[str, float]]], pixels: Array) -> Array:
+    """By the affine part of the truth: a smooth deformation is the film's, and the same in both scans."""
+    x, y = (pixels * [0.02, -0.02]).T
+    a1, a2, a3, b1, b2, b3 = (image["transformation"][name]["value"] for name in ("a1", "a2", "a3", "b1", "b2", "b3"))
+    return np.stack([a1 + a2 * x + a3 * y, b1 + b2 * x + b3 * y], axis=1)
+
+
+if __name__ == "__main__":
+    main()

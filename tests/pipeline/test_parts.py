@@ -1,0 +1,285 @@
+"""Frames scanned in overlapping halves, from rendered scans to one adjustment and one resampled frame."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from measure.natural_points.joins import measure_joins
+from measure.natural_points.tie_frame import TieFrame
+from pipeline.archive.measurement import read_measurement
+from pipeline.cli import run
+from pipeline.errors import InputError
+from pipeline.files.images_file import read_images
+from pipeline.files.project_file import Project, read_project
+from pipeline.measuring.joins import with_joins
+from pipeline.results.measured_scan import MeasuredScan
+
+MARKS = """
+[camera]
+name = "K"
+frame_mm = [44.0, 44.0]
+principal_distance_mm = 60.0
+[camera.sigma]
+principal_distance_mm = 0.1
+principal_point_mm = 0.1
+[camera.mark.m]
+kind = "ring-cross"
+polarity = "light"
+ring_mm = 0.7
+ring_line_mm = 0.14
+arm_mm = 0.5
+line_mm = 0.14
+""" + "".join(
+    f'[[camera.fiducial]]\nid = "{id}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0.003\nmark = "m"\n'
+    for id, (x, y) in {"1": (19.0, -19.0), "2": (-19.0, -19.0), "3": (-19.0, 19.0), "4": (19.0, 19.0)}.items()
+)
+SCENE = f"""
+name = "halves"
+seed = 4
+{MARKS}
+[field]
+kind = "disks"
+unit = "m"
+diameter_mm = 40.0
+surround = 2.0
+[[field.grid]]
+first = 101
+columns = 5
+rows = 5
+center = [0.0, 0.0, 0.0]
+right = [0.5, 0.0, 0.0]
+up = [0.0, 0.5, 0.0]
+jitter = 0.1
+relief = 0.4
+[picture]
+background = "wall"
+pad_mm = 1.9
+[picture.tones]
+contrast = 0.1
+[film]
+scale_sigma_ppm = 300.0
+shear_sigma_urad = 100.0
+grain = 0.01
+[scan]
+pitch_um = 60.0
+margin_mm = 3.0
+turn_sigma_deg = 0.3
+offset_sigma_mm = 0.2
+noise = 0.005
+[given]
+fiducial_error_mm = 0.003
+""" + "".join(
+    f'[[image]]\nname = "f{half}"\nposition = [0.1, -0.1, 4.0]\nangles_deg = [1.0, -2.0, 3.0]\n'
+    f'part_of = "f"\npart = [{first}, {end}]\n'
+    for half, first, end in (("a", 0.0, 0.6), ("b", 0.4, 1.0))
+)
+
+
+@pytest.fixture(scope="module")
+def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the project, measured and adjusted."""
+    folder = tmp_path_factory.mktemp("halves")
+    (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
+    assert run(["render", str(folder / "scene.toml"), str(folder)]) == 0
+    for command in ("measure", "adjust", "report"):
+        assert run([command, str(folder / "project.toml")]) in (0, 1)
+    return folder
+
+
+def truth_of(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    return content["images"]
+
+
+def camera_of(image: dict[str, Any], pixels: np.ndarray) -> np.ndarray:
+    """Camera mm of pixels (n, 2), by the truth."""
+    x, y = (pixels * [0.06, -0.06]).T
+    t = {name: value["value"] for name, value in image["transformation"].items() if name != "kind"}
+    return np.stack([t["a1"] + t["a2"] * x + t["a3"] * y, t["b1"] + t["b2"] * x + t["b3"] * y], axis=1)
+
+
+def test_half_of_the_marks_lie_outside_and_the_others_are_found(halves: Path) -> None:
+    truth = truth_of(halves)
+    for scan in read_measurement(halves / "out" / "measurement.db"):
+        for mark in scan.frame.marks:
+            if mark.kind != "fiducial":
+                continue
+            true = truth[scan.frame.image]["fiducials"][mark.point]
+            if true["visible"]:
+                assert mark.status.is_observation
+                assert mark.center_px is not None
+                assert np.hypot(*(mark.center_px - [true["col_px"], true["row_px"]])) < 0.1
+            else:
+                assert "another scan of its frame" in mark.reason
+
+
+def test_joins_are_the_same_places_of_the_film(halves: Path) -> None:
+    """Their errors are as large as their standard deviations say."""
+    truth = truth_of(halves)
+    first, second = (
+        {mark.point: mark for mark in scan.frame.marks if mark.kind == "join"}
+        for scan in read_measurement(halves / "out" / "measurement.db")
+    )
+    assert len(first) >= 40
+    assert first.keys() == second.keys()
+    places = [
+        camera_of(truth[image], np.array([mark.center_px for mark in of.values()]))
+        for image, of in (("fa", first), ("fb", second))
+    ]
+    sigma = np.array(
+        [
+            np.sqrt(np.trace(first[point].covariance_px2 + second[point].covariance_px2) / 2)  # type: ignore[operator]
+            for point in first
+        ]
+    )
+    off = (places[0] - places[1]) / 0.06 / sigma[:, None]
+    assert 0.8 < np.sqrt(np.mean(off**2)) < 1.25
+
+
+def test_one_adjustment_knows_both_films_one_orientation_and_all_marks_in_one_frame(halves: Path) -> None:
+    truth, result = truth_of(halves), json.loads((halves / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    assert result["converged"]
+    assert result["images"]["fa"]["exterior"] == result["images"]["fb"]["exterior"]
+    assert result["groups"]["join"]["redundancy"] > 60.0
+    frame = result["frames"]["f"]
+    assert set(frame["parts"]) == {"fa", "fb"}
+    assert len(frame["joins"]) >= 40
+    for name, part in frame["parts"].items():
+        corners = np.array([[0.0, 0.0], [0.0, 832.0], [499.0, 0.0], [499.0, 832.0]])
+        own = {key: value for key, value in result["images"][name]["transformation"].items() if key != "mirrored"}
+        adjusted = camera_of({"transformation": own}, corners)
+        off_um = 1000.0 * np.hypot(*(adjusted - camera_of(truth[name], corners)).T)
+        assert off_um.max() < 5.0 * part["corner_sigma_um"]
+    errors = []
+    for mark in frame["marks"]:
+        if mark["kind"] == "target":
+            true = truth[mark["image"]]["targets"][mark["point"]]
+            place = camera_of(truth[mark["image"]], np.array([[true["ellipse_col_px"], true["ellipse_row_px"]]]))[0]
+            errors += [(mark["x_mm"] - place[0]) / mark["sx_mm"], (mark["y_mm"] - place[1]) / mark["sy_mm"]]
+    assert len(errors) > 40
+    assert np.sqrt(np.mean(np.square(errors))) < 2.0
+
+
+def test_the_report_shows_the_joins(halves: Path) -> None:
+    page = (halves / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Frames scanned in parts" in page
+    assert "from where one scan puts each join" in page
+    assert "fiducial marks not measured" not in page
+
+
+def test_the_whole_frame_is_resampled_from_both(halves: Path) -> None:
+    """Targets lie where the truth has them, on either side of the seam, which the file states."""
+    assert run(["resample", str(halves / "project.toml"), str(halves / "frames")]) in (0, 1)
+    with tifffile.TiffFile(halves / "frames" / "f.tif") as file:
+        said = json.loads(file.pages.first.description)
+        grey, mask = file.pages[0].asarray().astype(float), file.pages[1].asarray()
+    assert said["image"] == "f"
+    assert said["parts"] == ["fa", "fb"]
+    (seam,) = said["seams_mm"]
+    assert np.ptp([y for _, y in seam]) > 40.0
+    assert np.abs([x for x, _ in seam]).max() < 4.0
+    assert mask.mean() > 0.97
+    offs: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    for image, true in truth_of(halves).items():
+        for place in true["targets"].values():
+            if not place["visible"]:
+                continue
+            at_mm = camera_of(true, np.array([[place["ellipse_col_px"], place["ellipse_row_px"]]]))[0]
+            col, row = (at_mm[0] - said["x_mm"]) / 0.06, (said["y_mm"] - at_mm[1]) / 0.06
+            window = grey[round(row) - 6 : round(row) + 7, round(col) - 6 : round(col) + 7]
+            light = np.clip(window - np.quantile(window, 0.7), 0.0, None)
+            rows, cols = np.indices(window.shape)
+            middle = np.array([(light * cols).sum(), (light * rows).sum()]) / light.sum()
+            off = middle - 6.0 - (col - round(col), row - round(row))
+            assert np.hypot(*off) < 0.6, (image, at_mm)
+            offs[bool(at_mm[0] > 0.0)].append(off)
+    for side in offs.values():
+        assert len(side) > 8
+        assert np.abs(np.mean(side, axis=0)).max() < 0.12
+
+
+def test_scans_that_have_nothing_in_common_are_told(tmp_path: Path) -> None:
+    parts = []
+    for seed, name in enumerate(("a", "b")):
+        noise = np.random.default_rng(seed).normal(30000.0, 3000.0, (300, 300))
+        tifffile.imwrite(tmp_path / f"{name}.tif", noise.astype(np.uint16))
+        parts.append(TieFrame(name, tmp_path / f"{name}.tif", np.eye(2, 3), None, np.zeros((0, 3))))
+    joins = measure_joins(parts)
+    assert not joins.marks["a"]
+    assert not joins.marks["b"]
+    assert "Nothing joins it to the other scans of its frame: with b" in joins.problems["a"]
+
+
+def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
+    """As if the frame of the right half had been found one mark too far to the right."""
+    project = _project(halves)
+    scans = [_bare(scan) for scan in read_measurement(halves / "out" / "measurement.db")]
+    shifted = scans[1].frame.pixel_from_camera
+    assert shifted is not None
+    shifted = shifted + np.array([[0.0, 0.0, 50.0], [0.0, 0.0, 0.0]])
+    wrong = _with_frame(scans[1], shifted)
+    told = with_joins(project, [scans[0], wrong], lambda *_: None, None)
+    assert all("contradict those of" in " ".join(scan.frame.problems) for scan in told)
+    assert not any(mark.kind == "fiducial" and mark.status.is_observation for mark in told[1].frame.marks)
+
+
+def _project(folder: Path) -> Project:
+    return read_project(folder / "project.toml")
+
+
+def _bare(scan: MeasuredScan) -> MeasuredScan:
+    marks = tuple(mark for mark in scan.frame.marks if mark.kind != "join")
+    return replace(scan, frame=replace(scan.frame, marks=marks, problems=()))
+
+
+def _with_frame(scan: MeasuredScan, pixel_from_camera: np.ndarray) -> MeasuredScan:
+    return replace(scan, frame=replace(scan.frame, pixel_from_camera=pixel_from_camera))
+
+
+def test_a_scan_that_nothing_joins_costs_the_other_nothing(halves: Path, tmp_path: Path) -> None:
+    """Its marks are left out with a sentence, and the other scan is adjusted alone."""
+    for name in ("project.toml", "camera.toml", "points.csv", "images.csv"):
+        shutil.copy(halves / name, tmp_path / name)
+    rows = (halves / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    kept = [row for row in rows if ",join," not in row and not (row.startswith("fb") and ",target," in row)]
+    (tmp_path / "comparator.csv").write_text("\n".join(kept) + "\n", encoding="utf-8")
+    project = (tmp_path / "project.toml").read_text(encoding="utf-8")
+    project = project.replace('"affine"', '"similarity"')  # which the two marks of one half determine
+    without = "\n".join(line for line in project.splitlines() if not line.startswith("scans"))
+    (tmp_path / "project.toml").write_text(without, encoding="utf-8")
+    code = run(["adjust", str(tmp_path / "project.toml")])
+    result = json.loads((tmp_path / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    assert set(result["images"]) == {"fa"}
+    assert code == 1
+    assert any("'fb' has no part in the adjustment" in warning for warning in result["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        ("a,,,,,,,f\n", "'a' is the only part of 'f'"),
+        ("a,,,,,,,f\nf,,,,,,,f\nb,,,,,,,b\nc,,,,,,,b\n", "part_of 'b' is an image itself"),
+        ("a,0,0,9,0,0,0,f\nb,1,0,9,0,0,0,f\n", "have different orientations"),
+    ],
+)
+def test_parts_that_cannot_be_are_refused(lines: str, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "images.csv"
+    path.write_text(f"image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,part_of\n{lines}", encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        read_images(path)
+
+
+def test_one_part_tells_the_orientation_of_all(tmp_path: Path) -> None:
+    path = tmp_path / "images.csv"
+    path.write_text(
+        "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,part_of\na,,,,,,,f\nb,1,0,9,0,0,0,f\n", encoding="utf-8"
+    )
+    given = read_images(path)
+    assert given.parts_of("f") == ("a", "b")
+    assert given.exterior["a"] is given.exterior["b"] is not None
