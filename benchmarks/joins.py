@@ -2,7 +2,7 @@
 
     python benchmarks/joins.py [--runs 200] [--pictures]
 
-Four frames of known points, each in two halves with films of their own, errors drawn anew in every run (seeds 0, 1, ...).
+Four frames of known points, each in two halves with films of their own, errors drawn anew in every run (seed 0 and on).
 --pictures: rendered frames instead, whose joins are measured: their errors beside their standard deviations.
 """
 

@@ -60,6 +60,16 @@ def design_json(
         "images": {image.name: _image(expected, image) for image in expected.network.images},
         "points": _points(expected),
         "point_summary": _point_summary(expected),
+        "distances": [
+            {
+                "name": each.name,
+                "sigma": expected.plan.sigma0 * each.sigma,
+                "redundancy": each.redundancy,
+                "detectable": expected.plan.sigma0 * each.detectable,
+            }
+            for each in adjustment.further
+            if each.group == "distance"
+        ],
         "reliability": _reliability(expected),
         "layouts": _layouts(layouts),
         "what_would_help": [

@@ -53,6 +53,8 @@ def planned_reliability(plan: Plan) -> PlannedReliability:
         scale = plan.sigma0 * (UM_PER_MM if unit.group in IN_MM else 1.0)
         rows = groups.setdefault(unit.group, [])
         rows += [(float(redundancy[i]), scale * float(smallest[i])) for i in range(len(unit.coordinates))]
+    for each in plan.adjustment.further:
+        groups.setdefault(each.group, []).append((each.redundancy, plan.sigma0 * each.detectable))
     camera = tuple(CameraEffect(one.parameter, one.in_sigmas, one.cause) for one in found.outer)
     return PlannedReliability(tuple(_group(name, rows) for name, rows in groups.items()), camera)
 
@@ -61,7 +63,7 @@ def error_unit(group: str) -> str:
     """The unit of a group's gross errors."""
     if group in IN_MM:
         return "um"
-    return "object unit" if group == "control" else "mixed"
+    return "object unit" if group in ("control", "distance") else "mixed"
 
 
 def _group(name: str, rows: list[tuple[float, float]]) -> GroupReliability:

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import DEFAULT_SCANNER
 from pipeline.rendered.design_table import DesignSettings
 from pipeline.rendered.scene_project import SceneFile, film_transformation
+from pipeline.text.spelling import did_you_mean
 from synthetic_images.film import turn
 from synthetic_images.projection import camera_from_object
 from synthetic_images.scene import SceneCamera, SceneImage
@@ -82,6 +84,8 @@ def setup_of(scene_file: SceneFile) -> Setup:
             f"{scene_file.path}: [design] control_points: the field has no target {min(unknown)!r}. Its targets are "
             f"{targets[0].id!r} to {targets[-1].id!r}."
         )
+    images = _frames(scene_file.scene.images)
+    _check_named(scene_file, {target.id for target in targets}, {image.name for image in images})
     points = []
     for target in targets:
         planimetry, height = settings.sigma_planimetry, settings.sigma_height
@@ -96,9 +100,31 @@ def setup_of(scene_file: SceneFile) -> Setup:
             f"{scene_file.path}: [design] transformation is {transformation!r}, but the camera has no fiducials. "
             'Write transformation = "none", or add the fiducials.'
         )
-    return Setup(
-        scene_file.scene.camera, scene_file.camera, transformation, tuple(points), scene_file.scene.images, settings
-    )
+    return Setup(scene_file.scene.camera, scene_file.camera, transformation, tuple(points), images, settings)
+
+
+def _frames(images: Sequence[SceneImage]) -> tuple[SceneImage, ...]:
+    """The frames: those that are to be scanned in parts are planned as wholes, under their own names."""
+    frames = {image.frame: image for image in reversed(images)}
+    return tuple(replace(image, name=frame, part_of="", part=(0.0, 1.0)) for frame, image in reversed(frames.items()))
+
+
+def _check_named(scene_file: SceneFile, targets: set[str], images: set[str]) -> None:
+    """Raises InputError where [design] names an end of a distance, or an image, that the scene does not have."""
+    known = targets | images
+    for distance in scene_file.design.distances:
+        for end in (distance.start, distance.end):
+            if end not in known:
+                raise InputError(
+                    f"{scene_file.path}: [[design.distance]]: {end!r} is neither a target nor an image."
+                    f"{did_you_mean(end, known)}"
+                )
+    for orientation in scene_file.design.orientations:
+        if orientation.image and orientation.image not in images:
+            raise InputError(
+                f"{scene_file.path}: [[design.orientation]]: there is no image {orientation.image!r}."
+                f"{did_you_mean(orientation.image, images)}"
+            )
 
 
 def planned_network(setup: Setup) -> tuple[Network, Approximations]:
@@ -122,15 +148,33 @@ def planned_network(setup: Setup) -> tuple[Network, Approximations]:
     points = [setup.points[i] for i in used]
     planned = Network(
         cameras=(camera,),
-        images=tuple(
-            network.Image(image.name, camera.name, setup.transformation, scanner=DEFAULT_SCANNER if setup.bends else "")
-            for image in setup.images
-        ),
+        images=tuple(_image(setup, camera.name, image) for image in setup.images),
         points=tuple(_object_point(point) for point in points),
         observations=observations,
+        distances=_distances(setup, {point.id: point.xyz for point in points}),
         scanners=_scanners(setup),
     )
     return planned, _values(setup, planned, points)
+
+
+def _image(setup: Setup, camera: str, image: SceneImage) -> network.Image:
+    observed = setup.settings.orientation_of(image.name)
+    exterior = None
+    if observed is not None:
+        sigmas = np.array([*observed.position, *np.radians(observed.angles_deg)])
+        exterior = network.Exterior(np.array(image.exterior), sigmas)
+    scanner = DEFAULT_SCANNER if setup.bends else ""
+    return network.Image(image.name, camera, setup.transformation, exterior, scanner)
+
+
+def _distances(setup: Setup, points: Mapping[str, Array]) -> tuple[network.Distance, ...]:
+    """Those whose ends take part."""
+    places = {image.name: np.array(image.exterior[:3]) for image in setup.images} | dict(points)
+    return tuple(
+        network.Distance(each.start, each.end, float(np.linalg.norm(places[each.end] - places[each.start])), each.sigma)
+        for each in setup.settings.distances
+        if each.start in places and each.end in places
+    )
 
 
 def _scanners(setup: Setup) -> tuple[network.Scanner, ...]:

@@ -1,6 +1,7 @@
 """The tables [design] of a scene: how well everything is to be measured, and what is to be varied."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast, get_args
 
@@ -24,6 +25,26 @@ class Photo:
     """A photograph that might be taken as well: X0, Y0, Z0 in object units, omega, phi, kappa in degrees."""
 
     name: str
+    position: tuple[float, float, float]
+    angles_deg: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class PlannedDistance:
+    """A distance that is to be measured, between two targets, two stations (by the images' names) or one of each; its
+    standard deviation in object units."""
+
+    start: str
+    end: str
+    sigma: float
+
+
+@dataclass(frozen=True)
+class PlannedOrientation:
+    """How well exterior orientations are to be observed: the standard deviations of X0, Y0, Z0 in object units and of
+    omega, phi, kappa in degrees; inf: not at all. image: of which; "": of all that are not named."""
+
+    image: str
     position: tuple[float, float, float]
     angles_deg: tuple[float, float, float]
 
@@ -56,10 +77,18 @@ class DesignSettings:
     alternatives: bool
     photos: tuple[Photo, ...]
     sweeps: tuple[Sweep, ...]
+    distances: tuple[PlannedDistance, ...] = ()
+    orientations: tuple[PlannedOrientation, ...] = ()
+
+    def orientation_of(self, image: str) -> PlannedOrientation | None:
+        """How well that of an image is to be observed; None where it is not."""
+        named = {each.image: each for each in self.orientations}
+        return named.get(image) or named.get("")
 
 
 def read_design(table: Table, sigma_planimetry: float, sigma_height: float) -> DesignSettings:
-    """The table [design] with its [[design.photo]] and [[design.sweep]]. Raises InputError.
+    """The table [design] with its [[design.photo]], [[design.sweep]], [[design.distance]] and [[design.orientation]].
+    Raises InputError.
 
     sigma_planimetry, sigma_height: what the table [given] says, where this one is silent.
     """
@@ -80,6 +109,8 @@ def read_design(table: Table, sigma_planimetry: float, sigma_height: float) -> D
         alternatives=table.flag("alternatives", True),
         photos=tuple(_photo(entry) for entry in table.tables("photo")),
         sweeps=tuple(_sweep(entry) for entry in table.tables("sweep")),
+        distances=tuple(_distance(entry) for entry in table.tables("distance")),
+        orientations=_orientations(table.tables("orientation")),
     )
     table.done()
     return settings
@@ -109,6 +140,39 @@ def _sweep(table: Table) -> Sweep:
     if len(set(values)) < 2:
         raise table.error("values", "needs two different values at least.")
     return Sweep(quantity, values)
+
+
+def _distance(table: Table) -> PlannedDistance:
+    distance = PlannedDistance(table.text("from"), table.text("to"), table.number("sigma", above=0.0))
+    table.done()
+    if distance.start == distance.end:
+        raise table.error("to", "is the same as from: a distance has two ends.")
+    return distance
+
+
+def _orientations(tables: Sequence[Table]) -> tuple[PlannedOrientation, ...]:
+    orientations: dict[str, PlannedOrientation] = {}
+    for table in tables:
+        image = table.text("image", "")
+        if image in orientations:
+            told = f"image {image!r}" if image else "all images"
+            raise table.error("image", f"an orientation of {told} is given already. Remove one of both.")
+        position, angles = (_free_sigmas(table, key) for key in ("position_sigma", "angles_sigma_deg"))
+        if all(math.isinf(sigma) for sigma in (*position, *angles)):
+            raise table.error("position_sigma", "or angles_sigma_deg must be given: else nothing is observed.")
+        orientations[image] = PlannedOrientation(image, position, angles)
+        table.done()
+    return tuple(orientations.values())
+
+
+def _free_sigmas(table: Table, key: str) -> tuple[float, float, float]:
+    """Three standard deviations, or one for all; not observed where the key is absent."""
+    if key not in table:
+        return (math.inf,) * 3
+    sigmas = table.triple(key) if isinstance(table.values[key], list) else (table.number(key),) * 3
+    if min(sigmas) <= 0.0:
+        raise table.error(key, "holds standard deviations, which must be positive.")
+    return sigmas
 
 
 def _is_text(values: Mapping[str, object]) -> bool:

@@ -332,3 +332,94 @@ def test_fiducials_of_photographs_alone_are_the_mean_of_as_many(tmp_path: Path) 
 def test_a_field_of_natural_points_cannot_be_planned() -> None:
     with pytest.raises(InputError, match="has no targets"):
         setup_of(read_scene(SCENES / "juhl_natural.toml"))
+
+
+def with_table(folder: Path, table: str) -> Path:
+    path = small(folder)
+    path.write_text(path.read_text(encoding="utf-8") + table, encoding="utf-8")
+    return path
+
+
+def test_a_distance_has_the_part_that_its_variance_gives_it(tmp_path: Path) -> None:
+    """Added to a plan by the law of least squares: N + a'a / sigma^2, by hand, for a base between two stations."""
+    known = "sigma_height = 0.001\nsigma_planimetry = 0.001"
+    before = expect(Variations.read(small(tmp_path, ("sigma_height = 0.001", known))).setup())
+    sigma = 0.0002
+    table = f'[[design.distance]]\nfrom = "one"\nto = "two"\nsigma = {sigma}\n'
+    text = (tmp_path / "small.toml").read_text(encoding="utf-8")
+    (tmp_path / "base.toml").write_text(text + table, encoding="utf-8")
+    after = expect(Variations.read(tmp_path / "base.toml").setup())
+    names = list(before.plan.adjustment.names)
+    cofactor = before.plan.adjustment.cofactor_of(names)
+    along = np.array([2.0, 0.0, -0.4]) / np.hypot(2.0, 0.4)
+    row = np.zeros(len(names))
+    for i, axis in enumerate(("X0", "Y0", "Z0")):
+        row[names.index(f"EO.one.{axis}")], row[names.index(f"EO.two.{axis}")] = -along[i], along[i]
+    gain = cofactor @ row
+    expected = cofactor - np.outer(gain, gain) / (sigma**2 + row @ gain)
+    for name in ("IO.K.c", "EO.two.X0", "PT.6.Z"):
+        i = names.index(name)
+        assert after.plan.sigma(name) == pytest.approx(np.sqrt(expected[i, i]), rel=1e-6)
+    (told,) = after.plan.adjustment.further
+    assert told.redundancy == pytest.approx(sigma**2 / (sigma**2 + row @ gain), rel=1e-6)
+    assert {group.group for group in after.reliability.groups} >= {"distance"}
+
+
+def test_observed_orientations_hold_what_they_are_of(tmp_path: Path) -> None:
+    """One frame's station is observed far better than targets give it; the other one's angles."""
+    path = with_table(
+        tmp_path,
+        '[[design.orientation]]\nimage = "one"\nposition_sigma = 1e-6\n'
+        "[[design.orientation]]\nangles_sigma_deg = [1e-5, 1e-5, 1e-5]\n",
+    )
+    plan = expect(Variations.read(path).setup()).plan
+    for axis in ("X0", "Y0", "Z0"):
+        assert plan.sigma(f"EO.one.{axis}") == pytest.approx(1e-6, rel=0.01)
+        assert plan.sigma(f"EO.two.{axis}") > 1e-5
+    assert plan.sigma("EO.two.omega") == pytest.approx(math.radians(1e-5), rel=0.01)
+    assert plan.sigma("EO.one.omega") > math.radians(1e-4)
+
+
+def test_distances_hold_the_scale_of_a_free_network(tmp_path: Path) -> None:
+    """Unknown points have no scale; one distance gives it, and design.json tells what would find an error of it."""
+    free = 'sigma_height = "free"\nsigma_planimetry = "free"\ndatum = "minimal"'
+    without = expect(Variations.read(small(tmp_path, ("sigma_height = 0.001", free))).setup())
+    text = (tmp_path / "small.toml").read_text(encoding="utf-8")
+    distances = "".join(
+        f'[[design.distance]]\nfrom = "{start}"\nto = "{end}"\nsigma = 0.001\n'
+        for start, end in (("1", "4"), ("13", "16"))
+    )
+    path = tmp_path / "free.toml"
+    path.write_text(text + distances, encoding="utf-8")
+    told = expect(Variations.read(path).setup())
+    assert without.plan.adjustment.redundancy + 1 == told.plan.adjustment.redundancy  # one of both is needed
+    assert run(["design", str(path)]) in (DONE, LOOK)
+    content = json.loads((tmp_path / "free-design" / "design.json").read_text(encoding="utf-8"))
+    assert [each["name"] for each in content["distances"]] == ["1 to 4", "13 to 16"]
+    assert all(each["detectable"] > 3.0 * 0.001 for each in content["distances"])
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ('[[design.distance]]\nfrom = "1"\nto = "one"\nsigma = 0.0\n', "sigma"),
+        ('[[design.distance]]\nfrom = "1"\nto = "three"\nsigma = 0.1\n', "'three' is neither a target nor an image"),
+        ('[[design.distance]]\nfrom = "1"\nto = "1"\nsigma = 0.1\n', "two ends"),
+        ('[[design.orientation]]\nimage = "ones"\nposition_sigma = 0.1\n', "no image 'ones'"),
+        ('[[design.orientation]]\nimage = "one"\n', "nothing is observed"),
+        ("[[design.orientation]]\nposition_sigma = -1.0\n", "must be positive"),
+    ],
+)
+def test_what_cannot_be_observed_is_refused(table: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        Variations.read(with_table(tmp_path, table)).setup()
+
+
+def test_frames_to_be_scanned_in_parts_are_planned_as_wholes(tmp_path: Path) -> None:
+    whole = small(tmp_path).read_text(encoding="utf-8")
+    half = '[[image]]\nname = "two_b"\nposition = [2.0, 0.0, 4.6]\nangles_deg = [0.0, 23.0, 90.0]\n'
+    parts = whole.replace('name = "two"\n', 'name = "two_a"\npart_of = "two"\npart = [0.0, 0.6]\n')
+    (tmp_path / "parts.toml").write_text(parts + half + 'part_of = "two"\npart = [0.4, 1.0]\n', encoding="utf-8")
+    first, second = (expect(Variations.read(tmp_path / name).setup()) for name in ("small.toml", "parts.toml"))
+    assert [image.name for image in second.network.images] == ["one", "two"]
+    assert second.plan.sigma("IO.K.c") == pytest.approx(first.plan.sigma("IO.K.c"), rel=1e-9)
