@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -224,8 +225,9 @@ def large(side: int = 11500) -> None:
         folder = Path(name)
         print(f"a scan of {side} px, 16 bit, LZW in strips of {STRIP_PX} rows, turned by 90 degrees", flush=True)
         print("| program | result, px | CPU s | wall s | peak MiB |\n|---|---|---|---|---|", flush=True)
-        for target, given in ((make_scan, (folder / "scan.tif", side)), *((measured, (of, folder)) for of in PROGRAMS)):
-            process = spawn.Process(target=target, args=given)
+        work = [partial(make_scan, folder / "scan.tif", side), *(partial(measured, of, folder) for of in PROGRAMS)]
+        for each in work:
+            process = spawn.Process(target=each)
             process.start()
             process.join()
 

@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.covariance import Covariance
-from measure.natural_points.features import Features, find_features, in_turn, reduction, shared_features
+from measure.errors import MeasurementError
+from measure.natural_points.features import Features, find_features, in_turn, shared_features
+from measure.natural_points.local_maps import outliers
 from measure.natural_points.multi_image import RADIUS_PX, SPARE_PX, Matched, Piece, match_pieces
-from measure.natural_points.neighbours import outliers
 from measure.natural_points.tie_frame import TieFrame
 from measure.probabilities import POINT_REFUSED
 from measure.reason import NO_REASON, Code, Reason
 from measure.results import MarkMeasurement
-from measure.scans.parallel import mapped
+from measure.scans.parallel import mapped_or_lost
 from measure.status import Status
 
 Array = NDArray[np.float64]
@@ -40,6 +41,7 @@ _APART_PX = 2 * RADIUS_PX + 2  # of joins: patches that overlap have correlated 
 _SHARP_PX = 0.5  # rms length of an error: with less texture a join is weak
 _CHUNK = 16  # places that a worker gets at a time
 _UNEVEN = Reason("parts of the picture about the place move unlike each other", Code.OTHER_SCANS)
+_LOST = Reason("the process that matched it was ended", Code.UNREACHABLE)
 _UNLIKE = Reason("the places about it map elsewhere from scan to scan: dust on the glass, or chance", Code.OTHER_SCANS)
 
 _Sought = tuple[Piece, Piece]
@@ -57,17 +59,23 @@ class Joins:
 def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Executor | None = None) -> Joins:
     """The joins of one frame's scans, so many wanted of every two that overlap.
 
-    Raises MeasurementError for a scan that cannot be read. The result does not depend on the number of workers.
+    Raises nothing for what the pictures show, nor for a scan that cannot be read: a problem says why it has none. The
+    result does not depend on the number of workers.
     """
-    features = list(mapped(workers, _features, parts))
+    found_or_not = list(mapped_or_lost(workers, _features, parts, lambda _, why: _out_of_reach(why)))
+    unseen = {part.image: each for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Reason)}
+    seen = [(part, each) for part, each in zip(parts, found_or_not, strict=True) if isinstance(each, Features)]
+    parts, features = [part for part, _ in seen], [each for _, each in seen]
     marks: dict[str, list[MarkMeasurement]] = {part.image: [] for part in parts}
     shared: dict[tuple[int, int], _Shared] = {}
     number, problems = 0, dict[str, Reason]()
     for i, j in combinations(range(len(parts)), 2):
-        shared[i, j] = _shared(parts[i], parts[j], features[i], features[j])
-        if shared[i, j].second_from_first is None:
+        shared[i, j] = _shared(features[i], features[j])
+        second_from_first = shared[i, j].second_from_first
+        if second_from_first is None:
             continue
-        found, refused = _joined(parts[i], parts[j], features[i], shared[i, j], wanted, workers)
+        both = features[i], features[j]
+        found, refused = _joined((parts[i], parts[j]), both, second_from_first, wanted, workers)
         for pair in found:
             number += 1
             for part, matched in zip((parts[i], parts[j]), pair, strict=True):
@@ -75,13 +83,20 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
         if len(found) < _FEW:
             problems |= {part.image: _few(parts[i], parts[j], len(found), refused) for part in (parts[i], parts[j])}
     unjoined = dict(_unjoined(parts, shared, marks))
-    return Joins({image: tuple(own) for image, own in marks.items()}, problems | unjoined)
+    return Joins({image: tuple(own) for image, own in marks.items()}, problems | unjoined | unseen)
 
 
-def _features(part: TieFrame) -> Features:
-    with part.open() as scan:
-        size = scan.width_px, scan.height_px
-        return find_features(scan, lambda places: part.usable(places, size), False, _FEATURES)
+def _features(part: TieFrame) -> Features | Reason:
+    try:
+        with part.open() as scan:
+            size = scan.width_px, scan.height_px
+            return find_features(scan, lambda places: part.usable(places, size), False, _FEATURES)
+    except MeasurementError as error:
+        return _out_of_reach(str(error))
+
+
+def _out_of_reach(why: str) -> Reason:
+    return Reason(f"It is not joined to the other scans of its frame: {why}", Code.UNREACHABLE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +109,12 @@ class _Shared:
     second_from_first: Array | None
 
 
-def _shared(one: TieFrame, other: TieFrame, first: Features, second: Features) -> _Shared:
+def _shared(first: Features, second: Features) -> _Shared:
     pairs = shared_features(first, second)
     if len(pairs) < _FEWEST:
         return _Shared(len(pairs), 0, None)
     here, there = first.places_px[pairs[:, 0]], second.places_px[pairs[:, 1]]
-    with one.open() as scan, other.open() as another:
-        within_px = _AGREE_PX * max(reduction(scan), reduction(another))
+    within_px = _AGREE_PX * max(first.reduction, second.reduction)
     cv2.setRNGSeed(0)
     _, inside = cv2.estimateAffinePartial2D(
         here, there, method=cv2.RANSAC, ransacReprojThreshold=within_px, maxIters=_TRIALS, confidence=_CONFIDENCE
@@ -118,13 +132,19 @@ def _affine(here: Array, there: Array) -> Array:
 
 
 def _joined(
-    one: TieFrame, other: TieFrame, features: Features, shared: _Shared, wanted: int, workers: Executor | None
+    both: tuple[TieFrame, TieFrame],
+    features: tuple[Features, Features],
+    second_from_first: Array,
+    wanted: int,
+    workers: Executor | None,
 ) -> tuple[list[_Measured], Counter[str]]:
     """Both places of every join, so many at most, and why other places are none."""
-    assert shared.second_from_first is not None
-    places = _places(other, features, shared.second_from_first, wanted)
-    pieces = list(zip(*(_pieces(part, of) for part, of in zip((one, other), places, strict=True)), strict=True))
-    matched = list(mapped(workers, _match, pieces, _CHUNK))
+    places = _places(both[1], features, second_from_first, wanted)
+    try:
+        pieces = list(zip(*(_pieces(part, of) for part, of in zip(both, places, strict=True)), strict=True))
+    except MeasurementError as error:
+        return [], Counter([str(error)])
+    matched = list(mapped_or_lost(workers, _match, pieces, lambda *_: (), _CHUNK))
     refused = Counter(str(_refused(pair)) for pair in matched if _refused(pair))
     good = [pair for pair in matched if not _refused(pair)]
     if good:
@@ -134,17 +154,21 @@ def _joined(
     return good[:wanted], refused
 
 
-def _places(other: TieFrame, features: Features, second_from_first: Array, wanted: int) -> tuple[list[Array], ...]:
+def _places(
+    other: TieFrame, features: tuple[Features, Features], second_from_first: Array, wanted: int
+) -> tuple[list[Array], ...]:
     """Maps (2, 3) from patches to both scans, the best textured of every part of the overlap first, none touching
     another."""
-    there = features.places_px @ second_from_first[:, :2].T + second_from_first[:, 2]
-    with other.open() as scan:
-        common = np.flatnonzero(other.usable(there, (scan.width_px, scan.height_px)))
-    here = features.places_px[common]
+    first, second = features
+    there = first.places_px @ second_from_first[:, :2].T + second_from_first[:, 2]
+    common = np.flatnonzero(other.usable(there, second.size_px))
+    if not len(common):
+        return [], []
+    here = first.places_px[common]
     cell_px = max(float(np.sqrt(np.prod(np.ptp(here, axis=0) + 1.0) / wanted)), float(_APART_PX))
     cell = np.floor((here - here.min(axis=0)) / cell_px).astype(np.intp) @ np.array([1, 10000])
     chosen = list[int]()
-    for k in in_turn(cell, features.textures[common]).tolist():
+    for k in in_turn(cell, first.textures[common]).tolist():
         if all(np.hypot(*(here[k] - here[other_k])) >= _APART_PX for other_k in chosen):
             chosen.append(k)
         if len(chosen) == _TRIED * wanted:
@@ -173,6 +197,8 @@ def _match(pieces: _Sought) -> _Measured:
 
 def _refused(pair: _Measured) -> Reason:
     """Why its own pictures are no join; empty where they are."""
+    if not pair:
+        return _LOST
     for matched in pair:
         if matched.reason:
             return matched.reason

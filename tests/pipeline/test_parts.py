@@ -94,7 +94,7 @@ def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def truth_of(folder: Path) -> dict[str, Any]:
     content: dict[str, Any] = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
-    return content["images"]
+    return dict(content["images"])
 
 
 def camera_of(image: dict[str, Any], pixels: np.ndarray) -> np.ndarray:
