@@ -22,21 +22,30 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from range_server import range_server
 
 from measure.marks.rendering import extent_px, picture
+from measure.marks.shapes import FiducialLayout
 from pipeline.archive.witness import Witnessed, witnessed_scan
+from pipeline.files.camera_file import read_camera
 from pipeline.files.project_file import read_project
 from pipeline.measuring.scan_task import scan_tasks
 
-_PITCH_UM, _GROUND_DN, _GRAIN_DN, _MARK_DN = 20.0, 110.0, 5.0, 90.0
-_EDGE_MM = 106.0
-_PLACES = [(x, y) for x in (-_EDGE_MM, 0.0, _EDGE_MM) for y in (-_EDGE_MM, 0.0, _EDGE_MM) if (x, y) != (0.0, 0.0)]
-_CAMERA = (
-    'name = "K"\nframe_mm = [228.0, 228.0]\nprincipal_distance_mm = 153.0\n'
-    + "".join(
-        f'[[fiducial]]\nid = "{number}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0.01\nmark = "m"\n'
-        for number, (x, y) in enumerate(_PLACES, 1)
+PITCH_UM, _EDGE_MM = 20.0, 106.0
+_GROUND_DN, _GRAIN_DN, _MARK_DN = 110.0, 5.0, 90.0
+_ROWS = 500  # of grain at a time
+
+
+def camera_text(edge_mm: float) -> str:
+    """A camera of eight ring-crosses, that far from the middle along an axis, of a frame somewhat larger."""
+    edges = (-edge_mm, 0.0, edge_mm)
+    places = [(x, y) for x in edges for y in edges if (x, y) != (0.0, 0.0)]
+    size = 2 * edge_mm + 16.0
+    return (
+        f'name = "K"\nframe_mm = [{size}, {size}]\nprincipal_distance_mm = {size}\n'
+        + "".join(
+            f'[[fiducial]]\nid = "{number}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0.01\nmark = "m"\n'
+            for number, (x, y) in enumerate(places, 1)
+        )
+        + '[mark.m]\nkind = "ring-cross"\nring_mm = 0.8\nring_line_mm = 0.1\narm_mm = 1.2\nline_mm = 0.1\n'
     )
-    + '[mark.m]\nkind = "ring-cross"\nring_mm = 0.8\nring_line_mm = 0.1\narm_mm = 1.2\nline_mm = 0.1\n'
-)
 
 
 def main() -> None:
@@ -46,12 +55,18 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        (folder / "camera.toml").write_text(_CAMERA, encoding="utf-8")
+        (folder / "camera.toml").write_text(camera_text(_EDGE_MM), encoding="utf-8")
+        layout = read_camera(folder / "camera.toml").layout()
         print("| tiles, px | overviews | off, px | marks | requests | bytes | share of the file | CPU, s |")
         print("|---" * 8 + "|")
         for tile_px, overviews, off_px in ((256, True, 0), (512, True, 0), (256, True, 350), (256, False, 350)):
             name = f"{tile_px}-{off_px}{'-with' if overviews else ''}.tif"
-            _write(folder / name, _frame(folder, options.side, options.seed, off_px), tile_px, overviews)
+            _write(
+                folder / name,
+                drawn_frame(layout, options.side, np.random.default_rng(options.seed), off_px),
+                tile_px,
+                overviews,
+            )
             with range_server(folder) as server:
                 start_s = time.process_time()
                 seen = _measured(folder, f"{server.url}/{name}")
@@ -66,20 +81,17 @@ def main() -> None:
 
 def _measured(folder: Path, address: str) -> Witnessed:
     """As `reseau measure` does it."""
-    text = f'camera = "camera.toml"\nscans = ["{address}"]\npitch_um = {_PITCH_UM}\n[measure]\npose = "0"\n'
+    text = f'camera = "camera.toml"\nscans = ["{address}"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'
     (folder / "project.toml").write_text(text, encoding="utf-8")
     project = read_project(folder / "project.toml")
     (task,) = scan_tasks(project, tuple(project.scans))
     return witnessed_scan(task)
 
 
-def _frame(folder: Path, side: int, seed: int, off_px: int) -> NDArray[np.uint8]:
-    rng = np.random.default_rng(seed)
+def drawn_frame(layout: FiducialLayout, side: int, rng: np.random.Generator, off_px: int = 0) -> NDArray[np.uint8]:
+    """A square scan of grainy film with a camera's marks, the frame's middle that far off the scan's, or 20 px more."""
     grey = np.full((side, side), _GROUND_DN, np.float32)
-    text = 'camera = "camera.toml"\ncomparator = "camera.toml"\n'
-    (folder / "project.toml").write_text(text, encoding="utf-8")
-    layout = read_project(folder / "project.toml").default_camera.layout()
-    scale, middle = 1000.0 / _PITCH_UM, side / 2 + off_px + rng.uniform(-20, 20, 2)
+    scale, middle = 1000.0 / PITCH_UM, side / 2 + off_px + rng.uniform(-20, 20, 2)
     for mark in layout.marks:
         x, y = mark.xy_mm
         linear = scale * np.array([[1.0, 0.0], [0.0, -1.0]])
@@ -89,9 +101,10 @@ def _frame(folder: Path, side: int, seed: int, off_px: int) -> NDArray[np.uint8]
         width, height = (np.ceil(greatest - least).astype(int) + 8).tolist()
         drawn = picture(mark.mark, np.column_stack([linear, center - low]), width, height, 1.0)
         grey[low[1] : low[1] + height, low[0] : low[0] + width] += _MARK_DN * drawn
-    for row in range(0, side, 500):
-        rows = grey[row : row + 500]
-        rows += cv2.GaussianBlur(rng.normal(0, 2 * _GRAIN_DN, rows.shape).astype(np.float32), (0, 0), 0.6)
+    for row in range(0, side, _ROWS):
+        rows = grey[row : row + _ROWS]
+        grain = rng.standard_normal(rows.shape, np.float32)
+        rows += cv2.GaussianBlur(2 * _GRAIN_DN * grain, (0, 0), 0.6)
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 

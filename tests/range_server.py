@@ -54,6 +54,10 @@ def range_server(folder: Path) -> Iterator[RangeServer]:
         def _data(self) -> bytes | None:
             """None where the refusal was sent."""
             file, is_closed = folder / self.path.lstrip("/"), self.path.startswith("/closed/")
+            if self.path.endswith("/") and file.is_dir() and not is_closed:
+                names = [f"{one.name}{'/' * one.is_dir()}" for one in sorted(file.iterdir())]
+                links = ["../", "?C=N;O=D", *names]
+                return "".join(f'<a href="{name}">{name}</a>\n' for name in links).encode()
             if file.is_file() and not is_closed:
                 return file.read_bytes()
             self._answer(403 if is_closed else 404, b"")

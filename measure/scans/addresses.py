@@ -6,6 +6,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from io import BufferedIOBase
 from pathlib import Path, PosixPath
@@ -124,6 +125,24 @@ def found_addresses(pattern: str) -> list[Path]:
         return [address]
     names = _persistently(address, lambda: list(system.glob(pattern)))
     return [Address(f"s3://{name}") for name in sorted(names)]
+
+
+def addresses_below(address: Address) -> list[Path]:
+    """Every object of a store below an address, at any depth, or every file that the pages of a server list there.
+    Raises as `Address` does."""
+    system = _file_system(address)
+    if _scheme(address) == "s3":
+        names = _persistently(address, lambda: list(system.find(str(address))))
+        return [Address(f"s3://{name}") for name in sorted(names)]
+    files, seen, folders = set[str](), set[str](), [f"{address}/"]
+    while folders:
+        folder = folders.pop()
+        seen.add(folder)
+        listed = {str(entry["name"]) for entry in _persistently(address, partial(system.ls, folder, detail=True))}
+        below = {name for name in listed if name.startswith(folder) and "?" not in name and "#" not in name} - seen
+        folders += sorted(name for name in below if name.endswith("/"))
+        files |= {name for name in below if not name.endswith("/")}
+    return [Address(name) for name in sorted(files)]
 
 
 def tiff_file(path: Path) -> "TiffFile":

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
+from measure.scans.addresses import Address, addresses_below
 from measure.scans.head import ScanHead, read_head
 from pipeline.archive.identity import content_hash, parts_hash
 from pipeline.errors import InputError
@@ -44,8 +45,9 @@ class Catalogue:
 
 
 def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None) -> Catalogue:
-    """All scans among the files, and in and below the folders. Of each some kilobytes are read, and held is its name.
-    Raises InputError where there is none."""
+    """All scans among the files and addresses, and in and below the folders, also those of stores and servers. Of each
+    some kilobytes are read, and held is its name. Raises InputError where there is none, MeasurementError for an
+    address that is not listed."""
     files, endings = _files(given)
     if not files:
         raise InputError(_no_scan(given, endings))
@@ -74,6 +76,13 @@ def _files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
     """In the order of their names; what is hidden is not looked at."""
     files, endings = dict[Path, None](), Counter[str]()
     for path in given:
+        if isinstance(path, Address) and path.suffix.lower() not in SCAN_ENDINGS:
+            for below in addresses_below(path):
+                if below.suffix.lower() in SCAN_ENDINGS:
+                    files[below] = None
+                else:
+                    endings[below.suffix] += 1
+            continue
         if not path.is_dir():
             files[path] = None
             continue

@@ -1,15 +1,17 @@
 """Scans measured by a cluster: Dask's scheduler as an ordinary executor, asked first whether its workers can do it."""
 
+import os
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from measure.errors import MeasurementError
 from measure.revision import MEASURE_REVISION
+from measure.scans.addresses import is_address, scan_path
 from pipeline.errors import InputError
 from pipeline.workers import KILLS, WorkerKilled, processes, work_alone
 
@@ -27,7 +29,8 @@ _NAMED = 3
 def cluster_executor(address: str, scans: Sequence[str], workers: int | None = None) -> Iterator[Executor]:
     """The executor of a scheduler that is there, or of one that is started here for as long as the block lasts.
 
-    address: such as tcp://host:8786, or `local`. scans: paths, of which one a folder is looked for by every worker.
+    address: such as tcp://host:8786, or `local`. scans: paths and addresses, of which one a folder is looked for by
+    every worker.
     Raises InputError where Dask is not installed, nobody answers, or a worker has other versions or cannot read them.
     """
     try:
@@ -118,9 +121,11 @@ def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None
         if other:
             complaints.append(f"{worker}: has {'; '.join(other)}. Install the same there.")
         if missing:
-            complaints.append(
-                f"{worker}: cannot read {', '.join(missing[:_NAMED])}. Give it the same path to the scans."
-            )
+            what = "; ".join(f"{scan} ({why})" for scan, why in missing[:_NAMED])
+            remedy = "the same path to the scans"
+            if any(is_address(scan) for scan, _ in missing):
+                remedy = "the extra, the credentials and the network that reach the store, as they are here"
+            complaints.append(f"{worker}: cannot read {what}. Give it {remedy}.")
     if complaints:
         more = f"\n... and {len(complaints) - _NAMED} more workers" if len(complaints) > _NAMED else ""
         raise InputError(
@@ -145,27 +150,32 @@ def _is_installed(name: str) -> bool:
     return True
 
 
-def _versions_and_unreachable(scans: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Asked of a worker: its versions, and which of these scans it cannot read."""
-    return versions(), [scan for scan in scans if not _is_readable(scan)]
+def _versions_and_unreachable(scans: Sequence[str]) -> tuple[dict[str, str], list[tuple[str, str]]]:
+    """Asked of a worker: its versions, and which of these scans it cannot read, and why."""
+    return versions(), [(scan, why) for scan in scans if (why := _why_unreadable(scan))]
 
 
-def _is_readable(scan: str) -> bool:
+def _why_unreadable(scan: str) -> str:
+    """Of a file or an address; "" of one that can be read."""
     try:
-        with Path(scan).open("rb") as file:
+        with scan_path(scan).open("rb") as file:
             file.read(1)
-            return True
-    except OSError:
-        return False
+            return ""
+    except OSError as error:
+        return error.strerror or str(error)
+    except MeasurementError as error:
+        return str(error)
 
 
 def _one_a_folder(scans: Sequence[str]) -> list[str]:
-    """The first scan of each folder that is there for us: one that nobody has says nothing of a worker."""
-    firsts: dict[Path, str] = {}
-    for scan in scans:
-        if scan and "://" not in scan and Path(scan).parent not in firsts and _is_readable(scan):
-            firsts[Path(scan).parent] = str(Path(scan).absolute())
-    return list(firsts.values())
+    """The first scan of each folder that is there for us: one that nobody has says nothing of a worker. An address that
+    does not answer is asked four times, so of these only the first is tried."""
+    firsts: dict[str, str] = {}
+    for scan in filter(None, scans):
+        folder = scan.rpartition("/")[0] if is_address(scan) else os.path.dirname(scan)
+        if folder not in firsts and (is_there := not _why_unreadable(scan)) | is_address(scan):
+            firsts[folder] = (scan if is_address(scan) else os.path.abspath(scan)) if is_there else ""
+    return [first for first in firsts.values() if first]
 
 
 def _alone_plugin() -> Any:

@@ -2,7 +2,6 @@
 
 import glob
 import os
-import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from measure.errors import MeasurementError
+from measure.scans.addresses import Address, is_address, scan_path
 from measure.scans.head import ScanHead
 from pipeline.archive.catalogue import Catalogue, Group, catalogue
 from pipeline.archive.sampling import library, name_cameras
@@ -27,6 +28,7 @@ from pipeline.text.toml_text import quoted
 Json = dict[str, Any]
 
 OUTPUT = "out"
+_LIST = ".txt"
 _SHOWN = 12  # of each kind of remark on the terminal
 _BROKEN = "cannot be read"
 _COPIES = "the same bytes as another scan"
@@ -136,21 +138,30 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
     for path in (folder / "project.toml", folder / "images.csv"):
         if path.exists():
             raise InputError(f"{path} is there already, and init writes over nothing. Give another folder by --out.")
+    given = [path for one in given for path in _named(one)]
     for path in given:
-        if re.match(r"\w+:/", path.as_posix()) and not path.exists():
-            raise InputError(
-                f"{path} is an address, and init looks into folders only. Name its scans in a project.toml of your own."
-            )
-        if not path.exists():
+        if not isinstance(path, Address) and not path.exists():
             raise InputError(f"there is no {path} (looked for {path.absolute()}). Give folders with scans, or scans.")
     with reporter.stage("looked at") as count:
-        found = catalogue(given, count, max_pixels)
+        try:
+            found = catalogue(given, count, max_pixels)
+        except MeasurementError as error:
+            raise InputError(str(error)) from error
     kinds, unread = name_cameras(found.groups, reporter, max_pixels)
     found = Catalogue(found.groups, {**found.broken, **unread}, found.copies, found.endings)
     new = NewProject(folder, tuple(given), found, tuple(kinds), _left_out(found, kinds))
     write_atomically(folder / "project.toml", project_text(new))
     write_atomically(folder / "images.csv", images_text(new))
     return new
+
+
+def _named(given: Path) -> list[Path]:
+    """Itself, or all that a list of paths and addresses names, a line each."""
+    if isinstance(given, Address) or given.suffix.lower() != _LIST or not given.is_file():
+        return [given]
+    lines = [line.strip() for line in given.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()]
+    named = [line for line in lines if line and not line.startswith("#")]
+    return [scan_path(line) if is_address(line) else given.parent / line for line in named]
 
 
 def chosen(kind: ScanKind) -> str:
@@ -216,7 +227,7 @@ def _left_out(found: Catalogue, kinds: Sequence[ScanKind]) -> dict[str, list[Pat
     """By reason. Where no camera is told at all, the project's own file has to say it, and is of all scans."""
     groups = list(zip(found.groups, kinds, strict=True))
     is_named = any(kind.cameras for kind in kinds)
-    broken = [path for path in found.broken if path.exists() or path.is_symlink()]
+    broken = [path for path in found.broken if isinstance(path, Address) or path.exists() or path.is_symlink()]
     unknown = [path for group, kind in groups if is_named and not kind.cameras for path in group.paths]
     taken = set(broken) | set(unknown)
     whole = [(path, group.head) for group in found.groups for path in group.paths if path not in taken]
@@ -242,7 +253,10 @@ def _patterns(new: NewProject) -> list[str]:
     """Of the scans below each given folder, as the project finds them: every ending of one as it is written."""
     patterns = dict[str, None]()
     for given in new.given:
-        shown = Path(os.path.relpath(given, new.folder)).as_posix()
+        if isinstance(given, Address):
+            patterns |= dict.fromkeys(_address_patterns(new, given))
+            continue
+        shown = _seen_from(new.folder, given)
         if not given.is_dir():
             patterns[shown] = None
             continue
@@ -252,16 +266,33 @@ def _patterns(new: NewProject) -> list[str]:
     return list(patterns)
 
 
+def _address_patterns(new: NewProject, given: Address) -> list[str]:
+    """Stores find what a pattern names; of servers every scan is named."""
+    below = [path for path in new.cameras if path.is_relative_to(given)]
+    if below == [given] or not _has_patterns(given):
+        return [str(path) for path in below]
+    return [f"{glob.escape(str(given))}/**/*{ending}" for ending in sorted({path.suffix for path in below})]
+
+
+def _has_patterns(path: Path) -> bool:
+    return not isinstance(path, Address) or str(path).startswith("s3:")
+
+
 def _exclude_lines(new: NewProject) -> list[str]:
     """With the reason of each; the project's own results are no scans of it."""
     excluded = list[str]()
     if any((new.folder.absolute() / OUTPUT).is_relative_to(given.absolute()) for given in new.given):
         excluded += [f"    {quoted(f'{OUTPUT}/**/*')},    # what the project itself writes"]
     for reason, paths in new.left_out.items():
-        found = [path for path in paths if path.suffix in {scan.suffix for scan in new.cameras}]
+        endings = {scan.suffix for scan in new.cameras}
+        found = [path for path in paths if path.suffix in endings and _has_patterns(path)]
         excluded += [f"    # {reason}"] if found else []
-        excluded += [f"    {quoted(Path(os.path.relpath(path, new.folder)).as_posix())}," for path in found]
+        excluded += [f"    {quoted(_seen_from(new.folder, path))}," for path in found]
     return ["exclude = [", *excluded, "]"] if excluded else []
+
+
+def _seen_from(folder: Path, path: Path) -> str:
+    return str(path) if isinstance(path, Address) else Path(os.path.relpath(path, folder)).as_posix()
 
 
 def _totals(new: NewProject) -> dict[tuple[str, str], tuple[int, int]]:

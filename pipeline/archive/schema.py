@@ -106,7 +106,10 @@ create index judged_lot_by_input on judged_lot (input);
 alter table judged_frame add column lot integer not null default 0;
 """
 
-MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS)
+# A hash of what the project asked for when it was known last whether the scan's result is current.
+_ASKED = "alter table scan add column asked text"
+
+MIGRATIONS: tuple[str, ...] = (_FIRST, _LOTS, _ASKED)
 VERSION = len(MIGRATIONS)
 
 

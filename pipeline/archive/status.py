@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from pipeline.archive.asked import asked_of
 from pipeline.archive.file_state import FileStates
 from pipeline.archive.store import Store
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
@@ -58,7 +59,7 @@ class ArchiveStatus:
 
 def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     """By the store, and by which files there are and how they look from outside: no scan is opened. path: of the store,
-    if not that of the project. What was measured with other options is known once `measure` has begun with these."""
+    if not that of the project."""
     path = path or project.measurement_path
     rows = {}
     if path.exists():
@@ -66,15 +67,16 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
             rows = {row[0]: row for row in store.connection.execute(_QUERY)}
     files, cameras = FileStates(project.path.resolve().parent), project.cameras.values()
     camera_names = {id(camera): camera.path.name for camera in cameras}
-    scans = []
+    scans, asked = [], asked_of(project)
     for name, file in project.scans.items():
         state, camera = files.of(file), camera_names[id(project.camera_of(name))]
         found = rows.get(state.uri)
         if found is None or found[5] is None:
             scans.append(ScanStatus(name, state.uri, camera, Verdict.WAITING))
             continue
-        _, bytes_, mtime_ns, etag, is_current, verdict, why, failure, seconds, finished = found
-        is_now = is_current and (bytes_, mtime_ns, etag) == (state.bytes, state.mtime_ns, state.etag)
+        _, bytes_, mtime_ns, etag, is_current, verdict, why, failure, seconds, finished, told = found
+        is_same = is_current and (bytes_, mtime_ns, etag) == (state.bytes, state.mtime_ns, state.etag)
+        is_now = is_same and told in (None, asked(name))
         now = _VERDICTS[verdict] if is_now else Verdict.OLD
         scans.append(ScanStatus(name, state.uri, camera, now, why or "", failure or "", seconds, finished))
     return ArchiveStatus(tuple(sorted(scans, key=itemgetter(0))))
@@ -85,7 +87,7 @@ _VERDICTS = {str(verdict): verdict for verdict in Verdict}
 _QUERY = """
 with latest as (select max(id) as id from judging where digest not like 'unfinished%'),
 seen as (
-    select scan.uri, scan.bytes, scan.mtime_ns, scan.etag, scan.is_current,
+    select scan.uri, scan.bytes, scan.mtime_ns, scan.etag, scan.is_current, scan.asked,
         coalesce(judged_frame.verdict, result.verdict) as verdict, result.seconds, result.finished,
         latest.id as judging, scan.id as scan, result.id as result, scan.duplicate_of as original
     from scan left join latest left join result on result.id = scan.result
@@ -104,7 +106,7 @@ select uri, bytes, mtime_ns, etag, is_current, verdict,
          order by number limit 1)
     ) end,
     case when verdict = 'failed' then (select detail ->> '$.failure.code' from result where id = seen.result) end,
-    seconds, finished
+    seconds, finished, asked
 from seen
 """
 

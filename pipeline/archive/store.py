@@ -6,7 +6,7 @@ One process writes it, each scan in a transaction of its own; any other may read
 import json
 import platform
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -84,24 +84,26 @@ class Store:
             self._db.execute("update scan set name = null, is_current = 0")
             self._db.executemany("update scan set name = ? where uri = ?", ((n, uri) for uri, n in names.items()))
 
-    def set_current(self, results: Iterable[int]) -> None:
-        """These results are those of their scans by today's file and options."""
+    def set_current(self, results: Mapping[int, str]) -> None:
+        """These results are those of their scans by today's file and options, and by what is asked of each."""
         with self.writing():
             self._db.executemany(
-                "update scan set result = ?1, is_current = 1 where id = (select scan from result where id = ?1)",
-                ((result,) for result in results),
+                "update scan set result = ?1, is_current = 1, asked = ?2 "
+                "where id = (select scan from result where id = ?1)",
+                results.items(),
             )
 
     # --- results
 
-    def keep(self, kept: Kept, name: str | None = None, current: bool = False) -> int:
+    def keep(self, kept: Kept, name: str | None = None, current: bool = False, asked: str | None = None) -> int:
         """Keep a result, whole or not at all, and give its row. name: the image's, where it is one of the project;
-        current: the scan's own by today's file and options, and not only what it tells others."""
+        current: the scan's own by today's file and options, and not only what it tells others; asked: of it."""
         with self.writing():
             scan = self._scan(kept, name)
             result = self._result(kept, scan)
             if current:
-                self._db.execute("update scan set result = ?, is_current = 1 where id = ?", (result, scan))
+                values = (result, asked, scan)
+                self._db.execute("update scan set result = ?, is_current = 1, asked = ? where id = ?", values)
             return result
 
     def record(self, result: int) -> Json:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from measure.scans.addresses import scan_path
+from pipeline.archive.asked import asked_of
 from pipeline.archive.decided import after_checks, before_checks, by_image, decided
 from pipeline.archive.expected_time import ExpectedTime
 from pipeline.archive.file_state import FileState, FileStates, Identity
@@ -58,6 +59,7 @@ class Work:
         self._identities, self._rows = store.identities(), store.fingerprints()
         self._files = FileStates(self._folder)
         self._states: dict[str, FileState] = {}
+        self._asked = asked_of(project)
         self._decisions = by_image(project.decisions)
         self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, of what was asked for last
         self.results: dict[str, int] = {}  # by image, the row of what was asked for last
@@ -82,7 +84,7 @@ class Work:
         missing = [task for task in tasks if task.name not in known]
         self.results |= known
         self.counts.kept += len(known)
-        self._store.set_current(known.values())
+        self._store.set_current({row: self._asked(name) for name, row in known.items()})
         if known or len(missing) > 1:
             reporter.say(f"{len(known)} of {len(tasks)} scans are measured already; {len(missing)} to measure")
         if missing:
@@ -182,7 +184,8 @@ class Work:
             kept = self._kept(task, states[task.name], seen)
             if self._thumbnails is not None and seen.thumbnails:
                 self._thumbnails.keep(kept.fingerprint, seen.thumbnails)
-            row = self._store.keep(kept, task.name if as_scans else None, as_scans)
+            asked = self._asked(task.name) if as_scans else None
+            row = self._store.keep(kept, task.name if as_scans else None, as_scans, asked)
             self._identities[kept.identity.state.uri], self._rows[kept.fingerprint] = kept.identity, row
             yield task, row, kept
 

@@ -45,17 +45,23 @@ def demo(
 
 def init(
     scans: Annotated[
-        list[Path], typer.Argument(metavar="FOLDER...", help="Folders with scans, or scans.", show_default=False)
+        list[str],
+        typer.Argument(
+            metavar="FOLDER_OR_URL...",
+            help="Folders with scans, or scans; addresses, s3:// or https://, of such; or lists of them, NAME.txt.",
+            show_default=False,
+        ),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where project.toml and images.csv go.")] = Path(),
     max_pixels: MaxPixels = None,
     as_json: AsJson = False,
 ) -> int:
     """Look at the scans; write a project of them, with each one's camera, and say what could not be told."""
+    from measure.scans.addresses import scan_path
     from pipeline.archive.new_project import init_project, print_new_project
     from pipeline.progress import Reporter
 
-    new = init_project(scans, out, Reporter(), max_pixels)
+    new = init_project([scan_path(text) for text in scans], out, Reporter(), max_pixels)
     show(as_json, new.as_json, lambda console: print_new_project(new, console))
     return LOOK if any(cases for _, cases in new.remarks()) else DONE
 

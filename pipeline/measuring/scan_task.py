@@ -5,20 +5,23 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from adjust.problem.network import Distortion, Exterior, Prior
 from measure.errors import MissingError
 from measure.fiducial_options import FiducialOptions
 from measure.results import Pose
 from measure.scans.addresses import scan_path
-from measure.scans.scan import Scan, open_scan
 from measure.scans.tone import SaidOfTone
 from measure.writing.line import KnownLine
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.sought_targets import SoughtTargets
 from pipeline.results.fingerprints import canonical_json
 from pipeline.results.measured_scan import MeasuredScan
+
+if TYPE_CHECKING:
+    from measure.scans.scan import Scan
+    from pipeline.measuring.sought_targets import SoughtTargets
 
 _NO_SCAN = "images.csv names it, and the project has no scan of that name. Look for the file, or take the line out."
 
@@ -39,7 +42,7 @@ class ScanOptions:
     known_pose: Pose | None = None
     tone: float | str = "auto"
     said: tuple[SaidOfTone, ...] = ()
-    targets: SoughtTargets | None = None
+    targets: "SoughtTargets | None" = None
     exterior: Exterior | None = None
 
     def knowing(self, lines: tuple[KnownLine, ...]) -> "ScanOptions":
@@ -70,10 +73,12 @@ class ScanTask:
         whatever may change the result changes it."""
         return self.options.json
 
-    def opened(self) -> Scan:
+    def opened(self) -> "Scan":
         """The scan. Raises MeasurementError where it cannot be read."""
         if not self.scan:
             raise MissingError(_NO_SCAN)
+        from measure.scans.scan import open_scan
+
         return open_scan(scan_path(self.scan), self.max_pixels).named(self.name)
 
     def posed(self, pose: str) -> "ScanTask":
@@ -96,15 +101,25 @@ def scan_tasks(
 ) -> tuple[ScanTask, ...]:
     """Tasks of these images, in their order; scans that have all in common share their options. said: by image what
     other scans say of its scanner's curve. Raises InputError for marks that cannot be sought."""
+    options = options_of(project, said or {})
+    scans = {name: project.scans.get(name) for name in names}
+    return tuple(
+        ScanTask(name, "" if scan is None else str(scan), options(name), project.max_pixels)
+        for name, scan in scans.items()
+    )
+
+
+def options_of(project: Project, said: Mapping[str, tuple[SaidOfTone, ...]]) -> Callable[[str], ScanOptions]:
+    """How each image is to be measured, by its name; as `scan_tasks` has it."""
     cameras = {name: _sought(project, camera) for name, camera in project.cameras.items()}
     key_of = {id(camera): name for name, camera in project.cameras.items()}
-    targets = SoughtTargets.of(project) if project.targets else None
+    targets = _targets(project)
     shared: dict[tuple[object, ...], ScanOptions] = {}
-    tasks = []
-    for name in names:
+
+    def options_for(name: str) -> ScanOptions:
         given = project.camera_of(name)
         pose, known = _pose(project, given, name)
-        told = (said or {}).get(name, ())
+        told = said.get(name, ())
         exterior = project.given_images.exterior.get(name) if project.given_images and targets else None
         part = bool(project.part_of(name))
         key = (key_of[id(given)], pose, known is None, part, *map(id, told), id(exterior))
@@ -112,9 +127,17 @@ def scan_tasks(
             options = FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm, writing=project.reads, part=part)
             camera = cameras[key_of[id(given)]]
             shared[key] = ScanOptions(camera, project.pitch_um, options, known, project.tone, told, targets, exterior)
-        scan = project.scans.get(name)
-        tasks.append(ScanTask(name, "" if scan is None else str(scan), shared[key], project.max_pixels))
-    return tuple(tasks)
+        return shared[key]
+
+    return options_for
+
+
+def _targets(project: Project) -> "SoughtTargets | None":
+    if project.targets is None:
+        return None
+    from pipeline.measuring.sought_targets import SoughtTargets  # and all that looks for them
+
+    return SoughtTargets.of(project)
 
 
 def few_of(names: Sequence[str], count: int) -> list[str]:

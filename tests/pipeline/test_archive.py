@@ -111,6 +111,8 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "an option of the adjustment": (
         lambda p: rewritten(p, "project.toml", "[measure]", "[adjust]\nrobust = true\n[measure]"), ""),
     "the camera's name": (lambda p: rewritten(p, "camera.toml", 'name = "K"', 'name = "L"'), ""),
+    "a pose decided": (
+        lambda p: (p / "decisions.jsonl").write_text('{"image": "b", "decision": "pose", "pose": "90"}\n'), "b"),
     "the marks' file deleted": (lambda p: (p / "comparator.csv").unlink(), ""),
 }  # fmt: skip
 
@@ -119,8 +121,11 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> None:
     act, again = CHANGES[change]
     act(folder)
+    seen = verdicts(folder)  # what is to be measured is known before
+    assert "".join(sorted(name for name in seen if seen[name] in ("old", "waiting"))) == again
     assert measure(folder) in (0, 1)
     assert "".join(sorted(measured)) == again
+    assert not {"old", "waiting"} & set(verdicts(folder).values())
     after = marks(folder)
     measured.clear()
     assert measure(folder) in (0, 1)

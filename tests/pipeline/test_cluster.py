@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from range_server import range_server
 
 from pipeline.archive import cluster
 from pipeline.archive.cluster import SubmittedAgain, cluster_executor
@@ -66,12 +67,16 @@ class Answers:
 
 def test_workers_are_asked_for_their_versions_and_their_way_to_the_scans() -> None:
     same = cluster.versions()
-    good = (same, list[str]())
+    good = (same, list[tuple[str, str]]())
     cluster._check_workers(Answers({"a": good}), "x", [])  # type: ignore[arg-type]
-    other = ({**same, "numpy": "1.0"}, list[str]())
+    other = ({**same, "numpy": "1.0"}, list[tuple[str, str]]())
     cases = {
         "b: has numpy 1.0, here": other,
-        "b: cannot read /scans/1.tif": (same, ["/scans/1.tif"]),
+        r"b: cannot read /scans/1.tif \(No such file\). Give it the same path": (
+            same,
+            [("/scans/1.tif", "No such file")],
+        ),
+        r"b: cannot read s3://x/1.tif \(403\). Give it the extra, the credentials": (same, [("s3://x/1.tif", "403")]),
         "b: cannot be asked .*is reseau installed": ModuleNotFoundError("pipeline"),
     }
     for words, answer in cases.items():
@@ -85,7 +90,21 @@ def test_one_scan_a_folder_is_looked_for(tmp_path: Path) -> None:
         for name in "12":
             (tmp_path / folder / name).write_bytes(b"1")
     scans = [str(tmp_path / place) for place in ("a/0", "a/1", "a/2", "b/1", "c/1")]
-    assert cluster._one_a_folder([*scans, "", "s3://x/1"]) == [str(tmp_path / "a/1"), str(tmp_path / "b/1")]
+    assert cluster._one_a_folder([*scans, ""]) == [str(tmp_path / "a/1"), str(tmp_path / "b/1")]
+
+
+def test_addresses_are_looked_for_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("measure.scans.addresses._WAITS_S", (0.01,))
+    for name in ("a/1.tif", "a/2.tif", "closed/1.tif", "closed/2.tif"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"1")
+    with range_server(tmp_path) as server:
+        scans = [f"{server.url}/{name}" for name in ("closed/1.tif", "a/1.tif", "closed/2.tif", "a/2.tif")]
+        assert cluster._one_a_folder(scans) == [f"{server.url}/a/1.tif"]
+        _, missing = cluster._versions_and_unreachable(scans[:2])
+        ((scan, why),) = missing
+    assert scan == scans[0]
+    assert "forbids to read it (403)" in why
 
 
 class Loses(Executor):

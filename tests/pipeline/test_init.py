@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from range_server import range_server
 
 from pipeline.archive import new_project, sampling
 from pipeline.archive.catalogue import Group, catalogue
 from pipeline.archive.new_project import chosen
 from pipeline.archive.sampling import name_cameras
 from pipeline.cli import run
+from pipeline.files.library import read_library
 from pipeline.files.project_file import read_project
 from pipeline.measuring.camera_answer import Identification, Trial
 from pipeline.measuring.scan_kinds import ScanKind
@@ -199,9 +201,28 @@ def test_of_each_kind_in_each_folder_three_are_tried(box: Path, monkeypatch: pyt
     assert unread == {box / "1952/0004.tif": "cannot be decoded"}
 
 
-def test_an_address_is_told_to_be_none_of_a_folder(tmp_path: Path, capsys: SAID) -> None:
-    assert run(["init", "s3://prints/1952/", "--out", str(tmp_path)]) == 2
-    assert "is an address, and init looks into folders only" in capsys.readouterr().err
+@pytest.mark.usefixtures("told")
+def test_what_a_server_lists_is_looked_at_as_a_folder_is(box: Path, tmp_path: Path) -> None:
+    with range_server(box) as server:
+        assert run(["init", f"{server.url}/1952/", "--out", str(tmp_path / "p")]) == 1  # a broken file
+        project = read_project(tmp_path / "p" / "project.toml")
+    text = (tmp_path / "p" / "project.toml").read_text(encoding="utf-8")
+    assert "broken" not in text
+    assert "**" not in text  # servers find nothing by patterns
+    assert {name: str(path) for name, path in project.scans.items()} == {
+        name: f"{server.url}/1952/{name}.tif" for name in ("0001", "0002", "0003", "0004", "sub/0001")
+    }
+    assert project.camera_of("sub/0001").name == read_library()["wild-rc10-153"].name
+
+
+@pytest.mark.usefixtures("told")
+def test_a_list_of_addresses_and_paths_is_looked_at(box: Path, tmp_path: Path) -> None:
+    with range_server(box) as server:
+        lines = ["# of box 1", f"{server.url}/1952/0001.tif", "", f"{server.url}/1952/0004.tif"]
+        (tmp_path / "list.txt").write_text("\n".join(lines), encoding="utf-8")
+        assert run(["init", str(tmp_path / "list.txt"), "--out", str(tmp_path / "p")]) in (0, 1)
+        assert list(read_project(tmp_path / "p" / "project.toml").scans) == ["0001", "0004"]
+        assert run(["init", f"{server.url}/nowhere/", "--out", str(tmp_path / "q")]) == 2
 
 
 @pytest.mark.parametrize(

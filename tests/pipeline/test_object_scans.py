@@ -1,7 +1,7 @@
 """A project of scans in an object store or on a server gives the rows of the same scans on the disk."""
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,13 @@ from moto.server import ThreadedMotoServer
 from range_server import range_server
 
 from measure.scans import addresses
+from pipeline.archive.catalogue import Group
 from pipeline.archive.file_state import file_state
 from pipeline.archive.identity import parts_hash
 from pipeline.cli import run
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
+from pipeline.measuring.scan_kinds import ScanKind
 
 pytestmark = pytest.mark.usefixtures("in_one_process")
 
@@ -36,6 +38,7 @@ def store() -> Iterator[Any]:
         fsspec.get_filesystem_class("s3").clear_instance_cache()
         client = boto3.client("s3")
         client.create_bucket(Bucket="prints")
+        client.create_bucket(Bucket="boxes")
         yield client
     server.stop()
 
@@ -96,6 +99,30 @@ def test_names_are_those_below_the_common_folder_and_contents_tell_copies(
     assert states["2/a"].etag
     hashes = {name: parts_hash(path) for name, path in scans.items()}
     assert hashes["2/a"] == hashes["2/copy"] != hashes["1/a"]
+
+
+def test_init_makes_a_project_of_a_bucket(
+    store: Any, local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, key in (("a", "1952/a.tif"), ("b", "1952/sub/b.tif"), ("b", "1952/sub/copy.tif")):
+        store.put_object(Bucket="boxes", Key=key, Body=(local / f"{name}.tif").read_bytes())
+    store.put_object(Bucket="boxes", Key="1952/broken.tif", Body=b"no scan")
+    store.put_object(Bucket="boxes", Key="1952/notes.txt", Body=b"by hand")
+
+    def untold(groups: Sequence[Group], *_: Any) -> tuple[list[ScanKind], dict[Path, str]]:
+        return [ScanKind(each.paths, each.head.width_px, each.head.height_px, ()) for each in groups], {}
+
+    monkeypatch.setattr("pipeline.archive.new_project.name_cameras", untold)
+    assert run(["init", "s3://boxes/1952/", "--out", str(tmp_path)]) == 1
+    text = (tmp_path / "project.toml").read_text(encoding="utf-8")
+    assert 'scans = ["s3://boxes/1952/**/*.tif"]' in text
+    (tmp_path / "camera.toml").write_text((local / "camera.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    scans = read_project(tmp_path / "project.toml").scans
+    assert {name: str(path) for name, path in scans.items()} == {
+        "a": "s3://boxes/1952/a.tif",
+        "sub/b": "s3://boxes/1952/sub/b.tif",
+    }
+    assert run(["init", "s3://nowhere/", "--out", str(tmp_path / "q")]) == 2
 
 
 def test_a_bucket_without_scans_and_one_that_is_not_there(store: Any, tmp_path: Path) -> None:
