@@ -25,7 +25,6 @@ class Code(StrEnum):
     SIZE = "size"
     SMALL = "small"
     BLUR = "blur"
-    TONE = "tone"
     NO_FIT = "no-fit"
     IMPRECISE = "imprecise"
     EDGES = "edges"
@@ -70,7 +69,6 @@ MEANING = {
     Code.SIZE: "It is larger, smaller or otherwise turned than it should be.",
     Code.SMALL: "It is so small that its size, its blur and dust look alike.",
     Code.BLUR: "Its blur is another than that of the other marks.",
-    Code.TONE: "The edges of the marks agree on no tone curve.",
     Code.NO_FIT: "The fit did not converge, or went to something else.",
     Code.IMPRECISE: "Its standard deviation is large.",
     Code.EDGES: "The place by its edges differs from the fitted one.",

@@ -369,7 +369,7 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
         edges=edge_place(linear, model.blur_px),
         sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
         own_shape=own_shape(linear, model.linear, model.departures()) if tells_shape else None,
-        tone=_tone(fit, linear, about),
+        tone=_tone(fit, linear, priors_dn2, about),
     )
 
 
@@ -377,7 +377,7 @@ def _landscape(model: PictureModel, about: _Surroundings) -> Landscape:
     return Landscape(about.grey, about.frame, model.design[-GREY])
 
 
-def _tone(fit: PictureFit, linear: LinearFit, about: _Surroundings) -> ToldTone | None:
+def _tone(fit: PictureFit, linear: LinearFit, priors_dn2: Array, about: _Surroundings) -> ToldTone | None:
     """What the picture says of the tone curve, None where that is known, or the mark is a chip, cut from scans of the
     same curve."""
     model, coding = fit.model, fit.coding
@@ -388,7 +388,7 @@ def _tone(fit: PictureFit, linear: LinearFit, about: _Surroundings) -> ToldTone 
     drawn, linear = model.drawn, replace(linear, noise=linear.noise.at_least(fit.floor_dn**2))
     clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
     landscape = _landscape(model, about)
-    return told_tone(linear, drawn, model.grey, clear, coding.tone, coding.full_scale_dn, landscape)
+    return told_tone(linear, drawn, model.grey, clear, priors_dn2, coding.tone, coding.full_scale_dn, landscape)
 
 
 def _blur_sigma(model: PictureModel, covariance: Array) -> float:

@@ -56,11 +56,13 @@ class Coding:
         return np.asarray(above - at, float)
 
     def stored_contrast_dn(self, ground: float, contrast: float) -> float:
-        """The difference of grey values that a contrast in light is, on ground of such light."""
+        """The difference of grey values that a contrast in light is, on ground of such light. Of a line finer than a
+        pixel it may be more than the scanner's range: no pixel shows it whole."""
         if self.tone.is_identity:
             return contrast
-        dark, light = self.tone.code(np.array([ground, ground + contrast]), self.full_scale_dn)
-        return float(light - dark)
+        ends = np.clip([ground, ground + contrast], 0.0, self.full_scale_dn)
+        codes, within = self.tone.code(ends, self.full_scale_dn), ends[1] - ends[0]
+        return float((codes[1] - codes[0]) * contrast / within) if within else contrast
 
 
 @dataclass(frozen=True, eq=False)

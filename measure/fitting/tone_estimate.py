@@ -5,6 +5,7 @@ place, blur and contrast are fitted, and by how much tells the curve: one more l
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from measure.scans.tone import SaidOfTone, Tone
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_LEAST_SHOWN = 1e-6  # of uneven light that the picture hardly tells from the unknowns
+_PIECE_PX = 8  # of a mark's edges that are witnesses of their own, and of what JPEG rounds by itself
 _LEAST_VARIANCE = 1e-9  # of a combination of departures that the picture hardly shows, over that of the others
 
 
@@ -28,29 +29,53 @@ def told_tone(
     drawn: Array,
     grey: Array,
     clear: Mask,
+    priors_dn2: Array,
     tone: Tone,
     full_scale_dn: float,
     landscape: Landscape,
 ) -> ToldTone:
     """Beside the unknowns of a linearised fit. drawn, grey (height, width): the light that it draws, and that it was
-    fitted to; clear, alike: where that is not near an end of the scanner's range, which changes what noise does.
-    landscape: in the mark.
+    fitted to; clear, alike: where that is not near an end of the scanner's range, where noise is cut off, which bends
+    an edge as a curve does; priors_dn2 (unknowns,): weights of what was known of the unknowns before. landscape: in the
+    mark.
 
     With the departures d the residuals are r + H d - D x. The score H'r of what D leaves of H grows with d by N and has
     the covariance S that the noise gives it: N' S^-1 N is the information, also where the noise is not white. H is
     taken at the drawn light: at the observed one, it would go along with the noise. Light that is not even on the mark
     or about it says nothing of the curve, but might seem to: D has bends of both, too.
 
+    Each piece of its edges is a witness. Where they differ by more than the noise makes them, in what moves the mark,
+    they are not as drawn, and S is so many times larger.
+
     What another curve moves the mark by follows from the observed light, with all that the drawing leaves unexplained.
     """
-    changes = tone.changes(drawn, full_scale_dn) * fit.used * fit.steadiness
-    left = _beside(fit, changes * clear)
+    counts = fit.used & clear
+    changes = tone.changes(drawn, full_scale_dn) * counts * fit.steadiness
+    uneven = _uneven(fit.design[-GREY], fit.steadiness)
+    known, priors = np.concatenate([fit.design, uneven]) * counts, np.diag(np.append(priors_dn2, np.zeros(len(uneven))))
+    inverse: Array = np.asarray(np.linalg.pinv(products(known, known) + priors, hermitian=True), float)
+    shares = inverse @ products(known, changes)
+    left = changes - combined(shares.T, known)
     normal = products(left, changes)
-    score = -products(left, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
-    covariance = fit.covariance(left) + landscape.covariance(left)
+    residuals = np.where(counts, fit.residuals, 0.0)
+    score = -products(left, residuals[None])[:, 0]
+    covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * shares.T @ priors @ shares
     covariance += _LEAST_VARIANCE * max(float(np.trace(covariance)), 1e-30) * np.eye(len(covariance))
-    said = SaidOfTone.by_score(normal, score + normal @ tone.mean, covariance)
-    return _told(fit, said, tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
+    told = _told(fit, SaidOfTone.nothing(), tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
+    weighted = np.linalg.solve(covariance, normal).T
+    estimate: Array = np.asarray(np.linalg.inv(np.eye(len(normal)) + weighted @ normal) @ weighted, float)
+    by_piece = told.on_place @ estimate @ _by_piece(left * (residuals + combined(estimate @ score, left)))
+    by_noise = np.trace(told.on_place @ estimate @ covariance @ estimate.T @ told.on_place.T)
+    worse = max(float(np.sum(by_piece**2) / max(by_noise, 1e-30)), 1.0)
+    return replace(told, said=SaidOfTone.by_score(normal, score + normal @ tone.mean, worse * covariance))
+
+
+def _by_piece(images: Array) -> Array:
+    """(k, pieces) sums of images (k, height, width) over squares."""
+    count, height, width = images.shape
+    whole = np.pad(images, ((0, 0), (0, -height % _PIECE_PX), (0, -width % _PIECE_PX)))
+    squares = whole.reshape(count, whole.shape[1] // _PIECE_PX, _PIECE_PX, -1, _PIECE_PX)
+    return np.asarray(squares.sum(axis=(2, 4)).reshape(count, -1))
 
 
 def untold_tone(
@@ -68,15 +93,6 @@ def _told(fit: LinearFit, said: SaidOfTone, changes: Array, tone: Tone, light: A
     return ToldTone(
         said, products(fit.by_grey[:2], changes * fit.used * fit.steadiness), float(codes[0]), float(codes[1])
     )
-
-
-def _beside(fit: LinearFit, changes: Array) -> Array:
-    """(k, height, width) what is left of changes beside the unknowns, and beside light that is uneven."""
-    uneven = _uneven(fit.design[-GREY], fit.steadiness) * fit.used
-    known = uneven - combined(products(uneven, fit.design), fit.by_grey)
-    left = changes - combined(products(changes, fit.design), fit.by_grey)
-    shares = np.linalg.pinv(products(known, uneven), rcond=_LEAST_SHOWN, hermitian=False) @ products(uneven, left)
-    return np.asarray((left - combined(shares.T, known)) * fit.used)
 
 
 def _uneven(shown: Array, about: Array) -> Array:

@@ -35,10 +35,8 @@ from measure.scans.tone import SaidOfTone, Tone
 Array = NDArray[np.float64]
 
 _STRAINED = 1 / 3  # of its standard deviation: an error of a twentieth more
-# Whether marks that contradict one another are doubted, in each round of matching by a better curve: far off all do.
-_TONE_ROUNDS = (False, False, False, True, True)
-_OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # powers; of a contradiction that needs none of them
-_CONTRADICTED, _FAR_PX = 1.0, 0.05  # of a contradiction, and of what is not known of any curve: marks are doubted
+_TONE_ROUNDS = 5  # of matching by a better curve
+_OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # powers; how unsettled a curve is that needs none of them
 _MOVED = 0.3  # of its standard deviation that a mark may still move
 _SETTLED_PX = 1.5  # about a mark that was matched already
 
@@ -51,10 +49,10 @@ def settle(sighter: FrameSighter) -> None:
     if sighter.belongs.sum() < 2:
         return
     _settle_from(sighter, sighter.scan.tone)
-    for power in _OTHER_STARTS if sighter.tone.contradiction > _AGREED and _leans_on_tone(sighter) else ():
+    for power in _OTHER_STARTS if sighter.tone.unsettled > _AGREED and _leans_on_tone(sighter) else ():
         before = sighter.tone, sighter.scan, list(sighter.sightings)
         _settle_from(sighter, sighter.prior_tone.like_power(power))
-        if sighter.tone.contradiction >= before[0].contradiction:
+        if sighter.tone.unsettled >= before[0].unsettled:
             sighter.tone, sighter.scan, sighter.sightings = before
             sighter.judge()
 
@@ -65,8 +63,8 @@ def _settle_from(sighter: FrameSighter, tone: Tone) -> None:
     if tone is not sighter.scan.tone:
         sighter.scan, unsettled = sighter.scan.seen_through(tone), set(_told_of_tone(sighter))
     edges = _told_by_edges(sighter)
-    for doubting in _TONE_ROUNDS:
-        unsettled |= _moved_by_tone(sighter, _frame_tone(sighter, edges, doubting))
+    for _ in range(_TONE_ROUNDS):
+        unsettled |= _moved_by_tone(sighter, _frame_tone(sighter, edges))
         if not unsettled:
             continue
         frame_sigma = _frame_sigma(sighter)
@@ -74,7 +72,7 @@ def _settle_from(sighter: FrameSighter, tone: Tone) -> None:
             _match_again(sighter, index, sighter.options.match, frame_sigma)
         sighter.judge()
         edges, unsettled = _told_by_edges(sighter), set()
-    sighter.tone = _frame_tone(sighter, edges, doubting=True)
+    sighter.tone = _frame_tone(sighter, edges)
 
 
 def _leans_or_is_strained(sighter: FrameSighter, index: int, fit: Match) -> bool:
@@ -92,9 +90,9 @@ def _moved_by_tone(sighter: FrameSighter, found: FrameTone) -> set[int]:
     return set(told)
 
 
-def _frame_tone(sighter: FrameSighter, edges: Sequence[SaidOfTone], doubting: bool) -> FrameTone:
-    """By the marks and the frame's edges; doubting: as `FrameTone.of` takes it."""
-    return FrameTone.of(sighter.prior_tone, _told_of_tone(sighter), sighter.scan.tone, doubting, edges)
+def _frame_tone(sighter: FrameSighter, edges: Sequence[SaidOfTone]) -> FrameTone:
+    """By the marks and the frame's edges."""
+    return FrameTone.of(sighter.prior_tone, _told_of_tone(sighter), sighter.scan.tone, edges)
 
 
 def _told_by_edges(sighter: FrameSighter) -> list[SaidOfTone]:
@@ -116,16 +114,11 @@ def _told_of_tone(sighter: FrameSighter) -> dict[int, ToldTone]:
 
 
 def count_tone(sighter: FrameSighter) -> None:
-    """What is not known of the tone curve, in the covariance of each mark that it moves. Where the marks agree on none,
-    something else is in their edges, and those that a curve moves far are doubted."""
+    """What is not known of the tone curve, in the covariance of each mark that it moves."""
     for index, sighting in enumerate(sighter.sightings):
         told = None if sighting is None or sighting.fit is None else sighting.fit.tone
         if told is not None:
-            sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(told, sighter.prior_tone))
-            sighter.widen(index, Cause.TONE, sighter.tone.covariance_of_own_px2(told, sighter.prior_tone))
-            if sighter.tone.contradiction > _CONTRADICTED and told.leans_px > _FAR_PX:
-                reason = "the marks' edges agree on no tone curve: they are not as drawn, or lit unevenly"
-                sighter.doubt(index, Reason(reason, Code.TONE))
+            sighter.widen(index, Cause.TONE, sighter.tone.covariance_px2(told))
 
 
 def share_blur(sighter: FrameSighter) -> None:

@@ -13,7 +13,7 @@ from measure.marks.rendering import extent_px
 from measure.marks.shapes import Disk, FrameCorner, Mark, MarkShape, MarkTemplate, Polygon
 from measure.noise.grain import BESIDE_PX
 from measure.reason import NO_REASON, Code, Reason
-from measure.scans.compression import covariance_of_compression
+from measure.scans.compression import covariance_of_compression, tone_variance
 from measure.scans.scan import Scan
 from measure.scans.tone import LINEAR
 from measure.search.candidates import FAINT
@@ -69,6 +69,9 @@ def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sig
         return Sighting(predicted, True, None, reason)
     loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
+    if fit.tone is not None:
+        variance = tone_variance(scan.rounding_step_dn, fit.stored_contrast_dn)
+        fit = replace(fit, tone=replace(fit.tone, said=fit.tone.said.loosened(variance)))
     return Sighting(predicted, True, fit, chance=chance)
 
 

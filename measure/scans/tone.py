@@ -9,6 +9,7 @@ the logarithm of the slope, a power's share and a few smooth waves over the rang
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,8 @@ _WAVE_SIGMAS = (0.3, 0.5, 0.2, 0.15)
 _SIGMAS = np.array([_POWER_SIGMA, *_WAVE_SIGMAS])
 # What is believed of a curve that the file says: programs round it, and a scanner's light and dark are not exactly its.
 _DECLARED_SIGMA = 0.1  # of the standard deviations above
-_CHANCE_SIGMAS = 2.0  # by which chance alone makes pictures contradict one another
-_WORTH_ROUNDS = 4  # of judging by the curve found how well the pictures agree on it
+# By how much pictures' own curves may differ from the scanner's: variances of each departure that are tried.
+_SCATTERS = (0.0, *np.geomspace(0.003, 30.0, 17))
 _CONTRADICTED = np.log(1000.0)  # log-odds, at which a picture is believed against what its file says
 
 
@@ -74,18 +75,34 @@ class SaidOfTone:
         return cls((information + information.T) / 2, weighted[-1] @ normal, float(weighted[-1] @ score), len(score))
 
     @classmethod
-    def together(cls, each: Sequence["SaidOfTone"], worth: float = 1.0) -> "SaidOfTone":
-        """What several pictures say, each worth a share of what it claims."""
+    def together(cls, each: Sequence["SaidOfTone"]) -> "SaidOfTone":
+        """What several pictures say."""
         return cls(
-            np.sum([worth * one.information for one in each], axis=0),
-            np.sum([worth * one.right for one in each], axis=0),
-            worth * sum(one.square for one in each),
+            np.sum([one.information for one in each], axis=0),
+            np.sum([one.right for one in each], axis=0),
+            sum(one.square for one in each),
             sum(one.count for one in each),
         )
 
-    def misfit(self, departures: Array) -> float:
-        """Chi-square of departures, on `count` degrees of freedom."""
-        return float(self.square - 2 * departures @ self.right + departures @ self.information @ departures)
+    def loosened(self, variance: float) -> "SaidOfTone":
+        """The same where what the picture says is of a curve of its own, each departure of which differs from the
+        scanner's with that variance."""
+        if not variance or not self.count:
+            return self
+        less = np.linalg.inv(np.eye(len(self.right)) + variance * self.information)
+        information, right = less @ self.information, less @ self.right
+        square = self.square - variance * float(self.right @ right)
+        return SaidOfTone((information + information.T) / 2, right, square, self.count)
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """A tone curve after pictures have said something. said: what that is together, None where nothing; scatter: the
+    variance of each departure of their own curves from it."""
+
+    tone: "Tone"
+    said: SaidOfTone | None = None
+    scatter: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -144,49 +161,39 @@ class Tone:
         sigma = np.sqrt(self.covariance[0, 0]) * np.eye(len(_SIGMAS))[0]
         return self.at(self.mean - sigma), self.at(self.mean + sigma)
 
-    def told(self, each: Sequence[SaidOfTone], doubting: bool = True) -> tuple["Tone", SaidOfTone | None]:
-        """What is believed when pictures have said something, too, and what that is together. What the file says they
-        may contradict. doubting: whether they count by how well they agree; far from the curve they need not."""
+    def told(self, each: Sequence[SaidOfTone]) -> "Believed":
+        """What is believed when pictures have said something, too. What the file says they may contradict, where they
+        agree."""
         if self.is_known or not each:
-            return self, None
-        believed, said, odds = self._told(each, doubting)
+            return Believed(self)
+        believed, odds = self._told(each)
         if not self.is_declared:
-            return believed, said
-        free, free_said, free_odds = self.forgetting()._told(each, doubting)
+            return believed
+        free, free_odds = self.forgetting()._told(each)
         if free_odds - odds < _CONTRADICTED:
-            return believed, said
-        contradicted = replace(free, source=f"{self.source}, but the pictures contradict it", is_declared=False)
-        return contradicted, free_said
+            return believed
+        source = f"{self.source}, but the pictures contradict it"
+        return replace(free, tone=replace(free.tone, source=source, is_declared=False))
 
-    def _told(self, each: Sequence[SaidOfTone], doubting: bool) -> tuple["Tone", SaidOfTone, float]:
-        """The posterior, what was said, and the logarithm of how likely the prior makes that.
+    def _told(self, each: Sequence[SaidOfTone]) -> tuple["Believed", float]:
+        """And the logarithm of how likely the prior makes what was said.
 
         Pictures that contradict one another or the prior beyond chance have edges that are not as they are drawn: of
-        sharpened pictures, of film developed unevenly. Their own scatter tells how little they are worth, and what
-        makes them differ may be common to all, so that their number does not help."""
-        worth = 1.0
-        for _ in range(_WORTH_ROUNDS if doubting else 1):
-            said = SaidOfTone.together(each, worth)
-            tone, odds = self._with(said)
-            worth = 1 / (1 + tone.contradiction(each) * len(each))
-        return tone, said, odds
+        sharpened pictures, of film developed unevenly. So each speaks of a curve of its own, and how far these scatter
+        about the scanner's is estimated with it, as the most likely variance of random effects. Beforehand its root
+        has a half-Cauchy distribution (Gelman, 2006, Prior distributions for variance parameters)."""
+        return max((self._scattered(each, scatter) for scatter in _SCATTERS), key=itemgetter(1))
 
-    def contradiction(self, each: Sequence[SaidOfTone]) -> float:
-        """By how much more than by chance pictures contradict this curve: chi-square over its degrees of freedom, less
-        what chance makes of that."""
-        count = sum(one.count for one in each)
-        if not count:
-            return 0.0
-        misfit = sum(one.misfit(self.mean) for one in each) / count
-        return max(misfit - 1 - _CHANCE_SIGMAS * float(np.sqrt(2 / count)), 0.0)
-
-    def _with(self, said: SaidOfTone) -> tuple["Tone", float]:
+    def _scattered(self, each: Sequence[SaidOfTone], scatter: float) -> tuple["Believed", float]:
+        said = SaidOfTone.together([one.loosened(scatter) for one in each])
         prior = np.linalg.inv(self.covariance)
         covariance = np.linalg.inv(prior + said.information)
         right = prior @ self.mean + said.right
         mean = covariance @ right
-        chance = np.linalg.slogdet(prior @ covariance)[1] + right @ mean - self.mean @ prior @ self.mean
-        return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2), float(chance) / 2
+        chance = np.linalg.slogdet(prior @ covariance)[1] + right @ mean - self.mean @ prior @ self.mean - said.square
+        chance -= sum(np.linalg.slogdet(np.eye(len(mean)) + scatter * one.information)[1] for one in each)
+        chance -= 2 * np.log1p(scatter)
+        return Believed(replace(self, mean=mean, covariance=(covariance + covariance.T) / 2), said, scatter), chance / 2
 
     def light(self, code: NDArray[np.floating] | NDArray[np.integer], full_scale: float) -> NDArray[np.float32]:
         """Light of grey values of a file whose largest is full_scale, on the same scale: 0 stays 0, and white white."""

@@ -28,7 +28,7 @@ def tone_before(setting: float | str, said: Sequence[SaidOfTone], scan: Path) ->
     """What is believed of the curve of a scan before it is measured, as the project, the file and other scans say: what
     it says itself is not in it yet. setting: as the project has it; said: by the others."""
     prior = _prior(setting, scan)
-    return prior.told(said)[0] if said else prior
+    return prior.told(said).tone
 
 
 def said_of_tones(

@@ -173,7 +173,8 @@ def _frame_tone(tone: FrameTone) -> Json:
         "said": tone.said and said_record(tone.said),
         "least": _numbers(tone.least),
         "greatest": _numbers(tone.greatest),
-        "contradiction": _numbers(tone.contradiction),
+        "scatter": _numbers(tone.scatter),
+        "apart": _numbers(tone.apart),
     }
 
 
@@ -181,7 +182,8 @@ def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
     mean, covariance = _some(tone["mean"]), _some(tone["covariance"])
     believed = Tone(_read_base(tone["base"]), mean, covariance, tone["source"], tone["is_declared"])
     said = tone["said"] and said_of(tone["said"])
-    return FrameTone(believed, said, float(tone["least"]), float(tone["greatest"]), float(tone["contradiction"]))
+    numbers = (float(tone[name]) for name in ("least", "greatest", "scatter", "apart"))
+    return FrameTone(believed, said, *numbers)
 
 
 def _base(base: Array) -> Any:

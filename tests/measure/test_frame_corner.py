@@ -126,7 +126,7 @@ def test_the_frames_edges_beside_its_marks_tell_the_curve(gamma: float) -> None:
     other = by_truth.like_power(gamma + 0.5)
     (said,) = told_by_edges(scan.seen_through(other), marks, MATRIX, None)
     prior = Tone(power(gamma + 0.5), covariance=4 * np.eye(5))
-    found, _ = prior.told([said])
+    found = prior.told([said]).tone
     value, sigma = found.power_between(0.2, 0.5)
     assert abs(value - gamma) < 3 * sigma
     assert sigma < 0.7 * prior.power_between(0.2, 0.5)[1]

@@ -25,7 +25,9 @@ from pipeline.results.measured_scan import Failure, FailureCode, MeasuredScan
 RNG = np.random.default_rng(5)
 SAID = SaidOfTone(RNG.normal(size=(5, 5)), RNG.normal(size=5), 3.3, 17)
 CURVE = sampled(np.linspace(0.0, 1.0, 50) ** 1.7 + 0.01 * np.linspace(0.0, 1.0, 50))
-TONE = FrameTone(Tone(CURVE, RNG.normal(size=5), RNG.normal(size=(5, 5)), "its profile", True), SAID, 0.1, 0.7, 1.9)
+TONE = FrameTone(
+    Tone(CURVE, RNG.normal(size=5), RNG.normal(size=(5, 5)), "its profile", True), SAID, 0.1, 0.7, 1.9, 0.4
+)
 LINE = Line(
     {"90m": Reading("RUN 7", 0.93, 4.6), "270m": Reading("L NNꓤ", 1 / 3, 1.1)},
     "90m",
