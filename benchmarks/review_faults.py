@@ -39,7 +39,6 @@ FRAMES = 40
 PITCH_UM, PX_PER_MM = 50.0, 20.0
 CORNERS = ((6.0, -6.0), (-6.0, -6.0), (-6.0, 6.0), (6.0, 6.0))
 PLACES = dict(enumerate((*CORNERS, (6.0, 0.0), (0.0, -6.0), (-6.0, 0.0), (0.0, 6.0)), 1))
-TELLS = 1  # the mark that tells the pose: two dots stand beside it
 OFF_MM = (0.18, 0.1)  # of a false mark, where the true one is hidden
 ASKEW_RAD = 0.35  # no search looks for a frame that lies so
 SEEN_PX = 1.5  # how far off a person sees that a cross is beside its mark
@@ -50,19 +49,28 @@ RING, BARS = (
     areas.ring((0.0, 0.0), 0.5, 0.1),
     (areas.bar((-0.8, 0), (0.8, 0), 0.1), areas.bar((0, -0.8), (0, 0.8), 0.1)),
 )
-DOTS = tuple(areas.disk((1.05, y), 0.12) for y in (-0.3, 0.3))
+DOTS = {1: ((1.05, -0.3), (1.05, 0.3)), 2: ((1.05, 0.3),)}  # beside these marks, mm: they tell the pose
+DOT_MM = 0.12
+SHAPES = (
+    'shape = "ring"\ncenter_mm = [0, 0]\nradius_mm = 0.5\nline_mm = 0.1\n',
+    'shape = "bar"\nfrom_mm = [-0.8, 0]\nto_mm = [0.8, 0]\nline_mm = 0.1\n',
+    'shape = "bar"\nfrom_mm = [0, -0.8]\nto_mm = [0, 0.8]\nline_mm = 0.1\n',
+)
 CAMERA = (
     'name = "K"\nframe_mm = [16.0, 16.0]\nprincipal_distance_mm = 30.0\n'
     + "".join(
-        f'[[fiducial]]\nid = "{n}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0.01\nmark = "{"one" if n == TELLS else "m"}"\n'
+        f'[[fiducial]]\nid = "{n}"\nxy_mm = [{x}, {y}]\nsigma_mm = 0.01\nmark = "m{n if n in DOTS else 0}"\n'
         for n, (x, y) in PLACES.items()
     )
-    + '[mark.m]\nkind = "ring-cross"\nring_mm = 0.5\nring_line_mm = 0.1\narm_mm = 0.8\nline_mm = 0.1\n'
-    + '[mark.one]\nkind = "parts"\n'
-    + '[[mark.one.part]]\nshape = "ring"\ncenter_mm = [0, 0]\nradius_mm = 0.5\nline_mm = 0.1\n'
-    + '[[mark.one.part]]\nshape = "bar"\nfrom_mm = [-0.8, 0]\nto_mm = [0.8, 0]\nline_mm = 0.1\n'
-    + '[[mark.one.part]]\nshape = "bar"\nfrom_mm = [0, -0.8]\nto_mm = [0, 0.8]\nline_mm = 0.1\n'
-    + "".join(f'[[mark.one.part]]\nshape = "disk"\ncenter_mm = [1.05, {y}]\nradius_mm = 0.12\n' for y in (-0.3, 0.3))
+    + "".join(
+        f'[mark.m{n}]\nkind = "parts"\n'
+        + "".join(f"[[mark.m{n}.part]]\n{shape}" for shape in SHAPES)
+        + "".join(
+            f'[[mark.m{n}.part]]\nshape = "disk"\ncenter_mm = [{x}, {y}]\nradius_mm = {DOT_MM}\n'
+            for x, y in DOTS.get(n, ())
+        )
+        for n in (0, *DOTS)
+    )
 )
 PROJECT = f'camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = {PITCH_UM}\n'
 
@@ -172,7 +180,9 @@ def planted(folder: Path, rng: np.random.Generator) -> dict[str, Truth]:
         for k, (name, fault) in enumerate(faults.items())
     )  # fmt: skip
     fiducials = tuple(
-        scene.SceneFiducial(str(n), xy, scene.DrawnMark((RING, *BARS, *(DOTS if n == TELLS else ()))))
+        scene.SceneFiducial(
+            str(n), xy, scene.DrawnMark((RING, *BARS, *(areas.disk(dot, DOT_MM) for dot in DOTS.get(n, ()))))
+        )
         for n, xy in PLACES.items()
     )
     camera = scene.SceneCamera("K", (16.0, 16.0), 30.0, fiducials=fiducials)
@@ -199,13 +209,13 @@ def plant(path: Path, fault: Fault, px: Mapping[str, Array], rng: np.random.Gene
     grey = tifffile.imread(path).astype(np.float64)
     design = np.column_stack([np.array(list(PLACES.values())), np.ones(len(PLACES))])
     matrix = np.linalg.lstsq(design, np.array([px[str(n)] for n in PLACES]), rcond=None)[0].T
-    x, y = PLACES[fault.mark or TELLS]
-    around = matrix @ (x, y + 1.3, 1.0)  # its pad
+    mark = fault.mark or next(iter(DOTS))
+    around = matrix @ (*(PLACES[mark] + np.array([0.0, 1.3])), 1.0)  # its pad
     dark = float(np.median(grey[tuple(slice(round(v) - 2, round(v) + 3) for v in around[::-1])]))
     light = float(grey.max())
 
-    def paint(value: float, *drawn: areas.Area, off: tuple[float, float] = (0.0, 0.0)) -> None:
-        place = np.array([x + off[0], y + off[1]])
+    def paint(value: float, *drawn: areas.Area, off: tuple[float, float] = (0.0, 0.0), at: int = mark) -> None:
+        place = np.array(PLACES[at]) + off
         in_px = tuple(tuple((o + place) @ matrix[:, :2].T + matrix[:, 2] for o in area) for area in drawn)
         col0, row0, width, height = areas.bounds(in_px)
         share = np.abs(areas.coverage(in_px, col0, row0, width, height))
@@ -214,7 +224,8 @@ def plant(path: Path, fault: Fault, px: Mapping[str, Array], rng: np.random.Gene
 
     match fault.kind:
         case "pose hidden":
-            paint(dark, areas.polygon(((0.86, -0.5), (1.3, -0.5), (1.3, 0.5), (0.86, 0.5))))
+            for each in DOTS:
+                paint(dark, areas.polygon(((0.86, -0.5), (1.3, -0.5), (1.3, 0.5), (0.86, 0.5))), at=each)
         case "missing":
             paint(dark, areas.disk((0.0, 0.0), 1.3))
         case "false mark":

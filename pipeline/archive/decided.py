@@ -21,6 +21,7 @@ from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
 
 KeyOf = Callable[[ScanTask], str]
+PoseOf = Callable[[str], str | None]
 
 
 @dataclass(frozen=True)
@@ -40,24 +41,30 @@ def by_image(decisions: Sequence[Decision]) -> Mapping[str, Sequence[Decision]]:
     return told
 
 
-def decided(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf) -> Decided:
-    """decisions: about this scan, the oldest first. key_of: the fingerprint of a task's result."""
+def decided(task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf) -> Decided:
+    """decisions: about this scan, the oldest first. key_of: the fingerprint of a task's result; pose_of: the pose in
+    which the result of a fingerprint names its marks, None where it is not known."""
     if not decisions:
         return Decided(task, {})
-    counted, now = list[Decision](), task
-    seen = {key_of(task)}  # of the results that a decision may have been made about
+    counted, now, key = list[Decision](), task, key_of(task)
+    seen = {key}  # of the results that a decision may have been made about
     ever = set(seen)
     for one in decisions:
         known = ever if one.decision is Choice.POSE else seen
         if one.decision is not Choice.UNDO and one.fingerprint and one.fingerprint not in known:
             continue
-        before, counted = now, [*counted, one]
+        before, old_key, counted = now, key, [*counted, one]
         now = _with(task, standing(counted).values())
         key = key_of(now)
-        # Marks have other names in another pose.
-        seen = {key} if now.options.fiducials.pose != before.options.fiducials.pose else seen | {key}
+        seen = seen | {key} if _names_alike(before, now, pose_of(old_key)) else {key}
         ever |= seen
     return Decided(now, standing(counted))
+
+
+def _names_alike(before: ScanTask, now: ScanTask, pose: str | None) -> bool:
+    """Whether marks keep their names: they have others in another pose than that in which they were found."""
+    was, will = before.options.fiducials.pose, now.options.fiducials.pose
+    return was == will or (will == pose and was == "auto")
 
 
 def before_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:

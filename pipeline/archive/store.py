@@ -227,6 +227,11 @@ class Store:
             raise
         self._db.execute("commit")
 
+    def pose_of(self, result: int) -> str | None:
+        """The name of the pose in which a result's marks have their names."""
+        found = self._db.execute("select pose from result where id = ?", (result,)).fetchone()
+        return None if found is None else found[0]
+
     # --- the inside
 
     def _scan(self, kept: Kept, name: str | None) -> int:

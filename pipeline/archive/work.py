@@ -158,7 +158,12 @@ class Work:
         if known is None or known.state != state:
             known = Identity(state, parts_hash(scan_path(task.scan), task.max_pixels))
         identity = known
-        now = decided(task, decisions, lambda one: fingerprint(identity, _hash_of(_options_json(one))))
+        now = decided(
+            task,
+            decisions,
+            lambda one: fingerprint(identity, _hash_of(_options_json(one))),
+            lambda key: None if (row := self._rows.get(key)) is None else self._store.pose_of(row),
+        )
         self._counting[task.name] = now.counting
         return now.task
 

@@ -38,7 +38,7 @@ _WORST = (Status.REJECTED, Status.WEAK, Status.PREDICTED, Status.ABSENT)
 class Entry:
     """A question. images: of a camera all its scans, of a pose all frames that it is the same for, else one.
     fingerprints: of the results that are looked at, in the order of the images; none of a camera. marks: how many were
-    found in the frame, or in one of the camera's. point, kind, status: of a mark.
+    found in the frame, or in one of the camera's. point, kind, status: of a mark; pose: in which it has that name.
     """
 
     question: Question
@@ -52,6 +52,7 @@ class Entry:
     point: str = ""
     kind: str = ""
     status: str = ""
+    pose: str = ""
 
     @property
     def key(self) -> str:
@@ -89,6 +90,7 @@ class _Frame:
     camera: str
     verdict: str
     marks: int
+    pose: str
     is_decided: bool
     evidence: str
     roll: str
@@ -126,10 +128,11 @@ def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
         found |= dict(db.execute(_FOUND.format(**source), {"judging": judging}).fetchall())
     for image, result, key, camera, verdict, _, pose_json, problem in db.execute(_FRAMES, (judging,)):
         pose = json.loads(pose_json) if pose_json else None
-        is_decided = pose is None or bool(pose["decided"])
+        name, is_decided = ("", True) if pose is None else (pose["name"], bool(pose["decided"]))
         evidence = "" if pose is None else " ".join(pose["evidence"])
         roll = "" if pose is None else pose["roll"]
-        yield _Frame(image, result, key, camera, verdict, found.get(result, 0), is_decided, evidence, roll, problem)
+        count = found.get(result, 0)
+        yield _Frame(image, result, key, camera, verdict, count, name, is_decided, evidence, roll, problem)
 
 
 def _cameras(project: Project, with_marks: Collection[str]) -> Iterator[Entry]:
@@ -162,7 +165,7 @@ def _marks(db: sqlite3.Connection, judging: int, frames: dict[int, _Frame]) -> I
             frame = frames.get(result)
             if frame is not None and frame.marks:
                 where = ((frame.image,), (frame.key,), frame.camera, frame.verdict, frame.marks)
-                yield Entry(Question.MARK, *where, reason, code, point, kind, status)
+                yield Entry(Question.MARK, *where, reason, code, point, kind, status, frame.pose)
 
 
 def _badness(entry: Entry) -> tuple[int, bool, int, str]:

@@ -194,13 +194,18 @@ class Session:
         return {entry.key: entry for image in images for entry in self._of_image.get(image, ())}.values()
 
     def _answer_of(self, entry: Entry) -> Decision | None:
-        """What answers a question: about all of its frames; of one without marks, about any of its marks."""
+        """What answers a question: about all of its frames; of one without marks, about any of its marks; of a mark in
+        a frame that lies otherwise, that it does."""
         match entry.question:
             case Question.CAMERA:
                 return self._ledger.learned(frozenset(entry.images))
             case Question.FRAME:
                 told = [one for one in self._ledger.of_image(entry.images[0]) if _is_about(one, entry.fingerprints[0])]
                 return told[-1] if told else None
+        if entry.question is Question.MARK:
+            pose = self._ledger.get((entry.images[0], "", ""))
+            if pose is not None and _is_about(pose, entry.fingerprints[0]) and pose.pose != entry.pose:
+                return pose  # the mark will have another name
         first = None
         for image, seen in zip(entry.images, entry.fingerprints, strict=True):
             one = self._ledger.get((image, entry.point, entry.kind))

@@ -33,6 +33,11 @@ def key_of(task: ScanTask) -> str:
     return f"{fiducials.pose} {[(click.point, click.col_px) for click in fiducials.clicks]}"
 
 
+def pose_of(key: str) -> str | None:
+    """In the stand-in for the store no result tells its pose."""
+    return None
+
+
 def mark_decision(choice: Choice, point: str = "1", **rest: Any) -> Decision:
     return Decision("a", choice, point, "fiducial", **rest)
 
@@ -102,30 +107,42 @@ def test_the_last_line_counts_and_undo_takes_back_the_one_before() -> None:
 def test_decisions_of_another_result_do_not_count() -> None:
     old = mark_decision(Choice.ACCEPT, fingerprint="another file")
     own = mark_decision(Choice.REJECT, "2", fingerprint=key_of(TASK))
-    assert list(decided(TASK, [old, own], key_of).counting.values()) == [own]
+    assert list(decided(TASK, [old, own], key_of, pose_of).counting.values()) == [own]
 
 
 def test_decisions_count_for_what_follows_from_those_before_them() -> None:
     """Accepted, then another mark placed, then, on what was measured from that, one more rejected."""
     accept = mark_decision(Choice.ACCEPT, "1", fingerprint=key_of(TASK))
     placed = place("2", 7.0, fingerprint=key_of(TASK))
-    now = decided(TASK, [accept, placed], key_of)
+    now = decided(TASK, [accept, placed], key_of, pose_of)
     assert now.task.options.fiducials.clicks == (Click("2", 7.0, 2.0),)
     reject = mark_decision(Choice.REJECT, "3", fingerprint=key_of(now.task))
-    assert set(decided(TASK, [accept, placed, reject], key_of).counting.values()) == {accept, placed, reject}
+    assert set(decided(TASK, [accept, placed, reject], key_of, pose_of).counting.values()) == {accept, placed, reject}
 
 
 def test_what_was_decided_about_marks_does_not_count_in_another_pose() -> None:
     placed = place("2", 7.0, fingerprint=key_of(TASK))
     pose = Decision("a", Choice.POSE, pose="90", fingerprint=key_of(TASK))
     late = mark_decision(Choice.ACCEPT, "3", fingerprint=key_of(TASK))  # on a page that was not measured anew yet
-    now = decided(TASK, [pose, late], key_of)
+    now = decided(TASK, [pose, late], key_of, pose_of)
     assert now.task.options.fiducials.pose == "90"
     assert list(now.counting.values()) == [pose]
     other = replace(pose, pose="180")  # somebody thinks again, on that page
-    assert decided(TASK, [pose, other], key_of).task.options.fiducials.pose == "180"
+    assert decided(TASK, [pose, other], key_of, pose_of).task.options.fiducials.pose == "180"
     undone = Decision("a", Choice.UNDO, fingerprint="whatever is shown")
-    assert decided(TASK, [placed, pose, undone], key_of).task.options.fiducials.pose == "auto"
+    assert decided(TASK, [placed, pose, undone], key_of, pose_of).task.options.fiducials.pose == "auto"
+
+
+def test_what_was_decided_about_marks_counts_on_in_the_pose_in_which_they_were_found() -> None:
+    """Decided on one page, the pose first or last, before it is measured anew."""
+    early, late = (mark_decision(Choice.ACCEPT, point, fingerprint=key_of(TASK)) for point in "13")
+    pose = Decision("a", Choice.POSE, pose="90", fingerprint=key_of(TASK))
+    found = {key_of(TASK): "90"}
+    now = decided(TASK, [early, pose, late], key_of, found.get)
+    assert now.task.options.fiducials.pose == "90"
+    assert set(now.counting.values()) == {early, pose, late}
+    found = {key_of(TASK): "180"}
+    assert set(decided(TASK, [pose, late], key_of, found.get).counting.values()) == {pose}
 
 
 def scan_of(*marks: MarkMeasurement) -> MeasuredScan:

@@ -316,11 +316,12 @@ def test_a_marks_frame_shows_how_it_lies_and_takes_another_pose_and_that_back(pa
     expect(page.locator("#whole-view")).to_be_visible()
     expect(page.locator('#poses button[aria-pressed="true"]')).to_contain_text("0")
     page.keyboard.press("2")
+    expect(page.locator("#left")).to_have_text("2 left: 1 frame, 1 mark")  # its mark will have another name
     expect(page.locator("#pose-view")).to_be_hidden()
     page.keyboard.press("f")
     expect(page.locator('#poses button[aria-pressed="true"]')).to_contain_text("90")
     page.keyboard.press("2")
-    expect(page.locator("#pose-view")).to_be_hidden()
+    expect(page.locator("#left")).to_have_text("3 left: 1 frame, 2 marks")
     told = [(one["image"], one["decision"], one.get("pose")) for one in decisions(measured)]
     assert told == [(SCRATCHED, "pose", "90"), (SCRATCHED, "undo", None)]
 

@@ -339,7 +339,7 @@ async function undo() {
     return undo();
   }
   const { image } = entry;
-  let about = [entry];
+  let about = [answer.decision === "pose" ? {} : entry];
   if (entry.question === "frame") about = state.frame?.decided ?? [];
   if (entry.question === "camera") about = [{ image: answer.image, kind: "learned" }];
   const lines = about.map((one) => ({ image: one.image ?? image, point: one.point ?? "", kind: one.kind ?? "", decision: "undo" }));
