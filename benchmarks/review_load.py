@@ -12,6 +12,7 @@ decided. Needs Chromium.
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -176,7 +177,7 @@ def draw(
 def reviewed(address: str, most: int) -> Reviewed:
     """At most so many marks accepted, one after the other."""
     with sync_playwright() as playwright:
-        found = next(path for path in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if os.path.exists(path))
+        found = shutil.which("chromium") or shutil.which("chromium-browser")
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
         page = browser.new_context(viewport={"width": 1300, "height": 900}, bypass_csp=True).new_page()
         began = time.monotonic()

@@ -200,8 +200,12 @@ def test_a_click_in_a_marks_picture_places_it(page: Page, measured: Path) -> Non
 @needs_browser
 def test_undo_takes_back_the_last_decision(page: Page, measured: Path) -> None:
     open_entry(page, SCRATCHED)
+    page.keyboard.press("c")
+    page.keyboard.type("a hair")
+    page.keyboard.press("Enter")
     page.keyboard.press("r")
     expect(page.locator("#left")).to_contain_text("2 left")
+    assert decisions(measured)[0]["note"] == "a hair"
     open_entry(page, SCRATCHED)
     expect(page.locator("#decided")).to_contain_text("Decided: reject by ann")
     page.keyboard.press("u")

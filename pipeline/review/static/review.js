@@ -233,6 +233,7 @@ async function open(index) {
     by("queue").children[index]?.scrollIntoView({ block: "nearest" });
     const entry = state.entries[index];
     for (const id of VIEWS) by(id).hidden = true;
+    by("note").value = "";
     by("title").textContent = entry ? title(entry) : "Nothing is left";
     by("reason").textContent = entry ? entry.reason : "";
     showAnswer(entry);
@@ -315,7 +316,8 @@ function decideMark(decision, rest = {}) {
   const entry = state.entries[state.at];
   if (entry?.question !== "mark" || !state.mark) return;
   const { image, point, kind, fingerprint } = state.mark;
-  return decide([{ image, point, kind, decision, fingerprint, window: seenWindow(views.mark), ...rest }]);
+  const note = by("note").value.trim();
+  return decide([{ image, point, kind, decision, fingerprint, note, window: seenWindow(views.mark), ...rest }]);
 }
 
 function decidePose(pose) {
@@ -764,6 +766,7 @@ const KEYS = {
   "+": () => zoom(2),
   "=": () => zoom(2),
   "-": () => zoom(0.5),
+  c: () => by("note").focus(),
   "/": () => by("search").focus(),
   "?": () => by("help").showModal(),
   Enter: () => keepClicks(),
@@ -777,6 +780,7 @@ function number(index) {
 
 document.addEventListener("keydown", (event) => {
   const writes = event.target.closest("input, select, textarea, dialog");
+  if (event.target.id === "note" && ["Enter", "Escape"].includes(event.key)) return by("mark").focus({ preventScroll: true });
   if (event.key === "Escape" && writes) return event.target.blur();
   if (writes || event.ctrlKey || event.metaKey || event.altKey) return;
   if (event.key === "Enter" && event.target.closest("button, summary")) return;
