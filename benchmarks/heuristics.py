@@ -2,8 +2,7 @@
 
 OPENBLAS_NUM_THREADS=1 PYTHONPATH=tests/measure python benchmarks/heuristics.py [--only NAME] [--count 24]
 
-Each row is one heuristic: the figure that it is there for, with it and without. The last rows compare a method of
-scikit-image with what is used in its place, on the same pictures.
+Each row is one heuristic: the figure that it is there for, with it and without.
 """
 
 import argparse
@@ -17,11 +16,9 @@ import numpy as np
 from dusty_marks import frame_of_disks
 from faint_marks import drawn_frame, measured_faint
 from large_networks import strip
-from measured_marks import CONTRAST, GROUND, drawn, measured, start_off
+from measured_marks import CONTRAST, GROUND, measured, start_off
 from numpy.typing import NDArray
-from skimage.measure import EllipseModel, find_contours
-from skimage.registration import phase_cross_correlation
-from true_marks import KIND, Border, TrueMark, over_border, some_mark
+from true_marks import KIND, Border, over_border, some_mark
 
 import measure.fitting.matching as matching
 import measure.frames.frame_measurement as frame_measurement
@@ -33,7 +30,7 @@ from measure.reason import NO_REASON
 
 Array = NDArray[np.float64]
 
-SEED, SNR, LARGE_PX, LEAST_CONTOUR = 5, 20.0, 0.5, 12
+SEED, SNR, LARGE_PX = 5, 20.0, 0.5
 
 
 def borders(count: int) -> str:
@@ -92,53 +89,6 @@ def one_front(count: int) -> str:
     return f"{time.process_time() - start:.2f} s for {8 * count} images"
 
 
-def ellipse_model(count: int) -> str:
-    """Ellipses by least-squares matching; by EllipseModel through the contour at half the contrast."""
-    rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
-    for _number in range(count):
-        mark = some_mark(KIND["ellipse"], 1.0, rng)
-        grey, _sign = drawn(mark, rng)
-        noisy = grey + CONTRAST / SNR * rng.standard_normal(grey.shape)
-        found, place = measured(mark, noisy, rng, off=start_off(mark, rng)), mark.place[:, 2]
-        ours += [] if found is None else [found.center_px - place]
-        theirs += [by_contour(noisy, place) - place]
-    return f"{_rms(ours)} px; EllipseModel {_rms(theirs)} px"
-
-
-def by_contour(grey: Array, about_px: Array) -> Array:
-    """(2,) the centre of an ellipse through the contour half way between the ground and the mark that lies about a
-    place."""
-    col, row = np.rint(about_px).astype(int)
-    level = (np.median(grey) + grey[row - 1 : row + 2, col - 1 : col + 2].mean()) / 2
-    contours = [each[:, ::-1] for each in find_contours(grey, level) if len(each) >= LEAST_CONTOUR]
-    nearest = min(contours, key=lambda each: float(np.hypot(*(each.mean(axis=0) - about_px))))
-    model = EllipseModel.from_estimate(nearest)
-    return np.asarray(model.center) if model else np.full(2, np.nan)
-
-
-def phase_correlation(count: int) -> str:
-    """The same mark in two scans, shifted: by matching the drawing in both; by phase_cross_correlation, 1/100 px."""
-    rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
-    for _number in range(count):
-        first = some_mark(KIND["ring-cross"], 1.0, rng)
-        shift = rng.uniform(-0.5, 0.5, 2)
-        place = first.place + np.column_stack([np.zeros((2, 2)), shift])
-        second = TrueMark(first.kind, place, first.size, first.blur_px)
-        pictures = [
-            GROUND + CONTRAST * (each.picture + rng.standard_normal(each.picture.shape) / SNR)
-            for each in (first, second)
-        ]
-        here, there = (
-            measured(each, grey, rng, off=start_off(each, rng))
-            for each, grey in zip((first, second), pictures, strict=True)
-        )
-        if here is not None and there is not None:
-            ours.append(there.center_px - here.center_px - shift)
-        moved, _error, _phase = phase_cross_correlation(pictures[1], pictures[0], upsample_factor=100)
-        theirs.append(np.asarray(moved)[::-1] - shift)
-    return f"{_rms(ours)} px; phase_cross_correlation {_rms(theirs)} px"
-
-
 def _rms(errors: Sequence[Array]) -> str:
     return f"{np.sqrt(np.nanmean(np.square(errors))):.4f}" if len(errors) else "-"
 
@@ -166,13 +116,12 @@ SWITCHED: dict[str, tuple[Study, Any, str, Any]] = {
     "rounding": (rounding, PictureFit, "unround", lambda _self: None),
     "fronts": (one_front, fronts, "FRONT_COST", 1e30),
 }
-COMPARED: dict[str, Study] = {"EllipseModel": ellipse_model, "phase_cross_correlation": phase_correlation}
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--only", choices=[*SWITCHED, *COMPARED])
+    parser.add_argument("--only", choices=SWITCHED)
     parser.add_argument("--count", type=int, default=24)
     given = parser.parse_args()
     for name, (study, where, what, instead) in SWITCHED.items():
@@ -181,9 +130,6 @@ def main() -> None:
             kept = run()
             with put(where, what, instead):
                 print(f"| {name} | {kept} | {run()} |", flush=True)
-    for name, study in COMPARED.items():
-        if given.only in (None, name):
-            print(f"| {name} | {study(given.count)} | |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,257 @@
+"""Methods of scikit-image in the place of the program's own, on the same pictures and points, whose truth is known.
+
+OPENBLAS_NUM_THREADS=1 PYTHONPATH=tests/measure python benchmarks/scikit_image.py [--only NAME] [--count 24]
+
+Each row is one method: what it is for, its figure, and that of what is used in its place.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+from drawn import scan_of
+from measured_marks import CONTRAST, GROUND, drawn, measured, start_off
+from numpy.typing import NDArray
+from skimage.feature import blob_log, corner_subpix, peak_local_max
+from skimage.filters import threshold_local
+from skimage.measure import EllipseModel, find_contours, label, ransac, regionprops
+from skimage.morphology import opening
+from skimage.registration import phase_cross_correlation
+from skimage.transform import AffineTransform, PiecewiseAffineTransform, PolynomialTransform
+from test_corners import NOISE as CORNER_NOISE
+from test_corners import SIZE as CORNER_PX
+from test_corners import board_steps, square_picture
+from test_disks import field
+from true_marks import KIND, TrueMark, some_mark
+
+from adjust.functional_model.transformation import film_kind
+from adjust.initial_values.fiducial_fit import fit_transformation
+from measure.codes_and_boards.corners import junction
+from measure.frames.frame_fit import outliers
+from measure.noise.damage import _opened
+from measure.search.response_layers import peaks
+from measure.single_targets.disk_patches import DiskSearch
+from measure.single_targets.disk_search import disk_candidates
+
+Array = NDArray[np.float64]
+
+SEED, SNR, LEAST_CONTOUR = 5, 20.0, 12
+DISKS, RADII_PX, HIT_PX = 32, (2.5, 15.0), 1.0
+MARKS_MM = 106.0 * np.array([(1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1)], float)
+FILM_MM, BENT_MM, GROSS_MM, GATE_MM = 0.01, 0.1, 1.0, 0.5
+
+
+def ellipse_model(count: int) -> str:
+    """Ellipses by EllipseModel through the contour at half the contrast; by least-squares matching."""
+    rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
+    for _number in range(count):
+        mark = some_mark(KIND["ellipse"], 1.0, rng)
+        grey, _sign = drawn(mark, rng)
+        noisy = grey + CONTRAST / SNR * rng.standard_normal(grey.shape)
+        found, place = measured(mark, noisy, rng, off=start_off(mark, rng)), mark.place[:, 2]
+        ours += [] if found is None else [found.center_px - place]
+        theirs += [by_contour(noisy, place) - place]
+    return f"{_rms(theirs)} px | least-squares matching {_rms(ours)} px"
+
+
+def by_contour(grey: Array, about_px: Array) -> Array:
+    """(2,) the centre of an ellipse through the contour half way between the ground and the mark that lies about a
+    place."""
+    col, row = np.rint(about_px).astype(int)
+    level = (np.median(grey) + grey[row - 1 : row + 2, col - 1 : col + 2].mean()) / 2
+    contours = [each[:, ::-1] for each in find_contours(grey, level) if len(each) >= LEAST_CONTOUR]
+    nearest = min(contours, key=lambda each: float(np.hypot(*(each.mean(axis=0) - about_px))))
+    model = EllipseModel.from_estimate(nearest)
+    return np.asarray(model.center) if model else np.full(2, np.nan)
+
+
+def phase_correlation(count: int) -> str:
+    """The same mark in two scans, shifted: by phase_cross_correlation, 1/100 px; by matching the drawing in both."""
+    rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
+    for _number in range(count):
+        first = some_mark(KIND["ring-cross"], 1.0, rng)
+        shift = rng.uniform(-0.5, 0.5, 2)
+        place = first.place + np.column_stack([np.zeros((2, 2)), shift])
+        second = TrueMark(first.kind, place, first.size, first.blur_px)
+        pictures = [
+            GROUND + CONTRAST * (each.picture + rng.standard_normal(each.picture.shape) / SNR)
+            for each in (first, second)
+        ]
+        here, there = (
+            measured(each, grey, rng, off=start_off(each, rng))
+            for each, grey in zip((first, second), pictures, strict=True)
+        )
+        if here is not None and there is not None:
+            ours.append(there.center_px - here.center_px - shift)
+        moved, _error, _phase = phase_cross_correlation(pictures[1], pictures[0], upsample_factor=100)
+        theirs.append(np.asarray(moved)[::-1] - shift)
+    return f"{_rms(theirs)} px | matching in both {_rms(ours)} px"
+
+
+def blobs(_: int) -> str:
+    """Disks of 3 to 12 px radius on clouds, with streaks: what is found at first look, before any fit; of the contrast
+    that the threshold is for, and of a third of it."""
+    drawn_field, centers = field(np.random.default_rng(SEED), DISKS)
+    truth = np.array(centers)
+    fainter = drawn_field.mean() + (drawn_field - drawn_field.mean()) / 3
+    return " || ".join(_first_looks(picture, truth) for picture in (drawn_field, fainter))
+
+
+def _first_looks(picture: Array, truth: Array) -> str:
+    def regions() -> Array:
+        light = picture > threshold_local(picture, 4 * int(RADII_PX[1]) + 1, method="mean", offset=-CONTRAST / 2)
+        sizes = np.pi * np.array(RADII_PX) ** 2
+        found = regionprops(label(light))
+        whole = [each for each in found if sizes[0] < each.area < sizes[1] and each.solidity > 0.85]
+        return np.array([each.centroid[::-1] for each in whole])
+
+    def laplacians() -> Array:
+        sigmas = np.array(RADII_PX) / np.sqrt(2)
+        found = blob_log(picture / 65535, min_sigma=sigmas[0], max_sigma=sigmas[1], num_sigma=8, threshold=0.1)
+        return np.asarray(found[:, 1::-1])
+
+    def own() -> Array:
+        return np.array(
+            [each.center_px for each in disk_candidates(scan_of(picture), DiskSearch((5.0, 30.0), "light"))]
+        )
+
+    return " | ".join(f"{method.__name__}: {_told(method, truth)}" for method in (regions, laplacians, own))
+
+
+def _told(method: Callable[[], Array], truth: Array) -> str:
+    start = time.process_time()
+    found = method().reshape(-1, 2)
+    seconds = time.process_time() - start
+    if not len(found):
+        return f"none of {len(truth)}, {seconds:.2f} s"
+    off = np.hypot(*np.moveaxis(found[:, None] - truth[None], -1, 0))
+    hit = off.min(axis=0) < HIT_PX
+    return f"{hit.sum()} of {len(truth)}, {int((off.min(axis=1) > HIT_PX).sum())} false, {seconds:.2f} s"
+
+
+def agreeing_marks(count: int) -> str:
+    """Marks on a film that is bent by some 0.1 mm, two of eight or none of four off by 1 mm: in how many frames just
+    these are told, and in how many a true mark, by RANSAC within the gate that the search has, and one by one."""
+    return " || ".join(_outliers_told(10 * count, *case) for case in ((MARKS_MM, 2), (MARKS_MM[:4], 0)))
+
+
+def _outliers_told(frames: int, marks_mm: Array, off: int) -> str:
+    rng, told = np.random.default_rng(SEED), {"RANSAC": [0, 0], "one by one": [0, 0]}
+    for number in range(frames):
+        x, y = marks_mm.T / 106.0
+        bend = np.stack([x * x, x * y, y * y], axis=1) @ rng.normal(0.0, BENT_MM, (3, 2))
+        seen = marks_mm + bend + FILM_MM * rng.standard_normal(marks_mm.shape)
+        wrong, angle = rng.choice(len(seen), off, replace=False), rng.uniform(0, 2 * np.pi, off)
+        seen[wrong] += GROSS_MM * np.column_stack([np.cos(angle), np.sin(angle)])
+        truth = np.isin(np.arange(len(seen)), wrong)
+        _, kept = ransac((marks_mm, seen), AffineTransform, 3, GATE_MM, max_trials=60, rng=number)
+        one_by_one = outliers(marks_mm, seen, np.full(len(seen), FILM_MM), np.eye(2), GATE_MM)
+        for name, out in (("RANSAC", ~kept if kept is not None else ~truth), ("one by one", one_by_one)):
+            told[name][0] += np.array_equal(out, truth)
+            told[name][1] += bool((out & ~truth).any())
+    told_of = [f"{name} right in {right}, a true one out in {extra}" for name, (right, extra) in told.items()]
+    return f"{off} of {len(marks_mm)} off, {frames} frames: {' | '.join(told_of)}"
+
+
+def corners(count: int) -> str:
+    """Crossings of a chessboard, a blur of 1 px: by corner_subpix, and by the own junction, from a whole pixel."""
+    rng, ours, theirs = np.random.default_rng(SEED), list[Array](), list[Array]()
+    for _number in range(4 * count):
+        center = np.full(2, (CORNER_PX - 1) / 2) + rng.uniform(-0.5, 0.5, 2)
+        grey = square_picture(center, board_steps(rng), 1.0, False)
+        grey = grey + CORNER_NOISE * rng.standard_normal(grey.shape)
+        start = np.rint(center)
+        ours.append(junction(grey, start, 3.5, np.ones_like(grey)) - center)
+        theirs.append(corner_subpix(grey, start[None, ::-1].astype(int), window_size=13)[0, ::-1] - center)
+    lost = int(np.isnan(np.array(theirs)).any(axis=1).sum())
+    return f"{_rms(theirs)} px, none for {lost} of {4 * count} | junction {_rms(ours)} px"
+
+
+def morphology(count: int) -> str:
+    """Masks of damage opened: whether both are the same, and seconds for each."""
+    rng = np.random.default_rng(SEED)
+    masks = [cv2.GaussianBlur(rng.standard_normal((61, 61)), (0, 0), 1.2) > 0.15 for _ in range(20 * count)]
+    start = time.process_time()
+    ours = [_opened(mask) for mask in masks]
+    middle = time.process_time()
+    theirs = [opening(mask, np.ones((2, 2), bool)) for mask in masks]
+    end = time.process_time()
+    same = sum(np.array_equal(*pair) for pair in zip(ours, theirs, strict=True))
+    return f"{end - middle:.2f} s, {same} of {len(masks)} masks the same | OpenCV {middle - start:.2f} s"
+
+
+def local_peaks(count: int) -> str:
+    """The hundred highest responses of maps of a reduced scan: how many are the same, and seconds for each."""
+    rng = np.random.default_rng(SEED)
+    maps = [
+        cv2.GaussianBlur(rng.standard_normal((1500, 1500)).astype(np.float32), (0, 0), 3) for _ in range(count // 6)
+    ]
+    start = time.process_time()
+    ours = [peaks(each, 100, 0.05)[0] for each in maps]
+    middle = time.process_time()
+    theirs = [peak_local_max(each, min_distance=3, threshold_abs=0.05, num_peaks=100)[:, ::-1] for each in maps]
+    end = time.process_time()
+    same = sum(
+        len({*map(tuple, a.astype(int).tolist())} & {*map(tuple, b.tolist())})
+        for a, b in zip(ours, theirs, strict=True)
+    )
+    return f"{end - middle:.2f} s, {same} of {100 * len(maps)} the same | OpenCV's dilation {middle - start:.2f} s"
+
+
+def film(count: int) -> str:
+    """A film that is bent by a polynomial of the second order, known by eight marks to 3 um: the error all over it."""
+    rng = np.random.default_rng(SEED)
+    inside = np.stack(np.meshgrid(*2 * [np.linspace(-100.0, 100.0, 9)]), axis=-1).reshape(-1, 2)
+    errors: dict[str, list[Array]] = {"PiecewiseAffine": [], "Polynomial": [], "film transformation": []}
+    for _number in range(count):
+        bend = rng.normal(0.0, 0.02, (2, 3))
+
+        def bent(xy: Array, bend: Array = bend) -> Array:
+            x, y = xy.T / 106.0
+            return np.asarray(xy + np.stack([x * x, x * y, y * y], axis=1) @ bend.T)
+
+        seen = bent(MARKS_MM) + 0.003 * rng.standard_normal(MARKS_MM.shape)
+        piecewise = PiecewiseAffineTransform.from_estimate(seen, MARKS_MM)
+        polynomial = PolynomialTransform.from_estimate(seen, MARKS_MM, order=2)
+        parameters, mirrored = fit_transformation("polynomial(2)", seen, MARKS_MM)
+        places = bent(inside)
+        errors["PiecewiseAffine"].append(piecewise(places) - inside)
+        errors["Polynomial"].append(polynomial(places) - inside)
+        own = film_kind("polynomial(2)", mirrored).apply(parameters, places)
+        errors["film transformation"].append(own - inside)
+    lost = np.isnan(np.concatenate(errors["PiecewiseAffine"])).any(axis=1).mean()
+    told = [f"{name} {1000 * np.sqrt(np.nanmean(np.square(each))):.2f} um" for name, each in errors.items()]
+    return f"{' | '.join(told)}; {lost:.0%} of the places outside of all triangles"
+
+
+def _rms(errors: Sequence[Array]) -> str:
+    return f"{np.sqrt(np.nanmean(np.square(errors))):.4f}" if len(errors) else "-"
+
+
+METHODS: dict[str, Callable[[int], str]] = {
+    "EllipseModel": ellipse_model,
+    "phase_cross_correlation": phase_correlation,
+    "regionprops, blob_log": blobs,
+    "ransac": agreeing_marks,
+    "corner_subpix": corners,
+    "morphology": morphology,
+    "peak_local_max": local_peaks,
+    "PolynomialTransform, PiecewiseAffineTransform": film,
+}
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--only", choices=METHODS)
+    parser.add_argument("--count", type=int, default=24)
+    given = parser.parse_args()
+    for name, method in METHODS.items():
+        if given.only in (None, name):
+            print(f"| {name} | {method(given.count)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
