@@ -13,7 +13,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -164,19 +164,15 @@ PITCH_MM = 0.02
 
 
 def make_scan(path: Path, side: int) -> None:
-    """A scan of noise on slow waves, written strip by strip: no more of it is ever in memory."""
+    """A scan of noise on slow waves, made strip by strip in a file beside it: no more of it need be in memory."""
     rng = np.random.default_rng(5)
     wave = 14000.0 + 4000.0 * np.sin(np.arange(side) / 90.0)
-
-    def strips() -> Iterator[NDArray[np.uint16]]:
-        for row0 in range(0, side, STRIP_PX):
-            rows = min(STRIP_PX, side - row0)
-            noise = rng.integers(-400, 400, (rows, side), dtype=np.int16)
-            yield (wave + 2000.0 * np.cos(row0 / 500.0) + noise).astype(np.uint16)
-
-    tifffile.imwrite(
-        path, strips(), shape=(side, side), dtype=np.uint16, rowsperstrip=STRIP_PX, compression="lzw", bigtiff=True
-    )
+    raw = np.memmap(path.with_suffix(".raw"), np.uint16, "w+", shape=(side, side))
+    for row0 in range(0, side, STRIP_PX):
+        noise = rng.integers(-400, 400, raw[row0 : row0 + STRIP_PX].shape, dtype=np.int16)
+        raw[row0 : row0 + STRIP_PX] = wave + 2000.0 * np.cos(row0 / 500.0) + noise
+    tifffile.imwrite(path, raw, rowsperstrip=STRIP_PX, compression="lzw")
+    path.with_suffix(".raw").unlink()
 
 
 def by_reseau(folder: Path, degree: Degree) -> str:

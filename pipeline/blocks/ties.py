@@ -42,12 +42,18 @@ def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[Compara
 
 def feature_sigma_px(mapped: Mapped) -> float:
     """The standard deviation of a feature's coordinate, from the reprojection errors of tracks that are seen thrice or
-    more: of 2 n coordinates three degrees of freedom went into the point."""
-    squares = [
-        mapped.errors_px[number] ** 2 / 2.0 * len(track) * 2 / (len(track) * 2 - 3)
-        for number, track in mapped.tracks.items()
-        if len(track) >= 3
-    ]
+    more: of 2 n coordinates three degrees of freedom went into the point.
+
+    COLMAP's error is the mean length of a point's residuals, whose square is pi / 4 of the mean square of the lengths
+    of normally distributed ones. Of many points the median counts, and the median of chi-square over its degrees of
+    freedom f is about (1 - 2 / (9 f))^3 (Wilson and Hilferty 1931).
+    """
+    squares = []
+    for number, track in mapped.tracks.items():
+        if len(track) >= 3:
+            free = 2 * len(track) - 3
+            of_lengths = mapped.errors_px[number] ** 2 * 4.0 / np.pi
+            squares.append(of_lengths / 2.0 * 2 * len(track) / free / (1.0 - 2.0 / (9.0 * free)) ** 3)
     if not squares:
         raise InputError("COLMAP found no point in three frames: a block needs more overlap.")
     return float(np.sqrt(np.median(squares)))

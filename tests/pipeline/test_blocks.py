@@ -86,8 +86,17 @@ def test_tracks_come_back_into_turned_and_mirrored_scans() -> None:
 
 
 def test_their_standard_deviation_is_that_of_the_features() -> None:
-    """Of eight coordinates of a point three degrees of freedom are gone."""
-    assert feature_sigma_px(mapped(0.5)) == pytest.approx(0.5, rel=1e-6)
+    """Simulated as COLMAP tells it: residuals of a fit with three unknowns, their mean length; 3, 4 and 7 sights."""
+    rng = np.random.default_rng(8)
+    tracks, errors = {}, {}
+    for number in range(4000):
+        sights = int(rng.choice([3, 4, 7]))
+        design = np.linalg.qr(rng.normal(size=(2 * sights, 3)))[0]
+        noise = rng.normal(0.0, 0.5, 2 * sights)
+        left = noise - design @ (design.T @ noise)
+        tracks[number] = [(f"f{i}", 1.0, 1.0) for i in range(sights)]
+        errors[number] = float(np.hypot(*left.reshape(-1, 2).T).mean())
+    assert feature_sigma_px(replace(mapped(), tracks=tracks, errors_px=errors)) == pytest.approx(0.5, rel=0.03)
     with pytest.raises(InputError, match="more overlap"):
         feature_sigma_px(replace(mapped(), tracks={1: [("f0", 1.0, 1.0), ("f1", 1.0, 1.0)]}))
 
