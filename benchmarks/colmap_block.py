@@ -1,10 +1,11 @@
 """A rendered block of 32 frames over relief without any orientation: through COLMAP and one adjustment, and alone.
 
-python benchmarks/colmap_block.py FOLDER
+python benchmarks/colmap_block.py FOLDER [SEED...]
 
 Renders 4 strips of 8 frames (60 % and 40 % overlap, 1:10,000, relief 60 m rms, six poses, films of their own), measures
 the fiducials, marks 12 control points in every frame that shows them (true places with 0.3 px of noise: what a person
-would do), and runs `reseau block`. FOLDER is kept: what is there already is not made again.
+would do), and runs `reseau block`. FOLDER is kept: what is there already is not made again. Of several seeds each has a
+folder in it.
 """
 
 import sys
@@ -44,7 +45,7 @@ MARGIN_MM = 12.0  # of the frame: there are its fiducials
 SEED = 11
 
 SCENE = f"""name = "colmap_block"
-seed = {SEED}
+seed = {{seed}}
 camera = "aerial_camera.toml"
 [field]
 kind = "natural"
@@ -80,15 +81,21 @@ point_sigma = [0.0, 0.03]
 
 
 def main() -> None:
+    folder, seeds = Path(sys.argv[1]), [int(word) for word in sys.argv[2:]]
+    for seed in seeds or [SEED]:
+        one_block(folder / str(seed) if seeds else folder, seed)
+
+
+def one_block(folder: Path, seed: int) -> None:
     """Render, measure, orient, adjust and compare; each step is timed."""
-    folder = Path(sys.argv[1])
-    scene = rendered(folder)
+    print(f"seed {seed}")
+    scene = rendered(folder, seed)
     project = replace(read_project(folder / "project" / "project.toml"), ties=None, given_images=None)
     if not project.comparator.exists():
         start = time.monotonic()
         run_measure(project, Reporter())
         print(f"measuring the fiducials: {time.monotonic() - start:.0f} s")
-    project = with_control(project, scene)
+    project = with_control(project, scene, seed)
     block = run_block(project, folder / "block", None, Reporter())
     print(f"COLMAP oriented {len(block.mapped.poses)} of {len(scene.images)} images; {block.ties} tie marks of "
           f"{block.tracks} points are taken of {len(block.mapped.points)}")  # fmt: skip
@@ -103,13 +110,13 @@ def main() -> None:
     tell_alone(block, scene)
 
 
-def rendered(folder: Path) -> Scene:
+def rendered(folder: Path, seed: int) -> Scene:
     path = folder / "scene.toml"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         camera = Path(synthetic_images.__file__).parent / "scenes" / "aerial_camera.toml"
         (folder / camera.name).write_text(camera.read_text(encoding="utf-8"), encoding="utf-8")
-        path.write_text(SCENE + images(np.random.default_rng(SEED)), encoding="utf-8")
+        path.write_text(SCENE.format(seed=seed) + images(np.random.default_rng(seed)), encoding="utf-8")
         render_project(path, folder / "project")
     return read_scene(path).scene
 
@@ -131,9 +138,9 @@ def images(rng: np.random.Generator) -> str:
     return "\n".join(tables)
 
 
-def with_control(project: Project, scene: Scene) -> Project:
+def with_control(project: Project, scene: Scene, seed: int) -> Project:
     """The project with control points, marked in every frame that shows them within its marks."""
-    rng = np.random.default_rng([SEED, 5])
+    rng = np.random.default_rng([seed, 5])
     reach = np.array([(FRAMES - 1) * BASE_M, (STRIPS - 1) * STRIP_M]) / 2.0
     x, y = np.meshgrid(*(np.linspace(-end, end, count) for end, count in zip(reach, CONTROL, strict=True)))
     plan = np.column_stack([x.ravel(), y.ravel()])
