@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError
-from adjust.functional_model.families import parameter_names
+from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import folded_over
 from adjust.functional_model.rotation import angles_from_rotation, angles_near
 from adjust.functional_model.sight import Sight
@@ -17,6 +17,7 @@ from adjust.initial_values.joined_frames import Film, joined_frames, whole_frame
 from adjust.initial_values.orientation import orient
 from adjust.initial_values.principal_distance import find_principal_distance
 from adjust.initial_values.resection import Pose
+from adjust.initial_values.wide_angle import find_wide_distance
 from adjust.problem.network import Approximations, Camera, Image, Network
 from adjust.validation import validate
 
@@ -99,7 +100,11 @@ def _interior(camera: Camera, frames: Frames) -> Array:
     )
     if camera.principal_distance_mm is not None:
         return np.array([camera.principal_distance_mm.value, x0, y0])
-    found = find_principal_distance(_known_fields(camera, frames, np.array([x0, y0])))
+    fields = _known_fields(camera, frames, np.array([x0, y0]))
+    if family(camera.distortion.family).is_pinhole_at_zero:
+        found = find_principal_distance(fields)
+    else:
+        found = find_wide_distance(fields, camera.distortion, _given_parameters(camera))
     if found is None:
         raise AdjustmentError(
             f"the principal distance of camera {camera.name} cannot be found from its images: they see too few known "
@@ -121,6 +126,12 @@ def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> 
     return fields
 
 
+def _given_parameters(camera: Camera) -> Array:
+    """(k,) of its distortion, 0 where nothing is given."""
+    known, names = camera.distortion.parameters, parameter_names(camera.distortion.family)
+    return np.array([known[name].value if name in known else 0.0 for name in names])
+
+
 def _known_place(network: Network, name: str) -> tuple[float, float, float]:
     point = network.point_by_id.get(name)
     if point is None or point.X is None or point.Y is None or point.Z is None:
@@ -132,7 +143,7 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
     """Freed of the distortion as it is known beforehand. Raises AdjustmentError where that folds an image over."""
     known = camera.distortion.parameters
     names = parameter_names(camera.distortion.family)
-    parameters = np.array([known[name].value if name in known else 0.0 for name in names])
+    parameters = _given_parameters(camera)
     images = frames.of_camera(camera.name)
     folds = folded_over(camera.distortion, interior, parameters, frames.xy_mm[frames.places(images)])
     first = np.cumsum([0, *np.diff(frames.starts)[images]])

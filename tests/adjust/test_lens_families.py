@@ -1,5 +1,7 @@
 """The families of industrial bundles, Zhang's skew and OpenCV's fisheye, against the renderer's own projections."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lens_networks import LENSES, R0_MM, network_of
@@ -21,6 +23,20 @@ def test_a_lens_is_found_from_exact_images(name: str) -> None:
     c, values = LENSES[name]
     for each, value in (values | {"c": c, "x0": 0.12, "y0": -0.07}).items():
         assert abs(found.value(f"IO.L.{each}") - value) < 1e-4 * found.sigma(f"IO.L.{each}") / found.sigma0, each
+
+
+@pytest.mark.parametrize("name", list(LENSES))
+def test_nothing_but_the_points_has_to_be_known(name: str) -> None:
+    """Neither c nor the principal point; of the fisheye points up to 80 degrees off the axis."""
+    network = network_of(name, np.random.default_rng(1))
+    camera = replace(network.cameras[0], principal_distance_mm=None, x0_mm=None, y0_mm=None)
+    network = replace(network, cameras=(camera,))
+    start = approximate(network)
+    assert start.interior["L"][0] == pytest.approx(LENSES[name][0], rel=0.1)
+    found = adjust(network, start)
+    assert found.converged
+    assert 0.9 < found.sigma0 < 1.1
+    assert abs(found.value("IO.L.c") - LENSES[name][0]) < 4.0 * found.sigma("IO.L.c")
 
 
 @pytest.mark.parametrize("name", list(LENSES))
