@@ -154,10 +154,10 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
             given = [name for name in names if name in known and known[name].value]
             values = ", ".join(f"{name} = {known[name].value:g}" for name in given)
             raise AdjustmentError(
-                f"camera {camera.name}: the distortion that is given ({values}) folds the image over: from "
+                f"camera {camera.name}: the distortion that is given ({values or 'all 0'}) folds the image over: from "
                 f"{radius_mm:.3g} mm off the principal point on, what lies farther out would appear farther in, and "
                 f"{folded.sum()} of the {len(folded)} points of an image were measured there. Correct the signs, the "
-                "units or the family of these values, or begin with 0."
+                "units or the family of these values, the principal point or c, or begin with 0."
             )
     return frames.sights(camera, interior, parameters)
 

@@ -23,12 +23,13 @@ CONVENTION = Convention(
 )
 _OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _FULL = ("k3", "k4", "k5", "k6")
+_FISHEYE = "OPENCV_FISHEYE"
 
 
 def write(block: Block, options: ExportOptions) -> Written:
     """sparse/*.bin; a camera an image, for every resampled frame has its own first pixel."""
     pycolmap = imported()
-    frames, left_out = pinhole_frames(block, options, (BROWN, RATIONAL), "colmap")
+    frames, left_out = pinhole_frames(block, options, (BROWN, RATIONAL), "colmap", knows_fisheye=True)
     made = reconstruction(pycolmap, block, frames)
     with tempfile.TemporaryDirectory() as folder:
         made.write_binary(folder)
@@ -72,11 +73,13 @@ def reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> A
 
 
 def colmap_camera(pycolmap: Any, frame: PinholeFrame, number: int) -> Any:
-    """OPENCV, or FULL_OPENCV where the lens has a third radial term."""
+    """OPENCV, or FULL_OPENCV where the lens has a third radial term; OPENCV_FISHEYE of a fisheye."""
     interior = frame.interior_px + np.array([0.0, 0.0, *CONVENTION.first_pixel_px])
     rest = frame.lens.named(_FULL)
     model = "FULL_OPENCV" if rest.any() else "OPENCV"
     params = [*interior, *frame.lens.named(_OPENCV[len(INTERIOR) :]), *(rest if model == "FULL_OPENCV" else ())]
+    if frame.lens.fisheye:
+        model, params = _FISHEYE, [*interior, *frame.lens.fisheye]
     return pycolmap.Camera(
         camera_id=number, model=model, width=frame.canvas.width_px, height=frame.canvas.height_px, params=params
     )
@@ -103,7 +106,8 @@ def read(paths: Sequence[Path], options: ImportOptions) -> Incoming:
             interior, lens = known
             pixels = tuple(np.array(interior) - np.array([0.0, 0.0, *CONVENTION.first_pixel_px]))
             size = (camera.width, camera.height)
-            cameras.append(opencv_camera(folder, f"camera{number}", pixels, lens, size, options))
+            family = "opencv_fisheye" if camera.model_name == _FISHEYE else "opencv"
+            cameras.append(opencv_camera(folder, f"camera{number}", pixels, lens, size, options, family))
         for image in made.images.values():
             if image.has_pose:
                 pose = image.cam_from_world()
@@ -123,6 +127,7 @@ def _parameters(camera: Any) -> tuple[list[float], dict[str, float]] | None:
         "RADIAL": (1, ("k1", "k2")),
         "OPENCV": (2, _OPENCV[4:]),
         "FULL_OPENCV": (2, (*_OPENCV[4:], *_FULL)),
+        _FISHEYE: (2, ("k1", "k2", "k3", "k4")),
     }
     if camera.model_name not in names:
         return None

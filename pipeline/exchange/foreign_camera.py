@@ -23,8 +23,10 @@ def opencv_camera(
     lens: Mapping[str, float],
     size_px: tuple[float, float] | None,
     options: ImportOptions,
+    family: str = "opencv",
 ) -> CameraFile:
-    """A camera in OpenCV's model, fx, fy, cx, cy (4,) in px from the first pixel's centre, everything fixed.
+    """A camera in OpenCV's model, or its fisheye's, everything fixed; fx, fy, cx, cy (4,) in px from the first pixel's
+    centre.
 
     Its principal point is in comparator coordinates of the picture, or from the picture's middle. Raises InputError
     where the pitch, or the size that the middle needs, is not known.
@@ -50,7 +52,7 @@ def opencv_camera(
         principal_point_mm=(float(x0), float(y0)),
         principal_distance_sigma_mm=0.0,
         principal_point_sigma_mm=(0.0, 0.0),
-        distortion=Distortion("opencv", given) if given else Distortion(),
+        distortion=Distortion(family, given) if given or family != "opencv" else Distortion(),
         fiducials=(),
     )
 

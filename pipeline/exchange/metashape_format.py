@@ -161,15 +161,14 @@ def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
     missing = [name for name in ("width", "height", "f") if not given.get(name, 0.0) > 0.0]
     if missing:
         raise InputError(f"{path}: has no positive {missing[0]}. Export the calibration again.")
-    strange = [name for name in ("k4", "b2") if given.get(name, 0.0) != 0.0]
-    if strange:
+    if given.get("k4", 0.0) != 0.0:
         raise InputError(
-            f"{path}: {strange[0]} is {given[strange[0]]:g}, and no family of distortion here has it. Calibrate again "
-            "with it held at 0."
+            f"{path}: k4 is {given['k4']:g}, and no family of distortion here has it. Calibrate again with it held at "
+            "0."
         )
     of = {name: given.get(name, 0.0) for name in NAMES}
     size = (given["width"], given["height"])
     interior = (of["f"] + of["b1"], of["f"], size[0] / 2 + of["cx"], size[1] / 2 + of["cy"])
     pixels = tuple(np.array(interior) - np.array([0.0, 0.0, *CONVENTION.first_pixel_px]))
-    lens = {name: of[name] for name in ("k1", "k2", "k3")} | {"p1": of["p2"], "p2": of["p1"]}
+    lens = {name: of[name] for name in ("k1", "k2", "k3")} | {"p1": of["p2"], "p2": of["p1"], "b2": of["b2"] / of["f"]}
     return opencv_camera(path, path.stem, pixels, lens, size, options)

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from adjust.functional_model.families import parameter_names
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
@@ -24,6 +25,7 @@ CONVENTION = Convention(
     "OpenCV, calib3d: projectPoints, and undistort, whose maps count from the first pixel's centre",
 )
 MOST_MB = 4
+FISHEYE = "fisheye"  # of cv2.fisheye, as ROS and others call the key and the model ("equidistant" too)
 _MATRIX = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix", "M1")
 _LENS = ("distortion_coefficients", "D", "Distortion_Coefficients", "distCoeffs", "D1")
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
@@ -31,7 +33,7 @@ _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height
 
 def write(block: Block, options: ExportOptions) -> Written:
     """NAME.yml an image, for cv2.FileStorage."""
-    frames, left_out = pinhole_frames(block, options, (BROWN, PRISMS, NAMES[4:]), "opencv")
+    frames, left_out = pinhole_frames(block, options, (BROWN, PRISMS, NAMES[4:]), "opencv", knows_fisheye=True)
     return Written(
         {f"{frame.frame.image}.yml": _yaml(frame) for frame in frames},
         ("the film transformation (it is that of the resampled frames)", "all standard deviations", "the marks"),
@@ -50,7 +52,11 @@ def _yaml(frame: PinholeFrame) -> str:
     storage.write("image_width", frame.canvas.width_px)
     storage.write("image_height", frame.canvas.height_px)
     storage.write("camera_matrix", np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
-    storage.write("distortion_coefficients", frame.lens.values[4 : 4 + count].reshape(1, -1))
+    if frame.lens.fisheye:
+        storage.write("distortion_model", FISHEYE)
+        storage.write("distortion_coefficients", np.array([frame.lens.fisheye]))
+    else:
+        storage.write("distortion_coefficients", frame.lens.values[4 : 4 + count].reshape(1, -1))
     storage.write("R", frame.rotation)
     storage.write("t", frame.translation.reshape(3, 1))
     return str(storage.releaseAndGetString())
@@ -88,15 +94,17 @@ def _camera_and_pose(path: Path, options: ImportOptions) -> tuple[CameraFile, Fo
     values = np.zeros(0) if lens is None else np.ravel(lens.mat()).astype(float)
     if values.size > len(NAMES[4:]) or not (np.isfinite(values).all() and np.isfinite(k).all() and k[0, 0] > 0.0):
         raise InputError(f"{path}: the camera matrix and up to {len(NAMES[4:])} distortion values are to be finite.")
-    if k[0, 1] != 0.0:
-        raise InputError(f"{path}: its camera matrix has a skew of {k[0, 1]:g}, which OpenCV's own model has not.")
     height = first(_HEIGHT)
     pixels = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
     extent = (size.real(), height.real()) if size is not None and height is not None else None
     name = storage.getNode("camera").string() or path.stem
     picture = image_name(storage.getNode("image").string() or path.stem)
-    given = dict(zip(NAMES[4:], values.tolist(), strict=False))
-    camera = opencv_camera(path, name, pixels, given, extent, options)
+    is_fisheye = storage.getNode("distortion_model").string() in (FISHEYE, "equidistant")
+    names = parameter_names("opencv_fisheye")[:4] if is_fisheye else NAMES[4:]
+    if is_fisheye and values.size > len(names):
+        raise InputError(f"{path}: a fisheye has {len(names)} distortion values, not {values.size}.")
+    given = dict(zip(names, values.tolist(), strict=False)) | {"b2": k[0, 1] / k[1, 1]}
+    camera = opencv_camera(path, name, pixels, given, extent, options, "opencv_fisheye" if is_fisheye else "opencv")
     turn, shift = storage.getNode("R").mat(), storage.getNode("t").mat()
     if turn is None or shift is None:
         return camera, None

@@ -30,10 +30,12 @@ _ONE_SCALE = ("none", "torlegard")  # families that stretch x and y alike
 @dataclass(frozen=True)
 class FittedLens:
     """OpenCV's parameters (18,) as `opencv_model` has them, in mm with y up. largest_mm: how far they put a point of
-    the frame beside its place."""
+    the frame beside its place. fisheye: k1 to k4 of OpenCV's fisheye, in the place of the distortion; empty otherwise.
+    """
 
     values: Array
     largest_mm: float
+    fisheye: tuple[float, ...] = ()
 
     def named(self, names: Sequence[str]) -> Array:
         return np.array([self.values[NAMES.index(name)] for name in names])
@@ -87,10 +89,10 @@ class PinholeFrame:
 
 
 def pinhole_frames(
-    block: Block, options: ExportOptions, models: Sequence[Sequence[str]], format: str
+    block: Block, options: ExportOptions, models: Sequence[Sequence[str]], format: str, knows_fisheye: bool = False
 ) -> tuple[list[PinholeFrame], list[str]]:
     """Every oriented image with its lens in the first of the models, each given by its parameters' names, that is near
-    enough; and why the other images are not among them.
+    enough; and why the other images are not among them. knows_fisheye: whether the program has OpenCV's fisheye.
 
     Raises InputError where no image is oriented, or where the last model, too, is off by more than the options allow.
     """
@@ -99,13 +101,28 @@ def pinhole_frames(
     frames, left_out = [], list(block.unoriented_note())
     for frame in block.oriented():
         if frame.camera not in lenses:
-            lenses[frame.camera] = nearest_lens(block, frame, models, options)
+            fisheye = fisheye_lens(block, frame, options) if knows_fisheye else None
+            lenses[frame.camera] = fisheye or nearest_lens(block, frame, models, options)
         try:
             frames.append(_pinhole(block, frame, lenses[frame.camera], options))
         except MeasurementError as error:
             left_out.append(f"{frame.image}: {error}")
     check_misfit({frame.frame.image: frame.misfit_px for frame in frames}, options, format)
     return frames, left_out
+
+
+def fisheye_lens(block: Block, frame: OutFrame, options: ExportOptions) -> FittedLens | None:
+    """The lens of an image's camera where it is OpenCV's fisheye; a skew, which programs leave out, is its misfit."""
+    lens = frame.lens
+    assert lens is not None
+    if lens.distortion.family != "opencv_fisheye" or options.with_lens:
+        return None
+    *k, b1, b2 = lens.parameters.tolist()
+    c, x0, y0 = lens.interior
+    values = np.zeros(len(NAMES))
+    values[:4] = c * (1.0 + b1), c, x0, y0
+    farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - y0).max())
+    return FittedLens(values, abs(b2) * farthest_mm, tuple(k))
 
 
 def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
