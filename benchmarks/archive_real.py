@@ -49,8 +49,8 @@ def measured(folder: Path, scans: int, side: int, workers: int) -> None:
     start_s = time.monotonic()
     command = [
         sys.executable,
-        "-m",
-        "pipeline.main",
+        "-c",
+        "from pipeline.main import main; main()",
         "measure",
         str(folder / "project.toml"),
         "--workers",
@@ -94,7 +94,8 @@ def results(folder: Path) -> int:
     if not path.exists():
         return 0
     with sqlite3.connect(path) as db:
-        return int(db.execute("select count(*) from result").fetchone()[0])
+        is_made = db.execute("select count(*) from sqlite_master where name = 'result'").fetchone()[0]
+        return int(db.execute("select count(*) from result").fetchone()[0]) if is_made else 0
 
 
 if __name__ == "__main__":

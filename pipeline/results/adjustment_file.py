@@ -1,10 +1,10 @@
 """`adjustment.json`, the result with everything it came from, and `adjustment.npz`, its full covariance."""
 
-import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from adjust.quality.correlation import correlations
 from adjust.quality.significance import SignificanceTest, board_tests, group_tests, parameter_tests, scanner_tests
 from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
 from pipeline.results.covariance_arrays import covariance_arrays, covariance_note
-from pipeline.results.fingerprints import of_content
+from pipeline.results.fingerprints import of_file
 from pipeline.results.joined_frames import frames_json
 from pipeline.results.reliability_json import point_tests, reliability_json, suspect_json
 from pipeline.text.atomic import atomic_path
@@ -32,6 +32,7 @@ Json = dict[str, Any]
 
 ANGLES = ("omega", "phi", "kappa", "angle")
 DEG_PER_RAD = 180.0 / math.pi
+_AT_A_TIME = 10_000  # words of JSON
 
 
 def write_adjustment(adjustment: Adjustment, path: Path, made_from: Mapping[str, str] | None = None) -> None:
@@ -45,14 +46,22 @@ def write_adjustment(adjustment: Adjustment, path: Path, made_from: Mapping[str,
     """
     content = adjustment_json(adjustment)
     content = {"reseau": content.pop("reseau"), "made_from": dict(made_from or {}), **content}
-    text = json.dumps(without_nan(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    arrays = io.BytesIO()
-    belongs_to = np.array(of_content(text.encode("utf-8")))
-    np.savez_compressed(arrays, allow_pickle=False, fingerprint=belongs_to, **covariance_arrays(adjustment))
     # Both are whole before either takes its place: a covariance belongs to its adjustment.
     with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
-        covariance.write_bytes(arrays.getvalue())
-        result.write_bytes(text.encode("utf-8"))
+        with result.open("w", encoding="utf-8", newline="\n") as file:
+            file.writelines(_json_text(content))
+        del content
+        belongs_to, arrays = np.array(of_file(result)), covariance_arrays(adjustment)
+        with covariance.open("wb") as data:
+            np.savez_compressed(data, allow_pickle=False, fingerprint=belongs_to, **arrays)
+
+
+def _json_text(content: Json) -> Iterator[str]:
+    """Some of it at a time: as one text a large result takes several times as much memory as in the file."""
+    parts = json.JSONEncoder(indent=1, ensure_ascii=False, allow_nan=False).iterencode(without_nan(content))
+    while some := "".join(islice(parts, _AT_A_TIME)):
+        yield some
+    yield "\n"
 
 
 def adjustment_json(adjustment: Adjustment) -> Json:
