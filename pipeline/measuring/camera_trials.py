@@ -15,7 +15,8 @@ from measure.frames.camera_recognition import likeness
 from measure.frames.frame import Frame
 from measure.marks.frame_border import at_border
 from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.scans.scan import open_scan
+from measure.scans.scan import Scan, open_scan
+from measure.scans.thumbnail import thumbnail
 from measure.writing.networks import networks
 from measure.writing.reading import read_writing
 from pipeline.files.camera_file import CameraFile
@@ -28,6 +29,7 @@ from pipeline.progress import Count, Reporter
 Array = NDArray[np.float64]
 Names = tuple[str, ...]
 
+_PICTURE_PX = 2400  # of the scan as it is looked at: a tenth of a millimetre of aerial film, in which plates are read
 _FEW = 3  # of the answers while the pitch is sought: those that are tried at the pitch that each comes to
 _CERTAIN = 0.01  # constellations expected by chance: no mark need be matched in wrong places to know better
 _BY_CHANCE = 1.0  # constellation expected: chance may have made it
@@ -47,18 +49,23 @@ def identify(
 
     Raises MeasurementError for a scan that cannot be read.
     """
-    with open_scan(path, max_pixels) as whole, reporter.stage("trying") as count:
-        search, given = LayoutSearch(whole), whole.pitch_um if pitch_um is None else (pitch_um, pitch_um)
-        layouts = {names: _as_seen(cameras[names[0]].layout()) for names in _alike(cameras)}
-        trials = list[Trial]()
+    with open_scan(path, max_pixels) as whole:
+        given = whole.pitch_um if pitch_um is None else (pitch_um, pitch_um)
+        picture, whole_px = thumbnail(whole, _PICTURE_PX), whole.width_px
+    times, search = whole_px / picture.width_px, LayoutSearch(picture)
+    layouts = {names: _as_seen(cameras[names[0]].layout()) for names in _alike(cameras)}
+    trials = list[Trial]()
+    with reporter.stage("trying") as count:
         if given is not None:
-            trials = _as_given(search, layouts, given, count)
+            trials = _as_given(search, layouts, (times * given[0], times * given[1]), count)
         if not any(trial.stands_out for trial in trials):
             trials = _at_any_pitch(search, layouts, count)
+    del search  # and the correlations that it holds
     sources = {name: camera.source for name, camera in cameras.items()}
     unreported = {name: source.text for name, source in sources.items() if source and not source.reports}
+    trials = [replace(trial, pixel_um=trial.pixel_um and trial.pixel_um / times) for trial in trials]
     ranked = tuple(sorted(trials, key=lambda trial: (-trial.score, trial.expected)))
-    plate = _plate(path, max_pixels) if any(trial.stands_out for trial in trials) else {}
+    plate = _plate(picture) if any(trial.stands_out for trial in trials) else {}
     told = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in told.items() if against}
     return Identification(path, ranked, unreported, given, plate, contradicted, drawn_alike(layouts))
@@ -73,13 +80,10 @@ def _as_seen(layout: FiducialLayout) -> FiducialLayout:
     return replace(layout, marks=marks)
 
 
-def _plate(path: Path, max_pixels: int | None) -> dict[str, str]:
+def _plate(picture: Scan) -> dict[str, str]:
     """What the camera's own plate says in the scan, as far as anything is there that reads."""
     reader = networks()
-    if reader is None:
-        return {}
-    with open_scan(path, max_pixels) as scan:
-        return plate_of(read_writing(scan, reader))
+    return {} if reader is None else plate_of(read_writing(picture, reader))
 
 
 def _as_given(

@@ -16,9 +16,7 @@ from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 
 Hypotheses = Sequence[Sequence[PitchHypothesis]]
 
-_LARGEST_PX = (
-    1600  # of what is looked at: a seventh of a millimetre of aerial film, about as wide as marks' finest lines
-)
+_LARGEST_PX = 1600  # of what is searched: a seventh of a millimetre of aerial film, about as wide as the finest lines
 _COARSE_PX = 1024  # the same while the pitch is sought: fine lines are half a pixel wide then
 _SOLID_PX = 800  # of solid marks, which are some millimetres large
 _COARSE_SOLID_PX = 512  # of these while the pitch is sought
@@ -42,11 +40,11 @@ class Tried:
 
 
 class LayoutSearch:
-    """The search in one scan."""
+    """The search in one scan, or in a thumbnail of it that its marks can be looked at in."""
 
-    def __init__(self, whole: Scan) -> None:
-        self._whole = whole
-        self._fine = thumbnail(whole, _LARGEST_PX)
+    def __init__(self, scan: Scan) -> None:
+        self._scan = scan
+        self._fine = thumbnail(scan, _LARGEST_PX)
         self._coarse, self._solid, self._coarse_solid = (
             thumbnail(self._fine, side_px) for side_px in (_COARSE_PX, _SOLID_PX, _COARSE_SOLID_PX)
         )
@@ -56,7 +54,7 @@ class LayoutSearch:
         """At the scan's pitch, or with pixels that are longer one way."""
         bold = _boldest(layout)
         picture = self._solid if all(_is_solid(mark) for mark in bold.marks) else self._fine
-        times = self._whole.width_px / picture.width_px
+        times = self._scan.width_px / picture.width_px
         options = FiducialOptions(pitch_is_right=True)
         hypotheses = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
         return self._tried(layout, bold, picture, hypotheses)
@@ -83,8 +81,8 @@ class LayoutSearch:
         return self._tried(layout, bold, tried.picture, tried.hypotheses, tried.before)
 
     def seen(self, tried: Tried) -> Frame | None:
-        """The frame as all its marks look in the scan itself."""
-        return seen(self._whole, tried.layout, tried.answer, self._whole.width_px / tried.picture.width_px)
+        """The frame as all its marks look."""
+        return seen(self._scan, tried.layout, tried.answer, self._scan.width_px / tried.picture.width_px)
 
     def _tried(
         self, layout: FiducialLayout, bold: FiducialLayout, picture: Scan, hypotheses: Hypotheses, before: int = 0
