@@ -11,6 +11,7 @@ from measure.fitting.matching import Match
 from measure.frames.frame import Frame
 from measure.frames.frame_measurement import look_at_frame
 from measure.marks.shapes import FiducialLayout
+from measure.match_options import MatchOptions
 from measure.probabilities import CAMERA_BY_CHANCE
 from measure.scans.scan import Scan
 from measure.search.candidates import Effort
@@ -19,8 +20,10 @@ from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis
 
 _COMPARED = 5  # best placements: the one that chance makes least is among them
-_QUICK = Effort(held_bytes=84 << 20, half_px=16)
+_QUICK = Effort(held_bytes=48 << 20, half_px=16)
+_LOOKS = 3  # at the best of these
 _PLACES = 2  # that are looked at, each in the poses that answer there
+_LOOK = FiducialOptions(match=MatchOptions(damage_rounds=1))  # how a mark looks takes less than where it lies
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +43,7 @@ def answer(
     search, ranked = FrameSearch(scan, layout, FiducialOptions(), effort=_QUICK), list[tuple[float, Placement]]()
     for group in hypotheses:
         tried += len(group)
-        found = search.anywhere(group)[:_COMPARED]
+        found = search.within(group)[:_COMPARED]
         ranked += [(tried * search.expected_alike(placement), placement) for placement in found]
         ranked.sort(key=lambda each: each[0])
         if ranked and ranked[0][0] <= CAMERA_BY_CHANCE:
@@ -53,12 +56,12 @@ def seen(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.
     the poses that answer there, None where they do nowhere. times: how many pixels a side the scan has for one of what
     answered, a thumbnail of it."""
     places = list[Placement]()
-    for placement in answered.placements:
+    for placement in answered.placements[:_LOOKS]:
         if not any(placement.same_place(other) for other in places):
             places.append(placement)
         if len(places) > _PLACES:
             break
-        frame = look_at_frame(scan, layout, _enlarged(placement, times), FiducialOptions())
+        frame = look_at_frame(scan, layout, _enlarged(placement, times), _LOOK)
         if frame.accepted:
             return frame
     return None

@@ -104,12 +104,17 @@ def respond(
 
 
 def respond_about(
-    scan: Scan, looks: Sequence[Look], places_px: Array, reach_px: float, signs: Collection[int] = (1, -1)
+    scan: Scan,
+    looks: Sequence[Look],
+    places_px: Array,
+    reach_px: float,
+    signs: Collection[int] = (1, -1),
+    most_px: int = FULL.half_px,
 ) -> tuple[Responses, tuple[int, ...]]:
     """The same, of each look only about its place (n, 2) in the scan, as far as reach_px and a little farther: of the
     file only these windows are read. A kind is a look at one place."""
     reduction = _reduction(scan, looks)
-    shapes, shape_of = _distinct(_templates(looks, reduction))
+    shapes, shape_of = _distinct(_templates(looks, reduction, most_px))
     details = [_reduced_detail_px(looks[0], reduction)] * len(shapes)
     sought = Sought(shapes, details, signs, WIDE, scan.full_scale_dn * FAINT)
     reach, half = int(np.ceil(reach_px / reduction)), sought.half_px

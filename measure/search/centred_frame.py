@@ -1,5 +1,6 @@
-"""A frame that lies about in the middle of a large scan: its marks are looked for where it puts them, and only the file
-about them is read. Where any of them is not plainly there, the whole scan is searched."""
+"""Where the marks are of a frame that lies in the middle of its scan, about so or as far as it has room: its marks are
+looked for there only. In a large scan only the file about them is read; where any of them is not plainly there, the
+whole scan is searched."""
 
 from collections.abc import Sequence
 
@@ -15,6 +16,7 @@ Array = NDArray[np.float64]
 _LARGE_PX = 1 << 24  # a smaller scan is read whole in no time
 _REACH = 0.025  # of the frame's side: laid by hand it is off by some millimetres and a degree
 _LARGEST_SHARE = 0.25  # of the scan: where windows hold more, the whole of it tells more
+_BEYOND_MM = 3.0  # the scan's edge: a frame may be cut off there by less than its rim
 _CORNERS = 4  # a mark toward each of them
 _FINE = 0.05  # of how near steps are alike
 _ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step aside could be one step off
@@ -23,6 +25,12 @@ _ALIKE = 0.5  # of the marks: a lattice of which more fall on others one step as
 def reach_mm(layout: FiducialLayout) -> float:
     """How far from its place in a centred frame a mark is looked for."""
     return _REACH * max(layout.frame_mm)
+
+
+def room_mm(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> float:
+    """How far from the middle of the scan that of a frame may lie which is whole in it."""
+    scan_mm = scan.width_px * pitch_mm[0], scan.height_px * pitch_mm[1]
+    return max((max(scan_mm) - min(layout.frame_mm)) / 2, 0.0) + _BEYOND_MM
 
 
 def is_worth_a_look(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> bool:

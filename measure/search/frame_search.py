@@ -13,7 +13,7 @@ from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.search.candidates import FULL, Effort, Look, Responses, respond, respond_about
-from measure.search.centred_frame import centred_places_px, reach_mm
+from measure.search.centred_frame import centred_places_px, reach_mm, room_mm
 from measure.search.constellation import NARROW, Bounds, Placement, PlacementSearch, same_picture, sign_of, signs_of
 from measure.search.correlation import WIDE, Map, Surroundings
 from measure.search.pitches import PitchHypothesis
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 _TWIN = 0.1  # of the tolerance: poses whose marks lie so near to one another's have the same placements
+_WINDOWS_SHARE = 0.6  # of the scan: where windows hold more, the whole of it takes no longer
 _WAYS = 3  # of being as good: by heights, by the misfit, or by that under a stretch
 _STRETCHES = np.linspace(-0.03, 0.03, 13)  # of pixels longer one way, in steps that move no mark by more than is narrow
 
@@ -102,12 +103,21 @@ class FrameSearch:
     def in_the_middle(self, hypothesis: PitchHypothesis) -> list[Placement]:
         """The placements of a frame that lies about in the middle of the scan, best first. Only the windows are read
         in which its marks lie then."""
-        linear = _flip(hypothesis.mm)
-        places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
-        reach_px = reach_mm(self.layout) / max(hypothesis.mm)
-        looks = self._looks(hypothesis.drawn_mm)
-        about = respond_about(self.scan, looks, np.concatenate(places), reach_px, self._signs)
-        return _best_first(self._placements([hypothesis], self._answers(*about)))
+        return _best_first(self._placements([hypothesis], self._about_middle(hypothesis.mm, reach_mm(self.layout))))
+
+    def within(self, hypotheses: Sequence[PitchHypothesis]) -> list[Placement]:
+        """The placements of a frame that the scan holds all of, best first: its marks are then looked for only where
+        it has room for them, if that is a small part of the scan."""
+        found: list[Placement] = []
+        for drawn_mm, alike in groupby(hypotheses, _drawn_mm):
+            own = list(alike)
+            room = room_mm(self.scan, self.layout, drawn_mm) + self._slack_mm(own)
+            window_px = float(np.prod(2 * room / np.asarray(drawn_mm)))
+            if len(self.layout.marks) * window_px > _WINDOWS_SHARE * self.scan.width_px * self.scan.height_px:
+                found += self.anywhere(own)
+            else:
+                found += self._placements(own, self._about_middle(drawn_mm, room))
+        return _best_first(found)
 
     def expected_alike(self, placement: Placement) -> float:
         """How many placements that answer as well chance would find in a scan like this without any frame, by this
@@ -191,10 +201,26 @@ class FrameSearch:
         span_px = (
             float(np.hypot(*np.ptp(self._camera_mm, axis=0))) / float(search.pitch.mean()) / search.responses.reduction
         )
-        places = self.scan.width_px * self.scan.height_px / search.responses.reduction**2
+        places = next(iter(search.layers.values())).map.size
         of_other = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
         polarities = 2 if len(self._signs) > 1 else 1
         return places / same_px * of_other / same_px * len(searched.unlike) * polarities
+
+    def _slack_mm(self, hypotheses: Sequence[PitchHypothesis]) -> float:
+        """How far a turn, and a pitch that is wrong or longer one way, move a mark from where the frame's middle puts
+        it."""
+        scale = max(each.tolerance + float(np.abs(np.divide(each.mm, each.drawn_mm) - 1).max()) for each in hypotheses)
+        farthest_mm = float(np.abs(self._camera_mm).max())
+        turn = float(np.deg2rad(self.options.rotation_deg))
+        return (scale + turn) * farthest_mm + self.options.search_mm(self.layout)
+
+    def _about_middle(self, drawn_mm: Pair, reach_mm: float) -> _Answers:
+        """What the windows answer that reach so far about the marks of a frame in the middle of the scan."""
+        linear, looks = _flip(drawn_mm), self._looks(drawn_mm)
+        places = [centred_places_px(self.scan, self.layout, linear @ up_from_camera(pose)) for pose in self.poses]
+        reach_px = reach_mm / max(drawn_mm)
+        about = respond_about(self.scan, looks, np.concatenate(places), reach_px, self._signs, self._most_px)
+        return self._answers(*about)
 
     @property
     def _signs(self) -> set[int]:

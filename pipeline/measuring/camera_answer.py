@@ -12,7 +12,7 @@ from rich.padding import Padding
 Json = dict[str, Any]
 
 _OUTSTANDING = 2.0  # times what chance finds
-_CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
+CLOSE = 0.85  # of the best score: a camera that comes so near is not told from it
 _SHRUNK = 0.03  # of its size: more than film and cameras of a model differ by
 
 
@@ -72,7 +72,7 @@ class Identification:
     def best(self) -> tuple[Trial, ...]:
         """The trial that stands out, and those that come too near to be told from it."""
         standing = [trial for trial in self.trials if trial.stands_out]
-        return tuple(trial for trial in standing if trial.score >= _CLOSE * standing[0].score)
+        return tuple(trial for trial in standing if trial.score >= CLOSE * standing[0].score)
 
     def sentence(self) -> str:
         if not self.best:

@@ -20,7 +20,7 @@ from measure.scans.thumbnail import thumbnail
 from measure.writing.networks import networks
 from measure.writing.reading import read_writing
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.camera_answer import Identification, Trial
+from pipeline.measuring.camera_answer import CLOSE, Identification, Trial
 from pipeline.measuring.camera_plate import contradictions, plate_of
 from pipeline.measuring.drawn_alike import drawn_alike
 from pipeline.measuring.layout_search import LayoutSearch, Tried, same_marks
@@ -49,10 +49,8 @@ def identify(
 
     Raises MeasurementError for a scan that cannot be read.
     """
-    with open_scan(path, max_pixels) as whole:
-        given = whole.pitch_um if pitch_um is None else (pitch_um, pitch_um)
-        picture, whole_px = thumbnail(whole, _PICTURE_PX), whole.width_px
-    times, search = whole_px / picture.width_px, LayoutSearch(picture)
+    picture, times, its_pitch_um = _picture(path, max_pixels)
+    given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
     layouts = {names: _as_seen(cameras[names[0]].layout()) for names in _alike(cameras)}
     trials = list[Trial]()
     with reporter.stage("trying") as count:
@@ -69,6 +67,14 @@ def identify(
     told = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in told.items() if against}
     return Identification(path, ranked, unreported, given, plate, contradicted, drawn_alike(layouts))
+
+
+def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[float, float] | None]:
+    """The scan as it is looked at, how many of its pixels one has a side, and the scan's pitch; of the scan itself
+    nothing is held."""
+    with open_scan(path, max_pixels) as whole:
+        picture = thumbnail(whole, _PICTURE_PX)
+        return picture, whole.width_px / picture.width_px, whole.pitch_um
 
 
 def _as_seen(layout: FiducialLayout) -> FiducialLayout:
@@ -114,16 +120,21 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
     as well a hundred times; and once one stands out, only of those that answer better than chance too, and may be more
     than a part of what was found."""
     trials: list[Trial] = []
-    ranked = sorted(tries, key=lambda names: tries[names].answer.expected)
+    ranked = sorted(tries, key=lambda names: _likeliest_first(tries[names]))
     for done, names in enumerate(ranked, len(ranked)):
-        each = tries[names]
-        limits = [_expected_at_most(trial, len(each.layout.marks)) for trial in trials if trial.stands_out]
+        each, standing = tries[names], [trial for trial in trials if trial.stands_out]
+        limits = [_expected_at_most(trial, len(each.layout.marks)) for trial in standing]
         if each.answer.expected > min([*limits, _HOPELESS]):
             trials.append(_not_looked_at(names, each))
         else:
             count(", ".join(names), done, 2 * len(ranked))
-            trials.append(_trial(search, names, each))
+            trials.append(_trial(search, names, each, CLOSE * max((trial.score for trial in standing), default=0.0)))
     return trials
+
+
+def _likeliest_first(each: Tried) -> tuple[float, int]:
+    """Of those that answer alike, as with the same corners, the one of fewest marks first."""
+    return float(f"{each.answer.expected:.2g}"), len(each.layout.marks)
 
 
 def _expected_at_most(seen: Trial, marks: int) -> float:
@@ -155,19 +166,21 @@ def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
     return [tuple(group) for group in groups]
 
 
-def _trial(search: LayoutSearch, names: Names, each: Tried) -> Trial:
+def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Trial:
+    """close: the score from which on it is named beside another: with less it need not be held against chance."""
     start, expected = time.perf_counter(), each.answer.expected
     frame = search.seen(each)
     fits = [fit for fit in frame.fits if fit] if frame else []
     residual = _residual(frame, each.layout) if frame else None
+    score = likeness(frame) if frame else 0.0
     return Trial(
         cameras=names,
         found=len(fits),
         drawn=len(each.layout.marks),
         likeness=float(np.mean([fit.likeness for fit in fits])) if fits else 0.0,
         snr=float(np.median([fit.snr for fit in fits])) if fits else 0.0,
-        score=likeness(frame) if frame else 0.0,
-        chance=_score_by_chance(search, each) if frame and expected > _CERTAIN else None,
+        score=score,
+        chance=_score_by_chance(search, each) if score > close and expected > _CERTAIN else None,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
         reason="" if frame else "no three of its marks are seen where its constellation answers best",

@@ -10,12 +10,16 @@ import tifffile
 from brute_marks import Array, written_scan
 from drawn_frames import CORNERS, NUMBERED, RING_CROSS, assert_right, frame_picture, layout_of, pixel_from_camera
 
+from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.marks.shapes import FiducialLayout, MarkShape, ring_cross
 from measure.results import FrameMeasurement
+from measure.scans.picture_scan import WholePicture
+from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan, open_scan
-from measure.search.centred_frame import is_lattice
+from measure.search.centred_frame import is_lattice, room_mm
 from measure.search.frame_search import FrameSearch
+from measure.search.pitches import PitchHypothesis
 from measure.status import Status
 
 PITCH_UM = (50.0, 50.0)
@@ -104,3 +108,28 @@ def test_a_lattice_is_told_from_a_frame() -> None:
     assert is_lattice(layout_of([cross] * 25, places))
     assert not is_lattice(layout_of([cross] * 4))
     assert not is_lattice(layout_of([cross] * 8, CORNERS + sides))
+
+
+@pytest.mark.parametrize("center", [(225.0, 180.0), (190.0, 206.0)])
+def test_a_frame_that_the_scan_holds_is_found_by_windows_as_by_the_whole(
+    center: tuple[float, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matrix = pixel_from_camera("90", center=center)
+    pitch_mm = (PITCH_UM[0] / 1000, PITCH_UM[1] / 1000)
+    with written_scan(frame_picture(NUMBERED, matrix), tmp_path) as scan:
+        hypothesis = [PitchHypothesis(pitch_mm, 0.02, pitch_mm)]
+        whole = FrameSearch(scan, NUMBERED, FiducialOptions()).anywhere(hypothesis)[0]
+        monkeypatch.setattr("measure.search.frame_search._WINDOWS_SHARE", np.inf)
+        monkeypatch.setattr(FrameSearch, "anywhere", None)
+        search = FrameSearch(scan, NUMBERED, FiducialOptions())
+        found = search.within(hypothesis)[0]
+        assert search.expected_alike(found) < 0.01
+    assert found.pose == whole.pose
+    assert found.same_place(whole)
+    assert np.hypot(*(found.pixel_from_camera - matrix)[:, 2]) < 3.0
+
+
+def test_a_frame_has_as_much_room_as_the_scan_is_larger() -> None:
+    scan = Scan(Path("a.tif"), WholePicture(np.zeros((100, 120, 1), np.uint8)), NO_TAGS)
+    layout = replace(NUMBERED, frame_mm=(90.0, 110.0))
+    assert room_mm(scan, layout, (1.0, 1.0)) == pytest.approx(15.0 + 3.0)
