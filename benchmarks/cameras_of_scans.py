@@ -38,7 +38,9 @@ def main() -> None:
     print("| scan | CPU, s | peak, MB | told |\n|---|---|---|---|")
     for scan in scans:
         sentence, seconds, megabytes = tried(scan, options.pitch)
-        print(f"| {scan.stem} | {seconds:.1f} | {megabytes:.0f} | {sentence.removeprefix(scan.name + ': ')} |", flush=True)
+        print(
+            f"| {scan.stem} | {seconds:.1f} | {megabytes:.0f} | {sentence.removeprefix(scan.name + ': ')} |", flush=True
+        )
 
 
 if __name__ == "__main__":

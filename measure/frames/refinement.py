@@ -110,22 +110,42 @@ def _fitted(
 ) -> tuple[Match | None, float]:
     """The mark matched where it looks most like itself, and the expected number of places that noise makes look so;
     None where nothing looks like it."""
-    mark, weights = expected.mark, expected.weights
+    mark = expected.mark
     if isinstance(mark, FrameCorner):
         return corner_of_edges(scan, mark, expected), 1.0
     look = seen(scan, expected)
     if look is None:
         return None, 1.0
     center_px, chance = look
-    start = expected.moved(center_px).pixel_from_mark
+    fit = _matched(scan, expected, center_px, options, frame_sigma)
+    # Along its edges a slim wedge looks like itself: a fit that runs away along them begins anew from where it came to.
+    if leans_on_frame(mark) and _ran_away(fit, center_px, options) and _is_near(fit, expected):
+        fit = _matched(scan, expected, fit.center_px, options, frame_sigma)
+    return fit, chance
+
+
+def _ran_away(fit: Match, start_px: Array, options: MatchOptions) -> bool:
+    return not fit.converged and bool(np.hypot(*(fit.center_px - start_px)) > options.max_shift_px)
+
+
+def _is_near(fit: Match, expected: MarkPrediction) -> bool:
+    """Whether it is still where the mark may be."""
+    return bool(np.hypot(*(fit.center_px - expected.center_px)) <= expected.search_px)
+
+
+def _matched(
+    scan: Scan, expected: MarkPrediction, center_px: Array, options: MatchOptions, frame_sigma: float | None
+) -> Match:
+    """The mark matched from a place."""
+    mark, start = expected.mark, expected.moved(center_px).pixel_from_mark
     seen_in = (
         scan.seen_through(LINEAR) if isinstance(mark, MarkTemplate) else scan
     )  # chips are cut as the file has them
-    window = read_window(seen_in, window_about(mark, start, options.margin_px + BESIDE_PX), weights)
+    window = read_window(seen_in, window_about(mark, start, options.margin_px + BESIDE_PX), expected.weights)
     if expected.surroundings == CLOSE and isinstance(mark, MarkShape):
         inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
         window = window.without(beyond_edge(window.grey, mark, inner, expected.polarity))
-    return match(window, mark, start, options_for(mark, options, frame_sigma)), chance
+    return match(window, mark, start, options_for(mark, options, frame_sigma))
 
 
 def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:

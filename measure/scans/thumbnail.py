@@ -19,7 +19,8 @@ def thumbnail(scan: Scan, largest_px: int) -> Scan:
     shrunk = max(max(scan.width_px, scan.height_px) / largest_px, 1.0)
     grey, unit = _reduced(scan, int(shrunk)), _FULL_SCALE_DN / scan.full_scale_dn
     size = round(scan.width_px / shrunk), round(scan.height_px / shrunk)
-    samples = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA)) if size != grey.shape[::-1] else grey
+    same = size == grey.shape[::-1]
+    samples = grey if same else np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint16)
     pitch = Pitch(None if scan.pitch_um is None else (shrunk * scan.pitch_um[0], shrunk * scan.pitch_um[1]))
     return Scan(scan.path, WholePicture(samples[:, :, None], scan.rounding_step_dn * unit / shrunk), pitch)
 

@@ -16,7 +16,7 @@ from measure.search.pitches import PitchHypothesis, pitch_hypotheses
 
 Hypotheses = Sequence[Sequence[PitchHypothesis]]
 
-_LARGEST_PX = 1600  # of what is searched: a seventh of a millimetre of aerial film, about as wide as the finest lines
+_LARGEST_PX = 1600  # of what is searched: of aerial film a seventh of a millimetre, about as wide as fine lines
 _COARSE_PX = 1024  # the same while the pitch is sought: fine lines are half a pixel wide then
 _SOLID_PX = 800  # of solid marks, which are some millimetres large
 _COARSE_SOLID_PX = 512  # of these while the pitch is sought
@@ -29,8 +29,8 @@ _STRETCH = (1.08, 0.93)  # of the layout that only chance can find: no film is s
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A layout of the marks that are looked at, its boldest marks, and how a picture of the scan answers to these under hypotheses about its pitch;
-    before: how many others had been tried."""
+    """A layout of the marks that are looked at, its boldest marks, and how a picture of the scan answers to these under
+    hypotheses about its pitch; before: how many others had been tried."""
 
     layout: FiducialLayout
     bold: FiducialLayout
