@@ -1,6 +1,6 @@
 """The simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9)."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +28,7 @@ __all__ = ["Datum", "Method", "Options", "adjust", "adjust_problem", "with_datum
 
 Indices = NDArray[np.intp]
 
+GUESSED = 0.1  # standard deviation of a principal distance, over it, from which on it is a guess
 TRIAL_STEPS = 6  # of an adjustment that only has to show whether the observations agree: v'Pv falls with every one
 
 
@@ -152,21 +153,37 @@ def _slips(network: Network, approximations: Approximations, options: Options) -
 
 def _begun_anew(network: Network, approximations: Approximations, options: Options, stopped: Adjustment) -> Adjustment:
     """The adjustment from the network's own approximations; what is there already where these are no better."""
-    try:
-        own = approximate(with_held(network, options.datum_coordinates))
-    except AdjustmentError:
-        return stopped
-    if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
-        return stopped
-    result = adjust_problem(_numbered(network, own, options), options)
-    if not result.converged:
-        return stopped
-    warning = (
-        f"From the given approximations the iteration did not come to rest ({stopped.termination} after "
-        f"{stopped.iterations} steps); it was begun anew from approximations found from the network itself. Check "
-        "those given."
-    )
-    return replace(result, remarks=(warning, *result.remarks))
+    for known in (*_without_guesses(network), network):
+        try:
+            own = approximate(with_held(known, options.datum_coordinates))
+        except AdjustmentError:
+            continue
+        if all(np.array_equal(own.exterior[name], approximations.exterior.get(name, [])) for name in own.exterior):
+            continue
+        result = adjust_problem(_numbered(network, own, options), options)
+        if result.converged:
+            warning = (
+                f"From the given approximations the iteration did not come to rest ({stopped.termination} after "
+                f"{stopped.iterations} steps); it was begun anew from approximations found from the network itself. "
+                "Check those given."
+            )
+            return replace(result, remarks=(warning, *result.remarks))
+    return stopped
+
+
+def _without_guesses(network: Network) -> Iterator[Network]:
+    """The network without principal distances of which so little is known that images of known points tell more."""
+    guessed = {
+        camera.name
+        for camera in network.cameras
+        if (c := camera.principal_distance_mm) is not None and c.sigma > GUESSED * abs(c.value)
+    }
+    if guessed:
+        cameras = (
+            replace(camera, principal_distance_mm=None) if camera.name in guessed else camera
+            for camera in network.cameras
+        )
+        yield replace(network, cameras=tuple(cameras))
 
 
 def adjust_problem(

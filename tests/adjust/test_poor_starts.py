@@ -71,3 +71,18 @@ def test_the_history_tells_what_was_done() -> None:
     assert sums == sorted(sums, reverse=True) or max(np.diff(sums)) < 1e-6 * sums[-1]
     assert any(step.damping > 0.0 and step.attempts > 1 for step in result.history)
     assert result.history[-1].damping == 0.0
+
+
+@pytest.mark.parametrize("sigma", [2.0, np.inf])
+def test_a_principal_distance_that_is_a_guess_is_found_from_the_images(sigma: float) -> None:
+    """Twice the true one, and known no better than that: it is sought where the iteration does not come to rest."""
+    rng = np.random.default_rng(1)
+    network, _ = simulated(rng, points=field_points(rng, 40))
+    camera = network.cameras[0]
+    assert camera.principal_distance_mm is not None
+    guess = 2.0 * camera.principal_distance_mm.value
+    for known, converges in ((sigma * guess, True), (0.05 * guess, False)):
+        guessed = replace(camera, principal_distance_mm=Prior(guess, known))
+        result = adjust(replace(network, cameras=(guessed,)), options=Options(iteration_limit=7))
+        assert result.converged == converges
+        assert any("begun anew" in remark for remark in result.remarks) == converges
