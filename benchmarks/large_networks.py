@@ -43,12 +43,12 @@ class Scene:
     seen: list[Seen]
 
 
-def known(views: int) -> Scene:
+def known(views: int, relief: float = 0.05) -> Scene:
     """A board of 100 points with some relief, all of them in every view."""
     rng = np.random.default_rng(views)
     grid = (np.arange(10) - 4.5) * 0.1
     plan = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    points = np.column_stack([plan, 0.05 * rng.normal(size=len(plan))])
+    points = np.column_stack([plan, relief * rng.normal(size=len(plan))])
     angles = np.column_stack([rng.uniform(-0.5, 0.5, (views, 2)), rng.uniform(-3.0, 3.0, views)])
     offset = np.column_stack([0.1 * rng.normal(size=(views, 2)), np.full(views, -1.2)])
     stations = -np.einsum("nij,ni->nj", rotation_from_angles(angles), offset)

@@ -1,0 +1,293 @@
+"""reseau, OpenCV, mrcal and COLMAP in turn: CPU seconds of calibrations, and what each solves of gross errors.
+
+python benchmarks/peers.py [boards] [bundles] [gross] [commands] [VIEWS ...]     tables, all where none is named
+python benchmarks/peers.py one PROGRAM VIEWS flat|relief given|free PERCENT     one measurement
+
+Every measurement is a process of its own with one thread; in each of five rounds the programs follow one another, and
+medians and ranges are told. Nobody gets orientations. c is given half a percent off, or not at all: then mrcal, which
+must have one, gets twice the true one, and so does OpenCV for points in relief. mrcal, which knows flat boards alone,
+is that of the system's interpreter; a program that is not installed is left out. Time is that of start values,
+adjustment and, of reseau and OpenCV, standard deviations; COLMAP resects image by image and adjusts with Ceres.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, known
+from numpy.typing import NDArray
+from scale import ONE_THREAD, measured
+
+from adjust.problem.network import Prior
+from adjust.solution.adjustment import Options, adjust
+
+Array = NDArray[np.float64]
+Figures = dict[str, Any]
+
+VIEWS, ROUNDS = (20, 50, 200, 1000), 5
+BUNDLES = ((60, 5000), (200, 20000))
+GROSS_PERCENT, GROSS_MM = (1, 5, 20), 20.0  # of the points, and how far at most they are moved along either axis
+OFF = 1.005  # a principal distance that is given, in parts of the true one
+GUESS = 2.0  # one that is not
+PIXELS_PER_MM = 10.0
+PATIENCE_S = 60.0  # a program that takes longer is measured once
+SYSTEM_PYTHON = "/usr/bin/python3"
+SOLVED_SIGMAS = 5.0  # of c, as reseau knows it without gross errors
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["one"]:
+        program, views, shape, c, percent = sys.argv[2:]
+        print(json.dumps(one(program, int(views), shape == "relief", c == "given", int(percent))))
+        return
+    views = [int(each) for each in sys.argv[1:] if each.isdigit()]
+    for table in [each for each in sys.argv[1:] if each in TABLES] or TABLES:
+        TABLES[table](views or VIEWS)
+
+
+def one(program: str, views: int, relief: bool, given: bool, percent: int) -> Figures:
+    """Seconds, and how far c is off in the standard deviations of an adjustment without gross errors."""
+    clean = known(views, 0.05 if relief else 0.0)
+    begin = time.process_time()
+    c_mm, cpu_s = PROGRAMS[program](spoilt(clean, percent), relief, given, percent > 0)
+    seconds = time.process_time() - begin if cpu_s is None else cpu_s
+    sigma_mm = adjust(clean.network, clean.start).sigma("IO.K.c")
+    return {"seconds": seconds, "sigmas": (c_mm - FOCAL_MM) / sigma_mm}
+
+
+def spoilt(scene: Scene, percent: int) -> Scene:
+    """The same scene, some of whose observations are gross errors."""
+    rng = np.random.default_rng(percent)
+    xy_mm = scene.network.observations.xy_mm.copy()
+    rows = rng.permutation(len(xy_mm))[: len(xy_mm) * percent // 100]
+    xy_mm[rows] += rng.uniform(-GROSS_MM, GROSS_MM, (len(rows), 2))
+    network = replace(scene.network, observations=replace(scene.network.observations, xy_mm=xy_mm))
+    ends = np.cumsum([len(inside) for inside, _ in scene.seen])[:-1]
+    seen = [(inside, xy) for (inside, _), xy in zip(scene.seen, np.split(xy_mm, ends), strict=True)]
+    return replace(scene, network=network, seen=seen)
+
+
+Found = tuple[float, float | None]  # c in mm, and CPU seconds where another process took them
+
+
+def reseau(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
+    c = Prior(FOCAL_MM * OFF, np.inf) if given else None
+    cameras = tuple(replace(each, principal_distance_mm=c, x0_mm=None, y0_mm=None) for each in scene.network.cameras)
+    options = Options(robust="igg3") if gross else None
+    result = adjust(replace(scene.network, cameras=cameras), None, options)
+    result.cofactor.variances  # noqa: B018 what OpenCV computes, too
+    return result.value("IO.K.c"), None
+
+
+def _pixels(scene: Scene) -> list[Array]:
+    """Per image the places (m, 2) of its marks, y down."""
+    return [(places * (1.0, -1.0) + FRAME_MM / 2) * PIXELS_PER_MM for _, places in scene.seen]
+
+
+def opencv(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
+    cv2.setNumThreads(1)
+    points = [scene.points[inside].astype(np.float32) for inside, _ in scene.seen]
+    places = [each.astype(np.float32) for each in _pixels(scene)]
+    size = int(FRAME_MM * PIXELS_PER_MM)
+    c = FOCAL_MM * PIXELS_PER_MM * (OFF if given else GUESS)
+    start = np.array([[c, 0.0, size / 2], [0.0, c, size / 2], [0.0, 0.0, 1.0]])
+    flags = cv2.CALIB_FIX_ASPECT_RATIO | (cv2.CALIB_USE_INTRINSIC_GUESS if given or relief else 0)
+    found = cv2.calibrateCameraExtended(points, places, (size, size), start, np.zeros(5), flags=flags)
+    return float(found[1][0, 0]) / PIXELS_PER_MM, None
+
+
+def colmap(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
+    import pycolmap
+
+    size = int(FRAME_MM * PIXELS_PER_MM)
+    c = FOCAL_MM * PIXELS_PER_MM * (OFF if given else GUESS)
+    camera = pycolmap.Camera(
+        camera_id=1, model="OPENCV", width=size, height=size, params=[c, c, size / 2, size / 2, 0.0, 0.0, 0.0, 0.0]
+    )
+    block, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
+    block.add_camera_with_trivial_rig(camera)
+    resection = pycolmap.AbsolutePoseEstimationOptions(estimate_focal_length=not given)
+    resection.ransac.random_seed = 1
+    tracks: dict[int, Any] = {}
+    for number, ((inside, _), places) in enumerate(zip(scene.seen, _pixels(scene), strict=True), 1):
+        own = pycolmap.Camera(model="OPENCV", width=size, height=size, params=camera.params)
+        refinement = pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=not given)
+        pose = pycolmap.estimate_and_refine_absolute_pose(places, scene.points[inside], own, resection, refinement)
+        if pose is None:
+            continue
+        marks = pycolmap.Point2DList([pycolmap.Point2D(place) for place in places])
+        shown = pycolmap.Image(image_id=number, camera_id=1, name=str(number), points2D=marks)
+        block.add_image_with_trivial_frame(shown, pose["cam_from_world"])
+        config.add_image(number)
+        for place, i in enumerate(inside):
+            if pose["inlier_mask"][place]:
+                tracks.setdefault(int(i), pycolmap.Track()).add_element(number, place)
+        if not given:
+            block.camera(1).params = [own.params[0]] * 2 + list(camera.params[2:])
+    for i, track in tracks.items():
+        config.add_constant_point(block.add_point3D(scene.points[i], track))
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+    options.ceres.solver_options.num_threads, options.ceres.solver_options.max_num_iterations = 1, 100
+    if gross:
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = SIGMA_MM * PIXELS_PER_MM
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, block).solve()
+    return float(np.mean(block.camera(1).params[:2])) / PIXELS_PER_MM, None
+
+
+MRCAL = """
+import json, sys, time, numpy as np, cv2, mrcal
+cv2.setNumThreads(1)
+given = np.load(sys.argv[1])
+observations, size, c, gross = given["observations"], int(given["size"]), float(given["c"]), bool(given["gross"])
+begin = time.process_time()
+indices = np.column_stack([np.arange(len(observations)), np.zeros(len(observations)), -np.ones(len(observations))])
+indices = indices.astype(np.int32)
+sizes = np.array([[size, size]], dtype=np.int32)
+core, extrinsics, frames = mrcal.seed_stereographic(
+    imagersizes=sizes, focal_estimate=c, indices_frame_camera=indices[:, :2].copy(), observations=observations,
+    object_spacing=0.1)
+problem = dict(
+    extrinsics_rt_fromref=np.zeros((0, 6)), frames_rt_toref=frames, points=None, observations_board=observations,
+    indices_frame_camintrinsics_camextrinsics=indices, observations_point=None,
+    indices_point_camintrinsics_camextrinsics=None, imagersizes=sizes, calibration_object_spacing=0.1, verbose=False,
+    do_apply_regularization=False, do_optimize_calobject_warp=False, do_apply_outlier_rejection=False,
+    do_optimize_extrinsics=False, do_optimize_frames=True)
+intrinsics = core
+mrcal.optimize(intrinsics=intrinsics, lensmodel="LENSMODEL_STEREOGRAPHIC", do_optimize_intrinsics_core=False,
+    do_optimize_intrinsics_distortions=False, **problem)
+intrinsics = np.hstack([core, np.zeros((1, 5))])
+problem["do_apply_outlier_rejection"] = gross
+mrcal.optimize(intrinsics=intrinsics, lensmodel="LENSMODEL_OPENCV5", do_optimize_intrinsics_core=True,
+    do_optimize_intrinsics_distortions=True, **problem)
+print(json.dumps([float(intrinsics[0, :2].mean()), time.process_time() - begin]))
+"""
+
+
+def mrcal(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
+    """In a process of the system's interpreter."""
+    observations = np.full((len(scene.seen), 100, 3), -1.0)
+    for of_view, (inside, _), places in zip(observations, scene.seen, _pixels(scene), strict=True):
+        of_view[inside] = np.column_stack([places, np.ones(len(places))])
+    file = Path(f"/tmp/peers-{os.getpid()}.npz")
+    size, c = FRAME_MM * PIXELS_PER_MM, FOCAL_MM * PIXELS_PER_MM * (OFF if given else GUESS)
+    np.savez(file, observations=observations.reshape(-1, 10, 10, 3), size=size, c=c, gross=gross)
+    try:
+        done = subprocess.run([SYSTEM_PYTHON, "-c", MRCAL, file], capture_output=True, text=True, check=True)
+    finally:
+        file.unlink()
+    c_px, seconds = json.loads(done.stdout.splitlines()[-1])
+    return c_px / PIXELS_PER_MM, seconds
+
+
+PROGRAMS: dict[str, Callable[[Scene, bool, bool, bool], Found]] = {
+    "reseau": reseau, "opencv": opencv, "mrcal": mrcal, "colmap": colmap,
+}  # fmt: skip
+
+
+def _once(program: str, views: int, shape: str, c: str, percent: int) -> Figures:
+    command = [sys.executable, __file__, "one", program, str(views), shape, c, str(percent)]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=2 * PATIENCE_S, check=False, env=os.environ | ONE_THREAD
+        )
+    except subprocess.TimeoutExpired:
+        return {}
+    return {} if done.returncode else dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def _rounds(programs: Sequence[str], measure: Callable[[str], Figures]) -> dict[str, list[Figures]]:
+    """Program after program, five times; one that fails, or takes too long, once."""
+    found: dict[str, list[Figures]] = {program: [] for program in programs}
+    for _ in range(ROUNDS):
+        for program, figures in found.items():
+            if all(each and each["seconds"] < PATIENCE_S for each in figures):
+                figures.append(measure(program))
+    return found
+
+
+def _told(figures: Sequence[Figures]) -> str:
+    if not all(figures):
+        return "fails"
+    seconds = [each["seconds"] for each in figures]
+    return f"{statistics.median(seconds):.3f} ({min(seconds):.3f} to {max(seconds):.3f})"
+
+
+def boards(views_of_tables: Sequence[int]) -> None:
+    """100 points a view."""
+    print(f"\n{'views':>5} {'points':7} {'c':6}" + "".join(f"{program:>26}" for program in PROGRAMS))
+    for views in views_of_tables:
+        for shape in ("flat", "relief"):
+            for c in ("given", "free"):
+                programs = [each for each in PROGRAMS if shape == "flat" or each != "mrcal"]
+                found = _rounds(programs, lambda program: _once(program, views, shape, c, 0))  # noqa: B023
+                cells = [f"{_cell(found.get(program, [])):>26}" for program in PROGRAMS]
+                print(f"{views:5} {shape:7} {c:6}" + "".join(cells), flush=True)
+
+
+def _cell(figures: Sequence[Figures]) -> str:
+    if not figures:
+        return "-"
+    off = any(each and abs(each["sigmas"]) > SOLVED_SIGMAS for each in figures)
+    return _told(figures) + (" wrong" if off else "")
+
+
+def bundles(_: Sequence[int]) -> None:
+    """With the covariance of camera, images and points."""
+    for images, points in BUNDLES:
+        found = _rounds(("reseau", "ceres"), lambda program: _bundle(program, images, points))  # noqa: B023
+        ours, theirs = (statistics.median(each["seconds"] for each in figures) for figures in found.values())
+        told = ", ".join(f"{program} {_told(figures)}" for program, figures in found.items())
+        print(f"{images} images, {points} points: {told}; ratio {ours / theirs:.2f}", flush=True)
+
+
+def _bundle(program: str, images: int, points: int) -> Figures:
+    found = measured("unknown", program, images, points)
+    return found | {"seconds": found["seconds"] + found.get("covariance_seconds", 0.0)} if "seconds" in found else {}
+
+
+def gross(views_of_tables: Sequence[int]) -> None:
+    """How far c is off, in standard deviations, and CPU seconds; of the smaller numbers of views."""
+    print(f"\n{'views':>5} {'points':7} {'c':6} {'%':>3}" + "".join(f"{program:>20}" for program in PROGRAMS))
+    for views in [each for each in views_of_tables if each <= 50]:
+        for shape in ("flat", "relief"):
+            for c in ("given", "free"):
+                for percent in GROSS_PERCENT:
+                    found = [
+                        {} if shape == "relief" and program == "mrcal" else _once(program, views, shape, c, percent)
+                        for program in PROGRAMS
+                    ]
+                    told = [f"{each['sigmas']:.1f} in {each['seconds']:.2f} s" if each else "-" for each in found]
+                    print(
+                        f"{views:5} {shape:7} {c:6} {percent:3}" + "".join(f"{each:>20}" for each in told), flush=True
+                    )
+
+
+def commands(_: Sequence[int]) -> None:
+    """Small commands: from their start to their end."""
+    command = str(Path(sys.executable).with_name("reseau"))
+    for arguments in (["--help"], ["check", "--help"]):
+        seconds = []
+        for _ in range(ROUNDS):
+            before = os.times()
+            subprocess.run([command, *arguments], capture_output=True, check=True, env=os.environ | ONE_THREAD)
+            after = os.times()
+            seconds.append(after.children_user + after.children_system - before.children_user - before.children_system)
+        print(
+            f"reseau {' '.join(arguments)}: {statistics.median(seconds):.2f} ({min(seconds):.2f} to {max(seconds):.2f})"
+        )
+
+
+TABLES = {"boards": boards, "bundles": bundles, "gross": gross, "commands": commands}
+
+if __name__ == "__main__":
+    main()
