@@ -49,9 +49,9 @@ def main() -> None:
         program, views, shape, c, percent = sys.argv[2:]
         print(json.dumps(one(program, int(views), shape == "relief", c == "given", int(percent))))
         return
-    views = [int(each) for each in sys.argv[1:] if each.isdigit()]
+    of_tables = [int(each) for each in sys.argv[1:] if each.isdigit()]
     for table in [each for each in sys.argv[1:] if each in TABLES] or TABLES:
-        TABLES[table](views or VIEWS)
+        TABLES[table](of_tables or VIEWS)
 
 
 def one(program: str, views: int, relief: bool, given: bool, percent: int) -> Figures:
@@ -277,14 +277,11 @@ def commands(_: Sequence[int]) -> None:
     command = str(Path(sys.executable).with_name("reseau"))
     for arguments in (["--help"], ["check", "--help"]):
         seconds = []
-        for _ in range(ROUNDS):
-            before = os.times()
+        for _round in range(ROUNDS):
+            before = sum(os.times()[2:4])  # of children
             subprocess.run([command, *arguments], capture_output=True, check=True, env=os.environ | ONE_THREAD)
-            after = os.times()
-            seconds.append(after.children_user + after.children_system - before.children_user - before.children_system)
-        print(
-            f"reseau {' '.join(arguments)}: {statistics.median(seconds):.2f} ({min(seconds):.2f} to {max(seconds):.2f})"
-        )
+            seconds.append({"seconds": sum(os.times()[2:4]) - before})
+        print(f"reseau {' '.join(arguments)}: {_told(seconds)}")
 
 
 TABLES = {"boards": boards, "bundles": bundles, "gross": gross, "commands": commands}
