@@ -76,6 +76,8 @@ def _check_camera(adjustment: Adjustment, name: str) -> CameraCheck:
 
 def _hindrance(camera: Camera) -> str:
     """Why OpenCV has no model for this camera; empty where it has."""
+    if camera.distortion.family == "opencv_fisheye":
+        return "OpenCV's own calibration of a fisheye gives no standard deviations: it is not compared."
     if camera.distortion.family not in COUNTERPARTS:
         return f"OpenCV has no counterpart of the distortion family {camera.distortion.family}."
     free = free_parameters(camera)
