@@ -1,10 +1,14 @@
 """How often `adjust.choices.comparison` says drift: of calibrations that are alike, and of ones that differ by 2, 3, 5
 sigmas.
 
-    python benchmarks/compare_power.py [pairs]
+    python benchmarks/compare_power.py [pairs] [--adjustment]
+
+--adjustment: how often an adjustment says so of an earlier calibration that is an observation of it, by `pairs` of
+simulated networks each.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,5 +64,17 @@ def main(pairs: int = 300) -> None:
         print(f"{sigmas:g} joint sigmas | {share(rng, c, pairs):.2f} | {share(rng, k5, pairs):.2f}")
 
 
+def in_adjustments(pairs: int = 200) -> None:
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "adjust"))
+    from test_earlier_calibrations import contradicted
+
+    for sigmas in (0.0, 2.0, 3.0, 5.0):
+        print(f"c changed by {sigmas:g} joint sigmas: {contradicted(sigmas, pairs, LEVEL):.3f}", flush=True)
+
+
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    given = [int(word) for word in sys.argv[1:] if word.isdigit()]
+    if "--adjustment" in sys.argv:
+        in_adjustments(*given)
+    else:
+        main(*given)

@@ -182,6 +182,30 @@ class Suspect:
     removed: bool
 
 
+@dataclass(frozen=True, eq=False)
+class Contradiction:
+    """What the images say against observations that are correlated, as an earlier calibration's quantities are.
+
+    names (m,); difference (m,): where the images put each less where it was observed, with the a-posteriori sigma (m,)
+    of that; nan and inf where the images do not tell it. statistic: of all together, F with freedom and the other
+    observations' redundancy; probability: of as much where they do not contradict each other.
+    """
+
+    group: str
+    names: tuple[str, ...]
+    difference: Array
+    sigma: Array
+    statistic: float
+    freedom: int
+    probability: float
+
+    @property
+    def direction(self) -> tuple[int, ...]:
+        """The quantities by number, those first in which both differ most in standard deviations of their own."""
+        size = np.where(np.isfinite(self.difference), np.abs(self.difference) / self.sigma, 0.0)
+        return tuple(np.argsort(-size, kind="stable").tolist())
+
+
 class Assessment(Protocol):
     """What an adjustment tells of its observations, each part computed where it is asked for (see `Adjustment`)."""
 
@@ -193,6 +217,9 @@ class Assessment(Protocol):
 
     @property
     def further(self) -> tuple[FurtherResidual, ...]: ...
+
+    @property
+    def contradictions(self) -> tuple[Contradiction, ...]: ...
 
     @property
     def variance_sigmas(self) -> Mapping[str, float]: ...
@@ -255,6 +282,11 @@ class Adjustment:
     def further(self) -> tuple[FurtherResidual, ...]:
         """The residuals of distances and the like."""
         return self.assessment.further
+
+    @property
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """What the images say against earlier calibrations as wholes."""
+        return self.assessment.contradictions
 
     @property
     def variance_sigmas(self) -> Mapping[str, float]:

@@ -37,7 +37,7 @@ def further_residuals(
     for each, block in zip(problem.further, rows, strict=True):
         v = each.computed(state.values) - each.observed
         root = np.linalg.cholesky(each.covariance)
-        free = np.zeros_like(root) if factor is None else _surplus(block, factor)
+        free = np.zeros_like(root) if factor is None else surplus(block, factor)
         cofactor_v = root @ free @ root.T
         weighted = np.linalg.inv(root).T @ free @ np.linalg.inv(root)
         redundancy = np.einsum("ij,ji->i", cofactor_v, np.linalg.inv(each.covariance))
@@ -49,7 +49,7 @@ def further_residuals(
             yield FurtherResidual(each.group, row[0], *map(float, row[1:]))
 
 
-def _surplus(block: Blocks, factor: Factor) -> Array:
+def surplus(block: Blocks, factor: Factor) -> Array:
     """I - H (m, m) of a block without own unknowns."""
     roots = (block.matrix / factor.scale[block.shared][:, None, :] @ factor.triangle.root_of(block.shared))[0]
     return np.asarray(np.eye(len(roots)) - roots @ roots.T)

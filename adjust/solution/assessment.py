@@ -11,8 +11,9 @@ from adjust.least_squares.iteration import factorise
 from adjust.problem.functions import computed_observations
 from adjust.problem.probabilities import Probabilities
 from adjust.problem.problem import Problem
-from adjust.problem.result import Cofactor, FurtherResidual, Group, Reliability, Residuals, Suspect
+from adjust.problem.result import Cofactor, Contradiction, FurtherResidual, Group, Reliability, Residuals, Suspect
 from adjust.problem.tested import TestedUnits
+from adjust.quality.contradiction import contradictions_of_groups
 from adjust.quality.reliability import Misfits, reliability
 from adjust.quality.residuals import further_residuals, groups, residuals
 from adjust.quality.snooping import contradictions, search, suspects
@@ -51,6 +52,15 @@ class RunAssessment:
         run, delta = self.run, self.probabilities.noncentrality(1)
         of_state = run.problem, run.end.state, run.end.rows.further
         return tuple(further_residuals(*of_state, run.solution.factor, delta))
+
+    @cached_property
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        run = self.run
+        if not run.has_solution or not run.problem.further:
+            return ()
+        of_state = run.problem, run.end.state, run.end.rows.further
+        found = contradictions_of_groups(*of_state, run.factor, run.end.vpv, self.redundancy)
+        return tuple(each for each in found if each.group == "calibration")
 
     @cached_property
     def groups(self) -> Mapping[str, Group]:

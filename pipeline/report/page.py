@@ -23,7 +23,7 @@ from pipeline.report.parameters import spoken_name
 from pipeline.report.scanner_views import scanner_views
 from pipeline.report.svg import round_step
 from pipeline.report.totals import totals_view
-from pipeline.report.verdict import critical_w, judge, sigma0_bounds
+from pipeline.report.verdict import contradiction, critical_w, judge, sigma0_bounds
 from pipeline.text.atomic import write_atomically
 
 LIST_LIMIT = 200  # rows of a long table
@@ -81,6 +81,7 @@ def _context(data: ReportData) -> dict[str, Any]:
         "verdict": judge(data),
         "check": data.check,
         "totals": totals_view(data) if data.totals else None,
+        "contradiction": lambda test: contradiction(test, adjustment["cameras"] if adjustment else {}),
         "spoken": lambda name: spoken_name(name, adjustment["cameras"] if adjustment else ()),
         "measured": bool(data.measurement),
         "cameras": cameras,

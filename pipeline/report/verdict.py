@@ -13,11 +13,14 @@ from pipeline.report.fractions import places_px
 from pipeline.report.frame_problems import assumed_poses, frame_problems, pixel_locking, said_by
 from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, value_and_sigma
+from pipeline.report.parameters import spoken_name
 from pipeline.text.wording import counted, listed
 
 Level = Literal["good", "look", "failed"]
 Look = Callable[[ReportData, list[Frame]], Iterable[Problem]]
 
+CONTRADICTED = 0.01  # probability of so much against an earlier calibration, below which it is a problem
+TOLD = 3  # of its quantities
 CONFIDENCE = 0.99  # of the global test, and that no good observation of the whole adjustment is called suspect
 
 # Observations other than marks, by their key in adjustment.json: what is said of one and of many, and what to do.
@@ -133,10 +136,27 @@ def _told(row: Json) -> str:
 def _further_problems(adjustment: Json) -> Iterator[Problem]:
     """Distances, earlier calibrations and antennas that the images contradict."""
     for group, one, many, remedy in FURTHER:
+        whole = [test for test in adjustment.get("calibration_tests", ()) if test["p"] < CONTRADICTED]
+        if group == "calibrations" and whole:
+            for test in whole:
+                yield Problem(f"{one}: {contradiction(test, adjustment['cameras'])}.", remedy)
+            continue
         bad = _beyond_chance(adjustment, adjustment[group])
         if bad:
             heading = (one if len(bad) == 1 else many).format(len(bad))
             yield Problem(f"{heading}: {listed([_with_residual(row) for row in bad])}.", remedy)
+
+
+def contradiction(test: Json, cameras: Json) -> str:
+    """What the images say against an earlier calibration as a whole, and in which direction."""
+    told = [row for row in test["direction"] if row["difference"] is not None and row["sigma"]][:TOLD]
+    by = ", ".join(
+        f"{spoken_name(row['name'], cameras)} {row['difference']:+.3g} (its sigma {row['sigma']:.2g})" for row in told
+    )
+    return (
+        f"so much comes by chance with a probability of {test['p']:.2g} (F = {fixed(test['F'], 1)}, {test['freedom']} "
+        f"degrees of freedom). They put it elsewhere most in {by}, in mm and powers of it"
+    )
 
 
 def _with_residual(row: Json) -> str:

@@ -16,7 +16,7 @@ from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.images import adjusted_image
 from adjust.problem.network import EXTERIOR_NAMES, Board, Camera, Distortion, Image, ObjectPoint, Prior, Scanner
-from adjust.problem.result import Adjustment, FurtherResidual
+from adjust.problem.result import Adjustment, Contradiction, FurtherResidual
 from adjust.quality.correlation import correlations
 from adjust.quality.significance import SignificanceTest, board_tests, group_tests, parameter_tests, scanner_tests
 from pipeline.results.adjustment_reader import FURTHER_NUMBERS, covariance_path
@@ -106,6 +106,7 @@ def adjustment_json(adjustment: Adjustment) -> Json:
         "earth_curvature": network.line_of_sight.curvature,
         "distances": _distances(adjustment),
         "calibrations": _named(adjustment, "calibration"),
+        "calibration_tests": [_contradiction(each) for each in adjustment.contradictions],
         "antennas": _named(adjustment, "antenna"),
         "groups": {
             name: {
@@ -312,6 +313,19 @@ def _named(adjustment: Adjustment, group: str) -> list[Json]:
         for row in adjustment.further
         if row.group == group
     ]
+
+
+def _contradiction(test: Contradiction) -> Json:
+    """An earlier calibration as a whole: whether the images contradict it, and in what, the most telling first."""
+    return {
+        "F": test.statistic,
+        "freedom": test.freedom,
+        "p": test.probability,
+        "direction": [
+            {"name": test.names[i], "difference": float(test.difference[i]), "sigma": float(test.sigma[i])}
+            for i in test.direction
+        ],
+    }
 
 
 def _further_numbers(row: FurtherResidual) -> Json:

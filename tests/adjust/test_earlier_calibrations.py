@@ -151,3 +151,66 @@ def test_a_calibration_that_cannot_be_is_refused(
         adjust(change(network, calibration), start)
     for word in words:
         assert word in str(error.value)
+
+
+def noisy(network: Network, rng: np.random.Generator, scale: float) -> Network:
+    """A network without errors to speak of, its observations drawn by covariances so many times as large."""
+    rows = network.observations
+    covariance = scale**2 * rows.covariance_mm2
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return replace(
+        network, observations=replace(rows, xy_mm=rows.xy_mm + rng.normal(0.0, sigma), covariance_mm2=covariance)
+    )
+
+
+def test_an_earlier_calibration_is_tested_as_a_whole() -> None:
+    """Against the calibration of the new images alone: d' (C_old + C_new)^-1 d, their sigma0, and d itself."""
+    (a, start_a), (b, start_b), _ = two_networks("none", 1.0)
+    calibration = calibration_of(adjust(a, start_a), False)
+    changed = replace(calibration, values=calibration.values + 2.0 * np.sqrt(np.diag(calibration.covariance)))
+    network = with_calibration(b, changed)
+    alone = adjust(replace(network, calibrations=()), start_b)
+    (found,) = adjust(network, start_b).contradictions
+    names = list(calibration.names)
+    difference = np.array([alone.value(name) for name in names]) - changed.values
+    joint = changed.covariance + alone.cofactor_of(names)
+    chi_square = difference @ np.linalg.solve(joint, difference)
+    assert found.names == calibration.names
+    assert found.freedom == len(names)
+    assert found.statistic == pytest.approx(chi_square / len(names) / alone.sigma0**2, rel=0.02)
+    sigma = alone.sigma0 * np.sqrt(np.diag(joint))
+    np.testing.assert_allclose(found.sigma, sigma, rtol=0.02)
+    np.testing.assert_allclose(found.difference / sigma, difference / sigma, atol=0.05)
+    assert found.direction[0] == np.argmax(np.abs(difference) / sigma)
+
+
+def contradicted(sigmas: float, draws: int, level: float = 0.05) -> float:
+    """The share of calibrations that are told to be contradicted, of cameras whose c has changed by so many sigmas."""
+    (a, start_a), (b, start_b), _ = two_networks("none", 1e-6)
+    rng = np.random.default_rng(4)
+    told = []
+    for _ in range(draws):
+        calibration = calibration_of(adjust(noisy(a, rng, 1e6), start_a), False)
+        c = calibration.names.index("IO.K.c")
+        values = calibration.values.copy()
+        values[c] += sigmas * np.sqrt(2.0 * calibration.covariance[c, c])
+        network = with_calibration(noisy(b, rng, 1e6), replace(calibration, values=values))
+        (found,) = adjust(network, start_b).contradictions
+        told.append(found.probability < level)
+    return float(np.mean(told))
+
+
+@pytest.mark.parametrize(("sigmas", "least", "most"), [(0.0, 0.005, 0.13), (4.0, 0.5, 1.0)])
+def test_a_contradiction_is_told_as_often_as_stated(sigmas: float, least: float, most: float) -> None:
+    """At a level of 5 %: of calibrations of the same camera, and of ones whose c has changed by so many sigmas."""
+    assert least < contradicted(sigmas, 80) <= most
+
+
+def test_what_the_images_do_not_tell_is_not_said_to_differ() -> None:
+    """Fiducials and films together can shift, turn and grow: images alone say nothing of that against a calibration."""
+    (a, start_a), (b, start_b), _ = two_networks("affine", 1.0)
+    (found,) = adjust(with_calibration(b, calibration_of(adjust(a, start_a), True)), start_b).contradictions
+    assert found.freedom == len(found.names) - 4
+    marks = [name.startswith("FID.") for name in found.names]
+    assert np.isnan(found.difference[marks]).all()
+    assert found.probability > 1e-3

@@ -24,6 +24,7 @@ from adjust.problem.network import (
 )
 from adjust.problem.result import (
     Adjustment,
+    Contradiction,
     FurtherResidual,
     Group,
     Iteration,
@@ -100,6 +101,7 @@ class Told:
     residuals: Residuals
     groups: Mapping[str, Group]
     further: tuple[FurtherResidual, ...] = ()
+    contradictions: tuple[Contradiction, ...] = ()
     variance_sigmas: Mapping[str, float] = field(default_factory=dict)
     reliability: Reliability | None = None
     suspects: tuple[Suspect, ...] = ()

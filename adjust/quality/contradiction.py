@@ -1,0 +1,56 @@
+"""Whether the images contradict what was observed together beside them, an earlier calibration say, and in what.
+
+Its quantities are correlated, and each by itself may pass where all together do not. With C = L L' their covariance,
+v their residuals and S = I - H (see `adjust.quality.residuals`), the others put them at observed + d, d = L S^+ L^-1 v,
+with the covariance L S^+ L'; and u' S^+ u, u = L^-1 v, is chi-square with as many degrees of freedom as S has rank:
+the test of a block of errors (Baarda 1968; Förstner and Wrobel, Photogrammetric Computer Vision, 4.6.4).
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, fdtrc
+
+from adjust.linear_algebra.factor import Blocks, Factor
+from adjust.problem.problem import Problem, State
+from adjust.problem.result import Contradiction
+from adjust.quality.residuals import surplus
+
+Array = NDArray[np.float64]
+
+UNSEEN = 1e-6  # part of a direction's variance: where the others say so little, they say nothing
+
+
+def contradictions_of_groups(
+    problem: Problem, state: State, rows: Sequence[Blocks], factor: Factor, vpv: float, redundancy: int
+) -> Iterator[Contradiction]:
+    """Of every further observation of several quantities; rows, factor: as of the residuals, vpv and redundancy of the
+    whole adjustment, whose other part tells sigma0."""
+    for each, block in zip(problem.further, rows, strict=True):
+        if len(each.observed) < 2:
+            continue
+        root = np.linalg.cholesky(each.covariance)
+        free, directions = np.linalg.eigh(surplus(block, factor))
+        seen = free > UNSEEN
+        freedom = int(seen.sum())
+        if not freedom:
+            continue
+        u = directions.T @ np.linalg.solve(root, each.computed(state.values) - each.observed)
+        chi_square = float((u[seen] ** 2 / free[seen]).sum())
+        left = redundancy - freedom
+        variance = (vpv - chi_square) / left if left > 0 and vpv > chi_square else 1.0
+        along = root @ directions
+        difference = along[:, seen] @ (u[seen] / free[seen])
+        sigma = np.sqrt(variance * (along[:, seen] ** 2 / free[seen]).sum(axis=1))
+        hidden = (along[:, ~seen] ** 2).sum(axis=1) > UNSEEN * np.diag(each.covariance)
+        test = chi_square / freedom / variance
+        yield Contradiction(
+            group=each.group,
+            names=each.names,
+            difference=np.where(hidden, np.nan, difference),
+            sigma=np.where(hidden, np.inf, sigma),
+            statistic=test,
+            freedom=freedom,
+            probability=float(fdtrc(freedom, left, test) if left > 0 else chdtrc(freedom, chi_square)),
+        )
