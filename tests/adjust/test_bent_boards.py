@@ -68,7 +68,7 @@ def network_of(rng: np.random.Generator | None, turned: Array | None = None, ben
     names = [f"p{k}" for k in range(len(flat))]
     kinds: list[ObservationKind] = ["target"] * len(xy)
     points = {name: turn @ place for name, place in zip(names, flat, strict=True)}
-    camera = Camera("C", None, None, None, Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
+    camera = Camera("C", Prior(20.5, np.inf), None, None, Distortion("opencv", {"k1": Prior(0.0, np.inf)}))
     return Network(
         (camera,),
         tuple(Image(f"i{i}", "C", "none") for i in range(len(TURNS))),
@@ -100,12 +100,12 @@ def test_the_bends_of_exact_views_are_found() -> None:
 
 
 def test_claimed_sigmas_of_bends_are_realised() -> None:
-    """Sixty sets of errors: chi-square per degree of freedom of both bends, c and k1 within three sigmas of 1."""
+    """Thirty sets of errors: chi-square per degree of freedom of both bends, c and k1 within three sigmas of 1."""
     rng = np.random.default_rng(8)
     start = approximate(network_of(None))
     names = ["BD.board.bend_x", "BD.board.bend_y", "IO.C.c", "IO.C.k1"]
     squares = []
-    for _ in range(60):
+    for _ in range(30):
         found = adjust(network_of(rng), start)
         errors = np.array([found.value(name) for name in names]) - [*BENDS_MM, C_MM, K1]
         squares.append(errors @ np.linalg.solve(found.cofactor_of(names), errors))
