@@ -69,10 +69,14 @@ def frame_truth(scene: Scene, index: int) -> FrameTruth:
 
 
 def _exposed_areas(geometry: FrameGeometry) -> list[Area]:
-    """The exposed frame and the neighbour's, mm in this camera's frame."""
+    """The exposed frame and the neighbour's, with the pockets of their fiducials, mm in this camera's frame."""
     half = np.asarray(geometry.scene.camera.frame_mm) / 2
     outline = subdivided(rounded_rectangle(half, geometry.scene.corner_radius_mm), EDGE_PIECES)
-    return [(outline + shift,) for shift in _advances(geometry)]
+    outlines = [outline]
+    if side := geometry.scene.pocket_mm:
+        square = rounded_rectangle(np.array([side, side]), 0.0)
+        outlines += [square + fiducial.xy_mm for fiducial in geometry.scene.camera.fiducials]
+    return [(part + shift,) for shift in _advances(geometry) for part in outlines]
 
 
 def _advances(geometry: FrameGeometry) -> list[Array]:

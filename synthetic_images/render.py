@@ -80,6 +80,7 @@ def _painted(frame: Frame, background: Background, row0: int, height: int) -> Pi
         touched = part.rows(*window)
         if touched is not None:
             exposed[touched[0]] += touched[1]
+    np.minimum(exposed, 1.0, out=exposed)  # a pocket reaches into the frame
     picture = border + exposed * (background.rows(geometry, row0, height) - border)
     for paint in frame.paints:
         touched = paint.rows(*window)

@@ -344,8 +344,9 @@ class Tones:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A series of photographs. pad_mm: radius of the unexposed disk behind every fiducial (0: none); corner_radius_mm:
-    of the rounded corners of the exposed frame (0: sharp).
+    """A series of photographs. pad_mm: radius of the unexposed disk behind every fiducial (0: none); pocket_mm:
+    half the side of the square about every fiducial that is exposed, too, as where marks stand in bays of the frame (0:
+    none); corner_radius_mm: of the rounded corners of the exposed frame (0: sharp).
 
     ground, relief: mean height of the terrain that carries the texture of a "terrain" background, and the rms of its
     heights about it.
@@ -363,12 +364,14 @@ class Scene:
     ground: float = 0.0
     relief: float = 0.0
     pad_mm: float = 0.0
+    pocket_mm: float = 0.0
     corner_radius_mm: float = 0.0
 
     def __post_init__(self) -> None:
         one_of("background", self.background, get_args(Background))
         not_negative("relief", self.relief)
         not_negative("pad_mm", self.pad_mm)
+        not_negative("pocket_mm", self.pocket_mm)
         not_negative("corner_radius_mm", self.corner_radius_mm)
         if 2 * self.corner_radius_mm > min(self.camera.frame_mm):
             raise ValueError(f"corner_radius_mm is {self.corner_radius_mm}: the frame's sides are not that long")

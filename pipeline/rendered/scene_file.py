@@ -86,6 +86,7 @@ def parse_scene(table: Table) -> SceneFile:
             ground=picture.number("ground", 0.0),
             relief=picture.number("relief", 0.0, least=0.0),
             pad_mm=picture.number("pad_mm", 0.0, least=0.0),
+            pocket_mm=picture.number("pocket_mm", 0.0, least=0.0),
             corner_radius_mm=picture.number("corner_radius_mm", 0.0, least=0.0),
         ),
     )

@@ -96,14 +96,18 @@ DRAWN = [names[0] for names in _alike(LIBRARY) if names[0] != "hasselblad-reseau
 
 def scene_of(name: str) -> str:
     """One frame, in a scan that holds the marks beyond its edge. Light lines stand on pads; what is solid or dark has
-    none, for it could not be seen there."""
-    marks = [each.mark for each in LIBRARY[name].layout().marks]
+    none, for it could not be seen there; what is dark beside the frame stands in exposed pockets."""
+    layout = LIBRARY[name].layout()
+    marks = [each.mark for each in layout.marks]
     solid = any(isinstance(part, Polygon) for mark in marks if isinstance(mark, MarkShape) for part in mark.parts)
     pad_mm = 0.0 if solid or any(mark.polarity == "dark" for mark in marks) else 3.0
     start, end = SCENE.index("[camera]\n"), SCENE.index("[field]\n")
     scene = SCENE[:start] + f'camera = "library:{name}"\n' + SCENE[end:]
     changes = {"pitch_um = 45.0": "pitch_um = 125.0", "margin_mm = 3.0": "margin_mm = 9.0"}
-    for old, new in (changes | {"pad_mm = 1.9": f"pad_mm = {pad_mm}"}).items():
+    beside = min(max(map(abs, each.xy_mm)) for each in layout.marks) > max(layout.frame_mm) / 2
+    pocket_mm = 6.0 if beside and all(mark.polarity == "dark" for mark in marks) else 0.0
+    behind = {"pad_mm = 1.9": f"pad_mm = {pad_mm}", "pocket_mm = 0.0": f"pocket_mm = {pocket_mm}"}
+    for old, new in (changes | behind).items():
         assert old in scene
         scene = scene.replace(old, new)
     return scene[: scene.rindex("[[image]]")]

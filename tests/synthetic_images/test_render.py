@@ -199,3 +199,18 @@ def test_eccentricity_follows_the_closed_form() -> None:
         e_mm = 14.0 * radius**2 * (n[:2] * n[2] + c[:2] / c[2] * tilt) / (c[2] ** 2 - radius**2 * tilt)
         position = frame.targets[target.id]
         assert position.figure_px - position.center_px == pytest.approx(e_mm / 0.04, abs=1e-5)
+
+
+def test_light_reaches_pockets_beside_the_frame_and_nowhere_twice(tmp_path: Path) -> None:
+    """Of a mark 0.5 mm beyond the frame's edge: its pocket reaches 0.3 mm into the frame."""
+    fiducials = (SceneFiducial("e", (6.5, 0.0), None),)
+    image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
+    camera = replace(CAMERA, fiducials=fiducials, distortion=Distortion())
+    clean = replace(SCANNER, margin_mm=2.0, noise=0.0)
+    made = scene(camera=camera, field=hidden_field(), images=(image,), scanner=clean, pad_mm=0.0, pocket_mm=0.8)
+    grey, truth = rendered(tmp_path, made)
+    col, row = np.rint(truth.frames[0].fiducials["e"].center_px).astype(int)
+    along = {mm: grey[row, col + round(mm / 0.04)] for mm in (-1.5, -0.65, -0.2, 0.6, 1.0)}
+    light, dark = made.tones.background, made.tones.border
+    assert along == pytest.approx({-1.5: light, -0.65: light, -0.2: light, 0.6: light, 1.0: dark}, abs=1e-3)
+    assert grey[row + round(1.0 / 0.04), col + 5] == pytest.approx(dark, abs=1e-3)
