@@ -14,10 +14,10 @@ from pipeline.results.measured_scan import MeasuredScan
 _FIDUCIAL_PX, _TARGET_PX = 81, 41  # the least width of a window
 _SHOWN_PX = 96  # a larger window is reduced to about this many pixels
 _REACH_SIZES = 2.0  # a window's width in the mark's own
-_WHOLE_PX = 640  # the longer side of the whole scan, at most
+_WHOLE_PX = 480  # the longer side of the whole scan, at most
 _WHOLE = ("", "frame")  # as a mark's name and kind
 _LOST_PER_MILLE = 1  # of a window's pixels, that may be darker or lighter than all that is told apart
-_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 85]
+_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 75]
 
 
 @dataclass(frozen=True)
