@@ -1,12 +1,13 @@
-"""A rendered project against its truth: names, errors over sigmas, and the adjusted camera in sigmas."""
+"""A rendered project against its truth: names, errors over sigmas, and the adjusted camera and scanner in sigmas."""
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import legval2d, legvander2d
 from numpy.typing import NDArray
 
 from measure.status import Status
@@ -15,7 +16,9 @@ from pipeline.results.measured_scan import MeasuredScan
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
+Quantity = tuple[float, float, float]  # value, sigma, truth
 
+_HIGHEST = 6  # degree along an axis of a scanner's terms
 WRONG_PX = 1.0  # farther from its own place than this, a mark is another one
 
 
@@ -39,10 +42,12 @@ class FrameComparison:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All frames, and every adjusted quantity of the camera: its name to (value, sigma, truth)."""
+    """All frames, and every adjusted quantity of the camera and of the scanner's bend, by its name; of the bend every
+    product that is adjusted by itself, in mm."""
 
     frames: tuple[FrameComparison, ...]
-    camera: Mapping[str, tuple[float, float, float]]
+    camera: Mapping[str, Quantity]
+    scanner: Mapping[str, Quantity] = field(default_factory=dict)
 
     @property
     def rms_error_over_sigma(self) -> float:
@@ -50,21 +55,30 @@ class Comparison:
 
     @property
     def worst_camera_sigmas(self) -> float:
-        return max(
-            (abs(value - truth) / sigma for value, sigma, truth in self.camera.values() if sigma > 0.0), default=0.0
-        )
+        return _worst(self.camera)
+
+    @property
+    def worst_scanner_sigmas(self) -> float:
+        return _worst(self.scanner)
+
+
+def _worst(quantities: Mapping[str, Quantity]) -> float:
+    return max((abs(value - truth) / sigma for value, sigma, truth in quantities.values() if sigma > 0.0), default=0.0)
 
 
 def compare_with_truth(truth_path: Path, measurement_path: Path, adjustment_path: Path | None = None) -> Comparison:
     """Compare what was measured, and adjusted if there is a file of it, with truth.json."""
     truth: Json = json.loads(truth_path.read_text(encoding="utf-8"))
     frames = tuple(_frame(scan, truth["images"][scan.frame.image]) for scan in read_measurement(measurement_path))
-    camera: dict[str, tuple[float, float, float]] = {}
+    camera, scanner = dict[str, Quantity](), dict[str, Quantity]()
     if adjustment_path is not None:
-        adjusted: Json = json.loads(adjustment_path.read_text(encoding="utf-8"))["cameras"]
+        adjusted: Json = json.loads(adjustment_path.read_text(encoding="utf-8"))
         for name, given in truth["cameras"].items():
-            camera |= dict(_quantities(adjusted[name], given))
-    return Comparison(frames, camera)
+            camera |= dict(_quantities(adjusted["cameras"][name], given))
+        for name, given in truth.get("scanners", {}).items():
+            if name in adjusted["scanners"]:
+                scanner |= dict(bend_quantities(adjusted["scanners"][name], given))
+    return Comparison(frames, camera, scanner)
 
 
 def _frame(scan: MeasuredScan, truth: Json) -> FrameComparison:
@@ -103,7 +117,29 @@ def _seen(place: Json) -> Array:
     return np.array([place.get("ellipse_col_px", place["col_px"]), place.get("ellipse_row_px", place["row_px"])])
 
 
-def _quantities(adjusted: Json, truth: Json, name: str = "") -> Iterator[tuple[str, tuple[float, float, float]]]:
+def bend_quantities(adjusted: Json, truth: Json) -> Iterator[tuple[str, Quantity]]:
+    """Every adjusted product of a scanner's bend with its truth over the adjusted extent: the scene's bend has another
+    one. What the films take of the scene's bend is in no product that is adjusted."""
+    along = np.linspace(-1.0, 1.0, 2 * _HIGHEST + 1)
+    units = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+    places_mm = np.array(adjusted["center_mm"]) + units * adjusted["half_mm"]
+    true_units = ((places_mm - truth["center_mm"]) / truth["half_mm"]).T
+    degrees = [_HIGHEST, _HIGHEST]
+    design = legvander2d(units[:, 0], units[:, 1], degrees)
+    for axis in "ab":
+        factors = np.zeros((_HIGHEST + 1, _HIGHEST + 1))
+        for name, given in truth["terms"].items():
+            if name[0] == axis:
+                factors[int(name[1]), int(name[2])] = given["value"]
+        there = np.linalg.lstsq(design, legval2d(true_units[0], true_units[1], factors), rcond=None)[0].reshape(
+            factors.shape
+        )
+        for name, mine in adjusted["terms"].items():
+            if name[0] == axis and name[1:].isdigit():
+                yield name, (mine["value"], mine["sigma"], float(there[int(name[1]), int(name[2])]))
+
+
+def _quantities(adjusted: Json, truth: Json, name: str = "") -> Iterator[tuple[str, Quantity]]:
     """Every quantity that both hold, by the path of its names."""
     for key, given in truth.items():
         mine = adjusted.get(key) if isinstance(adjusted, dict) else None

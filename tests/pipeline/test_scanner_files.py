@@ -16,6 +16,7 @@ from adjust.initial_values.approximations import approximate
 from adjust.problem.network import Network, Prior, Scanner
 from adjust.solution.adjustment import adjust
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
+from pipeline.rendered.against_truth import Comparison, bend_quantities
 from pipeline.rendered.scene_file import read_scene
 from pipeline.rendered.scene_project import write_project as write_rendered
 from pipeline.report.scanner_views import bend_field
@@ -205,3 +206,18 @@ def test_two_photographs_of_a_rendered_scene_give_its_scanner_back(tmp_path: Pat
     (half_x, half_y), terms = found["half_mm"], found["terms"]
     for name, true in (("a20", 0.020 * (half_x / bed_mm) ** 2), ("b11", -0.015 * half_x * half_y / bed_mm**2)):
         assert abs(terms[name]["value"] - true) < 4.0 * terms[name]["sigma"]
+
+
+def test_a_scenes_bend_is_compared_over_the_extent_that_was_adjusted() -> None:
+    """u = r t + s takes P2(u) to r^2 P2(t), and P3(u) to r^3 P3(t) + 5 r^2 s P2(t), and what films take."""
+    truth = {
+        "center_mm": [60.0, -60.0],
+        "half_mm": [60.0, 60.0],
+        "terms": {"a30": {"value": 0.02}, "b02": {"value": 0.01}},
+    }
+    terms = {name: {"value": 0.0, "sigma": 0.001} for name in ("a20", "a30", "b02", "b11", "stretch")}
+    found = dict(bend_quantities({"center_mm": [66.0, -54.0], "half_mm": [48.0, 30.0], "terms": terms}, truth))
+    r, s = 0.8, 0.1
+    expected = {"a20": 5 * r**2 * s * 0.02, "a30": r**3 * 0.02, "b02": 0.5**2 * 0.01, "b11": 0.0}
+    assert {name: quantity[2] for name, quantity in found.items()} == pytest.approx(expected, abs=1e-12)
+    assert Comparison((), {}, found).worst_scanner_sigmas == pytest.approx(1e3 * r**3 * 0.02)
