@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from lone_frames import image_of, lone_frame, painted
 from numpy.typing import NDArray
 
 from measure.marks.shapes import (
@@ -26,23 +27,17 @@ from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
 from pipeline.rendered.scene_file import scene_mark
-from synthetic_images.background import scene_background
 from synthetic_images.film import FrameGeometry
-from synthetic_images.frame import frame_truth, make_frame
+from synthetic_images.frame import frame_truth
 from synthetic_images.paint import AreaPaint, ChipPaint, Paint
-from synthetic_images.render import grey_strips
 from synthetic_images.scene import (
     POSES,
     Background,
-    DiskField,
     DrawnMark,
     Film,
-    FilmTransformation,
     Scanner,
     Scene,
-    SceneCamera,
     SceneFiducial,
-    SceneImage,
     Side,
     Tones,
 )
@@ -106,7 +101,7 @@ def case_of(
     clutter = _clutter(rng, layout, truth.geometry, tones)
     uncovered = tuple(replace(image, covered=()) for image in scene.images)
     bare = replace(scene, camera=replace(scene.camera, fiducials=()), images=uncovered)
-    grey, positions = _painted(scene, clutter), truth.fiducials
+    grey, positions = painted(scene, *clutter), truth.fiducials
     return Case(
         kind=kind,
         symmetry=symmetry,
@@ -117,15 +112,8 @@ def case_of(
         scan=Scan(Path(name), WholePicture(grey[..., None]), NO_TAGS),
         centers_px={id: position.center_px for id, position in positions.items()},
         hidden=frozenset(id for id, position in positions.items() if position.hidden),
-        without_marks=lambda: _painted(bare, clutter).astype(float),
+        without_marks=lambda: painted(bare, *clutter).astype(float),
     )
-
-
-def _painted(scene: Scene, clutter: Sequence[Paint]) -> NDArray[np.uint16]:
-    """The picture's grey values, (rows, columns)."""
-    frame = make_frame(scene, 0)
-    frame = replace(frame, paints=(*frame.paints, *clutter))
-    return np.concatenate(list(grey_strips(frame, 0, scene_background(scene))))
 
 
 def _layout(rng: Generator, kind: str, symmetry: str) -> FiducialLayout:
@@ -181,24 +169,23 @@ def _scene(rng: Generator, layout: FiducialLayout, tones: Tones) -> Scene:
     ids = [mark.id for mark in layout.marks]
     covered = rng.choice(ids, int(rng.integers(1, len(ids) // 2)), replace=False) if rng.random() < 0.2 else ()
     scale = 1.0 + rng.normal(0.0, 0.001, 2)
-    image = SceneImage(
-        name="frame",
-        exterior=(0.0, 0.0, 100.0, 0.0, 0.0, 0.0),
-        pose=str(rng.choice(POSES)),
-        turn_rad=float(np.radians(rng.normal(0.0, 1.0))),
+    image = image_of(
+        str(rng.choice(POSES)),
+        float(rng.normal(0.0, 1.0)),
         offset_mm=(float(rng.normal(0.0, 0.4)), float(rng.normal(0.0, 0.4))),
-        film=FilmTransformation((float(scale[0]), float(scale[1])), float(rng.normal(0.0, 3e-4))),
+        scale=scale,
+        shear=float(rng.normal(0.0, 3e-4)),
         covered=tuple(str(id) for id in covered),
         neighbour=SIDES[rng.integers(4)] if rng.random() < 0.5 else None,
         neighbour_gap_mm=float(rng.uniform(0.8, 2.5)),
     )
     backgrounds: tuple[Background, ...] = ("wall", "wall", "terrain", "plain")
-    return Scene(
-        name="search",
-        seed=int(rng.integers(2**31)),
-        camera=SceneCamera("search", (FRAME_MM, FRAME_MM), 25.0, fiducials=fiducials),
-        field=DiskField((), 1.0),
-        images=(image,),
+    return lone_frame(
+        "search",
+        int(rng.integers(2**31)),
+        FRAME_MM,
+        fiducials,
+        image,
         scanner=Scanner(
             (PITCH_UM, PITCH_UM),
             margin_mm=MARGIN_MM,

@@ -7,6 +7,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from lone_frames import fiducials_of, image_of, lone_frame, painted
 from numpy.typing import NDArray
 
 from measure.marks.shapes import (
@@ -24,20 +25,13 @@ from measure.scans.compression import rounding_step_dn
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from pipeline.rendered.scene_file import scene_mark
-from synthetic_images.background import scene_background
-from synthetic_images.frame import frame_truth, make_frame
-from synthetic_images.render import grey_strips
+from synthetic_images.frame import frame_truth
 from synthetic_images.scene import (
     Background,
-    DiskField,
     Film,
-    FilmTransformation,
     Scanner,
     Scene,
-    SceneCamera,
     SceneFiducial,
-    SceneImage,
     Tones,
 )
 from synthetic_images.tone_curve import coded
@@ -85,9 +79,8 @@ def draw_case(seed: int, index: int) -> Case:
     snr = float(np.exp(rng.uniform(np.log(8), np.log(100))))
     layout, tones = _layout(rng, kind), _tones(rng, kind)
     scene, missing = _scene(rng, layout, tones, difficulty)
-    painted = np.concatenate(list(grey_strips(make_frame(scene, 0), 0, scene_background(scene))))
-    light: Picture = painted.astype(np.float32) / np.float32(_FULL)
-    whole = replace(scene, camera=replace(scene.camera, fiducials=_fiducials(layout)))
+    light: Picture = painted(scene).astype(np.float32) / np.float32(_FULL)
+    whole = replace(scene, camera=replace(scene.camera, fiducials=fiducials_of(layout.marks)))
     truth = frame_truth(whole, 0)
     centers = {id: position.center_px for id, position in truth.fiducials.items()}
     hidden = set(missing)
@@ -164,14 +157,10 @@ def _tones(rng: Generator, kind: str) -> Tones:
     return Tones(border=border, background=background, contrast=contrast, mark=mark, dark_mark=border)
 
 
-def _fiducials(layout: FiducialLayout) -> tuple[SceneFiducial, ...]:
-    return tuple(SceneFiducial(mark.id, mark.xy_mm, scene_mark(mark.mark)) for mark in layout.marks)
-
-
 def _scene(rng: Generator, layout: FiducialLayout, tones: Tones, difficulty: str) -> tuple[Scene, tuple[str, ...]]:
     """And which marks are not painted."""
     missing = (str(rng.choice([mark.id for mark in layout.marks])),) if difficulty == "missing" else ()
-    shown = tuple(fiducial for fiducial in _fiducials(layout) if fiducial.id not in missing)
+    shown = tuple(fiducial for fiducial in fiducials_of(layout.marks) if fiducial.id not in missing)
     if difficulty == "neighbour":
         shift = FRAME_MM + _GAP_MM
         beside = [
@@ -182,22 +171,21 @@ def _scene(rng: Generator, layout: FiducialLayout, tones: Tones, difficulty: str
         shown = (*shown, *beside)
     scale = 1.0 + rng.normal(0.0, 0.0005, 2)
     backgrounds: tuple[Background, ...] = ("wall", "terrain", "plain")
-    image = SceneImage(
-        name="frame",
-        exterior=(0.0, 0.0, 100.0, 0.0, 0.0, 0.0),
-        pose=str(rng.choice(("0", "90", "180m"))),
-        turn_rad=float(np.radians(rng.uniform(-3.0, 3.0))),
+    image = image_of(
+        str(rng.choice(("0", "90", "180m"))),
+        float(rng.uniform(-3.0, 3.0)),
         offset_mm=(float(rng.normal(0.0, 0.2)), float(rng.normal(0.0, 0.2))),
-        film=FilmTransformation((float(scale[0]), float(scale[1])), float(rng.normal(0.0, 2e-4))),
+        scale=scale,
+        shear=float(rng.normal(0.0, 2e-4)),
         neighbour="right" if difficulty == "neighbour" else None,
         neighbour_gap_mm=_GAP_MM,
     )
-    scene = Scene(
-        name="tone",
-        seed=int(rng.integers(2**31)),
-        camera=SceneCamera("tone", (FRAME_MM, FRAME_MM), 25.0, fiducials=shown),
-        field=DiskField((), 1.0),
-        images=(image,),
+    scene = lone_frame(
+        "tone",
+        int(rng.integers(2**31)),
+        FRAME_MM,
+        shown,
+        image,
         scanner=Scanner((PITCH_UM, PITCH_UM), margin_mm=MARGIN_MM, blur_px=0.5),
         film=Film(deformation_um=1000 * FILM_MM),
         tones=tones,

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from lone_frames import fiducials_of, image_of, lone_frame, painted
 from numpy.typing import NDArray
 
 from measure.fiducials import measure_fiducials
@@ -22,19 +23,10 @@ from measure.results import FrameMeasurement
 from measure.scans.picture_scan import WholePicture
 from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
-from pipeline.rendered.scene_file import scene_mark
-from synthetic_images.background import scene_background
-from synthetic_images.frame import frame_truth, make_frame
-from synthetic_images.render import grey_strips
+from synthetic_images.frame import frame_truth
 from synthetic_images.scene import (
-    DiskField,
     Film,
-    FilmTransformation,
     Scanner,
-    Scene,
-    SceneCamera,
-    SceneFiducial,
-    SceneImage,
     Tones,
 )
 
@@ -75,25 +67,21 @@ def draw_case(seed: int, index: int) -> Case:
     snr = SNRS[index % len(SNRS)]
     unequal = float(rng.choice([-1.0, 1.0]) * rng.uniform(*UNEQUAL))
     pitch_um = (PITCH_UM * (1 + unequal / 2), PITCH_UM * (1 - unequal / 2))
-    image = SceneImage(
-        name="frame",
-        exterior=(0.0, 0.0, 1000.0, 0.0, 0.0, 0.0),
-        pose="0",
-        turn_rad=float(np.radians(rng.normal(0.0, 0.5))),
+    image = image_of(
+        "0",
+        float(rng.normal(0.0, 0.5)),
         offset_mm=(float(rng.normal(0.0, 1.0)), float(rng.normal(0.0, 1.0))),
-        film=FilmTransformation((1 + float(rng.normal(0, 3e-4)), 1 + float(rng.normal(0, 3e-4))), 0.0),
+        scale=(1 + float(rng.normal(0, 3e-4)), 1 + float(rng.normal(0, 3e-4))),
+        shear=0.0,
+        height_mm=1000.0,
     )
-    scene = Scene(
-        name="unequal pixels",
-        seed=int(rng.integers(2**31)),
-        camera=SceneCamera(
-            "faint",
-            (FRAME_MM, FRAME_MM),
-            153.0,
-            fiducials=tuple(SceneFiducial(mark.id, mark.xy_mm, scene_mark(mark.mark)) for mark in LAYOUT.marks),
-        ),
-        field=DiskField((), 1.0),
-        images=(image,),
+    scene = lone_frame(
+        "unequal pixels",
+        int(rng.integers(2**31)),
+        FRAME_MM,
+        fiducials_of(LAYOUT.marks),
+        image,
+        153.0,
         scanner=Scanner(pitch_um, margin_mm=6.0, blur_px=float(rng.uniform(0.4, 0.8)), noise=NOISE),
         film=Film(grain=0.02, grain_px=1.0, dust=600, scratches=20, hairs=30),
         tones=Tones(border=0.03, background=0.4, contrast=0.15, mark=PAD + snr * 1.2 * NOISE),
@@ -101,7 +89,7 @@ def draw_case(seed: int, index: int) -> Case:
         pad_mm=float(rng.choice([2.2, 4.0])),
     )
     truth = frame_truth(scene, 0)
-    grey = np.concatenate(list(grey_strips(make_frame(scene, 0), 0, scene_background(scene))))
+    grey = painted(scene)
     return Case(
         snr,
         unequal,

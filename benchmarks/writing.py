@@ -18,6 +18,7 @@ from typing import Any, get_args
 
 import cv2
 import numpy as np
+from lone_frames import fiducials_of, image_of, lone_frame, painted
 from search_frames import SIDES
 from writing_lines import ALIKE, line_text
 
@@ -30,20 +31,11 @@ from measure.scans.resolution import NO_TAGS
 from measure.scans.scan import Scan
 from measure.writing.fields import is_plate
 from measure.writing.line import Line, Reading
-from pipeline.rendered.scene_file import scene_mark
-from synthetic_images.background import scene_background
-from synthetic_images.frame import make_frame
-from synthetic_images.render import grey_strips
 from synthetic_images.scene import (
     Background,
-    DiskField,
     Film,
-    FilmTransformation,
     Scanner,
     Scene,
-    SceneCamera,
-    SceneFiducial,
-    SceneImage,
     Tones,
     Writing,
 )
@@ -154,7 +146,7 @@ def row_of(index: int, written: bool) -> Row:
     corners = [(AT_MM, -AT_MM), (-AT_MM, -AT_MM), (-AT_MM, AT_MM), (AT_MM, AT_MM)]
     marks = tuple(LayoutMark(str(number), xy, (0.005, 0.005), mark) for number, xy in enumerate(corners, 1))
     made = scene(rng, marks, tuple(lines) if written else ())
-    grey = np.concatenate(list(grey_strips(make_frame(made, 0), 0, scene_background(made))))
+    grey = painted(made)
     scan = Scan(Path(f"{index}.tif"), WholePicture(stored(rng, grey)[..., None]), NO_TAGS)
     layout = FiducialLayout(marks, (FRAME_MM, FRAME_MM), places)
     found = measure_fiducials(scan, layout, (PITCH_UM, PITCH_UM), FiducialOptions(writing="pose"))
@@ -211,12 +203,11 @@ def line(rng: Generator, text: str, side: Side, way: str, slot: int, font: str |
 
 def scene(rng: Generator, marks: tuple[LayoutMark, ...], lines: tuple[Writing, ...]) -> Scene:
     scale = 1.0 + rng.normal(0.0, 0.001, 2)
-    image = SceneImage(
-        name="frame",
-        exterior=(0.0, 0.0, 100.0, 0.0, 0.0, 0.0),
-        pose=str(rng.choice(POSES)),
-        turn_rad=float(np.radians(rng.normal(0.0, 0.8))),
-        film=FilmTransformation((float(scale[0]), float(scale[1])), float(rng.normal(0.0, 3e-4))),
+    image = image_of(
+        str(rng.choice(POSES)),
+        float(rng.normal(0.0, 0.8)),
+        scale,
+        float(rng.normal(0.0, 3e-4)),
         neighbour=SIDES[rng.integers(4)] if not lines and rng.random() < 0.5 else None,
         writing=lines,
     )
@@ -227,17 +218,12 @@ def scene(rng: Generator, marks: tuple[LayoutMark, ...], lines: tuple[Writing, .
         noise=0.01,
         negative=bool(rng.random() < 0.3),
     )
-    return Scene(
-        name="written",
-        seed=int(rng.integers(2**31)),
-        camera=SceneCamera(
-            "written",
-            (FRAME_MM, FRAME_MM),
-            25.0,
-            fiducials=tuple(SceneFiducial(mark.id, mark.xy_mm, scene_mark(mark.mark)) for mark in marks),
-        ),
-        field=DiskField((), 1.0),
-        images=(image,),
+    return lone_frame(
+        "written",
+        int(rng.integers(2**31)),
+        FRAME_MM,
+        fiducials_of(marks),
+        image,
         scanner=scanner,
         film=Film(deformation_um=3.0, grain=float(rng.uniform(0.0, 0.03)), grain_px=1.0, dust=30, scratches=3, hairs=3),
         tones=Tones(background=float(rng.uniform(0.25, 0.5)), contrast=float(rng.uniform(0.04, 0.12))),
