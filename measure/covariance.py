@@ -26,6 +26,7 @@ class Cause(StrEnum):
     SECOND_METHOD = "second method"
     GIVEN_PLACES = "given places"
     OTHER_FRAMES = "other frames"
+    INTERPOLATION = "interpolation"
     CLICK = "click"
 
 
@@ -42,6 +43,7 @@ MEANING = {
     Cause.SECOND_METHOD: "Its edges put it elsewhere.",
     Cause.GIVEN_PLACES: "It contradicts the given places.",
     Cause.OTHER_FRAMES: "It contradicts the camera's other frames.",
+    Cause.INTERPOLATION: "Two scans have their pixels at other places, and between these no picture is sure.",
     Cause.CLICK: "A person pointed at it, and nothing could be matched there.",
 }
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.covariance import Covariance
+from measure.covariance import Cause, Covariance
 from measure.errors import MeasurementError
 from measure.natural_points.features import Features, find_features, in_turn, shared_features
 from measure.natural_points.local_maps import outliers
@@ -39,6 +39,9 @@ _FEWEST = 12  # features that one similarity explains: chance makes three or fou
 _TRIALS, _CONFIDENCE = 5000, 0.9999  # of RANSAC
 _APART_PX = 2 * RADIUS_PX + 2  # of joins: patches that overlap have correlated errors
 _SHARP_PX = 0.5  # rms length of an error: with less texture a join is weak
+_INTERPOLATION_PX = (
+    0.01  # that sharp pictures without noise are off by, between pixels; in aerial photographs 0.01 at most
+)
 _CHUNK = 16  # places that a worker gets at a time
 _UNEVEN = Reason("parts of the picture about the place move unlike each other", Code.OTHER_SCANS)
 _LOST = Reason("the process that matched it was ended", Code.UNREACHABLE)
@@ -212,9 +215,9 @@ def _mark(name: str, matched: Matched) -> MarkMeasurement:
     if error_px > _SHARP_PX:
         status = Status.WEAK
         reason = Reason(f"the texture fixes it to {error_px:.2f} px only", Code.IMPRECISE)
-    return MarkMeasurement(
-        name, "join", matched.center_px, Covariance.of_noise(matched.covariance_px2), status, reason, quality
-    )
+    covariance = Covariance.of_noise(matched.covariance_px2)
+    covariance = covariance.plus(Cause.INTERPOLATION, _INTERPOLATION_PX**2 * np.eye(2))
+    return MarkMeasurement(name, "join", matched.center_px, covariance, status, reason, quality)
 
 
 def _few(one: TieFrame, other: TieFrame, found: int, refused: Counter[str]) -> Reason:
