@@ -89,7 +89,7 @@ class _Search:
     def best(self, offs_px: Array, turns_rad: Array) -> LikelyBorder | None:
         """Which border of any of the distances in any of the directions takes most from the squares; None where none
         divides the area."""
-        gained = np.array([self._gained(offs_px, turn_rad) for turn_rad in turns_rad])
+        gained = self._gained(offs_px, turns_rad)
         turn, off = np.unravel_index(int(np.argmax(gained)), gained.shape)
         return LikelyBorder(offs_px[off], turns_rad[turn]) if gained[turn, off] > 0 else None
 
@@ -113,47 +113,51 @@ class _Search:
         )
         return is_overwhelming(chi_square, 2, noise, len(self.left) - len(self.base) - 2)
 
-    def _gained(self, offs_px: Array, turn_rad: float) -> Array:
-        """(offs,) by how much the edge at each distance, with a change of contrast, lessens the sum of squares: 0 where
-        it does not divide the area."""
-        weighted, squares = self._edge_sums(offs_px, turn_rad)
-        by_edge, by_change = np.split(weighted[:, :-_POWERS], 2, axis=1)
-        explained = by_edge[:, :-1], by_change[:, :-1]
-        first = np.maximum(squares[:, 0] - (explained[0] ** 2).sum(axis=1), 1e-6)
-        both = squares[:, 1] - (explained[0] * explained[1]).sum(axis=1)
-        own = squares[:, 2] - (explained[1] ** 2).sum(axis=1) - both**2 / first
-        of_edge, of_change = by_edge[:, -1], by_change[:, -1]
+    def _gained(self, offs_px: Array, turns_rad: Array) -> Array:
+        """(turns, offs) by how much the edge at each distance in each direction, with a change of contrast, lessens the
+        sum of squares: 0 where it does not divide the area."""
+        weighted, squares = self._edge_sums(offs_px, turns_rad)
+        by_edge, by_change = np.split(weighted[..., :-_POWERS], 2, axis=2)
+        explained = by_edge[..., :-1], by_change[..., :-1]
+        first = np.maximum(squares[..., 0] - (explained[0] ** 2).sum(axis=2), 1e-6)
+        both = squares[..., 1] - (explained[0] * explained[1]).sum(axis=2)
+        own = squares[..., 2] - (explained[1] ** 2).sum(axis=2) - both**2 / first
+        of_edge, of_change = by_edge[..., -1], by_change[..., -1]
         further = (of_change - both / first * of_edge) ** 2 / np.maximum(own, 1e-6)
-        gained = of_edge**2 / first + np.where(own > _LEAST_LEFT * squares[:, 0], further, 0.0)
-        side = weighted[:, -_POWERS] / len(self.left)
+        gained = of_edge**2 / first + np.where(own > _LEAST_LEFT * squares[..., 0], further, 0.0)
+        side = weighted[..., -_POWERS] / len(self.left)
         return np.where((side > _LEAST_SIDE) & (side < 1 - _LEAST_SIDE), gained, 0.0)
 
-    def _edge_sums(self, offs_px: Array, turn_rad: float) -> tuple[Array, Array]:
-        """(offs, columns) the sums of all rows, each pixel by the step of 1 beyond the edge at each distance; and those
-        of the powers of the picture by the step's square.
+    def _edge_sums(self, offs_px: Array, turns_rad: Array) -> tuple[Array, Array]:
+        """(turns, offs, columns) the sums of all rows, each pixel by the step of 1 beyond the edge at each distance in
+        each direction; and those of the powers of the picture by the step's square.
 
         The step rises in a straight line from one bound to another: it is the difference of how far a pixel lies beyond
         each, and what lies beyond a bound is summed up for all of them at once.
         """
-        across = np.array([np.cos(turn_rad), np.sin(turn_rad)]) @ self.place
+        across = np.stack([np.cos(turns_rad), np.sin(turns_rad)], axis=1) @ self.place
         bounds = np.concatenate([offs_px - self.soft_px / 2, offs_px + self.soft_px / 2])
         order = np.argsort(bounds)
-        cells = np.searchsorted(bounds[order], across)
+        shape = len(turns_rad), len(bounds) + 1
+        cells = np.searchsorted(bounds[order], across) + shape[1] * np.arange(shape[0])[:, None]
+        of_pixel = np.arange(0, cells.size + 1, shape[0])
 
         def beyond(power: int, rows: Array) -> Array:
-            moments = csc_array((across**power, cells, np.arange(len(cells) + 1)), shape=(len(bounds) + 1, len(cells)))
-            sums = np.empty((len(bounds), rows.shape[1]))
-            sums[order] = np.cumsum((moments @ rows)[::-1], axis=0)[-2::-1]
+            moments = csc_array(
+                ((across.T**power).ravel(), cells.T.ravel(), of_pixel), shape=(shape[0] * shape[1], len(rows))
+            )
+            sums = np.empty((shape[0], len(bounds), rows.shape[1]))
+            sums[:, order] = np.cumsum((moments @ rows).reshape(*shape, -1)[:, ::-1], axis=1)[:, -2::-1]
             return sums
 
         at = bounds[:, None]
         count, first = beyond(0, self._rows), beyond(1, self._rows)
         far = first - at * count
         squares = slice(-_POWERS, None)
-        square = beyond(2, self._rows[:, squares]) - at * (far + first)[:, squares]
+        square = beyond(2, self._rows[:, squares]) - at * (far + first)[..., squares]
         begin, end = slice(len(offs_px)), slice(len(offs_px), None)
-        of_squares = (square[begin] - square[end]) / self.soft_px - 2 * far[end, squares]
-        return (far[begin] - far[end]) / self.soft_px, of_squares / self.soft_px
+        of_squares = (square[:, begin] - square[:, end]) / self.soft_px - 2 * far[:, end, squares]
+        return (far[:, begin] - far[:, end]) / self.soft_px, of_squares / self.soft_px
 
     def _edge(self, border: LikelyBorder) -> Array:
         """(n,) a step of 1 beyond it."""
