@@ -344,5 +344,6 @@ def test_filters_and_search_show_only_what_they_let_through(page: Page) -> None:
         expect(page.locator("#queue button")).to_have_count(len(shown))
         assert {text.rpartition(":")[0] for text in page.locator("#queue button").all_inner_texts()} == shown
         page.locator(f"#{name}").select_option("")
+        expect(page.locator("#queue button")).to_have_count(3)
     page.locator("#search").fill("SCRAT")
     expect(page.locator("#queue button")).to_have_count(1)

@@ -4,6 +4,7 @@ const by = (id) => document.getElementById(id);
 const FILTERS = ["question", "verdict", "status", "code", "camera", "folder"];
 const VIEWS = ["mark-view", "pose-view", "frame-view", "whole-view", "near-view", "facts-view", "tries-view"];
 const CLICK_HALF_PX = 40; // of the window about a coarse click
+const COARSE_STEP = 8; // pixels of the page that an arrow key moves by in a whole scan; the window beside it shows as much about a click
 const POLL_MS = 3000; // after which another window's decisions are known here
 const COLOURS = { measured: "--measured", second: "--second", predicted: "--predicted", outline: "--outline" };
 
@@ -42,9 +43,10 @@ async function guarded(work) {
 // --- a picture of a part of a scan, in the scan's own pixels
 
 class View {
-  constructor(canvas, place) {
+  constructor(canvas, place, coarse = false) {
     this.canvas = canvas;
     this.place = place; // (col, row) => what a click does
+    this.coarse = coarse; // whether arrow keys move by parts of the picture, and not by pixels of the scan
     this.zoom = 4;
     this.center = [0, 0];
     this.picture = null;
@@ -142,7 +144,7 @@ class View {
     const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.key in steps) {
-      const px = (this.zoom < 1 ? 4 / this.zoom : 1) * (event.shiftKey ? 0.1 : 1);
+      const px = (this.coarse ? COARSE_STEP / this.zoom : 1) * (event.shiftKey ? 0.1 : 1);
       this.cursor = (this.cursor ?? this.center).map((value, axis) => value + px * steps[event.key][axis]);
     } else if (event.key === "Enter" && this.cursor) {
       this.place(...this.cursor);
@@ -160,7 +162,7 @@ const colour = (name) => getComputedStyle(document.documentElement).getPropertyV
 const views = {
   mark: new View(by("mark"), (col, row) => decideMark("place", { col_px: col, row_px: row })),
   surroundings: new View(by("surroundings"), null),
-  whole: new View(by("whole"), (col, row) => clickedWhole(col, row)),
+  whole: new View(by("whole"), (col, row) => clickedWhole(col, row), true),
   near: new View(by("near"), (col, row) => clickedNear(col, row)),
 };
 
@@ -644,7 +646,7 @@ function clickedWhole(col, row) {
     const view = views.near;
     state.trial = null;
     state.clicks.set(state.named, [col, row]);
-    view.zoom = view.canvas.width / (2 * state.click.half);
+    view.zoom = view.canvas.width / (2 * Math.max(state.click.half, COARSE_STEP / views.whole.zoom));
     view.center = view.cursor = [col, row];
     view.marks = (pen) => drawFrame(view, pen, { marks: [] });
     await view.load(state.frame.image);
@@ -742,9 +744,11 @@ function forgetClicks() {
 // --- keys and buttons
 
 function zoom(factor) {
-  const view = views.mark;
-  view.zoom = Math.min(64, Math.max(0.5, view.zoom * factor));
-  return guarded(() => view.load(state.mark.image));
+  const view = by("near-view").hidden ? views.mark : views.near;
+  const image = state.mark?.image ?? state.frame?.image;
+  if (!image || !view.picture) return;
+  view.zoom = Math.min(64, Math.max(0.25, view.zoom * factor));
+  return guarded(() => view.load(image));
 }
 
 function toggleOverlay() {
