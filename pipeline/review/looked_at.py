@@ -24,6 +24,7 @@ from pipeline.review.outlines import outlines_px
 Json = dict[str, Any]
 Array = NDArray[np.float64]
 
+_NEAR = 100  # scans before and after it among which these are sought
 _OTHERS = 6  # frames beside which a mark is shown
 _LEAST_PX = 40  # of a window, so that the surroundings can be seen
 _REACH_SIZES = 2.5  # of a window, in the mark's own size
@@ -156,7 +157,8 @@ class Looking:
     def others(self, image: str, point: str, kind: str) -> Sequence[str]:
         """Frames beside which the mark is shown: of the same camera, where it was measured."""
         with Store(self._store) as store:
-            rows = store.connection.execute(_BESIDE, (image, image, point, kind, _OTHERS)).fetchall()
+            told = (image, _NEAR, _NEAR, image, point, kind, _OTHERS)
+            rows = store.connection.execute(_BESIDE, told).fetchall()
         return [name for (name,) in rows]
 
 
@@ -171,7 +173,8 @@ with own as (
     select s.camera, s.id from judged_frame f join scan s on s.id = f.scan
     where f.name = ? and f.judging = (select max(id) from judging)
 )
-select f.name from own join scan s on s.camera = own.camera join judged_frame f on f.scan = s.id
+select f.name from own join scan s on s.id between own.id - ? and own.id + ? and s.camera = own.camera
+join judged_frame f on f.scan = s.id
 join mark m on m.result = f.result
 where f.judging = (select max(id) from judging) and f.name <> ? and m.point = ? and m.kind = ? and m.status = 'measured'
 order by abs(s.id - own.id) limit ?

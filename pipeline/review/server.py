@@ -282,7 +282,7 @@ def _trial_json(scan: MeasuredScan) -> Any:
     return {
         "image": scan.frame.image,
         "marks": [mark_json(mark) for mark in scan.frame.marks],
-        "pose": pose and pose.name,
+        "pose": pose and f"{pose.name}{'' if pose.decided else ' (assumed)'}",
         "problems": [failure] if failure else list(map(str, scan.frame.problems)),
     }
 

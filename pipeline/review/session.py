@@ -5,6 +5,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import chain
 from typing import Any
 
 from measure.marks.poses import POSES
@@ -50,16 +51,19 @@ class Filters:
 
 @dataclass(frozen=True)
 class _Shown:
-    """The questions that filters let through, and the keys of those that need an answer."""
+    """The questions that filters let through, their keys, and those of them that need an answer."""
 
     filters: Filters
     entries: tuple[Entry, ...]
+    keys: tuple[str, ...]
     asked: frozenset[str]
 
     @classmethod
     def of(cls, filters: Filters, queue: Sequence[Entry]) -> "_Shown":
         entries = tuple(filter(filters.lets_through, queue))
-        return cls(filters, entries, frozenset(entry.key for entry in entries if entry.is_left))
+        keys = tuple(entry.key for entry in entries)
+        asked = (key for key, entry in zip(keys, entries, strict=True) if entry.is_left)
+        return cls(filters, entries, keys, frozenset(asked))
 
 
 class Session:
@@ -119,15 +123,21 @@ class Session:
             if self._shown is None or self._shown.filters != filters:
                 self._shown = _Shown.of(filters, self._queue)
             shown = self._shown
+            order = chain(range(start, len(shown.keys)), range(min(start, len(shown.keys))))
             return {
                 "judging": self._judging,
                 "total": sum(entry.is_left for entry in self._queue),
                 "left": {"all": self._left.total(), **{str(question): self._left[question] for question in Question}},
                 "shown": len(shown.entries),
                 "shown_left": len(shown.asked - self._answers.keys()),
+                "next_left": next((at for at in order if self._asks(shown, at)), -1),
                 "start": start,
                 "entries": [self.entry_json(entry) for entry in shown.entries[start : start + PAGE]],
             }
+
+    def _asks(self, shown: _Shown, at: int) -> bool:
+        key = shown.keys[at]
+        return key in shown.asked and key not in self._answers
 
     def choices(self) -> Json:
         """What filters can be set to."""

@@ -16,6 +16,9 @@ from review_pages import comparator, decisions, steer
 from review_server import BARE, GOOD, SCRATCHED, TURNED, Served, mark_px, served, write_faults
 
 from pipeline.cli import run
+from pipeline.files.decisions_file import Choice, Decision
+from pipeline.files.project_file import read_project
+from pipeline.review.session import Filters, Session
 
 pytestmark = pytest.mark.xdist_group("review")
 
@@ -347,3 +350,15 @@ def test_filters_and_search_show_only_what_they_let_through(page: Page) -> None:
         expect(page.locator("#queue button")).to_have_count(3)
     page.locator("#search").fill("SCRAT")
     expect(page.locator("#queue button")).to_have_count(1)
+
+
+def test_the_next_question_that_is_left_is_told_wherever_it_stands(measured: Path) -> None:
+    """Of the frame and the two marks that are asked about, beginning behind the frame."""
+    (measured / "decisions.jsonl").unlink(missing_ok=True)
+    session = Session(read_project(measured / "project.toml"), "bob")
+    for expected, entry in zip((1, 2), session.page(Filters())["entries"][1:], strict=True):
+        assert session.page(Filters(), start=1)["next_left"] == expected
+        about = (entry["image"], Choice.ABSENT, entry["point"], "fiducial")
+        session.decide([Decision(*about, fingerprint=entry["fingerprint"])])
+    assert session.page(Filters(), start=1)["next_left"] == 0
+    assert session.page(Filters(question="mark"))["next_left"] == -1

@@ -5,6 +5,7 @@ const FILTERS = ["question", "verdict", "status", "code", "camera", "folder"];
 const VIEWS = ["mark-view", "pose-view", "frame-view", "whole-view", "near-view", "facts-view", "tries-view"];
 const CLICK_HALF_PX = 40; // of the window about a coarse click
 const COARSE_STEP = 8; // pixels of the page that an arrow key moves by in a whole scan; the window beside it shows as much about a click
+const PAGE = 100; // questions that the server gives at a time
 const POLL_MS = 3000; // after which another window's decisions are known here
 const COLOURS = { measured: "--measured", second: "--second", predicted: "--predicted", outline: "--outline" };
 
@@ -283,7 +284,7 @@ async function step(by_) {
 
 async function turn(pages, index) {
   await guarded(async () => {
-    state.start = Math.max(0, state.start + pages * 100);
+    state.start = Math.max(0, state.start + pages * PAGE);
     await refresh(false);
     await open(index < 0 ? state.entries.length - 1 : index);
   });
@@ -293,8 +294,13 @@ async function nextLeft() {
   const rest = state.entries.findIndex((entry, index) => index > state.at && isLeft(entry));
   const first = rest >= 0 ? rest : state.entries.findIndex(isLeft);
   if (first >= 0) return open(first);
-  const more = state.page.shown_left > 0 && state.start + state.entries.length < state.page.shown;
-  return more ? turn(1, 0) : open(state.at);
+  return state.page.next_left >= 0 ? openAt(state.page.next_left) : open(state.at);
+}
+
+// at: among all that filters let through.
+async function openAt(at) {
+  const pages = Math.floor(at / PAGE) - state.start / PAGE;
+  return turn(pages, at % PAGE);
 }
 
 // --- deciding
@@ -812,8 +818,8 @@ async function filtered() {
     state.start = 0;
     state.at = -1;
     await refresh(false);
-    const first = state.entries.findIndex(isLeft);
-    await open(first >= 0 ? first : 0);
+    if (state.page.next_left >= PAGE) await openAt(state.page.next_left);
+    else await open(Math.max(0, state.page.next_left));
   });
 }
 
