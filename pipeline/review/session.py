@@ -94,6 +94,7 @@ class Session:
                 changed = None
             if changed is None:
                 self._answers, self._left = {}, Counter(entry.question for entry in self._queue if entry.is_left)
+                self._total = self._left.total()
             for entry in self._queue if changed is None else self._entries_of(changed):
                 before, now = self._answers.pop(entry.key, None), self._answer_of(entry)
                 if now is not None:
@@ -126,7 +127,7 @@ class Session:
             order = chain(range(start, len(shown.keys)), range(min(start, len(shown.keys))))
             return {
                 "judging": self._judging,
-                "total": sum(entry.is_left for entry in self._queue),
+                "total": self._total,
                 "left": {"all": self._left.total(), **{str(question): self._left[question] for question in Question}},
                 "shown": len(shown.entries),
                 "shown_left": len(shown.asked - self._answers.keys()),
