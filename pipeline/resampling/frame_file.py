@@ -20,7 +20,7 @@ Samples = NDArray[np.uint8 | np.uint16]
 TILE_PX = 512
 _REDUCTION = 4  # between a page and the next smaller one
 _SMALLEST_PX = 512
-_LARGEST_REDUCED_BYTES = 64 << 20  # of the first reduced page, which is held in memory
+_LARGEST_REDUCED_BYTES = 32 << 20  # of the first reduced page, which is held in memory
 _CLASSIC_BYTES = 3_900_000_000  # TIFF counts bytes in 32 bits
 _REDUCED, _MASK = 1, 4  # TIFF 6.0, NewSubfileType
 
@@ -71,11 +71,12 @@ def write_frame(
 ) -> int:
     """Write the frame, tile by tile as `tile_at(col0, row0)` gives them; how many samples were clamped.
 
-    Memory holds a tile, the first reduced page and the mask. Raises InputError where the file cannot be written.
+    Memory holds a tile, the first reduced page, and the mask of tiles at the scan's edge. Raises InputError where the
+    file cannot be written.
     """
     canvas = described.canvas
     reduced = _Reduced(canvas, channels, dtype)
-    mask = np.zeros((canvas.height_px, -(-canvas.width_px // 8)), np.uint8)
+    masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = {}  # most tiles are inside or outside as wholes
     clamped = 0
 
     def tiles() -> Iterator[Samples]:
@@ -85,16 +86,15 @@ def write_frame(
                 tile = tile_at(col0, row0)
                 clamped += tile.clamped
                 reduced.take(tile.samples, col0, row0)
-                packed = np.packbits(tile.is_inside, axis=1)
-                part = mask[row0 : row0 + TILE_PX, col0 // 8 : (col0 + TILE_PX) // 8]
-                part[:] = packed[: part.shape[0], : part.shape[1]]
+                inside = bool(tile.is_inside.flat[0])
+                is_even = bool((tile.is_inside == inside).all())
+                masks[row0, col0] = inside if is_even else np.packbits(tile.is_inside, axis=1)
                 yield tile.samples if channels > 1 else tile.samples[..., 0]
 
     def masked() -> Iterator[NDArray[np.bool_]]:
-        for row0 in range(0, canvas.height_px, TILE_PX):
-            rows = np.unpackbits(mask[row0 : row0 + TILE_PX], axis=1, count=canvas.width_px).astype(bool)
-            for col0 in range(0, canvas.width_px, TILE_PX):
-                yield _filled(rows[:, col0 : col0 + TILE_PX], TILE_PX)
+        for (row0, col0), mask in masks.items():  # in the order of the tiles
+            tile = np.unpackbits(mask, axis=1) if isinstance(mask, np.ndarray) else np.full((TILE_PX,) * 2, mask)
+            yield _filled(tile[: canvas.height_px - row0, : canvas.width_px - col0].astype(bool), TILE_PX)
 
     pages = reduced.count
     size = canvas.width_px * canvas.height_px * channels * np.dtype(dtype).itemsize
