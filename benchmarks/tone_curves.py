@@ -1,11 +1,11 @@
 """Marks measured through unknown tone curves, against their truth.
 
-    python benchmarks/tone_curves.py [--frames 60] [--first 0] [--seed 1] [--keep FILE]
+    python benchmarks/tone_curves.py [--frames 60] [--first 0] [--seed 1] [--keep FILE] [--every 50]
 
 Frames as `tone_frames` draws them: seven kinds of marks; gamma 1, 1.8, 2.2, sRGB and an S-curve; 16 and 8 bit and JPEG
 of quality 60 to 95; signal-to-noise 8 to 100; turned by up to 3 degrees; uneven focus, vignetting, a stamp over a mark,
-a mark missing, a neighbouring frame. Nothing is said of the curve, and each frame is alone. --keep holds a line a mark,
-so that a run can be stopped and go on, or be printed again.
+a mark missing, a neighbouring frame. Nothing is said of the curve, and each frame is alone. --keep holds a line a
+frame, so that a run can be stopped and go on, or be printed again; the table so far comes after --every frames.
 
 Told are, for each kind, curve, way to store, difficulty and noise: marks that can be seen, of these the per cent found
 and the per cent `measured`; of the marks `measured` the rms error, the rms of error over claim, the largest one, and
@@ -16,7 +16,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterable
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -115,20 +115,29 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path)
+    parser.add_argument("--every", type=int, default=50)
     options = parser.parse_args()
-    rows: list[Row] = []
-    if options.keep and options.keep.exists():
-        rows = [json.loads(line) for line in options.keep.read_text(encoding="utf-8").splitlines()]
-    done = {row["frame"] for row in rows}
-    for index in range(options.first, options.first + options.frames):
-        if index in done:
-            continue
-        new = rows_of(draw_case(options.seed, index), index)
-        rows += new
+    kept = kept_frames(options.keep) if options.keep else {}
+    wanted = range(options.first, options.first + options.frames)
+    for done, index in enumerate((index for index in wanted if index not in kept), 1):
+        kept[index] = rows_of(draw_case(options.seed, index), index)
         if options.keep:
             with options.keep.open("a", encoding="utf-8") as file:
-                file.writelines(json.dumps(row) + "\n" for row in new)
-    print_table(rows)
+                file.write(json.dumps(kept[index]) + "\n")
+        if not done % options.every:
+            print(f"\nafter {len(kept)} frames", flush=True)
+            print_table(list(chain(*kept.values())))
+    print(f"\nall {len(kept)} frames")
+    print_table(list(chain(*kept.values())))
+
+
+def kept_frames(path: Path) -> dict[int, list[Row]]:
+    """The rows of each frame that stands in a file whole: the line of one that a run was cut off in does not."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+    frames = [json.loads(line) for line in lines if line.endswith("\n")]
+    if len(frames) < len(lines):
+        path.write_text("".join(lines[:-1]), encoding="utf-8")
+    return {rows[0]["frame"]: rows for rows in frames}
 
 
 if __name__ == "__main__":
