@@ -4,9 +4,9 @@
 
 FOLDER holds the frames of aerial film (film_scans/aerial of the test data). Each is decoded and coded anew, in 16 bits,
 by light = code ** 2.2 and by its inverse, so that what the scanner coded with one curve now has three. Every copy is
-measured by itself, with nothing said of its curve; --linear takes grey values as light, as a comparison. Told is how
-far each mark lies elsewhere in one copy than in another, in px and in the standard deviations of both claims together,
-with its statuses; then the largest of each frame, of marks that both copies call `measured` and of all.
+measured and judged by itself, with nothing said of its curve; --linear takes grey values as light, as a comparison.
+Told is how far each mark lies elsewhere in one copy than in another, in px and in the standard deviations of both
+claims together, with its statuses; then the largest of each frame, of marks `measured` in both copies and of all.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from measure.checks.judgement import judged
 from measure.fiducial_options import FiducialOptions
 from measure.fiducials import measure_fiducials
 from measure.results import FrameMeasurement, MarkMeasurement
@@ -62,7 +63,8 @@ def copies(scan: Scan) -> dict[str, Scan]:
 
 def measured(scan: Scan, camera: str, tone: Tone, pitch_um: tuple[float, float] | None) -> FrameMeasurement:
     layout = read_camera(camera_path(f"library:{camera}", Path())).layout()
-    return measure_fiducials(scan.seen_through(tone), layout, pitch_um, FiducialOptions(pose="0"))
+    frame = measure_fiducials(scan.seen_through(tone), layout, pitch_um, FiducialOptions(pose="0"))
+    return judged([frame], layout, [pitch_um or (1.0, 1.0)]).frames[0]
 
 
 def main() -> None:
