@@ -61,7 +61,8 @@ def command(arguments: list[str]) -> int:
     """One command in this process, and at its end what it took, processes that it started not counted."""
     from pipeline.cli import run
 
-    use()
+    if arguments[0] == "measure":
+        use()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     code = run([*arguments, "--workers", "2"] if arguments[0] == "measure" else arguments)
     used = resource.getrusage(resource.RUSAGE_SELF)
