@@ -30,7 +30,7 @@ DRIFT, NO_DRIFT = "drift", "no drift"
 def run_compare(
     paths: Sequence[Path], camera: str | None, times: Sequence[float] | None, use: Use, level: float, out: Path | None
 ) -> tuple[Comparison, tuple[str, ...]]:
-    """The comparison of the camera in all files, and remarks on it; compare.json and compare.png into `out`, if any.
+    """The comparison of the camera in all files, and remarks on it; compare.json and compare.svg into `out`, if any.
 
     Raises InputError or AdjustmentError for a file that holds no calibration of the camera, or for what cannot be
     compared.
@@ -45,7 +45,7 @@ def run_compare(
         check_writable(out)
         content = json.dumps(without_nan(comparison_json(comparison, remarks, level)), indent=1, ensure_ascii=False)
         write_atomically(out / "compare.json", content + "\n")
-        draw_comparison(comparison, out / "compare.png")
+        draw_comparison(comparison, out / "compare.svg")
     return comparison, remarks
 
 

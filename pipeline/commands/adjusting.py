@@ -82,7 +82,7 @@ def compare(
     level: Annotated[
         float, typer.Option(min=1e-12, max=0.5, help="Drift is said where chance makes as much more rarely than this.")
     ] = 0.01,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write compare.json and compare.png there.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write compare.json and compare.svg there.")] = None,
     as_json: AsJson = False,
 ) -> int:
     """Calibrations of a camera: where and by how much they differ over the frame; `drift` or `no drift`."""

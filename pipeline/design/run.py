@@ -64,7 +64,7 @@ def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> De
     for number, asked in enumerate(setup.settings.sweeps, 1):
         with reporter.stage("varying") as count:
             swept.append(sweep(scene, number, asked, count))
-        picture = folder / f"sweep-{number}-{asked.quantity}.png"
+        picture = folder / f"sweep-{number}-{asked.quantity}.svg"
         plot_sweep(swept[-1], picture)
         files[f"sweep of {asked.quantity}"] = picture
     pictures = [path.name for path in files.values()][1:]

@@ -8,7 +8,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from pipeline.report import svg
+from pipeline.drawing import svg
 from pipeline.report.data import Json
 from pipeline.results.adjustment_reader import Covariance
 

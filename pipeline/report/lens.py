@@ -10,7 +10,7 @@ from adjust.functional_model.distortion import image_equations
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.projection import ideal_from_observed
 from adjust.problem.network import Distortion
-from pipeline.report import svg
+from pipeline.drawing import svg
 from pipeline.report.data import Json
 from pipeline.results.adjustment_reader import Covariance, calibrated_lens
 

@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from pipeline.report import svg
+from pipeline.drawing import svg
 from pipeline.report.lens import Lens, displacement
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.vectors import FOOT_PX, Plane, scale_bar

@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from measure import reason, status
+from pipeline.drawing import svg
 from pipeline.report.camera_views import camera_views
 from pipeline.report.charts import fraction_plot
 from pipeline.report.data import Json, ReportData
@@ -21,7 +22,6 @@ from pipeline.report.marks import Frame, frames
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.report.parameters import spoken_name
 from pipeline.report.scanner_views import scanner_views
-from pipeline.report.svg import round_step
 from pipeline.report.totals import totals_view
 from pipeline.report.verdict import contradiction, critical_w, judge, sigma0_bounds
 from pipeline.text.atomic import write_atomically
@@ -62,6 +62,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.globals["drawing_css"] = Markup(svg.style())
     environment.globals["quantity"] = lambda entry: value_and_sigma(entry["value"], entry["sigma"])
     environment.filters |= {"fixed": fixed, "significant": significant}
     return environment
@@ -137,7 +138,7 @@ def _fractions(places: Mapping[str, Array]) -> Iterator[tuple[str, FractionTest,
 def _arrow_bar(shots: list[Frame]) -> tuple[float, float]:
     """A round length in um for the legend of the marks' pictures, and its page pixels."""
     px_per_um = thumbnail_scale(shots)
-    um = round_step(40.0 / px_per_um)
+    um = svg.round_step(40.0 / px_per_um)
     return um, um * px_per_um
 
 

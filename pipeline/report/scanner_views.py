@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from adjust.functional_model.scanner import Bend
-from pipeline.report import svg
+from pipeline.drawing import svg
 from pipeline.report.data import Json, ReportData
 from pipeline.report.fiducials import ellipse_axes, ellipses
 from pipeline.report.numbers import value_and_sigma

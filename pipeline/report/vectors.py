@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from pipeline.report import svg
+from pipeline.drawing import svg
 from pipeline.report.data import Json
 from pipeline.report.numbers import fixed
 

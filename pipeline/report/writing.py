@@ -4,7 +4,7 @@ from markupsafe import Markup
 
 from measure.marks.poses import up_from_camera
 from measure.writing.line import Line
-from pipeline.report import svg
+from pipeline.drawing import svg
 from pipeline.results.measured_scan import MeasuredScan
 
 _WIDTH_PX = 1000.0  # plates of 20 mm on film of 230 are read

@@ -3,11 +3,14 @@
 import json
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from pipeline.cli import run
+
+SVG = "{http://www.w3.org/2000/svg}"
 
 
 def moved(project: Path, name: str, change_mm: float) -> Path:
@@ -35,7 +38,8 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, capsys: pytest.Cap
     assert told.startswith("drift\n")
     (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) um", told)
     assert float(largest) < 0.2  # of their 0.3 um: c and the marks are hardly tied
-    assert (out / "compare.png").stat().st_size > 10_000
+    drawn = ElementTree.parse(out / "compare.svg").getroot()
+    assert len(drawn.findall(f".//{SVG}ellipse")) == 49  # one a place of the field
     content = json.loads((out / "compare.json").read_text(encoding="utf-8"))
     (difference,) = content["differences"]
     corner = np.array(difference["field_um"])[np.abs(content["places_mm"]).sum(axis=1).argmax()]

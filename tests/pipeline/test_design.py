@@ -4,6 +4,7 @@ import json
 import math
 from importlib import resources
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -178,7 +179,9 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert {one["parameter"] for one in content["reliability"]["camera"]} >= {"IO.K.c", "IO.K.k3", "FID.K.a.x"}
     (swept,) = content["sweeps"]
     assert [step["value"] for step in swept["steps"]] == ["similarity", "affine"]
-    assert (folder / swept["picture"]).read_bytes().startswith(b"\x89PNG")
+    drawn = ElementTree.parse(folder / swept["picture"]).getroot()
+    drawn_words = {word.text for word in drawn.iter("{http://www.w3.org/2000/svg}text")}
+    assert drawn_words >= {"similarity", "affine", "design.transformation", "c", "k3"}
     assert run(["design", str(scene), str(tmp_path / "there")]) == DONE
     table = capsys.readouterr().out
     for words in (

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from measure.reason import NO_REASON
 from measure.status import Status
+from pipeline.drawing.svg import Axes, round_step, ticks
 from pipeline.report import Thumbnail
 from pipeline.report.data import Json
 from pipeline.report.marks import Mark, natural
 from pipeline.report.numbers import fixed, significant, value_and_sigma
-from pipeline.report.svg import round_step, ticks
 from pipeline.report.thumbnails import SIZE_PX, arrow_scale, drawn
 from pipeline.report.vectors import all_images_plot, plane, vector_scale
 
@@ -51,6 +51,14 @@ def test_ticks_are_round_and_inside() -> None:
     assert ticks(0.0, 1.0, 6) == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
     assert ticks(-3.0, 17.0, 5) == pytest.approx([0.0, 5.0, 10.0, 15.0])
     assert [round_step(size) for size in (1.0, 1.99, 2.0, 4.9, 0.051, 70.0)] == pytest.approx([1, 1, 2, 2, 0.05, 50])
+
+
+def test_a_logarithmic_axis_has_its_powers_at_equal_distances() -> None:
+    axes = Axes((1.0, 100.0), (0.1, 10.0), width=400.0, left=0.0, right=0.0, x_is_log=True, y_is_log=True)
+    assert axes.x([1.0, 10.0, 100.0]) == pytest.approx([0.0, 200.0, 400.0])
+    drawn = axes.drawn("x", "y")
+    assert all(f">{tick}</text>" in drawn for tick in ("0.1", "0.2", "0.5", "1", "2", "5", "10"))
+    assert ">3</text>" not in drawn
 
 
 def test_names_sort_by_their_numbers() -> None:

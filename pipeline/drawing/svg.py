@@ -1,12 +1,30 @@
-"""Drawing in SVG: elements, and the axes of a chart."""
+"""Drawing in SVG: elements, the axes of a chart, and files that hold one picture."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.text.atomic import write_atomically
+
 Array = NDArray[np.float64]
+
+
+def style() -> str:
+    """What all pictures look like, as CSS."""
+    return (files("pipeline.drawing") / "drawing.css").read_text(encoding="utf-8")
+
+
+def write_picture(path: Path, width: float, height: float, title: str, *content: Markup) -> None:
+    """A file of its own, on white; `title` as in `picture`. Raises InputError where it cannot be written."""
+    ground = tag("rect", width=width, height=height, fill="white")
+    look = tag("style", Markup(style() + "svg { font-family: sans-serif; }"))
+    drawn = picture(width, height, title, look, ground, *content, xmlns="http://www.w3.org/2000/svg")
+    write_atomically(path, str(drawn) + "\n")
 
 
 def tag(name: str, *content: str, **attributes: object) -> Markup:
@@ -18,8 +36,10 @@ def tag(name: str, *content: str, **attributes: object) -> Markup:
     return Markup(f"<{name}{pairs}>{inside}</{name}>")
 
 
-def picture(width: float, height: float, title: str, *content: Markup, class_: str = "plot") -> Markup:
-    """A whole drawing; `title` is what a reader who cannot see it is told."""
+def picture(
+    width: float, height: float, title: str, *content: Markup, class_: str = "plot", **attributes: str
+) -> Markup:
+    """A whole drawing; `title` is what a reader who cannot see it is told; further attributes as of `tag`."""
     return tag(
         "svg",
         *content,
@@ -29,6 +49,7 @@ def picture(width: float, height: float, title: str, *content: Markup, class_: s
         viewBox=f"0 0 {width:g} {height:g}",
         width=f"{width:g}",
         height=f"{height:g}",
+        **attributes,
     )
 
 
@@ -50,7 +71,10 @@ def words(x: float, y: float, content: str, class_: str = "label", anchor: str =
 
 @dataclass(frozen=True)
 class Axes:
-    """A chart's plane: data ranges drawn into width x height px, with room for labels at the left and below."""
+    """A chart's plane: data ranges drawn into width x height px, with room for labels at the left and below.
+
+    x_is_log, y_is_log: whether an axis is logarithmic. x_ticks: those along x, by their values; None: round ones.
+    """
 
     x_range: tuple[float, float]
     y_range: tuple[float, float]
@@ -60,20 +84,24 @@ class Axes:
     right: float = 14.0
     top: float = 12.0
     bottom: float = 44.0
+    x_is_log: bool = False
+    y_is_log: bool = False
+    x_ticks: Mapping[float, str] | None = None
 
     def x(self, value: ArrayLike) -> Array:
-        low, high = self.x_range
-        span = self.width - self.left - self.right
-        return self.left + (np.asarray(value, dtype=float) - low) / (high - low) * span
+        return self.left + _share(value, self.x_range, self.x_is_log) * (self.width - self.left - self.right)
 
     def y(self, value: ArrayLike) -> Array:
-        low, high = self.y_range
         span = self.height - self.top - self.bottom
-        return self.height - self.bottom - (np.asarray(value, dtype=float) - low) / (high - low) * span
+        return self.height - self.bottom - _share(value, self.y_range, self.y_is_log) * span
 
     def drawn(self, x_label: str, y_label: str) -> Markup:
         """Grid, ticks and labels."""
-        x_ticks, y_ticks = ticks(*self.x_range, self.width / 50.0), ticks(*self.y_range, self.height / 28.0)
+        x_ticks = self.x_ticks
+        if x_ticks is None:
+            x_ticks = {t: _tick_text(t) for t in _ticks(self.x_range, self.x_is_log, self.width / 50.0)}
+        at_x = self.x(list(x_ticks))
+        y_ticks = _ticks(self.y_range, self.y_is_log, self.height / 28.0)
         x_left, x_right = self.left, self.width - self.right
         y_top, y_bottom = self.top, self.height - self.bottom
         middle = 0.5 * (y_top + y_bottom)
@@ -84,11 +112,11 @@ class Axes:
         return Markup("").join(
             [
                 *grid,
-                *(line((x, x), (y_bottom, y_bottom + 4.0), "axis") for x in self.x(x_ticks)),
+                *(line((x, x), (y_bottom, y_bottom + 4.0), "axis") for x in at_x),
                 line((x_left, x_right), (y_bottom, y_bottom), "axis"),
                 *(
-                    words(x, y_bottom + 17.0, _tick_text(t), "tick", "middle")
-                    for t, x in zip(x_ticks, self.x(x_ticks), strict=True)
+                    words(x, y_bottom + 17.0, text, "tick", "middle")
+                    for text, x in zip(x_ticks.values(), at_x, strict=True)
                 ),
                 *(
                     words(x_left - 7.0, y + 4.0, _tick_text(t), "tick", "end")
@@ -104,6 +132,24 @@ class Axes:
                 ),
             ]
         )
+
+
+def _share(value: ArrayLike, limits: tuple[float, float], is_log: bool) -> Array:
+    """Where values lie between the limits, from 0 to 1."""
+    values, (low, high) = np.asarray(value, dtype=float), limits
+    if is_log:
+        values, low, high = np.log(values), np.log(low), np.log(high)
+    return (values - low) / (high - low)
+
+
+def _ticks(limits: tuple[float, float], is_log: bool, most: float) -> list[float]:
+    """Round values inside of the limits: of a wide logarithmic axis 1, 2 and 5 times powers of ten."""
+    low, high = limits
+    if not is_log or high < 5.0 * low:
+        return ticks(low, high, most)
+    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
+    every = (1.0, 2.0, 5.0) if 3 * len(powers) <= most else (1.0,)
+    return [float(m * power) for power in powers for m in every if low <= m * power <= high]
 
 
 def ticks(low: float, high: float, most: float) -> list[float]:
