@@ -134,6 +134,16 @@ class Block:
                 "first."
             )
 
+    def needs_whole_scans(self, format: str) -> None:
+        """Raises InputError where a scan shows a part of its frame only: what is resampled is the frame as a whole."""
+        parts = [frame.image for frame in self.frames if self.project.part_of(frame.image)]
+        if parts:
+            raise InputError(
+                f"{format} is written of resampled frames, each of one scan, and {parts[0]!r} is a part of frame "
+                f"{self.project.part_of(parts[0])!r} (column part_of). Export csv, parquet or mmvii, which take every "
+                "scan by itself."
+            )
+
 
 def read_block(project: Project) -> Block:
     """What a project has measured and adjusted.

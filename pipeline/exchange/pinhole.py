@@ -94,9 +94,11 @@ def pinhole_frames(
     """Every oriented image with its lens in the first of the models, each given by its parameters' names, that is near
     enough; and why the other images are not among them. knows_fisheye: whether the program has OpenCV's fisheye.
 
-    Raises InputError where no image is oriented, or where the last model, too, is off by more than the options allow.
+    Raises InputError where no image is oriented, where frames were scanned in parts, or where the last model, too, is
+    off by more than the options allow.
     """
     block.needs_orientation(format)
+    block.needs_whole_scans(format)
     lenses: dict[str, FittedLens] = {}
     frames, left_out = [], list(block.unoriented_note())
     for frame in block.oriented():

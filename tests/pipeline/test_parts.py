@@ -173,6 +173,14 @@ def test_the_report_shows_the_joins(halves: Path) -> None:
     assert "fiducial marks not measured" not in page
 
 
+def test_formats_of_resampled_frames_refuse_parts(halves: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for format in ("opencv", "colmap", "asp"):
+        assert run(["export", str(halves / "project.toml"), format, str(halves / "exported")]) == 2
+        assert "'fa' is a part of frame 'f' (column part_of)" in capsys.readouterr().err
+        assert not (halves / "exported").exists()
+    assert run(["export", str(halves / "project.toml"), "mmvii", str(halves / "exported")]) == 0
+
+
 def test_the_whole_frame_is_resampled_from_both(halves: Path) -> None:
     """Targets lie where the truth has them, on either side of the seam, which the file states."""
     assert run(["resample", str(halves / "project.toml"), str(halves / "frames")]) in (0, 1)
