@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _PIECE_PX = 8  # of a mark's edges that are witnesses of their own, and of what JPEG rounds by itself
-_LEAST_VARIANCE = 1e-9  # of a combination of departures that the picture hardly shows, over that of the others
+_LEAST_VARIANCE = 1e-9  # of what is left of departures, over that of the departures themselves
 
 
 def told_tone(
@@ -60,7 +60,9 @@ def told_tone(
     residuals = np.where(counts, fit.residuals, 0.0)
     score = -products(left, residuals[None])[:, 0]
     covariance = fit.covariance(left) + landscape.covariance(left) + fit.noise.variance_dn2 * shares.T @ priors @ shares
-    covariance += _LEAST_VARIANCE * max(float(np.trace(covariance)), 1e-30) * np.eye(len(covariance))
+    # Of departures that the picture's own unknowns take up whole, only rounding is left: it must not tell of the curve.
+    whole = float(np.trace(fit.covariance(changes)))
+    covariance += _LEAST_VARIANCE * max(whole, 1e-30) * np.eye(len(covariance))
     told = _told(fit, SaidOfTone.nothing(), tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
     weighted = np.linalg.solve(covariance, normal).T
     estimate: Array = np.asarray(np.linalg.inv(np.eye(len(normal)) + weighted @ normal) @ weighted, float)

@@ -5,11 +5,15 @@ import pytest
 from drawn import scan_of
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
+from measure.fitting.hidden_causes import Landscape
+from measure.fitting.linear_fit import LinearFit
 from measure.fitting.matching import Match, match
 from measure.fitting.scan_window import read_window
+from measure.fitting.tone_estimate import told_tone
 from measure.frames.refinement import options_for
 from measure.marks.shapes import MarkShape, polygon
 from measure.match_options import MatchOptions
+from measure.noise.noise import NoiseModel
 from measure.scans.told_tone import FrameTone, ToldTone
 from measure.scans.tone import LINEAR, SaidOfTone, Tone, power, sampled, srgb
 from synthetic_images.tone_curve import coded
@@ -53,6 +57,20 @@ def settled_from(
         found = FrameTone.of(prior, told, tone)
         tone = found.step_from(tone)
     return fits, found
+
+
+def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the_curve() -> None:
+    """All but a few pixels of the mark lie at the ends of the scanner's range: what they leave is rounding."""
+    rng, shape = np.random.default_rng(3), (24, 24)
+    row, col = np.indices(shape) / 24.0
+    design = np.stack([np.cos(7 * col), np.sin(7 * row), np.exp(-col), col * row + 0.5, np.ones(shape), col, row])
+    noise = NoiseModel(1.0, np.ones((1, 1)), 0.0)
+    drawn, clear = 30000.0 * (0.1 + 0.8 * col), np.zeros(shape, bool)
+    clear[5, 6:9] = True
+    used, landscape = np.ones(shape, bool), Landscape(drawn, np.zeros(shape, bool), design[3])
+    fit = LinearFit(rng.normal(size=shape), used, design, design / 576.0, noise, np.ones(shape))
+    said = told_tone(fit, drawn, drawn, clear, np.zeros(7), Tone.unknown(), FULL, landscape).said
+    assert np.abs(said.information).max() < 1e-3
 
 
 @pytest.mark.parametrize(("tone", "code", "light"), [
