@@ -49,6 +49,9 @@ def told_tone(
 
     What another curve moves the mark by follows from the observed light, with all that the drawing leaves unexplained.
     """
+    told = _told(fit, SaidOfTone.nothing(), tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
+    if not fit.noise.variance_dn2:  # neither noise nor contrast: nothing is drawn there
+        return told
     counts = fit.used & clear
     changes = tone.changes(drawn, full_scale_dn) * counts * fit.steadiness
     uneven = _uneven(fit.design[-GREY], fit.steadiness)
@@ -63,7 +66,6 @@ def told_tone(
     # Of departures that the picture's own unknowns take up whole, only rounding is left: it must not tell of the curve.
     whole = float(np.trace(fit.covariance(changes)))
     covariance += _LEAST_VARIANCE * max(whole, 1e-30) * np.eye(len(covariance))
-    told = _told(fit, SaidOfTone.nothing(), tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
     weighted = np.linalg.solve(covariance, normal).T
     estimate: Array = np.asarray(np.linalg.inv(np.eye(len(normal)) + weighted @ normal) @ weighted, float)
     by_piece = told.on_place @ estimate @ _by_piece(left * (residuals + combined(estimate @ score, left)))

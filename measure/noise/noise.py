@@ -33,7 +33,9 @@ class NoiseModel:
 
     def at_least(self, variance_dn2: float) -> "NoiseModel":
         """The same, of a variance that is not smaller."""
-        larger = max(variance_dn2 / max(self.variance_dn2, 1e-300), 1.0)
+        if not self.variance_dn2:  # a picture without any noise: there is nothing to enlarge
+            return NoiseModel(variance_dn2, np.full((1, 1), variance_dn2), 0.0, self.is_grain)
+        larger = max(variance_dn2 / self.variance_dn2, 1.0)
         return replace(
             self, variance_dn2=self.variance_dn2 * larger, autocovariance_dn2=self.autocovariance_dn2 * larger
         )

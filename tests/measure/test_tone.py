@@ -1,5 +1,7 @@
 """Tone curves: what is believed of them, what pictures say of them, and marks measured through them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drawn import scan_of
@@ -71,6 +73,13 @@ def test_pixels_that_the_pictures_own_unknowns_take_up_whole_tell_nothing_of_the
     fit = LinearFit(rng.normal(size=shape), used, design, design / 576.0, noise, np.ones(shape))
     said = told_tone(fit, drawn, drawn, clear, np.zeros(7), Tone.unknown(), FULL, landscape).said
     assert np.abs(said.information).max() < 1e-3
+    blank = replace(fit, residuals=np.zeros(shape), noise=NoiseModel(0.0, np.zeros((1, 1)), 0.0))
+    assert not told_tone(blank, drawn, drawn, used, np.zeros(7), Tone.unknown(), FULL, landscape).said.information.any()
+
+
+def test_noise_that_is_none_is_raised_to_a_floor() -> None:
+    raised = NoiseModel(0.0, np.zeros((1, 1)), 0.0).at_least(4.0)
+    assert raised.variance_dn2 == raised.autocovariance_dn2[0, 0] == 4.0
 
 
 @pytest.mark.parametrize(("tone", "code", "light"), [
