@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _PIECE_PX = 8  # of a mark's edges that are witnesses of their own, and of what JPEG rounds by itself
+_LEAST_CONTRAST = 1e-6  # of the light that is drawn: rounding is about that large
 _LEAST_VARIANCE = 1e-9  # of what is left of departures, over that of the departures themselves
 
 
@@ -50,7 +51,7 @@ def told_tone(
     What another curve moves the mark by follows from the observed light, with all that the drawing leaves unexplained.
     """
     told = _told(fit, SaidOfTone.nothing(), tone.changes(grey, full_scale_dn), tone, drawn, full_scale_dn)
-    if not fit.noise.variance_dn2:  # neither noise nor contrast: nothing is drawn there
+    if np.ptp(drawn) <= _LEAST_CONTRAST * np.abs(drawn).max():  # nothing is drawn: there are no edges
         return told
     counts = fit.used & clear
     changes = tone.changes(drawn, full_scale_dn) * counts * fit.steadiness
