@@ -12,13 +12,13 @@ _STRETCH, _SHEAR = ((1.0, 0.0), (0.0, -1.0)), ((0.0, 1.0), (1.0, 0.0))
 _OF_FREEDOM: dict[Freedom, tuple[tuple[tuple[float, float], tuple[float, float]], ...]] = {
     "shift": (),
     "similarity": (_SCALE, _TURN),
-    "affine": (_SCALE, _STRETCH, _SHEAR, _TURN),
+    "affine": (_SCALE, _TURN, _STRETCH, _SHEAR),
     "ellipse": (_SCALE, _STRETCH, _SHEAR),
 }
 
 
 def generators(freedom: Freedom, mark: Mark) -> NDArray[np.float64]:
-    """(n, 2, 2) of the changes that a fit estimates, the scale's first; a round mark has no rotation."""
+    """(n, 2, 2) of the changes that a fit estimates, scale and rotation first; a round mark has no rotation."""
     shown = [each for each in _OF_FREEDOM[freedom] if not (each is _TURN and is_round(mark))]
     return np.array(shown).reshape(-1, 2, 2)
 

@@ -361,14 +361,15 @@ def _weighed(fit: PictureFit, used: Mask, noise: NoiseModel, about: _Surrounding
     place = place.plus(Cause.LANDSCAPE, _landscape(model, about).covariance(by_grey[:2]))
     linear = LinearFit(model.residuals, used, model.design, by_grey, noise, model.steadiness)
     freedom = model.options.freedom
-    tells_shape = freedom == "similarity" and not is_round(model.mark)
+    tells_shape = freedom in ("similarity", "affine") and not is_round(model.mark)
+    shape, strain = slice(2, 4), slice(4, model.linear.stop)
     return _Precision(
         place,
         covariance,
         contrast_sigma=float(np.sqrt(max(float(model.contrast_by @ covariance @ model.contrast_by), 1e-12))),
         edges=edge_place(linear, model.blur_px),
         sloping=sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
-        own_shape=own_shape(linear, model.linear, model.departures()) if tells_shape else None,
+        own_shape=own_shape(linear, shape, strain, model.departures()) if tells_shape else None,
         tone=_tone(fit, linear, priors_dn2, about),
     )
 

@@ -27,20 +27,24 @@ class OwnShape:
     on_place: Array
 
 
-def own_shape(fit: LinearFit, shape: slice, departures: Array) -> OwnShape | None:
+def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) -> OwnShape | None:
     """What the picture says of the two unknowns of a shape, None where they were its own anyway, or it says nothing.
 
-    shape: which unknowns of the fit these are; departures (unknowns,): of the match from what the frame gave.
+    shape: which unknowns of the fit these are; strain: those of stretch and shear, which stay held by the frame;
+    departures (unknowns,): of the match from what the frame gave.
     """
     told = products(fit.by_grey, fit.design)
     if np.diag(told)[shape].min() > _OWN:
         return None
+    let_go = told.copy()  # as if no other unknown were held: each column is how far that unknown itself decides
+    let_go[:, strain] = np.eye(len(told))[:, strain]
     try:
-        by_noise = combined(np.asarray(np.linalg.inv(told), float)[shape], fit.by_grey)
+        freed = np.asarray(np.linalg.inv(let_go), float)[shape]
     except np.linalg.LinAlgError:
         return None
+    by_noise = combined(freed, fit.by_grey)
     variance = np.diag(fit.covariance(by_noise))
     if not np.all(variance > 0):
         return None
     change = products(by_noise, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
-    return OwnShape(change + departures[shape], np.sqrt(variance), -told[:2, shape])
+    return OwnShape(change + freed @ told @ departures, np.sqrt(variance), -told[:2, shape])

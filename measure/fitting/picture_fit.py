@@ -177,13 +177,15 @@ class PictureFit:
         design, bent = self.model.design * self.used, np.sqrt(self.model.curvature)
         plain = design * bent / variance  # of residuals that are as large as their information says
         smeared = plain * variance if noise.is_white else correlated(plain, noise) * self.used
-        return self._covariance(plain * bent, smeared / bent)
+        return self._covariance(plain * bent, smeared / bent, self.variance_dn2 / variance)
 
-    def _covariance(self, weights: Array, smeared: Array) -> tuple[Array, Array]:
-        """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these."""
+    def _covariance(self, weights: Array, smeared: Array, held: float = 1.0) -> tuple[Array, Array]:
+        """As `weigh` gives them, from weighted derivatives and the noise's covariance matrix times these. held: how
+        many times as much as their variances say the priors counted: the floor under the fit's scale holds rotation
+        and scale of a clear mark on a clean scan close, and their errors then go into its place."""
         priors = np.diag(self.model.prior_weights())
-        inverse: Array = np.asarray(np.linalg.inv(products(weights, self.model.design) + priors))
-        covariance = np.asarray(inverse @ (products(weights, smeared) + priors) @ inverse.T)
+        inverse: Array = np.asarray(np.linalg.inv(products(weights, self.model.design) + held * priors))
+        covariance = np.asarray(inverse @ (products(weights, smeared) + held**2 * priors) @ inverse.T)
         if not np.all(np.linalg.eigvalsh(covariance[:2, :2] + covariance[:2, :2].T) > 0):
             covariance = inverse  # lags that are noise themselves: as if it were white
         if isinstance(self.model.mark, MarkTemplate):

@@ -57,7 +57,7 @@ def told_tone(
     changes = tone.changes(drawn, full_scale_dn) * counts * fit.steadiness
     uneven = _uneven(fit.design[-GREY], fit.steadiness)
     known, priors = np.concatenate([fit.design, uneven]) * counts, np.diag(np.append(priors_dn2, np.zeros(len(uneven))))
-    inverse: Array = np.asarray(np.linalg.pinv(products(known, known) + priors, hermitian=True), float)
+    inverse = _inverse(products(known, known) + priors)
     shares = inverse @ products(known, changes)
     left = changes - combined(shares.T, known)
     normal = products(left, changes)
@@ -73,6 +73,13 @@ def told_tone(
     by_noise = np.trace(told.on_place @ estimate @ covariance @ estimate.T @ told.on_place.T)
     worse = max(float(np.sum(by_piece**2) / max(by_noise, 1e-30)), 1.0)
     return replace(told, said=SaidOfTone.by_score(normal, score + normal @ tone.mean, worse * covariance))
+
+
+def _inverse(normal: Array) -> Array:
+    """(n, n) with all unknowns brought to one size: beside a strong prior the others would pass for nothing."""
+    size = np.sqrt(np.where(np.diag(normal) > 0, np.diag(normal), 1.0))
+    scale = np.outer(size, size)
+    return np.asarray(np.linalg.pinv(normal / scale, hermitian=True) / scale, float)
 
 
 def _by_piece(images: Array) -> Array:

@@ -50,8 +50,8 @@ class Sighting:
 def sight(scan: Scan, expected: MarkPrediction, options: MatchOptions, frame_sigma: float | None = None) -> Sighting:
     """Look for the mark within the search radius of its predicted place and match it there.
 
-    frame_sigma: standard deviation of the predicted rotation (rad) and scale, where a frame fitted to all marks gives
-    them.
+    frame_sigma: standard deviation of the predicted rotation (rad), scale, stretch and shear, where a frame fitted to
+    all marks gives them.
     """
     predicted = expected.center_px.copy()
     inside = bool(np.all(predicted >= -0.5) and np.all(predicted < np.array([scan.width_px, scan.height_px]) - 0.5))
@@ -149,8 +149,8 @@ def _matched(
 
 
 def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) -> MatchOptions:
-    """A solid mark gets more ground. Where the mark leans on the frame, its rotation and scale stay as predicted, or
-    near it."""
+    """A solid mark gets more ground. Where the mark leans on the frame, its rotation, scale, stretch and shear stay
+    as predicted, or as near it as the frame knows them."""
     if _is_solid(mark):
         options = replace(
             options,
@@ -161,7 +161,7 @@ def options_for(mark: Mark, options: MatchOptions, frame_sigma: float | None) ->
         return options
     if frame_sigma is None:
         return replace(options, freedom="shift")
-    return replace(options, freedom="similarity", linear_sigma=frame_sigma)
+    return replace(options, freedom="affine", linear_sigma=frame_sigma)
 
 
 def _is_solid(mark: Mark) -> bool:

@@ -1,9 +1,12 @@
 """Marks at the Cramér-Rao bound, by the error that the best linear estimate makes in the very same noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drawn import scan_of
 from true_marks import (
+    ALL_MOVES,
     KIND,
     WING,
     Kind,
@@ -50,6 +53,25 @@ def test_marks_are_at_the_bound_with_honest_sigmas_in_white_noise_and_in_grain(n
         bounds.append(mark.bound(1 / SNR, None, correlation))
     assert np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(best))) < 1.12
     assert 0.9 < whitened_rms(errors, covariances) / whitened_rms(best, bounds) < 1.1
+
+
+def test_wedges_and_wings_say_how_well_their_frame_s_stretch_and_shear_are_known() -> None:
+    """A few marks close together, say, that are given a little off: all their tips are then off alike."""
+    rng, roughly = np.random.default_rng(8), 2e-3
+    errors, covariances, best = [], [], []
+    for name in ("wedge", "wing"):
+        true = some_mark(replace(KIND[name], known=roughly), 1.0, rng)
+        for _ in range(10):
+            unit = rng.standard_normal((true.size, true.size)) / 200
+            off = rng.normal(0, roughly, len(ALL_MOVES))
+            told = (np.eye(2) + np.tensordot(off, np.reshape(ALL_MOVES, (-1, 2, 2)), 1)) @ true.place[:, :2]
+            predicted = TrueMark(true.kind, np.column_stack([told, true.place[:, 2]]), true.size, 1.0)
+            fit = sighted(predicted, GROUND + CONTRAST * (true.picture + unit), rng)
+            errors.append(fit.center_px - true.place[:, 2])
+            covariances.append(fit.covariance_px2)
+            best.append(true.best_errors(unit, 1 / 200, told=off))
+    assert np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(best))) < 1.6  # by rotation and scale only: 3.4
+    assert 0.8 < whitened_rms(errors, covariances) < 1.25  # likewise, or by the noise's part only: 1.4 and more
 
 
 def test_a_disk_on_plain_ground_uses_more_of_it() -> None:

@@ -142,6 +142,16 @@ def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: floa
     assert whitened_rms(errors, covariances) < 2.2  # of three scans, in fact: the tips of one are off together
 
 
+def test_a_mark_says_no_more_of_the_curve_where_its_frame_is_known_without_error() -> None:
+    rng = np.random.default_rng(3)
+    mark = some_mark(TIP, 1.0, rng)
+    code = code_of(mark, 2.2, 80.0, rng)
+    alike = [replace(mark, kind=replace(TIP, known=known)) for known in (1e-4, 1e-6)]
+    told = [fitted(each, code, Tone.unknown().like_power(2.2)).tone for each in alike]
+    information = [one.said.information for one in told if one is not None]
+    np.testing.assert_allclose(information[1], information[0], rtol=0.1, atol=0.1)
+
+
 def test_the_linearised_effect_of_a_curve_is_that_of_a_fit_at_another_one() -> None:
     rng = np.random.default_rng(5)
     mark = some_mark(TIP, 1.0, rng)

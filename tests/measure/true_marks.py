@@ -23,6 +23,7 @@ Moves = tuple[tuple[float, float, float, float], ...]
 # Unknown changes of a mark's linear part, as generators (xx, xy, yx, yy).
 TURN, SCALE = (0.0, -1.0, 1.0, 0.0), (1.0, 0.0, 0.0, 1.0)
 STRETCH, SHEAR = (1.0, 0.0, 0.0, -1.0), (0.0, 1.0, 1.0, 0.0)
+ALL_MOVES = (SCALE, TURN, STRETCH, SHEAR)
 GREYS = 4  # gain, offset, two slopes
 MARGIN_PX = 8  # of ground about a mark's bounds
 MARGIN_BLURS = 4.0  # standard deviations of the blur, about its outline
@@ -55,9 +56,9 @@ KINDS = (
     Kind("ring-cross", MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15, angle_deg=45.0))),
     Kind("ring-dot", MarkShape(ring_dot(1.0, 0.15, 0.25)), (SCALE,)),
     Kind("ellipse", MarkShape(dot(1.0)), (SCALE, STRETCH, SHEAR)),
-    Kind("wedge", MarkShape(polygon(WEDGE)), (SCALE, TURN), FROM_FRAME),
-    Kind("wing", MarkShape(polygon(WING)), (SCALE, TURN), FROM_FRAME),
-    Kind("notch", MarkShape(polygon(NOTCH)), (SCALE, TURN), FROM_FRAME),
+    Kind("wedge", MarkShape(polygon(WEDGE)), ALL_MOVES, FROM_FRAME),
+    Kind("wing", MarkShape(polygon(WING)), ALL_MOVES, FROM_FRAME),
+    Kind("notch", MarkShape(polygon(NOTCH)), ALL_MOVES, FROM_FRAME),
 )
 KIND = {kind.name: kind for kind in KINDS}
 
