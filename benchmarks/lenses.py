@@ -10,6 +10,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 
 import cv2
 import numpy as np
@@ -88,7 +89,7 @@ def main() -> None:
         true = {
             f"IO.C.{each}": value for each, value in (values | dict(zip(("x0", "y0"), POINT_MM, strict=True))).items()
         }
-        simulate(name, lambda rng, name=name: lens_network(name, rng), true | {"IO.C.c": c}, sets)  # type: ignore[misc]
+        simulate(name, partial(lens_network, name), true | {"IO.C.c": c}, sets)
     bends = dict(zip(("BD.board.bend_x", "BD.board.bend_y"), BENDS_MM, strict=True))
     simulate("bent board", lambda rng: board_network(rng)[0], bends | {"IO.C.c": 20.0, "IO.C.k1": -0.08}, sets)
 

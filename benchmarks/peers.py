@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ def reseau(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
     cameras = tuple(replace(each, principal_distance_mm=c, x0_mm=None, y0_mm=None) for each in scene.network.cameras)
     options = Options(robust="igg3") if gross else None
     result = adjust(replace(scene.network, cameras=cameras), None, options)
-    result.cofactor.variances  # noqa: B018 what OpenCV computes, too
+    assert len(result.cofactor.variances)  # OpenCV computes them, too
     return result.value("IO.K.c"), None
 
 
@@ -229,7 +230,7 @@ def boards(views_of_tables: Sequence[int]) -> None:
         for shape in ("flat", "relief"):
             for c in ("given", "free"):
                 programs = [each for each in PROGRAMS if shape == "flat" or each != "mrcal"]
-                found = _rounds(programs, lambda program: _once(program, views, shape, c, 0))  # noqa: B023
+                found = _rounds(programs, partial(_once, views=views, shape=shape, c=c, percent=0))
                 cells = [f"{_cell(found.get(program, [])):>26}" for program in PROGRAMS]
                 print(f"{views:5} {shape:7} {c:6}" + "".join(cells), flush=True)
 
@@ -244,7 +245,7 @@ def _cell(figures: Sequence[Figures]) -> str:
 def bundles(_: Sequence[int]) -> None:
     """With the covariance of camera, images and points."""
     for images, points in BUNDLES:
-        found = _rounds(("reseau", "ceres"), lambda program: _bundle(program, images, points))  # noqa: B023
+        found = _rounds(("reseau", "ceres"), partial(_bundle, images=images, points=points))
         ours, theirs = (statistics.median(each["seconds"] for each in figures) for figures in found.values())
         told = ", ".join(f"{program} {_told(figures)}" for program, figures in found.items())
         print(f"{images} images, {points} points: {told}; ratio {ours / theirs:.2f}", flush=True)

@@ -181,12 +181,12 @@ def _measure(project: Project, new: Unpublished, reporter: Reporter, work: WorkO
 
     with Store(project.measurement_path) as store:
         tell_place(store, project.path.parent)
-        done = measure_archive(
+        digest = measure_archive(
             project, store, lambda: measured_from(project), new.place(project.output / "learned"), reporter, work
         )
-        if not marks_as_written(store, done.digest, project.comparator):
-            _write_marks(project, store, done.digest, new)
-        return done.digest
+        if not marks_as_written(store, digest, project.comparator):
+            _write_marks(project, store, digest, new)
+        return digest
 
 
 def _adjusted_marks(

@@ -54,9 +54,10 @@ def gauss_newton_step(design: NDArray[Real], residuals: NDArray[Real], weights: 
 def solution(normal: Array, right: Array, free: Mask) -> Array | None:
     """The solution of normal equations (unknowns, unknowns) for the free unknowns, 0 for the others; None where they
     are singular."""
-    size = np.sqrt(np.diag(normal))[free]
-    if not np.all(size > 0) or not np.all(np.isfinite(size)):
+    squares = np.diag(normal)[free]
+    if not np.all(squares > 0) or not np.all(np.isfinite(squares)):
         return None
+    size = np.sqrt(squares)
     scaled = normal[np.ix_(free, free)] / np.outer(size, size)
     values = np.linalg.eigvalsh(scaled)
     if not values[-1] < _WORST_CONDITION * values[0]:

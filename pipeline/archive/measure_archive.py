@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from pipeline.archive.moved import find_moved, hash_contents
 from pipeline.archive.store import Store
 from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.archive.together import find_copies, input_of, judged_lots
-from pipeline.archive.work import Counts, Work
+from pipeline.archive.work import Work
 from pipeline.archive.work_options import WorkOptions
 from pipeline.files.project_file import Project
 from pipeline.measuring.learn_stage import learn_marks
@@ -28,14 +27,6 @@ from pipeline.progress import Reporter
 from pipeline.workers import worker_pool
 
 
-@dataclass(frozen=True)
-class Done:
-    """digest: of the judging of all scans; "" of a shard, which does not judge. counts: what there was to do."""
-
-    digest: str
-    counts: Counts
-
-
 def measure_archive(
     project: Project,
     store: Store,
@@ -43,12 +34,13 @@ def measure_archive(
     learned_folder: Path,
     reporter: Reporter,
     options: WorkOptions | None = None,
-) -> Done:
+) -> str:
     """Measure what is missing of the project's scans, and judge all of them together, unless that is as it was.
 
-    Raises InputError for what is wrong in the user's own files, before anything is measured, and MeasurementError where
-    no scan at all could be measured; a scan that fails is a result. made_from: what a judging says that it is
-    of, asked when all is measured; learned_folder: where what is learned of marks is written.
+    Returns the digest of that judging; "" of a shard, which does not judge. Raises InputError for what is wrong in the
+    user's own files, before anything is measured, and MeasurementError where no scan at all could be measured; a scan
+    that fails is a result. made_from: what a judging says that it is of, asked when all is measured; learned_folder:
+    where what is learned of marks is written.
     """
     options = options or WorkOptions()
     names = check_measurable(project)
@@ -65,7 +57,7 @@ def measure_archive(
         if options.shard is not None:
             part, parts = options.shard
             work.complete([task for task in tasks if shard_of(task.name, parts) == part], reporter)
-            return Done("", work.counts)
+            return ""
         work.complete(tasks, reporter)
         if options.moved:
             hash_contents(store, tasks, work, reporter)
@@ -75,10 +67,10 @@ def measure_archive(
         told = input_of(tasks, work, copies, made)
         before = latest(store)
         if before is not None and before.input == told:
-            return Done(before.digest, work.counts)
+            return before.digest
         share = partial(tied, learned, reporter=reporter, executor=executor)
         lots = judged_lots(learned, tasks, work, copies, share, told)
-        return Done(judge_lots(store, made, told, lots), work.counts)
+        return judge_lots(store, made, told, lots)
 
 
 def executor_of(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:

@@ -4,7 +4,6 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from functools import lru_cache
 
 from measure.scans.addresses import scan_path
@@ -31,15 +30,6 @@ _SAID_EVERY_S = 30.0
 _hash_of = lru_cache(maxsize=4096)(options_hash)
 
 
-@dataclass
-class Counts:
-    """Of the scans of a project: how many were measured now, how many of these failed, and how many were kept."""
-
-    measured: int = 0
-    failed: int = 0
-    kept: int = 0
-
-
 class Work:
     """Scans measured as tasks ask for them: what the store holds is read there, all else measured and kept at once."""
 
@@ -62,8 +52,8 @@ class Work:
         self._asked = asked_of(project)
         self._decisions = by_image(project.decisions)
         self._counting: dict[str, Mapping[About, Decision]] = {}  # by image, of what was asked for last
+        self._now: set[int] = set()  # rows that were measured now
         self.results: dict[str, int] = {}  # by image, the row of what was asked for last
-        self.counts = Counts()
 
     def measure(self, tasks: Iterable[ScanTask]) -> Iterator[MeasuredScan]:
         """What each task gives, measured or kept, without the marks that are none by decision: a `Measure`."""
@@ -83,10 +73,10 @@ class Work:
         known = {task.name: row for task in tasks if (row := self._row(task)) is not None}
         missing = [task for task in tasks if task.name not in known]
         self.results |= known
-        self.counts.kept += len(known)
+        earlier = sum(row not in self._now for row in known.values())
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
-        if known or len(missing) > 1:
-            reporter.say(f"{len(known)} of {len(tasks)} scans are measured already; {len(missing)} to measure")
+        if earlier or len(missing) > 1:
+            reporter.say(f"{earlier} of {len(tasks)} scans are measured already; {len(missing)} to measure")
         if missing:
             self._complete(missing, reporter)
 
@@ -135,7 +125,6 @@ class Work:
         with reporter.stage("measured") as count:
             for done, (task, row, kept) in enumerate(self._measured(tasks, as_scans=True), 1):
                 self.results[task.name] = row
-                self.counts.measured += 1
                 expected.is_done(task.name, kept.seconds, kept.bytes_read)
                 if kept.record["failure"]:
                     failed.append(task.name)
@@ -146,7 +135,6 @@ class Work:
                 if done < len(tasks) and (done == self._at_a_time or now_s - said_s > _SAID_EVERY_S):
                     said_s = now_s
                     reporter.say(f"{left}; {expected.sentence}")
-        self.counts.failed += len(failed)
 
     def _decided(self, task: ScanTask) -> ScanTask:
         """The task as decisions about its scan have it."""
@@ -192,6 +180,7 @@ class Work:
             asked = self._asked(task.name) if as_scans else None
             row = self._store.keep(kept, task.name if as_scans else None, as_scans, asked)
             self._identities[kept.identity.state.uri], self._rows[kept.fingerprint] = kept.identity, row
+            self._now.add(row)
             yield task, row, kept
 
     def _kept(self, task: ScanTask, state: FileState, seen: Witnessed) -> Kept:

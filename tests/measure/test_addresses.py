@@ -92,8 +92,7 @@ def with_overviews(path: Path, picture: Any, below: bool = False) -> None:
             file.write(one, subfiletype=1, **tiles)
 
 
-@pytest.mark.parametrize("below", [False, True])
-@pytest.mark.parametrize("factor", [3, 4, 5, 8, 20])
+@pytest.mark.parametrize(("factor", "below"), [(3, False), (4, True), (5, False), (8, True), (20, False)])
 def test_a_scan_is_looked_at_small_by_its_overviews(
     tmp_path: Path, server: RangeServer, factor: int, below: bool
 ) -> None:

@@ -1,5 +1,6 @@
 """What joins two scans of one frame: places of the film, matched to what their standard deviations say."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def shifted(grey: Array, col: float, row: float) -> Array:
     return np.asarray(np.fft.irfft2(np.fft.rfft2(grey) * turn, s=(SIDE, SIDE)))
 
 
-def joined(folder: Path, noise: float, blur: float = 1.2) -> tuple[Joins, Array]:
+def scanned(folder: Path, noise: float, blur: float = 1.2) -> tuple[list[TieFrame], Array]:
     """The left and the right part of a picture, the right one moved by a broken number of pixels, and how far."""
     rng = np.random.default_rng(3)
     grey = picture(blur)
@@ -45,7 +46,7 @@ def joined(folder: Path, noise: float, blur: float = 1.2) -> tuple[Joins, Array]
         stored = np.clip(np.rint(part + rng.normal(0.0, noise, part.shape)), 0, 65535).astype(np.uint16)
         tifffile.imwrite(folder / f"{name}.tif", stored)
         parts.append(TieFrame(name, folder / f"{name}.tif", np.eye(2, 3), None, np.zeros((0, 3))))
-    return measure_joins(parts, 30), move - (first, 0)
+    return parts, move - (first, 0)
 
 
 def off_and_sigma(joins: Joins, move: Array) -> tuple[Array, Array]:
@@ -62,7 +63,8 @@ def off_and_sigma(joins: Joins, move: Array) -> tuple[Array, Array]:
 
 
 def test_errors_of_joins_are_as_large_as_their_standard_deviations(tmp_path: Path) -> None:
-    joins, move = joined(tmp_path, 1500.0)
+    parts, move = scanned(tmp_path, 1500.0)
+    joins = measure_joins(parts, 30)
     assert len(joins.marks["a"]) == 30
     off, sigma = off_and_sigma(joins, move)
     assert 0.8 < np.sqrt(np.mean((off / sigma) ** 2)) < 1.25
@@ -71,7 +73,8 @@ def test_errors_of_joins_are_as_large_as_their_standard_deviations(tmp_path: Pat
 
 def test_without_noise_what_lies_between_pixels_is_left(tmp_path: Path) -> None:
     """A hundredth of a pixel, and no less is claimed."""
-    joins, move = joined(tmp_path, 1.0)
+    parts, move = scanned(tmp_path, 1.0)
+    joins = measure_joins(parts, 30)
     off, sigma = off_and_sigma(joins, move)
     assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.2
     first = joins.marks["a"][0]
@@ -81,20 +84,15 @@ def test_without_noise_what_lies_between_pixels_is_left(tmp_path: Path) -> None:
 
 
 def test_marks_that_are_known_are_no_joins(tmp_path: Path) -> None:
-    joined(tmp_path, 500.0)
+    (first, second), _ = scanned(tmp_path, 500.0)
     taken = np.array([[300.0, 350.0, 60.0]])
-    parts = [
-        TieFrame(name, tmp_path / f"{name}.tif", np.eye(2, 3), None, taken if name == "a" else np.zeros((0, 3)))
-        for name in "ab"
-    ]
-    for mark in measure_joins(parts, 30).marks["a"]:
+    for mark in measure_joins([replace(first, taken_px=taken), second], 30).marks["a"]:
         assert mark.center_px is not None
         assert np.hypot(*(mark.center_px - (300.0, 350.0))) > 60.0
 
 
 def test_a_scan_that_cannot_be_read_costs_the_other_nothing(tmp_path: Path) -> None:
-    joined(tmp_path, 500.0)
+    parts, _ = scanned(tmp_path, 500.0)
     (tmp_path / "b.tif").write_bytes(b"no picture")
-    parts = [TieFrame(name, tmp_path / f"{name}.tif", np.eye(2, 3), None, np.zeros((0, 3))) for name in "ab"]
     joins = measure_joins(parts)
     assert "It is not joined to the other scans of its frame" in joins.problems["b"]

@@ -371,15 +371,17 @@ def test_learned_marks_stay_when_a_scan_comes(three: Path, tmp_path: Path) -> No
 TIPS = 'kind = "polygon"\nvertices_mm = [[0, 0], [0.8, -1.0], [0.8, 1.0]]\n'  # leans on the tone curve
 
 
-def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(three: Path, tmp_path: Path) -> None:
+def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(three: Path, tmp_path: Path, capsys: SAID) -> None:
     folder = tmp_path / "p"
     shutil.copytree(three, folder)
     camera = CAMERA.split("[mark.m]")[0] + f"[mark.m]\n{TIPS}"
     (folder / "camera.toml").write_text(camera, encoding="utf-8")
     measure(folder)
+    assert "0 of 3 scans are measured already" in capsys.readouterr().err  # this call asked them for the curve itself
     measured.clear()
     measure(folder)
     assert not measured
+    assert "3 of 3 scans are measured already" in capsys.readouterr().err
     one_more(folder)
     (folder / "a.tif").unlink()
     measure(folder)
