@@ -61,6 +61,7 @@ def test_normal_equations_are_solved_for_what_is_free_and_refused_where_they_tel
     twice = design[:, [0, 0, 2]]
     assert solution(twice.T @ twice, truth, np.ones(3, bool)) is None
     assert solution(np.diag([1.0, 0.0, 1.0]), truth, np.ones(3, bool)) is None
+    assert solution(np.diag([1.0, -1e-18, 1.0]), truth, np.ones(3, bool)) is None  # as rounding leaves it
 
 
 def test_a_line_by_tukeys_weights_leaves_outliers_aside() -> None:
