@@ -18,6 +18,7 @@ import cv2
 from adjust.least_squares.kept_memory import keep_freed_memory
 
 KILLS = 2  # of its process, after which a task is given up: once may be chance, or another program's doing
+STARTS = 5  # of processes that are killed before they stand, one after another: then none will
 
 
 class WorkerKilled(BrokenExecutor):
@@ -109,23 +110,35 @@ class LocalPool(Executor):
         try:
             working = pool.submit(task.call)
         except BrokenProcessPool:  # killed while it had nothing in hand
-            pool = self._replaced(pool)
-            working = pool.submit(task.call)
+            self._start_anew(pool, task)
         except RuntimeError as error:  # shut down meanwhile
             task.future.set_exception(error)
-            return
-        working.add_done_callback(partial(self._done, pool, task))
+        else:
+            working.add_done_callback(partial(self._done, pool, task))
+
+    def _start_anew(self, broken: ProcessPoolExecutor, task: _Task, starts: int = STARTS) -> None:
+        """In a new process, once that stands: one that is killed on its way there says nothing of the task."""
+        pool = self._replaced(broken)
+
+        def stands(ready: Future[int]) -> None:
+            if ready.cancelled() or not isinstance(ready.exception(), BrokenProcessPool):
+                self._start(pool, task)
+            elif starts and not self._ended:
+                self._start_anew(pool, task, starts - 1)
+            else:
+                self._give_up(pool, task)
+
+        pool.submit(os.getpid).add_done_callback(stands)
 
     def _done(self, pool: ProcessPoolExecutor, task: _Task, done: Future[Any]) -> None:
         error = CancelledBeforeStart() if done.cancelled() else done.exception()
         if isinstance(error, BrokenProcessPool):
             task.kills += 1
-            error = WorkerKilled()
-            if not self._ended:
-                pool = self._replaced(pool)
-                if task.kills < KILLS:
-                    self._start(pool, task)
-                    return
+            if not self._ended and task.kills < KILLS:
+                self._start_anew(pool, task)
+            else:
+                self._give_up(pool, task)
+            return
         self._is_idle(pool)
         if error is None:
             task.future.set_result(done.result())
@@ -133,13 +146,17 @@ class LocalPool(Executor):
             task.future.set_exception(error)
         self._feed()
 
+    def _give_up(self, broken: ProcessPoolExecutor, task: _Task) -> None:
+        self._is_idle(self._replaced(broken))
+        task.future.set_exception(WorkerKilled())
+        self._feed()
+
     def _is_idle(self, pool: ProcessPoolExecutor) -> None:
         with self._lock:
             self._idle.append(pool)
 
     def _replaced(self, broken: ProcessPoolExecutor) -> ProcessPoolExecutor:
-        broken.shutdown(wait=False)
-        pool = _process()
+        pool = _process()  # a broken one has ended itself, and may hold its lock while it tells of that
         with self._lock:
             self._pools.discard(broken)
             self._pools.add(pool)

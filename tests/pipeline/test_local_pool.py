@@ -1,5 +1,6 @@
 """A process that is killed costs its own scan at most, and only when it is killed with it again."""
 
+import multiprocessing
 import os
 import signal
 import time
@@ -51,6 +52,27 @@ def test_a_process_killed_without_a_task_is_replaced() -> None:
         os.kill(first, signal.SIGKILL)
         time.sleep(0.2)
         assert pool.submit(process).result(60) != first
+
+
+def test_a_process_killed_on_its_way_says_nothing_of_the_task(tmp_path: Path) -> None:
+    with worker_pool(1, workers=1) as pool:
+        killed = {pool.submit(process).result(60)}
+        task = pool.submit(killed_times, 1, tmp_path, 7)
+        for _ in range(2):
+            while not (coming := [child for child in multiprocessing.active_children() if child.pid not in killed]):
+                assert not task.done()
+                time.sleep(0.001)
+            killed.add(coming[0].pid or 0)
+            coming[0].kill()
+        assert task.result(60) == 7
+
+
+def test_where_no_process_stands_tasks_are_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.workers.prepare", os.abort)
+    with worker_pool(1, workers=1) as pool:
+        for task in [pool.submit(square, number) for number in range(2)]:
+            with pytest.raises(WorkerKilled):
+                task.result(60)
 
 
 def test_what_a_task_raises_is_its_own() -> None:
