@@ -2,33 +2,30 @@
 
 python benchmarks/colmap_block.py FOLDER [SEED...]
 
-Renders 4 strips of 8 frames (60 % and 40 % overlap, 1:10,000, relief 60 m rms, six poses, films of their own), measures
-the fiducials, marks 12 control points in every frame that shows them (true places with 0.3 px of noise: what a person
-would do), and runs `reseau block`. FOLDER is kept: what is there already is not made again. Of several seeds each has a
-folder in it.
+Renders 4 strips of 8 frames (60 % and 40 % overlap, 1:10,000, relief 60 m rms, six poses, films of their own), runs
+`reseau measure` for the fiducials, marks 12 control points in every frame that shows them (true places with 0.3 px of
+noise: what a person would do), and runs `reseau block`. FOLDER is kept: what is there already is not made again. Of
+several seeds each has a folder in it.
 """
 
+import csv
+import json
+import resource
+import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 import synthetic_images
-from adjust.problem.network import EXTERIOR_NAMES, ObjectPoint, Prior
-from adjust.problem.result import Adjustment
-from pipeline.adjusting.adjust_stage import adjust_marks
-from pipeline.blocks.block_stage import OrientedBlock, run_block
-from pipeline.blocks.mapping import run_mapping
 from pipeline.blocks.ties import similarity
-from pipeline.files.points_file import GivenPoints
-from pipeline.files.project_file import Project, read_project
-from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import read_scene, render_project
-from pipeline.results.comparator_file import comparator_from_pixel, read_comparator
-from pipeline.stages import run_measure
+from pipeline.results.comparator_file import comparator_from_pixel
 from synthetic_images.film import frame_geometry
 from synthetic_images.projection import object_rotation
 from synthetic_images.scene import Scene
@@ -43,6 +40,18 @@ CONTROL = (4, 3)
 CONTROL_SIGMA_M, CLICK_PX = 0.05, 0.3
 MARGIN_MM = 12.0  # of the frame: there are its fiducials
 SEED = 11
+
+PROJECT = """camera = "project/camera.toml"
+scans = ["project/scans/*.tif"]
+comparator = "comparator.csv"
+output = "out"
+[object]
+points = "control.csv"
+unit = "m"
+[adjust]
+transformation = "affine"
+datum = "control"
+"""
 
 SCENE = f"""name = "colmap_block"
 seed = {{seed}}
@@ -87,27 +96,32 @@ def main() -> None:
 
 
 def one_block(folder: Path, seed: int) -> None:
-    """Render, measure, orient, adjust and compare; each step is timed."""
-    print(f"seed {seed}")
+    """Render, measure, orient and adjust by the user's commands, and compare; each step is timed."""
+    print(f"seed {seed}", flush=True)
     scene = rendered(folder, seed)
-    project = replace(read_project(folder / "project" / "project.toml"), ties=None, given_images=None)
-    if not project.comparator.exists():
-        start = time.monotonic()
-        run_measure(project, Reporter())
-        print(f"measuring the fiducials: {time.monotonic() - start:.0f} s")
-    project = with_control(project, scene, seed)
-    block = run_block(project, folder / "block", None, Reporter())
-    print(f"COLMAP oriented {len(block.mapped.poses)} of {len(scene.images)} images; {block.ties} tie marks of "
-          f"{block.tracks} points are taken of {len(block.mapped.points)}")  # fmt: skip
-    for step, seconds in block.seconds.items():
-        print(f"  {step}: {seconds:.0f} s")
-    start = time.monotonic()
-    adjustment = adjust_marks(block.project, read_comparator(block.project.comparator))
-    print(
-        f"  one adjustment: {time.monotonic() - start:.0f} s, {adjustment.termination}, {adjustment.unknowns} unknowns"
-    )
+    project, comparator = folder / "block.toml", folder / "comparator.csv"
+    if not comparator.exists():
+        project.write_text(PROJECT, encoding="utf-8")
+        give_control(folder, scene, seed)
+        reseau("measure", str(project))
+        click_control(comparator, scene, seed)
+    print(reseau("block", str(project), str(folder / "block")))
+    adjustment = json.loads((folder / "block" / "out" / "adjustment.json").read_text(encoding="utf-8"))
     tell(adjustment, scene)
-    tell_alone(block, scene)
+    tell_alone(folder / "block", scene)
+
+
+def reseau(*arguments: str) -> str:
+    """What a command prints; how long it takes is told."""
+    start, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [str(Path(sys.executable).with_name("reseau")), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    print(f"reseau {arguments[0]}: exit code {done.returncode}, {cpu:.0f} s of CPU in {time.monotonic() - start:.0f} s")
+    if done.returncode not in (0, 1):
+        sys.exit(done.stderr)
+    return done.stdout
 
 
 def rendered(folder: Path, seed: int) -> Scene:
@@ -138,33 +152,38 @@ def images(rng: np.random.Generator) -> str:
     return "\n".join(tables)
 
 
-def with_control(project: Project, scene: Scene, seed: int) -> Project:
-    """The project with control points, marked in every frame that shows them within its marks."""
-    rng = np.random.default_rng([seed, 5])
+def control_points(scene: Scene) -> Array:
+    """(n, 3) on the ground, on a grid over the block."""
     reach = np.array([(FRAMES - 1) * BASE_M, (STRIPS - 1) * STRIP_M]) / 2.0
     x, y = np.meshgrid(*(np.linspace(-end, end, count) for end, count in zip(reach, CONTROL, strict=True)))
     plan = np.column_stack([x.ravel(), y.ravel()])
-    true = np.column_stack([plan, scene_terrain(scene).heights(plan)])
-    lines = [line for line in project.comparator.read_text(encoding="utf-8").splitlines() if ",control-" not in line]
+    return np.column_stack([plan, scene_terrain(scene).heights(plan)])
+
+
+def give_control(folder: Path, scene: Scene, seed: int) -> None:
+    """control.csv, as a survey would give it."""
+    true = control_points(scene)
+    given = true + np.random.default_rng([seed, 6]).normal(0.0, CONTROL_SIGMA_M, true.shape)
+    rows = [[f"control-{number}", *xyz, *[CONTROL_SIGMA_M] * 3] for number, xyz in enumerate(given.round(3).tolist())]
+    with (folder / "control.csv").open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file).writerows([["point", "X", "Y", "Z", "sX", "sY", "sZ"], *rows])
+
+
+def click_control(comparator: Path, scene: Scene, seed: int) -> None:
+    """Mark control points in every frame that shows them within its marks."""
+    rng, true = np.random.default_rng([seed, 5]), control_points(scene)
+    pitch = (float(scene.scanner.pitch_um[0]), float(scene.scanner.pitch_um[1]))
+    half = np.array(scene.camera.frame_mm) / 2.0 - MARGIN_MM
+    lines = comparator.read_text(encoding="utf-8").splitlines()
     for index, image in enumerate(scene.images):
         geometry = frame_geometry(scene, index)
         seen = geometry.pixel_from_object(true)
-        camera = geometry.camera_from_scan(seen)
-        half = np.array(scene.camera.frame_mm) / 2.0 - MARGIN_MM
-        pitch = (float(scene.scanner.pitch_um[0]), float(scene.scanner.pitch_um[1]))
-        for number in np.flatnonzero((np.abs(camera) < half).all(axis=1)):
+        for number in np.flatnonzero((np.abs(geometry.camera_from_scan(seen)) < half).all(axis=1)):
             px = seen[number] + rng.normal(0.0, CLICK_PX, 2)
             (mm, sigma) = comparator_from_pixel(px, pitch), CLICK_PX * pitch[0] / 1000.0
             place = f"{mm[0]:.6f},{mm[1]:.6f},{sigma:.6f},{sigma:.6f},0,{px[0]:.4f},{px[1]:.4f}"
             lines.append(f"{image.name},control-{number},target,{place},measured,")
-    project.comparator.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    given = true + rng.normal(0.0, CONTROL_SIGMA_M, true.shape)
-    points = [
-        ObjectPoint(f"control-{number}", *(Prior(float(value), CONTROL_SIGMA_M) for value in xyz))
-        for number, xyz in enumerate(given)
-    ]
-    settings = replace(project.adjust, datum="control")
-    return replace(project, given_points=GivenPoints(tuple(points), {}), adjust=settings)
+    comparator.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -176,79 +195,85 @@ class Errors:
     sigma: Array
 
 
-def tell(adjustment: Adjustment, scene: Scene) -> None:
+def tell(adjustment: dict[str, Any], scene: Scene) -> None:
     """Orientation, lens and fiducials against the truth."""
-    names = [image.name for image in adjustment.network.images]
     truth = {image.name: np.array(image.exterior) for image in scene.images}
+    images = adjustment["images"]
     rows = []
-    for number, element in enumerate(EXTERIOR_NAMES):
-        off = np.array([adjustment.value(f"EO.{name}.{element}") - truth[name][number] for name in names])
+    for number, element in enumerate(("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")):
+        unit = np.pi / 180.0 if number >= 3 else 1.0
+        stored = [own["exterior"][element] for own in images.values()]
+        off = np.array([unit * own["value"] for own in stored]) - [truth[name][number] for name in images]
         if number >= 3:
             off = (off + np.pi) % (2.0 * np.pi) - np.pi
-        rows.append(Errors(element, off, np.array([adjustment.sigma(f"EO.{name}.{element}") for name in names])))
-    factors = {name: round(value, 3) for name, value in adjustment.variance_factors.items()}
-    print(f"sigma0 {adjustment.sigma0:.3f}, redundancy {adjustment.redundancy}, variance factors {factors}")
-    print(f"{'element':8} {'rms error':>12} {'rms sigma':>12} {'error/sigma':>12}")
+        rows.append(Errors(element, off, np.array([unit * own["sigma"] for own in stored])))
+    groups = {name: round(group["sigma0"], 3) for name, group in adjustment["groups"].items() if group["sigma0"]}
+    print(f"sigma0 {adjustment['sigma0']:.3f}, redundancy {adjustment['redundancy']}, of groups {groups}")
+    print(f"{'element':10} {'rms error':>12} {'rms sigma':>12} {'error/sigma':>12}   (m, urad)")
     for row in rows:
-        unit = 1e6 if row.name in EXTERIOR_NAMES[3:] else 1.0
+        unit = 1e6 if row.name.endswith("deg") else 1.0
         rms, sigma = (unit * float(np.sqrt((each**2).mean())) for each in (row.error, row.sigma))
         ratio = float(np.sqrt(((row.error / row.sigma) ** 2).mean()))
-        print(f"{row.name:8} {rms:12.4f} {sigma:12.4f} {ratio:12.3f}")
+        print(f"{row.name:10} {rms:12.4f} {sigma:12.4f} {ratio:12.3f}")
     ratios = np.concatenate([row.error / row.sigma for row in rows])
     print(f"all orientation elements: error over sigma {np.sqrt((ratios**2).mean()):.3f}")
-    camera = scene.camera
-    own = adjustment.network.cameras[0]
+    camera, (own,) = scene.camera, adjustment["cameras"].values()
+    point, lens = own["principal_point_mm"], own["distortion"]
+    quantities = {"c": own["principal_distance_mm"], "x0": point["x"], "y0": point["y"]}
+    quantities |= {name: lens[name] for name in camera.distortion.parameters}
     known = {"c": camera.principal_distance_mm, "x0": camera.principal_point_mm[0], "y0": camera.principal_point_mm[1]}
-    known |= dict(camera.distortion.parameters)
-    for name, value in known.items():
-        full = f"IO.{own.name}.{name}"
-        sigma = adjustment.sigma(full)
-        if sigma > 0.0:
-            found = adjustment.value(full)
-            print(
-                f"{name:8} {found:14.7g} true {value:14.7g} sigma {sigma:10.3g}: {(found - value) / sigma:+.2f} sigmas"
-            )
+    for name, value in (known | dict(camera.distortion.parameters)).items():
+        found, sigma = quantities[name]["value"], quantities[name]["sigma"]
+        print(f"{name:8} {found:14.7g} true {value:14.7g} sigma {sigma:10.3g}: {(found - value) / sigma:+.2f} sigmas")
     worst = [
-        abs(adjustment.value(f"FID.{own.name}.{mark.id}.{axis}") - value)
-        / adjustment.sigma(f"FID.{own.name}.{mark.id}.{axis}")
+        abs(own["fiducials"][mark.id][f"{axis}_mm"]["value"] - value) / own["fiducials"][mark.id][f"{axis}_mm"]["sigma"]
         for mark in camera.fiducials
         for axis, value in zip("xy", mark.xy_mm, strict=True)
     ]
-    ground = np.array(
-        [
-            [adjustment.value(f"PT.{point.id}.{axis}") for axis in "XYZ"]
-            for point in adjustment.network.points
-            if point.id.startswith("tie-")
-        ]
-    )
-    above = ground[:, 2] - scene_terrain(scene).heights(ground[:, :2])
-    print(f"ground: {np.mean(above):+.3f} m, rms {np.sqrt(np.mean(above**2)):.3f} m beside the terrain")
     print(f"fiducials: rms {np.sqrt(np.mean(np.square(worst))):.2f}, at most {max(worst):.2f} sigmas")
+    ties = [point for id, point in adjustment["points"].items() if id.startswith("tie-")]
+    ground = np.array([[point[axis]["value"] for axis in "XYZ"] for point in ties])
+    tell_ground("ground", ground, scene)
 
 
-def tell_alone(block: OrientedBlock, scene: Scene) -> None:
-    """COLMAP by itself, its camera estimated as it does by default, its block laid on the true stations."""
-    folder = block.project.comparator.parent
-    alone = run_mapping(block.pictures, folder, True)
+def tell_ground(name: str, points: Array, scene: Scene) -> None:
+    above = points[:, 2] - scene_terrain(scene).heights(points[:, :2])
+    print(f"{name}: {np.mean(above):+.3f} m, rms {np.sqrt(np.mean(above**2)):.3f} m beside the terrain")
+
+
+def tell_alone(folder: Path, scene: Scene) -> None:
+    """COLMAP by itself, of the same features, its camera estimated as it does by default, its block laid on the true
+    stations."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 0
+    models = pycolmap.incremental_mapping(str(folder / "colmap.db"), str(folder / "pictures"), str(folder), options)
+    model = max(models.values(), key=lambda each: each.num_reg_images())
+    poses = {Path(model.images[id].name).stem: model.images[id].cam_from_world() for id in model.reg_image_ids()}
     truth = {image.name: np.array(image.exterior) for image in scene.images}
-    names = sorted(alone.poses)
-    stations = np.array([-rotation.T @ shift for rotation, shift in (alone.poses[name] for name in names)])
-    true = np.array([truth[name][:3] for name in names])
+    turns = [pose.rotation.matrix() for pose in poses.values()]
+    stations = np.array([-turn.T @ pose.translation for turn, pose in zip(turns, poses.values(), strict=True)])
+    true = np.array([truth[name][:3] for name in poses])
     scale, turn, shift = similarity(stations, true)
     off = shift + scale * stations @ turn.T - true
     angles = []
-    for name in names:
-        rotation = np.diag([1.0, -1.0, -1.0]) @ alone.poses[name][0] @ turn.T
+    for name, own in zip(poses, turns, strict=True):
+        rotation = np.diag([1.0, -1.0, -1.0]) @ own @ turn.T
         angles.append(np.arccos(np.clip((np.trace(rotation @ object_rotation(*truth[name][3:]).T) - 1.0) / 2.0, -1, 1)))
     plan, height = (float(np.sqrt((part**2).mean())) for part in (off[:, :2], off[:, 2]))
-    print(f"COLMAP alone, laid on the true stations: rms {plan:.3f} m in plan, {height:.3f} m in height, "
-          f"{1e6 * np.sqrt(np.mean(np.square(angles))):.0f} urad")  # fmt: skip
-    terrain = scene_terrain(scene)
-    points = np.array([shift + scale * turn @ point for point in alone.points.values()])
-    above = points[:, 2] - terrain.heights(points[:, :2])
-    print(f"  its ground: {np.mean(above):+.3f} m, rms {np.sqrt(np.mean(above**2)):.3f} m beside the terrain")
-    print(f"  its c is {alone.focal_px * block.pictures[0].lattice.pitch_mm:.3f} mm of "
-          f"{scene.camera.principal_distance_mm:.3f} mm")  # fmt: skip
+    print(f"COLMAP alone, {len(poses)} images laid on the true stations: rms {plan:.3f} m in plan, {height:.3f} m in "
+          f"height, {1e6 * np.sqrt(np.mean(np.square(angles))):.0f} urad")  # fmt: skip
+    tell_ground("  its ground", np.array([shift + scale * turn @ each.xyz for each in model.points3D.values()]), scene)
+    pitch_mm = pitch_of(folder)
+    focal_px = np.mean([camera.mean_focal_length() for camera in model.cameras.values()])
+    print(f"  its c is {focal_px * pitch_mm:.3f} mm of {scene.camera.principal_distance_mm:.3f} mm", flush=True)
+
+
+def pitch_of(folder: Path) -> float:
+    """mm, of the block's pictures."""
+    import tifffile
+
+    with tifffile.TiffFile(next((folder / "frames").glob("*.tif"))) as file:
+        return float(json.loads(file.pages.first.description)["pitch_mm"])
 
 
 if __name__ == "__main__":

@@ -25,20 +25,16 @@ _NEIGHBOURS = 12
 class Mapped:
     """What COLMAP found, in coordinates of its own: by image the rotation (3, 3) and translation (3,) to axes x right,
     y down, z forward; by point its coordinates (3,) and its tracks (image, column, row), the first pixel's centre being
-    (0, 0), with their reprojection errors in px; focal_px: of its cameras, the mean."""
+    (0, 0), with their reprojection errors in px."""
 
     poses: dict[str, tuple[Array, Array]]
     points: dict[int, Array]
     tracks: dict[int, list[tuple[str, float, float]]]
     errors_px: dict[int, float]
-    focal_px: float
 
 
-def mapped(
-    pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], folder: Path, refine_camera: bool = False
-) -> Mapped:
-    """The largest part of the block that COLMAP orients. refine_camera: let it estimate the camera, too, as it does by
-    default. Raises InputError where it orients nothing."""
+def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], folder: Path) -> Mapped:
+    """The largest part of the block that COLMAP orients. Raises InputError where it orients nothing."""
     pycolmap = quiet_colmap()
     database = folder / "colmap.db"
     for left in folder.glob("colmap.db*"):
@@ -47,7 +43,7 @@ def mapped(
         own = [picture for picture in pictures if picture.camera == camera]
         _extract(pycolmap, database, folder, own, cameras[camera])
     _match(pycolmap, database, len(pictures))
-    return run_mapping(pictures, folder, refine_camera)
+    return _run_mapping(pictures, folder)
 
 
 def quiet_colmap() -> Any:
@@ -57,16 +53,15 @@ def quiet_colmap() -> Any:
     return pycolmap
 
 
-def run_mapping(pictures: Sequence[BlockPicture], folder: Path, refine_camera: bool) -> Mapped:
-    """From the matches in the database to poses and points."""
+def _run_mapping(pictures: Sequence[BlockPicture], folder: Path) -> Mapped:
+    """From the matches in the database to poses and points, the cameras held."""
     pycolmap = quiet_colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
     options.min_model_size = 3
     options.extract_colors = False
-    options.ba_refine_focal_length = options.ba_refine_extra_params = refine_camera
-    options.ba_refine_principal_point = refine_camera
-    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = refine_camera
+    options.ba_refine_focal_length = options.ba_refine_extra_params = options.ba_refine_principal_point = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     sparse = folder / "sparse"
     sparse.mkdir(exist_ok=True)
     models = pycolmap.incremental_mapping(str(folder / "colmap.db"), str(folder / "pictures"), str(sparse), options)
@@ -91,8 +86,7 @@ def read_model(model: Any, pictures: Sequence[BlockPicture]) -> Mapped:
             col, row = image.points2D[element.point2D_idx].xy - CONVENTION.first_pixel_px
             places.append((names[image.name], float(col), float(row)))
         tracks[int(number)], points[int(number)], errors[int(number)] = places, np.array(point.xyz), float(point.error)
-    focal_px = float(np.mean([camera.mean_focal_length() for camera in model.cameras.values()]))
-    return Mapped(poses, points, tracks, errors, focal_px)
+    return Mapped(poses, points, tracks, errors)
 
 
 def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[BlockPicture], camera: CameraFile) -> None:

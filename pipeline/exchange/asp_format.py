@@ -2,7 +2,8 @@
 
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
-from pipeline.exchange.pinhole import BROWN, PinholeFrame, misfit_note, pinhole_frames
+from pipeline.exchange.fitted_lens import BROWN
+from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
 
 CONVENTION = Convention(
     (0.0, 0.0),

@@ -11,9 +11,10 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.fitted_lens import BROWN, INTERIOR, RATIONAL
 from pipeline.exchange.foreign_camera import foreign_pose, opencv_camera
 from pipeline.exchange.incoming import ImportOptions, Incoming
-from pipeline.exchange.pinhole import BROWN, INTERIOR, RATIONAL, PinholeFrame, misfit_note, pinhole_frames
+from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
 from pipeline.text.image_names import image_name
 
 CONVENTION = Convention(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.fitted_lens import frame_corners_mm
 from pipeline.exchange.map_projection import lon_lat
-from pipeline.exchange.pinhole import frame_corners_mm
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,11 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.fitted_lens import BROWN, FittedLens, sheared_lens
 from pipeline.exchange.foreign_camera import opencv_camera
 from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.exchange.micmac_format import box_of
-from pipeline.exchange.pinhole import BROWN, FittedLens, check_misfit, nearest_lens, sight_misfit_mm
+from pipeline.exchange.pinhole import check_misfit, sight_misfit_mm
 from pipeline.exchange.xml_tree import numbers_of, plain_number, read_xml, xml_lines, xml_text
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.canvas import Canvas
@@ -44,7 +45,7 @@ def write(block: Block, options: ExportOptions) -> Written:
     notes = []
     for camera in dict.fromkeys(frame.camera for frame in frames if frame.is_oriented):
         own = [frame for frame in frames if frame.camera == camera and frame.is_oriented]
-        lens, box = nearest_lens(block, own[0], (BROWN,), _unresampled(options)), box_of(block, own[0], options)
+        lens, box = sheared_lens(block, own[0], at_ideal=False), box_of(block, own[0], options)
         misfit = {frame.image: (lens.largest_mm + sight_misfit_mm(block, frame)) / box.pitch_mm for frame in own}
         check_misfit(misfit, options, "metashape")
         files[f"{_calibration_name(camera)}.xml"] = _calibration(lens, box)
@@ -62,10 +63,6 @@ def write(block: Block, options: ExportOptions) -> Written:
     )
     lost = ("the standard deviations of marks", "the poses but for their stations", "what is not affine in the film")
     return Written(files, lost, tuple(notes), tuple(left_out))
-
-
-def _unresampled(options: ExportOptions) -> ExportOptions:
-    return ExportOptions(options.pitch_um, False, options.largest_misfit_px)
 
 
 def _hindrance(frame: OutFrame) -> str:
@@ -131,6 +128,7 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
         "p1": p2,
         "p2": p1,
         "b1": (fx - fy) / box.pitch_mm,
+        "b2": lens.shear * fy / box.pitch_mm,
     }
     head = [*xml_lines("projection", "frame"), *xml_lines("width", str(box.width_px))]
     content = [*head, *xml_lines("height", str(box.height_px))]

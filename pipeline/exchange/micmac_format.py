@@ -12,17 +12,10 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.fitted_lens import BROWN, FittedLens, frame_corners_mm, sheared_lens
 from pipeline.exchange.foreign_camera import fiducial_camera
 from pipeline.exchange.incoming import ForeignMark, ImportOptions, Incoming
-from pipeline.exchange.pinhole import (
-    BROWN,
-    Y_DOWN_Z_FORWARD,
-    FittedLens,
-    check_misfit,
-    frame_corners_mm,
-    nearest_lens,
-    sight_misfit_mm,
-)
+from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD, check_misfit, sight_misfit_mm
 from pipeline.exchange.xml_tree import Element, numbers_of, plain_number, read_xml, text_of, xml_lines, xml_text
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
@@ -85,7 +78,7 @@ def _camera_files(block: Block, camera: str, frames: Sequence[OutFrame], options
     oriented = [frame for frame in (usable if fiducials else frames) if frame.is_oriented]
     if not oriented:
         return Written(files, notes=_no_orientation(camera), left_out=tuple(left_out))
-    lens = nearest_lens(block, oriented[0], (BROWN,), ExportOptions(largest_misfit_px=options.largest_misfit_px))
+    lens = sheared_lens(block, oriented[0], at_ideal=True)
     box = box_of(block, oriented[0], options) if fiducials else picture_box(block, oriented[0])
     reech = _REECH if fiducials else ""
     misfit = {each.image: (lens.largest_mm + sight_misfit_mm(block, each)) / box.pitch_mm for each in oriented}
@@ -154,7 +147,7 @@ def _calibration(lens: FittedLens, box: Canvas) -> str:
     radial = [k / focal ** (2 * i) for i, k in enumerate((k1, k2, k3), 1)]
     terms = [*xml_lines("CDist", _numbers(point)), *chain(*(xml_lines("CoeffDist", plain_number(k)) for k in radial))]
     distortion = [*xml_lines("RadialePart", terms)]
-    for name, value in {"P1": p2 / focal, "P2": p1 / focal, "b1": fx / fy - 1.0, "b2": 0.0}.items():
+    for name, value in {"P1": p2 / focal, "P2": p1 / focal, "b1": fx / fy - 1.0, "b2": lens.shear}.items():
         distortion += xml_lines(name, plain_number(value))
     content = [
         *xml_lines("KnownConv", _KNOWN),

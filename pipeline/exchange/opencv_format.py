@@ -11,9 +11,10 @@ from adjust.functional_model.families import parameter_names
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
+from pipeline.exchange.fitted_lens import BROWN, PRISMS
 from pipeline.exchange.foreign_camera import foreign_pose, opencv_camera
 from pipeline.exchange.incoming import ForeignPose, ImportOptions, Incoming
-from pipeline.exchange.pinhole import BROWN, PRISMS, PinholeFrame, misfit_note, pinhole_frames
+from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
 from pipeline.files.camera_file import CameraFile
 from pipeline.opencv_check.opencv_model import NAMES
 from pipeline.text.image_names import image_name

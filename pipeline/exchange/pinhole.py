@@ -6,39 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adjust.functional_model.families import parameter_names
 from adjust.functional_model.line_of_sight import STRAIGHT
-from adjust.functional_model.projection import ideal_from_observed
 from measure.errors import MeasurementError
 from pipeline.errors import InputError
 from pipeline.exchange.block import Block, OutFrame
 from pipeline.exchange.convention import ExportOptions
-from pipeline.opencv_check.opencv_model import NAMES, Freedom, image_grid, project, refit
+from pipeline.exchange.fitted_lens import INTERIOR, FittedLens, fisheye_lens, nearest_lens
 from pipeline.resampling.canvas import Canvas, canvas_of
 from pipeline.results.comparator_file import ComparatorPoint
 
 Array = NDArray[np.float64]
 
-INTERIOR = ("fx", "fy", "cx", "cy")
-BROWN = ("k1", "k2", "p1", "p2", "k3")
-RATIONAL = (*BROWN, "k4", "k5", "k6")
-PRISMS = (*BROWN, "s1", "s2", "s3", "s4")
 Y_DOWN_Z_FORWARD = np.diag([1.0, -1.0, -1.0])  # from the camera's axes (y up, looking along -z) to these programs'
-_ONE_SCALE = ("none", "torlegard")  # families that stretch x and y alike
-
-
-@dataclass(frozen=True)
-class FittedLens:
-    """OpenCV's parameters (18,) as `opencv_model` has them, in mm with y up. largest_mm: how far they put a point of
-    the frame beside its place. fisheye: k1 to k4 of OpenCV's fisheye, in the place of the distortion; empty otherwise.
-    """
-
-    values: Array
-    largest_mm: float
-    fisheye: tuple[float, ...] = ()
-
-    def named(self, names: Sequence[str]) -> Array:
-        return np.array([self.values[NAMES.index(name)] for name in names])
 
 
 @dataclass(frozen=True)
@@ -113,29 +92,6 @@ def pinhole_frames(
     return frames, left_out
 
 
-def fisheye_lens(block: Block, frame: OutFrame, options: ExportOptions) -> FittedLens | None:
-    """The lens of an image's camera where it is OpenCV's fisheye; a skew, which programs leave out, is its misfit."""
-    lens = frame.lens
-    assert lens is not None
-    if lens.distortion.family != "opencv_fisheye" or options.with_lens:
-        return None
-    *k, b1, b2 = lens.parameters.tolist()
-    c, x0, y0 = lens.interior
-    values = np.zeros(len(NAMES))
-    values[:4] = c * (1.0 + b1), c, x0, y0
-    farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - y0).max())
-    return FittedLens(values, abs(b2) * farthest_mm, tuple(k))
-
-
-def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
-    """The lens of an image's camera in the first model that is near enough, or else in the last one."""
-    for names in models:
-        lens = frame_lens(block, frame, names, options.with_lens)
-        if lens.largest_mm <= options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0:
-            break
-    return lens
-
-
 def check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: str) -> None:
     """Raises InputError where the worst image is off by more than the options allow."""
     worst = max(misfit_px, key=lambda image: misfit_px[image], default=None)
@@ -145,45 +101,6 @@ def check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: st
             f"in image {worst!r}, and {options.largest_misfit_px:g} px are allowed. Export with --lens, for frames "
             "that were resampled with --lens, or allow more with --misfit-px."
         )
-
-
-def frame_lens(block: Block, frame: OutFrame, names: Sequence[str], ideal: bool = False) -> FittedLens:
-    """The lens of an image's camera by parameters of these names. ideal: of a frame that is free of it."""
-    lens = frame.lens
-    assert lens is not None
-    c, x0, y0 = lens.interior
-    start = np.zeros(len(NAMES))
-    start[:4] = c, c, x0, y0
-    family = lens.distortion.family
-    if ideal or family == "none":
-        return FittedLens(start, 0.0)
-    if family == "opencv":
-        given = dict(zip(parameter_names(family), lens.parameters, strict=True))
-        start[0] *= 1.0 + given["b1"]
-        start[4:] = [given[name] if name in names else 0.0 for name in NAMES[4:]]
-        if not any(given[name] for name in (*NAMES[4:], "b2") if name not in names):
-            return FittedLens(start, 0.0)
-    grid = image_grid(frame_corners_mm(block, frame))
-    free = tuple(name for name in INTERIOR if name != "fy" or family not in _ONE_SCALE)
-    fitted = refit(lens.distortion, lens.interior, lens.parameters, grid, Freedom((*free, *names)), start).parameters
-    ideal_mm, found = ideal_from_observed(lens.distortion, lens.interior, lens.parameters, grid)
-    imaged_mm, _ = project(fitted, (ideal_mm[found] - lens.interior[1:]) / c)
-    return FittedLens(fitted, float(np.linalg.norm(imaged_mm - grid[found], axis=1).max()))
-
-
-def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
-    """(2, 2) two opposite corners of what a camera exposes, camera mm: as its file says, or what was observed of it."""
-    camera = block.camera_file(frame.camera)
-    if camera.fiducials and camera.frame_mm is not None:
-        half = np.array(camera.frame_mm) / 2.0
-        return np.array([-half, half])
-    places = [
-        each.model.camera_from_comparator(np.array([mark.xy_mm for mark in each.marks]))
-        for each in block.frames
-        if each.camera == frame.camera and each.model is not None and each.marks
-    ]
-    seen = np.concatenate(places)
-    return np.array([seen.min(axis=0), seen.max(axis=0)])
 
 
 def sight_misfit_mm(block: Block, frame: OutFrame) -> float:

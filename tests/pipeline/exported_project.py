@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from simulated import Truth, affine, camera_point, rotation, simulated, torlegard
 from simulated_project import write_project
 
+from adjust.problem.network import Network
 from pipeline.cli import DONE, run
 
 Array = NDArray[np.float64]
@@ -25,6 +26,11 @@ POINTS = np.random.default_rng(8).uniform((-700.0, -700.0, -150.0), (700.0, 700.
 def adjusted_project(folder: Path, truth: Truth = TRUTH, crs: str = "", kind: str = "affine") -> Path:
     """project.toml of an adjusted project, with scans that have a size and nothing in them."""
     network, _ = simulated(np.random.default_rng(1), truth, kind, points=POINTS, noise=False)
+    return project_of(network, folder, crs)
+
+
+def project_of(network: Network, folder: Path, crs: str = "") -> Path:
+    """The same of a network of four images f0 to f3."""
     path = write_project(network, folder)
     text = path.read_text(encoding="utf-8")
     more = f'crs = "{crs}"\n' if crs else ""

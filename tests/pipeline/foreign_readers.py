@@ -18,6 +18,9 @@ def opencv_px(folder: Path, image: str, points: Array) -> Array:
     matrix, lens, turn, shift = (
         storage.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients", "R", "t")
     )
+    if storage.getNode("distortion_model").string() == "fisheye":
+        wide, _ = cv2.fisheye.projectPoints(points[:, None], cv2.Rodrigues(turn)[0], shift, matrix, lens)
+        return np.asarray(wide.reshape(-1, 2), dtype=float)
     pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(turn)[0], shift, matrix, lens)
     return np.asarray(pixels.reshape(-1, 2), dtype=float)
 
@@ -97,7 +100,7 @@ def metashape_mm(path: Path, pitch_mm: float, in_camera: Array) -> Array:
     radial = 1 + given["k1"] * r2 + given["k2"] * r2**2 + given["k3"] * r2**3
     xd = x * radial + given["p1"] * (r2 + 2 * x * x) + 2 * given["p2"] * x * y
     yd = y * radial + given["p2"] * (r2 + 2 * y * y) + 2 * given["p1"] * x * y
-    u = given["cx"] + xd * given["f"] + xd * given["b1"]
+    u = given["cx"] + xd * given["f"] + xd * given["b1"] + yd * given.get("b2", 0.0)
     v = given["cy"] + yd * given["f"]
     return np.column_stack([u, -v]) * pitch_mm
 

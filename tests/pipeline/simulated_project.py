@@ -25,7 +25,9 @@ def write_project(network: Network, folder: Path) -> Path:
         f"principal_point_mm = [{sigma(x0)}, {sigma(y0)}]",
         "[distortion]",
         f'family = "{camera.distortion.family}"',
-        f"r0_mm = {camera.distortion.r0_mm!r}",
+        f"r0_dm = {camera.distortion.r0_mm / 100.0!r}"
+        if camera.distortion.family == "juhl"
+        else f"r0_mm = {camera.distortion.r0_mm!r}",
         "[distortion.value]",
         *(f"{name} = {prior.value!r}" for name, prior in given.items()),
         "[distortion.sigma]",

@@ -64,7 +64,7 @@ def mapped(noise_px: float = 0.0) -> Mapped:
     tracks = {j: [(f"f{i}", *seen[i][j].tolist()) for i in IMAGES] for j in range(100)}
     free = np.sqrt((8 - 3) / 8)  # of eight coordinates three went into the point
     off = noise_px * np.sqrt(2.0) * free
-    return Mapped(poses, dict(enumerate(theirs)), tracks, dict.fromkeys(range(100), off), 1530.0)
+    return Mapped(poses, dict(enumerate(theirs)), tracks, dict.fromkeys(range(100), off))
 
 
 def test_a_similarity_is_found() -> None:

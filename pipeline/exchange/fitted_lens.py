@@ -1,0 +1,192 @@
+"""A camera's lens in the terms of another program: the very same, or the nearest one over the frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.projection import ideal_from_observed
+from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.convention import ExportOptions
+from pipeline.opencv_check.opencv_model import NAMES, Freedom, image_grid, project, refit
+from pipeline.resampling.frame_chain import Lens
+
+Array = NDArray[np.float64]
+
+INTERIOR = ("fx", "fy", "cx", "cy")
+BROWN = ("k1", "k2", "p1", "p2", "k3")
+RATIONAL = (*BROWN, "k4", "k5", "k6")
+PRISMS = (*BROWN, "s1", "s2", "s3", "s4")
+_AFFINE = ("b1", "b2")
+_ONE_SCALE = ("none", "torlegard")  # families that stretch x and y alike, and have no shear
+_ROUNDS = 8  # of a fit whose affinity is of the distorted point: each leaves some thousandths of the step
+
+
+@dataclass(frozen=True)
+class FittedLens:
+    """OpenCV's parameters (18,) as `opencv_model` has them, in mm with y up. largest_mm: how far they put a point of
+    the frame beside its place. fisheye: k1 to k4 of OpenCV's fisheye, in the place of the distortion; empty otherwise.
+    shear: b2 as `opencv` has it, of programs that know one.
+    """
+
+    values: Array
+    largest_mm: float
+    fisheye: tuple[float, ...] = ()
+    shear: float = 0.0
+
+    def named(self, names: Sequence[str]) -> Array:
+        return np.array([self.values[NAMES.index(name)] for name in names])
+
+
+def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
+    """The lens of an image's camera, in the first of the models (names of OpenCV's parameters) that says the very same,
+    else in the first one that is near enough, else in the last one. With the lens taken out, that of an ideal frame."""
+    lens = frame.lens
+    assert lens is not None
+    if options.with_lens or lens.distortion.family == "none":
+        return FittedLens(_pinhole(lens), 0.0)
+    for names in models:
+        if _is_of(lens, (*names, "b1")):
+            return _opencv(lens)
+    for names in models:
+        fitted = _fitted(block, frame, names)
+        if fitted.largest_mm <= options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0:
+            break
+    return fitted
+
+
+def fisheye_lens(block: Block, frame: OutFrame, options: ExportOptions) -> FittedLens | None:
+    """The lens of an image's camera where it is OpenCV's fisheye; a skew, which programs leave out, is its misfit."""
+    lens = frame.lens
+    assert lens is not None
+    if lens.distortion.family != "opencv_fisheye" or options.with_lens:
+        return None
+    *k, b1, b2 = lens.parameters.tolist()
+    c, x0, y0 = lens.interior
+    values = np.zeros(len(NAMES))
+    values[:4] = c * (1.0 + b1), c, x0, y0
+    farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - y0).max())
+    return FittedLens(values, abs(b2) * farthest_mm, tuple(k))
+
+
+def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
+    """The lens of an image's camera by k1, k2, k3, p1, p2, affinity and shear. at_ideal: these two are of the ideal
+    point, as MicMac has them, and not of the distorted one, as Metashape has them."""
+    lens = frame.lens
+    assert lens is not None
+    family = lens.distortion.family
+    if family == "none":
+        return FittedLens(_pinhole(lens), 0.0)
+    if _is_of(lens, BROWN if at_ideal else (*BROWN, *_AFFINE)):
+        return _opencv(lens)
+    if family in _ONE_SCALE:
+        return _fitted(block, frame, BROWN)
+    rays, observed_mm = _over_frame(block, frame)
+    fitted = _pinhole(lens)
+    shear = 0.0
+    for _ in range(1 if at_ideal else _ROUNDS):
+        fitted, shear = _sheared_step(rays, observed_mm, rays if at_ideal else _bent(fitted, rays))
+    imaged_mm = _sheared(fitted, shear, rays, at_ideal)
+    return FittedLens(fitted, _largest(imaged_mm - observed_mm), shear=shear)
+
+
+def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
+    """(2, 2) two opposite corners of what a camera exposes, camera mm: as its file says, or what was observed of it."""
+    camera = block.camera_file(frame.camera)
+    if camera.fiducials and camera.frame_mm is not None:
+        half = np.array(camera.frame_mm) / 2.0
+        return np.array([-half, half])
+    places = [
+        each.model.camera_from_comparator(np.array([mark.xy_mm for mark in each.marks]))
+        for each in block.frames
+        if each.camera == frame.camera and each.model is not None and each.marks
+    ]
+    seen = np.concatenate(places)
+    return np.array([seen.min(axis=0), seen.max(axis=0)])
+
+
+def _pinhole(lens: Lens) -> Array:
+    c, x0, y0 = lens.interior
+    values = np.zeros(len(NAMES))
+    values[:4] = c, c, x0, y0
+    return values
+
+
+def _is_of(lens: Lens, names: Sequence[str]) -> bool:
+    """Whether a lens is of OpenCV's family, and has no parameters but these."""
+    family = lens.distortion.family
+    known = zip(parameter_names(family), lens.parameters, strict=True)
+    return family == "opencv" and not any(value for name, value in known if name not in names)
+
+
+def _opencv(lens: Lens) -> FittedLens:
+    given = dict(zip(parameter_names(lens.distortion.family), lens.parameters.tolist(), strict=True))
+    values = _pinhole(lens)
+    values[0] *= 1.0 + given["b1"]
+    values[4:] = [given[name] for name in NAMES[4:]]
+    return FittedLens(values, 0.0, shear=given["b2"])
+
+
+def _over_frame(block: Block, frame: OutFrame) -> tuple[Array, Array]:
+    """Rays (n, 2) over the frame, y up, and where the lens images them (n, 2), mm."""
+    lens = frame.lens
+    assert lens is not None
+    grid_mm = image_grid(frame_corners_mm(block, frame))
+    ideal_mm, found = ideal_from_observed(lens.distortion, lens.interior, lens.parameters, grid_mm)
+    return (ideal_mm[found] - lens.interior[1:]) / lens.interior[0], grid_mm[found]
+
+
+def _fitted(block: Block, frame: OutFrame, names: Sequence[str]) -> FittedLens:
+    """The nearest lens by parameters of these names."""
+    lens = frame.lens
+    assert lens is not None
+    family = lens.distortion.family
+    start = _pinhole(lens)
+    if family == "opencv":
+        own = _opencv(lens).values
+        held = [index for index, name in enumerate(NAMES) if name in (*INTERIOR, *names)]
+        start[held] = own[held]
+    grid_mm = image_grid(frame_corners_mm(block, frame))
+    free = tuple(name for name in INTERIOR if name != "fy" or family not in _ONE_SCALE)
+    fitted = refit(lens.distortion, lens.interior, lens.parameters, grid_mm, Freedom((*free, *names)), start).parameters
+    rays, observed_mm = _over_frame(block, frame)
+    return FittedLens(fitted, _largest(project(fitted, rays)[0] - observed_mm))
+
+
+def _sheared_step(rays: Array, observed_mm: Array, affine: Array) -> tuple[Array, float]:
+    """Parameters (18,) and shear by one linear fit: what is observed is linear in c, in c times each of the others, and
+    in the principal point. affine (n, 2): the points that affinity and shear belong to, for the distorted ones about
+    right."""
+    a, b = (rays * (1.0, -1.0)).T  # OpenCV's axes
+    r2, none, one = a * a + b * b, np.zeros_like(a), np.ones_like(a)
+    across = [a, a * r2, a * r2**2, 2 * a * b, r2 + 2 * a * a, a * r2**3, affine[:, 0], -affine[:, 1], one, none]
+    down = [b, b * r2, b * r2**2, r2 + 2 * b * b, 2 * a * b, b * r2**3, none, none, none, -one]
+    design = np.concatenate([np.stack(across, axis=1), np.stack(down, axis=1)])
+    scale = np.linalg.norm(design, axis=0)
+    seen = np.concatenate([observed_mm[:, 0], -observed_mm[:, 1]])
+    c, k1, k2, p1, p2, k3, b1, b2, x0, y0 = (np.linalg.lstsq(design / scale, seen)[0] / scale).tolist()
+    values = np.zeros(len(NAMES))
+    values[:9] = c + b1, c, x0, y0, k1 / c, k2 / c, p1 / c, p2 / c, k3 / c
+    return values, b2 / c
+
+
+def _bent(values: Array, rays: Array) -> Array:
+    """The rays as the distortion alone shows them, y up."""
+    alone = values.copy()
+    alone[:4] = 1.0, 1.0, 0.0, 0.0
+    return project(alone, rays)[0]
+
+
+def _sheared(values: Array, shear: float, rays: Array, at_ideal: bool) -> Array:
+    """Camera coordinates (n, 2) in mm of rays."""
+    fx, fy = values[:2]
+    bent = _bent(values, rays)
+    of = rays if at_ideal else bent
+    across = fy * bent[:, 0] + (fx - fy) * of[:, 0] - fy * shear * of[:, 1]
+    return np.asarray(np.column_stack([across, fy * bent[:, 1]]) + values[2:4])
+
+
+def _largest(off_mm: Array) -> float:
+    return float(np.linalg.norm(off_mm, axis=1).max())
