@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.block import Block, Frame, WholeFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.resampling.frame_chain import Lens
 
@@ -21,11 +21,10 @@ CONVENTION = Convention(
 def write(block: Block, options: ExportOptions) -> Written:
     """bingo.txt with the refined coordinates of every point of every adjusted image."""
     block.needs_orientation("bingo")
-    texts, left_out = [], []
-    for frame in block.frames:
-        if frame.model is None:
-            left_out.append(f"{frame.image}: it has no part in the adjustment, so its film is not known.")
-            continue
+    unknown = (scan.image for scan in block.frames if scan.model is None)
+    left_out = [f"{image}: it has no part in the adjustment, so its film is not known." for image in unknown]
+    texts = []
+    for frame in block.whole(scan for scan in block.frames if scan.model is not None):
         text, folded = _image(frame, _origin(block, frame))
         texts.append(text)
         left_out += folded
@@ -44,7 +43,7 @@ def write(block: Block, options: ExportOptions) -> Written:
     )
 
 
-def _origin(block: Block, frame: OutFrame) -> Array:
+def _origin(block: Block, frame: Frame) -> Array:
     """The middle of the fiducial frame; of a digital camera, which has none, the principal point."""
     if block.camera_file(frame.camera).fiducials or frame.lens is None:
         return np.zeros(2)
@@ -56,12 +55,11 @@ def _interior(camera: str, lens: Lens, origin: Array) -> str:
     return f"Camera {_word(camera)}: c = {lens.interior[0]:.5f} mm, principal point {x:.5f}, {y:.5f} mm, no distortion."
 
 
-def _image(frame: OutFrame, origin: Array) -> tuple[str, list[str]]:
+def _image(frame: WholeFrame, origin: Array) -> tuple[str, list[str]]:
     """The lines of an image, and the points whose lens could not be taken out."""
     assert frame.model is not None
     marks = frame.observed(fiducials=False)
-    places = np.array([mark.xy_mm for mark in marks], dtype=float).reshape(-1, 2)
-    refined, found = frame.model.ideal_from_observed(frame.model.camera_from_comparator(places))
+    refined, found = frame.model.ideal_from_observed(frame.camera_mm(marks))
     lines = [f"{_word(frame.image)} {_word(frame.camera)}"]
     for mark, (x, y), usable in zip(marks, (refined - origin).tolist(), found, strict=True):
         lines += [f"{_word(mark.point)} {x:.6f} {y:.6f}"] if usable else []

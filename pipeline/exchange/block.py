@@ -1,6 +1,6 @@
 """What goes out: the observed marks of every image, and what an adjustment says of it."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -86,6 +86,60 @@ class OutFrame:
 
 
 @dataclass(frozen=True)
+class WholeFrame:
+    """A frame as it was exposed, by its name: of one scan, or of several that show a part of it each."""
+
+    image: str
+    scans: tuple[OutFrame, ...]
+
+    @property
+    def camera(self) -> str:
+        return self.scans[0].camera
+
+    @property
+    def model(self) -> ImageModel | None:
+        """Of its first scan; all have one exterior orientation."""
+        return self.scans[0].model
+
+    @property
+    def lens(self) -> Lens | None:
+        return self.scans[0].lens
+
+    @property
+    def known_pitch_um(self) -> tuple[float, float]:
+        """Of its first scan. Raises InputError where it is not known."""
+        return self.scans[0].known_pitch_um
+
+    def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
+        """Its fiducials, or its points; of what several of its scans show, the most precise mark."""
+        best: dict[str, ComparatorPoint] = {}
+        for mark in (mark for scan in self.scans for mark in scan.observed(fiducials)):
+            best[mark.point] = min(best.get(mark.point, mark), mark, key=_variance)
+        return tuple(best.values())
+
+    def camera_mm(self, marks: tuple[ComparatorPoint, ...]) -> Array:
+        """Observed places (n, 2) of its marks in the camera's frame."""
+        return self._by_scan(marks, lambda scan, own: scan.model.camera_from_comparator(_places_mm(own)))  # type: ignore[union-attr]
+
+    def frame_mm(self, marks: tuple[ComparatorPoint, ...], with_lens: bool) -> Array:
+        """The same in the resampled frame, whose lens may have been taken out."""
+        return self._by_scan(marks, lambda scan, own: scan.chain(with_lens).frame_from_scan(scan.pixels(own))[0])
+
+    def _by_scan(
+        self, marks: tuple[ComparatorPoint, ...], places: Callable[[OutFrame, tuple[ComparatorPoint, ...]], Array]
+    ) -> Array:
+        made = np.zeros((len(marks), 2))
+        for scan in self.scans:
+            rows = [row for row, mark in enumerate(marks) if mark.image == scan.image]
+            if rows:
+                made[rows] = places(scan, tuple(marks[row] for row in rows))
+        return made
+
+
+Frame = OutFrame | WholeFrame
+
+
+@dataclass(frozen=True)
 class Block:
     """A project's images in the order of their names; adjustment: None where there is none that holds."""
 
@@ -120,6 +174,13 @@ class Block:
     def oriented(self) -> Iterator[OutFrame]:
         return (frame for frame in self.frames if frame.is_oriented)
 
+    def whole(self, scans: Iterable[OutFrame]) -> list[WholeFrame]:
+        """The frames that scans show: those of one frame (column part_of) together."""
+        parts: dict[str, list[OutFrame]] = {}
+        for scan in scans:
+            parts.setdefault(self.project.part_of(scan.image) or scan.image, []).append(scan)
+        return [WholeFrame(name, tuple(own)) for name, own in parts.items()]
+
     def unoriented_note(self) -> tuple[str, ...]:
         """A sentence an image that has no exterior orientation."""
         return tuple(
@@ -132,16 +193,6 @@ class Block:
             raise InputError(
                 f"{format} is for oriented images, and {self.project.adjustment_path} has none. Run `reseau adjust` "
                 "first."
-            )
-
-    def needs_whole_scans(self, format: str) -> None:
-        """Raises InputError where a scan shows a part of its frame only: what is resampled is the frame as a whole."""
-        parts = [frame.image for frame in self.frames if self.project.part_of(frame.image)]
-        if parts:
-            raise InputError(
-                f"{format} is written of resampled frames, each of one scan, and {parts[0]!r} is a part of frame "
-                f"{self.project.part_of(parts[0])!r} (column part_of). Export csv, parquet or mmvii, which take every "
-                "scan by itself."
             )
 
 
@@ -223,6 +274,10 @@ def _model(
         chain.bend,
         chain.bend_parameters,
     )
+
+
+def _variance(mark: ComparatorPoint) -> float:
+    return np.inf if mark.sigma_mm is None else float((mark.sigma_mm**2).sum())
 
 
 def _places_mm(marks: tuple[ComparatorPoint, ...]) -> Array:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ideal_from_observed
-from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.block import Block, Frame
 from pipeline.exchange.convention import ExportOptions
 from pipeline.opencv_check.opencv_model import NAMES, Freedom, image_grid, project, refit
 from pipeline.resampling.frame_chain import Lens
@@ -40,7 +40,7 @@ class FittedLens:
         return np.array([self.values[NAMES.index(name)] for name in names])
 
 
-def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
+def nearest_lens(block: Block, frame: Frame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
     """The lens of an image's camera, in the first of the models (names of OpenCV's parameters) that says the very same,
     else in the first one that is near enough, else in the last one. With the lens taken out, that of an ideal frame."""
     lens = frame.lens
@@ -57,7 +57,7 @@ def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]],
     return fitted
 
 
-def fisheye_lens(block: Block, frame: OutFrame, options: ExportOptions) -> FittedLens | None:
+def fisheye_lens(block: Block, frame: Frame, options: ExportOptions) -> FittedLens | None:
     """The lens of an image's camera where it is OpenCV's fisheye; a skew, which programs leave out, is its misfit."""
     lens = frame.lens
     assert lens is not None
@@ -71,7 +71,7 @@ def fisheye_lens(block: Block, frame: OutFrame, options: ExportOptions) -> Fitte
     return FittedLens(values, abs(b2) * farthest_mm, tuple(k))
 
 
-def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
+def sheared_lens(block: Block, frame: Frame, at_ideal: bool) -> FittedLens:
     """The lens of an image's camera by k1, k2, k3, p1, p2, affinity and shear. at_ideal: these two are of the ideal
     point, as MicMac has them, and not of the distorted one, as Metashape has them."""
     lens = frame.lens
@@ -92,7 +92,7 @@ def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
     return FittedLens(fitted, _largest(imaged_mm - observed_mm), shear=shear)
 
 
-def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
+def frame_corners_mm(block: Block, frame: Frame) -> Array:
     """(2, 2) two opposite corners of what a camera exposes, camera mm: as its file says, or what was observed of it."""
     camera = block.camera_file(frame.camera)
     if camera.fiducials and camera.frame_mm is not None:
@@ -129,7 +129,7 @@ def _opencv(lens: Lens) -> FittedLens:
     return FittedLens(values, 0.0, shear=given["b2"])
 
 
-def _over_frame(block: Block, frame: OutFrame) -> tuple[Array, Array]:
+def _over_frame(block: Block, frame: Frame) -> tuple[Array, Array]:
     """Rays (n, 2) over the frame, y up, and where the lens images them (n, 2), mm."""
     lens = frame.lens
     assert lens is not None
@@ -138,7 +138,7 @@ def _over_frame(block: Block, frame: OutFrame) -> tuple[Array, Array]:
     return (ideal_mm[found] - lens.interior[1:]) / lens.interior[0], grid_mm[found]
 
 
-def _fitted(block: Block, frame: OutFrame, names: Sequence[str]) -> FittedLens:
+def _fitted(block: Block, frame: Frame, names: Sequence[str]) -> FittedLens:
     """The nearest lens by parameters of these names."""
     lens = frame.lens
     assert lens is not None

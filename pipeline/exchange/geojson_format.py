@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
-from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.block import Block, WholeFrame
 from pipeline.exchange.convention import Convention, ExportOptions, Written
 from pipeline.exchange.fitted_lens import frame_corners_mm
 from pipeline.exchange.map_projection import lon_lat
@@ -33,7 +33,7 @@ def write(block: Block, options: ExportOptions) -> Written:
         )
     block.needs_orientation("geojson")
     features, left_out = [], list(block.unoriented_note())
-    for frame in block.oriented():
+    for frame in block.whole(block.oriented()):
         outline = footprint(block, frame)
         if isinstance(outline, str):
             left_out.append(f"{frame.image}: {outline}")
@@ -45,7 +45,7 @@ def write(block: Block, options: ExportOptions) -> Written:
     return Written({"footprints.geojson": json.dumps(content, ensure_ascii=False) + "\n"}, lost, notes, tuple(left_out))
 
 
-def footprint(block: Block, frame: OutFrame) -> Array | str:
+def footprint(block: Block, frame: WholeFrame) -> Array | str:
     """The outline (n, 3) in object coordinates of what a frame shows of level ground, or why there is none."""
     model = frame.model
     assert model is not None
@@ -71,7 +71,7 @@ def _outline(corners_mm: Array) -> Array:
     return np.concatenate([start + share * (end - start) for start, end in pairwise(turns)])
 
 
-def _feature(frame: OutFrame, outline: Array, height: float) -> dict[str, Any]:
+def _feature(frame: WholeFrame, outline: Array, height: float) -> dict[str, Any]:
     ring = outline if _area(outline) > 0.0 else outline[::-1]  # from the other side of a plane it runs clockwise
     closed = [*ring.tolist(), ring[0].tolist()]
     return {

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.line_of_sight import STRAIGHT
 from measure.errors import MeasurementError
 from pipeline.errors import InputError
-from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.block import Block, Frame, WholeFrame
 from pipeline.exchange.convention import ExportOptions
 from pipeline.exchange.fitted_lens import INTERIOR, FittedLens, fisheye_lens, nearest_lens
 from pipeline.resampling.canvas import Canvas, canvas_of
@@ -25,7 +25,7 @@ class PinholeFrame:
     """One image in its resampled frame: pixel (0, 0) is the centre of the first one, the camera's axes are x right, y
     down, z forward. misfit_px: the largest in its frame."""
 
-    frame: OutFrame
+    frame: WholeFrame
     canvas: Canvas
     lens: FittedLens
     misfit_px: float
@@ -61,8 +61,7 @@ class PinholeFrame:
 
     def pixels(self, marks: tuple[ComparatorPoint, ...]) -> Array:
         """Column and row (n, 2) of the marks in the resampled frame."""
-        chain = self.frame.chain(self.with_lens)
-        places, _ = chain.frame_from_scan(self.frame.pixels(marks))
+        places = self.frame.frame_mm(marks, self.with_lens)
         first = np.array([self.canvas.x_mm, self.canvas.y_mm])
         return np.asarray((places - first) * (1.0, -1.0) / self.canvas.pitch_mm)
 
@@ -73,14 +72,12 @@ def pinhole_frames(
     """Every oriented image with its lens in the first of the models, each given by its parameters' names, that is near
     enough; and why the other images are not among them. knows_fisheye: whether the program has OpenCV's fisheye.
 
-    Raises InputError where no image is oriented, where frames were scanned in parts, or where the last model, too, is
-    off by more than the options allow.
+    Raises InputError where no image is oriented, or where the last model, too, is off by more than the options allow.
     """
     block.needs_orientation(format)
-    block.needs_whole_scans(format)
     lenses: dict[str, FittedLens] = {}
     frames, left_out = [], list(block.unoriented_note())
-    for frame in block.oriented():
+    for frame in block.whole(block.oriented()):
         if frame.camera not in lenses:
             fisheye = fisheye_lens(block, frame, options) if knows_fisheye else None
             lenses[frame.camera] = fisheye or nearest_lens(block, frame, models, options)
@@ -103,7 +100,7 @@ def check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: st
         )
 
 
-def sight_misfit_mm(block: Block, frame: OutFrame) -> float:
+def sight_misfit_mm(block: Block, frame: Frame) -> float:
     """How far refraction and the earth's curvature, which other programs do not know, move an image's points."""
     model = frame.model
     assert model is not None
@@ -116,10 +113,11 @@ def sight_misfit_mm(block: Block, frame: OutFrame) -> float:
     return float(np.linalg.norm(bent - straight, axis=1).max())
 
 
-def _pinhole(block: Block, frame: OutFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
+def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
     """Raises MeasurementError where the lens folds within the scan."""
     pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
-    canvas = canvas_of([(frame.chain(options.with_lens), *block.size_px(frame))], pitch_um / 1000.0)
+    scans = [(scan.chain(options.with_lens), *block.size_px(scan)) for scan in frame.scans]
+    canvas = canvas_of(scans, pitch_um / 1000.0)
     misfit_mm = lens.largest_mm + sight_misfit_mm(block, frame)
     return PinholeFrame(frame, canvas, lens, misfit_mm / canvas.pitch_mm, options.with_lens)
 

@@ -1,14 +1,19 @@
 """Frames scanned in overlapping halves, from rendered scans to one adjustment and one resampled frame."""
 
+import csv
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 import tifffile
+from foreign_readers import asp_px, colmap_px, opencv_px
 
 from measure.natural_points.joins import measure_joins
 from measure.natural_points.tie_frame import TieFrame
@@ -18,6 +23,7 @@ from pipeline.errors import InputError
 from pipeline.files.images_file import read_images
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.joins import with_joins
+from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_scan import MeasuredScan
 
 MARKS = """
@@ -173,18 +179,59 @@ def test_the_report_shows_the_joins(halves: Path) -> None:
     assert "fiducial marks not measured" not in page
 
 
-def test_formats_of_resampled_frames_refuse_parts(halves: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for format in ("opencv", "colmap", "asp"):
-        assert run(["export", str(halves / "project.toml"), format, str(halves / "exported")]) == 2
-        assert "'fa' is a part of frame 'f' (column part_of)" in capsys.readouterr().err
-        assert not (halves / "exported").exists()
-    assert run(["export", str(halves / "project.toml"), "mmvii", str(halves / "exported")]) == 0
-
-
-def test_the_whole_frame_is_resampled_from_both(halves: Path) -> None:
-    """Targets lie where the truth has them, on either side of the seam, which the file states."""
+@pytest.fixture(scope="module")
+def whole(halves: Path) -> Path:
+    """The frame, resampled from both of its scans."""
     assert run(["resample", str(halves / "project.toml"), str(halves / "frames")]) in (0, 1)
-    with tifffile.TiffFile(halves / "frames" / "f.tif") as file:
+    return halves / "frames" / "f.tif"
+
+
+@pytest.mark.parametrize(("format", "reader"), [("opencv", opencv_px), ("colmap", colmap_px), ("asp", asp_px)])
+def test_formats_of_resampled_frames_are_of_the_whole(
+    format: str, reader: Callable[[Path, str, np.ndarray], np.ndarray], halves: Path, whole: Path, tmp_path: Path
+) -> None:
+    """Given points, projected by another program, lie in the whole frame where the truth has the targets of its
+    scans."""
+    out = tmp_path / format
+    assert run(["export", str(halves / "project.toml"), format, str(out)]) == 0
+    with tifffile.TiffFile(whole) as file:
+        said, shape = json.loads(file.pages.first.description), file.pages.first.shape
+    if format == "opencv":
+        storage = cv2.FileStorage(str(out / "f.yml"), cv2.FILE_STORAGE_READ)
+        assert [storage.getNode(f"image_{side}").real() for side in ("height", "width")] == list(shape[:2])
+    truth = truth_of(halves)
+    rows = list(csv.DictReader((halves / "points.csv").read_text(encoding="utf-8").splitlines()))
+    points = np.array([[float(row[axis]) for axis in "XYZ"] for row in rows])
+    projected = reader(out, "f", points)
+    for image in ("fa", "fb"):
+        for row, place in zip(rows, projected, strict=True):
+            true = truth[image]["targets"].get(row["point"])
+            if true is not None and true["visible"]:
+                seen = np.array([[true["ellipse_col_px"], true["ellipse_row_px"]]])
+                at_mm = camera_of(truth[image], seen)[0]
+                there = np.array([at_mm[0] - said["x_mm"], said["y_mm"] - at_mm[1]]) / said["pitch_mm"]
+                assert np.hypot(*(place - there)) < 0.5, (image, row["point"])
+
+
+def test_a_point_that_both_scans_show_goes_out_once(halves: Path, tmp_path: Path) -> None:
+    comparator = read_comparator(halves / "comparator.csv")
+    seen = [mark.point for mark in comparator if mark.kind == "target" and mark.status.is_observation]
+    assert len(seen) > len(set(seen))  # in the overlap
+    assert run(["export", str(halves / "project.toml"), "colmap", str(tmp_path / "colmap")]) == 0
+    model = pycolmap.Reconstruction(str(tmp_path / "colmap" / "sparse"))
+    (image,) = model.images.values()
+    assert (image.name, len(image.points2D), model.num_points3D()) == ("f.tif", len(set(seen)), len(set(seen)))
+    assert run(["export", str(halves / "project.toml"), "bingo", str(tmp_path / "bingo")]) == 0
+    lines = (tmp_path / "bingo" / "bingo.txt").read_text(encoding="utf-8").split("\n")
+    assert lines[0] == "f K"
+    assert len(lines) == 1 + len(set(seen)) + 1
+    assert run(["export", str(halves / "project.toml"), "mmvii", str(tmp_path / "mmvii")]) == 0  # the scans themselves
+    assert len(list(tmp_path.glob("mmvii/**/MesIm-*.xml"))) == 4
+
+
+def test_the_whole_frame_is_resampled_from_both(halves: Path, whole: Path) -> None:
+    """Targets lie where the truth has them, on either side of the seam, which the file states."""
+    with tifffile.TiffFile(whole) as file:
         said = json.loads(file.pages.first.description)
         grey, mask = file.pages[0].asarray().astype(float), file.pages[1].asarray()
     assert said["image"] == "f"

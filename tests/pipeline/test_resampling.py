@@ -20,7 +20,7 @@ from measure.scans.scan import open_scan
 from pipeline.cli import run
 from pipeline.resampling.canvas import canvas_of, scan_places
 from pipeline.resampling.frame_chain import FrameChain, Lens
-from pipeline.resampling.resample_stage import BEST, FAST, ResampleTask, resampled
+from pipeline.resampling.resample_stage import BEST, FAST, OtherScan, ResampleTask, resampled
 from pipeline.resampling.source import source_of
 
 Array = NDArray[np.float64]
@@ -106,7 +106,14 @@ def test_marks_measured_in_the_frame_lie_where_the_transformation_puts_them(
     said = described(tmp_path / "a.tif")
     to_mm, to_px = np.diag([PITCH_UM[0], -PITCH_UM[1]]) / 1000.0, np.diag([1.0, -1.0]) / said["pitch_mm"]
     there = ((middles @ to_mm) @ matrix.T + shift - (said["x_mm"], said["y_mm"])) @ to_px
-    form = to_px @ matrix @ to_mm
+    off = mark_shifts(frame, there, to_px @ matrix @ to_mm)
+    assert len(off) > 80
+    assert np.sqrt(np.mean(np.square(off))) < 0.002
+
+
+def mark_shifts(frame: Array, there: Array, form: Array) -> Array:
+    """How far (n, 2) Gaussian marks of a scan lie from given places of its resampled frame; form (2, 2): from a scan's
+    pixel to a frame's."""
     inverse = np.linalg.inv(BLUR_PX**2 * form @ form.T)
     at = np.arange(-9, 10)
     off = []
@@ -118,8 +125,40 @@ def test_marks_measured_in_the_frame_lie_where_the_transformation_puts_them(
         slopes = 20000.0 * mark[..., None] * (d @ inverse)
         design = np.concatenate([np.stack([mark, np.ones_like(mark)], axis=-1), slopes], axis=-1).reshape(-1, 4)
         off.append(np.linalg.lstsq(design, seen.ravel())[0][2:])
-    assert len(off) > 80
-    assert np.sqrt(np.mean(np.square(off))) < 0.002
+    return np.array(off)
+
+
+def test_marks_of_both_scans_of_a_frame_lie_where_their_transformations_put_them(tmp_path: Path) -> None:
+    """Each scan shows marks of its own; the second lies beside the first, turned by half a turn and mirrored. The seam
+    is in the middle of what both show."""
+    middles, picture = marked()
+    tifffile.imwrite(tmp_path / "scan.tif", np.rint(picture).astype(np.uint16))
+    to_mm = np.diag([PITCH_UM[0], -PITCH_UM[1]]) / 1000.0
+    overlap_mm = 3.0
+    ways = []
+    for turn_deg, mirrored, side in ((0.4, False, -1.0), (180.3, True, 1.0)):
+        transformation, matrix, shift = film(turn_deg, mirrored)
+        beside = side * (WIDTH * PITCH_UM[0] / 1000.0 - overlap_mm) / 2.0
+        parameters = transformation.parameters + np.array([beside, 0.0, 0.0, 0.0, 0.0, 0.0])
+        ways.append((replace(transformation, parameters=parameters), matrix, shift + np.array([beside, 0.0]), side))
+    one, two = (FrameChain(PITCH_UM, way[0]) for way in ways)
+    both = replace(
+        task(tmp_path / "scan.tif", tmp_path, one), part="l", others=(OtherScan("r", tmp_path / "scan.tif", two),)
+    )
+    assert resampled(both).problem == ""
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        frame = file.pages[0].asarray().astype(float)
+    said = described(tmp_path / "a.tif")
+    ((seam_x, _), *_) = said["seams_mm"][0]
+    assert abs(seam_x - 0.3) < 0.3
+    to_px = np.diag([1.0, -1.0]) / said["pitch_mm"]
+    for _, matrix, shift, side in ways:
+        places_mm = (middles @ to_mm) @ matrix.T + shift
+        own = side * (places_mm[:, 0] - seam_x) > 0.4
+        there = (places_mm[own] - (said["x_mm"], said["y_mm"])) @ to_px
+        off = mark_shifts(frame, there, to_px @ matrix @ to_mm)
+        assert len(off) > 60
+        assert np.sqrt(np.mean(np.square(off))) < 0.002
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
