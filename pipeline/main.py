@@ -1,11 +1,13 @@
 """The command `reseau`."""
 
+import gc
 import importlib
 import os
 import signal
 import sys
 
 _INTERRUPTED = 130
+_OBJECTS = 10_000  # made between searches for cycles: most of an archive's live to the end, and each search sees them
 
 
 def main() -> None:
@@ -15,6 +17,7 @@ def main() -> None:
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    gc.set_threshold(_OBJECTS)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as an interrupt does, worker processes with it
     try:
         sys.exit(importlib.import_module("pipeline.cli").run())

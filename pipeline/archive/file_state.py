@@ -3,13 +3,13 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from measure.errors import MissingError, UnreachableError
 from measure.scans.addresses import Address
 
 
-@dataclass(frozen=True)
-class FileState:
+class FileState(NamedTuple):  # archives have many
     """What is known of a scan's file without reading it.
 
     uri: its path relative to the project's folder with `/`, or its address. bytes: its size, -1 where it is not there.
@@ -38,7 +38,7 @@ class FileStates:
         self._folder = os.path.abspath(folder)
         self._below: dict[str, str] = {}  # by folder, what stands before the names of its files
 
-    def of(self, path: Path) -> FileState:
+    def of(self, path: str | Path) -> FileState:
         """Of a file or an object; one that does not answer is as one that is not there."""
         try:
             if isinstance(path, Address):
@@ -49,7 +49,7 @@ class FileStates:
             return FileState(self.uri(path), -1)
         return FileState(self.uri(path), stat.st_size, stat.st_mtime_ns)
 
-    def uri(self, path: Path) -> str:
+    def uri(self, path: str | Path) -> str:
         """Relative to the folder, where that is possible, with `/`; an address as it is."""
         if isinstance(path, Address):
             return str(path)

@@ -18,6 +18,7 @@ from pipeline.archive.file_state import FileStates
 from pipeline.archive.store import Store
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
 from pipeline.files.project_file import Project
+from pipeline.files.scan_files import as_named
 
 NAMED = 20  # scans that a summary names
 _LOOK = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK)  # the worst first
@@ -68,7 +69,7 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     files, cameras = FileStates(project.path.resolve().parent), project.cameras.values()
     camera_names = {id(camera): camera.path.name for camera in cameras}
     scans, asked = [], asked_of(project)
-    for name, file in project.scans.items():
+    for name, file in as_named(project.scans).items():
         state, camera = files.of(file), camera_names[id(project.camera_of(name))]
         found = rows.get(state.uri)
         if found is None or found[5] is None:

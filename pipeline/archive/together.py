@@ -29,6 +29,7 @@ from pipeline.results.measured_record import record_of
 from pipeline.results.measured_scan import MeasuredScan
 
 _TOGETHER = 2000  # frames of a camera that are checked beside one another: more would only take memory
+OfCamera = tuple[CameraFile, Sequence[ScanTask]]
 Said = Mapping[str, tuple[tuple[Reason, ...], tuple[str, ...]]]  # by image problems and notes
 
 
@@ -37,17 +38,16 @@ def judged_lots(
     tasks: Sequence[ScanTask],
     work: Work,
     copies: Mapping[str, str],
-    share: Callable[[Sequence[CheckedScan]], Iterable[MeasuredScan]],
+    share: Callable[[Sequence[MeasuredScan]], Iterable[MeasuredScan]],
     told: str,
 ) -> Iterator[Lot]:
     """Every scan as all of them show it, in lots: those whose scans are as they were need not be judged again.
 
     project: with its learned marks. copies: by image the one whose file its own is a copy of. share: the third step of
-    measuring, where targets or natural points ask for it; told: `input_of` all. Of frames that only the checks of their
-    camera concern, a lot is held at a time.
+    measuring; told: `input_of` all. A lot is held at a time.
     """
     own = [task for task in tasks if task.name not in copies]
-    lots, keys = _beside(project, own), work.keys()
+    keys, said = work.keys(), _said_by_writing(project, own, work)
 
     def lot(some: Sequence[ScanTask], depends_on: object, scans: Callable[[], Iterable[MeasuredScan]]) -> Lot:
         results = [[task.name, keys[task.name], work.counting(task.name)] for task in some]
@@ -56,14 +56,16 @@ def judged_lots(
             fingerprint([results, depends_on, made_by]), lambda: (_judged(scan, work, project) for scan in scans())
         )
 
-    if project.ties is not None or project.targets is not None or project.has_parts:
-        yield lot(own, told, lambda: share([scan for each in lots for scan in _checked_beside(project, *each, work)]))
-    else:
-        said = _said_by_writing(project, own, work)
-        for camera, some in lots:
-            of_writing = [said[task.name] for task in some if task.name in said]
-            beside = partial(_with_said, project, camera, some, work, said)
-            yield lot(some, [camera, project.film_sigma_mm, of_writing], beside)
+    def seen(of_cameras: Sequence[OfCamera]) -> Iterable[MeasuredScan]:
+        scans = [scan for each in of_cameras for scan in _checked_beside(project, *each, work)]
+        return share([_with_said(scan, said) for scan in scans])
+
+    for of_cameras in _lots(project, own):
+        some = [task for _, each in of_cameras for task in each]
+        of_writing = [said[task.name] for task in some if task.name in said]
+        cameras = [camera for camera, _ in of_cameras]
+        depends_on = [cameras, project.film_sigma_mm, of_writing, _shared(project, some, told)]
+        yield lot(some, depends_on, partial(seen, of_cameras))
     if copies:
         again = sorted(copies.items())
         yield lot(
@@ -105,10 +107,26 @@ def input_of(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str], m
     return hashlib.sha256(told.encode()).hexdigest()
 
 
-def _beside(project: Project, tasks: Sequence[ScanTask]) -> list[tuple[CameraFile, Sequence[ScanTask]]]:
+def _lots(project: Project, tasks: Sequence[ScanTask]) -> Sequence[Sequence[OfCamera]]:
+    """Which scans are looked at beside one another, by camera. Natural points may be in any of all; of a sheet of
+    targets the pictures of a lot tell as much."""
+    of_cameras = _beside(project, tasks)
+    are_few = len(tasks) <= _TOGETHER and (project.targets is not None or project.has_parts)
+    return [of_cameras] if project.ties is not None or are_few else [[each] for each in of_cameras]
+
+
+def _shared(project: Project, tasks: Sequence[ScanTask], told: str) -> object:
+    """What of the project the third step depends on, beside the scans themselves."""
+    if project.ties is not None:
+        return told
+    points = None if project.targets is None else project.object_points
+    return [project.targets, points, [project.part_of(task.name) for task in tasks] if project.has_parts else None]
+
+
+def _beside(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
     """The scans of each camera that are checked beside one another: all of them, or of many as good as half of
-    `_TOGETHER` or more, by chance, of which one scan more changes a single lot."""
-    found = list[tuple[CameraFile, Sequence[ScanTask]]]()
+    `_TOGETHER` or more, by chance, of which one scan more changes a single lot. The parts of a frame are in one."""
+    found = list[OfCamera]()
     for camera in project.cameras.values():
         own = [task for task in tasks if project.camera_of(task.name) is camera]
         lots = 1
@@ -116,7 +134,7 @@ def _beside(project: Project, tasks: Sequence[ScanTask]) -> list[tuple[CameraFil
             lots *= 2
         some = defaultdict[int, list[ScanTask]](list)
         for task in own:
-            some[shard_of(task.name, lots)].append(task)
+            some[shard_of(project.part_of(task.name) or task.name, lots)].append(task)
         found += [(camera, some[lot]) for lot in sorted(some)]
     return found
 
@@ -132,8 +150,8 @@ def _checked_beside(
 
 
 def _said_by_writing(project: Project, tasks: Sequence[ScanTask], work: Work) -> Said:
-    """What is written on the scans says of others, as `tied` has it: plates of other cameras, frames that were scanned
-    twice. No more of the scans is held than that."""
+    """What is written on the scans says of others: plates of other cameras, frames that were scanned twice. No more of
+    the scans is held than that."""
     names = work.written([task.name for task in tasks])
     bare = dict[str, MeasuredScan]()
     for camera in project.cameras.values():
@@ -143,13 +161,10 @@ def _said_by_writing(project: Project, tasks: Sequence[ScanTask], work: Work) ->
     return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in seen if scan.frame.problems or scan.notes}
 
 
-def _with_said(
-    project: Project, camera: CameraFile, tasks: Sequence[ScanTask], work: Work, said: Said
-) -> Iterator[MeasuredScan]:
-    for scan in _checked_beside(project, camera, tasks, work):
-        problems, notes = said.get(scan.frame.image, ((), ()))
-        frame = replace(scan.frame, problems=(*scan.frame.problems, *problems))
-        yield replace(scan, frame=frame, notes=(*scan.notes, *notes))
+def _with_said(scan: MeasuredScan, said: Said) -> MeasuredScan:
+    problems, notes = said.get(scan.frame.image, ((), ()))
+    frame = replace(scan.frame, problems=(*scan.frame.problems, *problems))
+    return replace(scan, frame=frame, notes=(*scan.notes, *notes))
 
 
 def _judged(scan: MeasuredScan, work: Work, project: Project) -> JudgedScan:

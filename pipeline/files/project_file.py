@@ -1,6 +1,7 @@
 """project.toml: which camera, which scans, what to measure, how to adjust, where to write."""
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,7 +23,7 @@ from pipeline.files.learned_table import Clicks
 from pipeline.files.library import camera_path
 from pipeline.files.pitch import FINEST_PITCH_UM
 from pipeline.files.points_file import GivenPoints, read_points
-from pipeline.files.scan_files import FoundScans, find_scans
+from pipeline.files.scan_files import FoundScans, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, read_targets
 from pipeline.files.tie_table import TieSettings, read_ties
 from pipeline.results.adjustment_reader import covariance_path
@@ -317,7 +318,8 @@ def _check_written(table: Table, project: Project, named: Mapping[str, Path]) ->
     if not project.scans:
         given["the comparator coordinates"] = project.comparator
     written = {path.resolve().name for path in project.results}  # of the scans only those are looked at
-    given |= {f"the scan {name}": path for name, path in project.scans.items() if path.name in written}
+    scans = as_named(project.scans).items()
+    given |= {f"the scan {name}": Path(file) for name, file in scans if os.path.basename(file) in written}
     places = {path.resolve(): f"{what}, {path}" for what, path in given.items()}
     for path in project.results:
         what = places.get(path.resolve())

@@ -3,15 +3,33 @@ called."""
 
 import glob
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from measure.errors import MeasurementError
-from measure.scans.addresses import found_addresses, is_address
+from measure.scans.addresses import found_addresses, is_address, scan_path
 from pipeline.text.image_names import names_below
 from pipeline.text.tables import Table
+
+Named = str | Path  # a file by its text; an address by itself, for it knows what its store said of it
+
+
+class ScanFiles(Mapping[str, Path]):
+    """Paths by image name. Each is made when it is asked for: of fifty thousand that takes longer than to find them."""
+
+    def __init__(self, named: Mapping[str, Named]) -> None:
+        self.named = named
+
+    def __getitem__(self, name: str) -> Path:
+        return scan_path(self.named[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.named)
+
+    def __len__(self) -> int:
+        return len(self.named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +44,7 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
     """The scan files that the patterns find, without those that `exclude` names or finds. Raises InputError for a
     pattern that finds nothing, and for files whose images would have the same name."""
     folder = table.file.parent
-    found = dict[str, Path]()  # paths are slow keys
+    found = dict[str, Named]()  # paths are slow keys
     for pattern in patterns:
         try:
             own = _found(pattern, folder)
@@ -45,34 +63,47 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
             "exclude" if found else "scans",
             what or 'is an empty list. Name files or patterns, such as ["scans/**/*.tif"].',
         )
-    scans: dict[str, Path] = {}
+    scans: dict[str, Named] = {}
     for file, name in zip(files, names_below(files), strict=True):
         if not name.isprintable():
-            raise table.error("scans", f"the file name {file.name!a} is not text in UTF-8 on one line. Rename it.")
+            told = f"the file name {Path(file).name!a} is not text in UTF-8 on one line. Rename it."
+            raise table.error("scans", told)
         if name in scans:
             raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
         scans[name] = file
-    return FoundScans(scans, frozenset(names_below(files, left_out.values())))
+    return FoundScans(ScanFiles(scans), frozenset(names_below(files, left_out.values())))
 
 
-def _found(pattern: str, folder: Path) -> list[Path]:
+def as_named(scans: Mapping[str, Path]) -> Mapping[str, Named]:
+    """The same, for those who need no paths."""
+    return scans.named if isinstance(scans, ScanFiles) else scans
+
+
+def _found(pattern: str, folder: Path) -> Sequence[Named]:
     """The file of that very name, brackets and all, or those that the pattern finds in the folder, also links
     that lead nowhere: a scan that is named is opened or refused. `**` is any number of folders."""
     if is_address(pattern):
         return found_addresses(pattern)
     if (folder / pattern).is_file():
-        return [folder / pattern]
+        return [str(folder / pattern)]
     names = glob.glob(pattern, root_dir=folder, recursive=True)
-    return _without_folders([folder / name for name in sorted(names)])
+    return _without_folders(_below(folder, sorted(names)))
 
 
-def _without_folders(paths: Sequence[Path]) -> list[Path]:
+def _below(folder: Path, names: Sequence[str]) -> list[str]:
+    """Names in a folder as its paths have them, without those that end as only folders do."""
+    places = [(name[: (end := name.rfind(os.sep) + 1)], name[end:]) for name in names]
+    begins = {place: str(folder / place / "_")[:-1] for place in {place for place, _ in places}}
+    return [begins[place] + name for place, name in places if name]
+
+
+def _without_folders(files: Sequence[str]) -> list[str]:
     """What is a folder is asked once for all that stands in one."""
     folders = set[str]()
-    for parent in {text[: text.rfind(os.sep) + 1] for text in map(str, paths)}:
+    for parent in {text[: text.rfind(os.sep) + 1] for text in files}:
         with suppress(OSError), os.scandir(parent or os.curdir) as entries:  # it may be opened, and not listed
             folders |= {parent + entry.name for entry in entries if entry.is_dir()}
-    return [path for path in paths if str(path) not in folders]
+    return [text for text in files if text not in folders]
 
 
 def _nothing_found(pattern: str, whole: Path) -> str:

@@ -15,7 +15,7 @@ def image_name(text: str) -> str:
     return folder + slash + (name if ending.lower() in SCAN_ENDINGS else file).strip()
 
 
-def names_below(files: Collection[Path], others: Collection[Path] | None = None) -> list[str]:
+def names_below(files: Collection[str | Path], others: Collection[str | Path] | None = None) -> list[str]:
     """The names of images, in the order of their files: the path below the folder that all the files share. others:
     whose names are asked for, if not those of the files."""
     given = {text[: text.rfind(os.sep) + 1] for text in map(str, files)}

@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import nullcontext
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -311,9 +312,20 @@ def test_the_page_of_archives_has_the_table_of_verdicts() -> None:
     assert all(f"| `{verdict}` | {MEANING[verdict]} | {NEXT_STEP[verdict]} |" in text for verdict in Verdict)
 
 
+BOARD = '[targets]\nkind = "chessboard"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\n'
+
+
+def without_targets(task: ScanTask) -> Witnessed:
+    """The board is sought in no scan: that takes longer than all the rest."""
+    return witnessed_scan(replace(task, options=replace(task.options, targets=None)))
+
+
 def test_of_many_scans_only_the_lot_of_a_new_one_is_judged_again(
     folder: Path, three: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("pipeline.archive.work.witnessed_scan", without_targets)
+    rewritten(folder, "project.toml", "[measure]", f"{BOARD}[measure]")
+    measure(folder)
     monkeypatch.setattr("pipeline.archive.together._TOGETHER", 1)
     beside = list[list[str]]()
 

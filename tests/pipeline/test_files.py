@@ -358,6 +358,7 @@ def project_of(folder: Path, scans: str, *files: str) -> Project:
         ('scans = ["box/1952/*.tif"]', ["0001"]),  # in one flat folder the stem
         ('scans = ["box/1952/*.tif", "box/1958/0001.tif"]', ["1952/0001", "1958/0001"]),
         ('scans = ["box/**/*.tif"]\nexclude = ["box/1952/**/*.tif"]', ["1958/0001", "0000"]),
+        ('scans = ["box/1952/*.tif", "./box//19*/0001.tif"]', ["1952/0001", "1958/0001"]),  # a file is one, found twice
         (
             'scans = ["box/**/*.tif"]\nexclude = ["box/1952/0001.tif", "no/such.tif"]',
             ["1952/deep/0001", "1958/0001", "0000"],
