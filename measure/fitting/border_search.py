@@ -13,7 +13,7 @@ from scipy.special import fdtrc
 
 from measure.fitting.picture_model import GREY, PictureModel
 from measure.noise.noise import REACH_PX, NoiseModel, autocovariance, correlated
-from measure.noise.pixel_sums import products
+from measure.noise.pixel_sums import by_squares, products, to_orthonormal
 from measure.probabilities import BORDER_FEIGNED
 
 Array = NDArray[np.float64]
@@ -55,26 +55,37 @@ def is_overwhelming(chi_square: float, greys: int, noise: NoiseModel, redundancy
     it than as many others would, by the sum of their squared correlations (Bartlett).
     """
     alike = float(np.sum(noise.autocovariance_dn2**2)) / max(noise.variance_dn2**2, 1e-300)
-    return bool(fdtrc(greys, max(redundancy / max(alike, 1.0), 1.0), chi_square / greys) < BORDER_FEIGNED)
+    return _is_rare(chi_square, greys, redundancy / max(alike, 1.0))
+
+
+def _is_rare(chi_square: float, greys: int, redundancy: float) -> bool:
+    return bool(fdtrc(greys, max(redundancy, 1.0), chi_square / greys) < BORDER_FEIGNED)
 
 
 class _Search:
     """used (height, width): n pixels that tell their grey value; place (2, n): where these are, from the mark's start,
     px; base (unknowns, n): orthonormal rows that span what the mark's unknowns change there; left (n,): what they leave
-    of the grey values; shown (n,): the mark's picture; soft_px: as wide a step is about as soft as the mark."""
+    of the grey values; shown (n,): the mark's picture; soft_px: as wide a step is about as soft as the mark.
+
+    What borders gain is summed up from squares hardly larger than such a step is wide."""
 
     def __init__(self, model: PictureModel, used: Mask) -> None:
         self.used = used
         rows, cols = np.nonzero(used)
         self.place = np.stack([cols - model.start[0, 2], rows - model.start[1, 2]])
-        self.base = np.linalg.qr(model.design[:, used].T)[0].T
-        self.left = self._beside(model.grey[used][None])[0]
-        self.shown = model.design[-GREY][used]
+        seen = model.design[:, used] / model.steadiness[used]
+        self.base = to_orthonormal(seen @ seen.T) @ seen
+        self.left = self._beside((model.residuals / model.steadiness)[used][None])[0]
+        self.shown = seen[-GREY]
         self.blur_px = model.seen_blur_px
         self.soft_px = np.sqrt(2 * np.pi) * self.blur_px
         both = np.concatenate([self.base, self.left[None]])
         powers = np.stack([np.ones_like(self.shown), self.shown, self.shown**2])
-        self._rows = np.ascontiguousarray(np.concatenate([both, both * self.shown, powers]).T)
+        images = np.zeros((2 * len(both) + _POWERS + 2, *used.shape))
+        images[:, used] = np.concatenate([both, both * self.shown, powers, self.place])
+        sums = by_squares(images, max(round(self.soft_px), 1))
+        sums = sums[:, sums[-_POWERS - 2] > 0]
+        self._rows, self._places = np.ascontiguousarray(sums[:-2].T), sums[-2:] / sums[-_POWERS - 2]
 
     def coarse(self) -> tuple[Array, Array]:
         """off_px and turn_rad of borders everywhere."""
@@ -101,8 +112,13 @@ class _Search:
         scores, normal = columns @ self.left, columns @ columns.T
         # Where the border passes beside the mark, the change is none, or one of the whole contrast.
         inverse = np.linalg.pinv(normal, rcond=_LEAST_LEFT, hermitian=True)
+        left = self.left - inverse @ scores @ columns
+        redundancy = len(self.left) - len(self.base) - 2
+        variance_dn2 = max(float(np.mean(left**2)), floor_dn**2)
+        if not _is_rare(float(scores @ inverse @ scores) / max(variance_dn2, 1e-300), 2, redundancy):
+            return False
         images = np.zeros((3, *self.used.shape))
-        images[:2, self.used], images[2, self.used] = columns, self.left - inverse @ scores @ columns
+        images[:2, self.used], images[2, self.used] = columns, left
         lags = autocovariance(images[2], self.used, REACH_PX)
         noise = NoiseModel(float(lags[REACH_PX, REACH_PX]), lags, 0.0).at_least(floor_dn**2)
         alike, white = products(images[:2], correlated(images[:2], noise)), noise.variance_dn2 * normal
@@ -111,7 +127,7 @@ class _Search:
             for each in (alike, white)
             if np.all(np.linalg.eigvalsh(each) > -_LEAST_LEFT * np.trace(each))
         )
-        return is_overwhelming(chi_square, 2, noise, len(self.left) - len(self.base) - 2)
+        return is_overwhelming(chi_square, 2, noise, redundancy)
 
     def _gained(self, offs_px: Array, turns_rad: Array) -> Array:
         """(turns, offs) by how much the edge at each distance in each direction, with a change of contrast, lessens the
@@ -135,7 +151,7 @@ class _Search:
         The step rises in a straight line from one bound to another: it is the difference of how far a pixel lies beyond
         each, and what lies beyond a bound is summed up for all of them at once.
         """
-        across = np.stack([np.cos(turns_rad), np.sin(turns_rad)], axis=1) @ self.place
+        across = np.stack([np.cos(turns_rad), np.sin(turns_rad)], axis=1) @ self._places
         bounds = np.concatenate([offs_px - self.soft_px / 2, offs_px + self.soft_px / 2])
         order = np.argsort(bounds)
         shape = len(turns_rad), len(bounds) + 1

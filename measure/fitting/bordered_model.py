@@ -39,7 +39,7 @@ class BorderedModel(PictureModel):
         by a linear fit to what is used (height, width), the mark's contrast being the same on both sides."""
         border = np.array([off_px, turn_rad, 0.0, 2 * np.log(plain.seen_blur_px), 0.0, 0.0])
         edge = _edge(border, self.start[:, 2], used.shape).value
-        border[STEP], *greys = factors(np.stack([edge, *plain.design[-GREY:]]) * used, self.grey)
+        border[STEP], *greys = factors(np.stack([edge, *plain.design[-GREY:] / plain.steadiness]) * used, self.grey)
         self.state = plain.state.with_border(border, np.array(greys))
         self.change_sigma_dn = _CHANGE_SIGMA * abs(border[STEP])
 

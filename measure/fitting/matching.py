@@ -198,9 +198,7 @@ def _with_border(given: _Given, part: _Part, fit: PictureFit) -> PictureFit:
     right; else the fit as it is."""
     if not _may_hide_border(given.mark, fit):
         return fit
-    plain = _begun(given, part, fit.options, None, fit.model.state.moved(np.zeros(2)))
-    plain.choose_area()
-    plain.model.linearise(plain.used)
+    plain = fit if fit.model.background_px is None else _on_whole_ground(given, part, fit)
     border = likely_border(plain.model, plain.area, fit.floor_dn)
     if border is None:
         return fit
@@ -211,6 +209,14 @@ def _with_border(given: _Given, part: _Part, fit: PictureFit) -> PictureFit:
     bordered.refine()
     bordered.unround()
     return bordered if _is_right(bordered) and _has_step(bordered, bordered.model) else fit
+
+
+def _on_whole_ground(given: _Given, part: _Part, detail: PictureFit) -> PictureFit:
+    """Where the mark's detail alone was fitted: the same state, with the ground that goes best with it."""
+    whole = _begun(given, part, detail.options, None, detail.model.state.moved(np.zeros(2)))
+    whole.choose_area()
+    whole.model.linearise(whole.used)
+    return whole
 
 
 def _may_hide_border(mark: Mark, fit: PictureFit) -> bool:

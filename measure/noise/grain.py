@@ -20,7 +20,7 @@ from scipy import fft
 from scipy.optimize import nnls
 
 from measure.noise.noise import NoiseModel, padded
-from measure.noise.pixel_sums import combined, products
+from measure.noise.pixel_sums import combined, products, to_orthonormal
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,7 +37,6 @@ REACH_PX = 8  # grain of 1.5 px is correlated by one in a thousand there
 _HERE = REACH_PX  # index of no lag at all
 _FARTHEST_PX = 3.0  # lags that are compared: beyond it the residuals hold the fit's marks rather than the noise's
 _FARTHEST_BLANK_PX = 5.0  # the same of blank film, which has no marks in it
-_ALIKE = 1e-10  # of the largest eigenvalue: what unknowns tell apart by less is no direction of its own
 
 
 def blank_patches(window: Array, free: Mask, variance_dn2: float) -> Array:
@@ -120,7 +119,8 @@ class _Window:
         self.rings = _rings(farthest_px)
         border = int(farthest_px)
         self.used = np.pad(used, border)
-        self.taken = np.pad(_orthonormal(design).astype(np.float32), [(0, 0), (border, border), (border, border)])
+        base = combined(to_orthonormal(products(design, design)), design)
+        self.taken = np.pad(base.astype(np.float32), [(0, 0), (border, border), (border, border)])
         self.pairs = self.products(self.used[None])
         self.weights = 1.0 / np.sqrt(np.maximum(self.pairs, 1.0))
 
@@ -150,15 +150,6 @@ class _Window:
             less = _KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel()
             left.append(pairs * _KERNELS[:, _HERE + ring.lags[0][0], _HERE + ring.lags[0][1]] + less)
         return np.stack(left, axis=1)
-
-
-def _orthonormal(design: Array) -> Array:
-    """(n, height, width) a base of the space of images (unknowns, height, width)."""
-    size = np.sqrt(np.maximum((design**2).sum(axis=(1, 2)), 1e-300))
-    unit = design / size[:, None, None]
-    values, vectors = np.linalg.eigh(products(unit, unit))
-    told = values > _ALIKE * values[-1]
-    return combined((vectors[:, told] / np.sqrt(values[told])).T, unit)
 
 
 @dataclass(frozen=True)

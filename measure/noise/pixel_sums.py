@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_ALIKE = 1e-10  # of the largest eigenvalue: what images differ by in less is no direction of its own
+
 
 def combined(factors: Array, images: Array) -> Array:
     """Images (n, height, width) times factors (n,), summed to one image, or (m, n), to m images."""
@@ -17,6 +19,22 @@ def combined(factors: Array, images: Array) -> Array:
 def products(first: Array, second: Array) -> Array:
     """(n, m) the sums over all pixels of the products of images (n, height, width) and (m, height, width)."""
     return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)
+
+
+def by_squares(images: Array, side_px: int) -> Array:
+    """(n, rows, columns) the sums of images (n, height, width) over squares of that side, the last ones cut off."""
+    height, width = images.shape[1:]
+    by_rows = np.add.reduceat(images, np.arange(0, height, side_px), axis=1)
+    return np.asarray(np.add.reduceat(by_rows, np.arange(0, width, side_px), axis=2))
+
+
+def to_orthonormal(normal: Array) -> Array:
+    """(k, n) the factors by which images become an orthonormal base of the space they span, of k dimensions; normal
+    (n, n): the sums of their products."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / np.outer(size, size))
+    told = values > _ALIKE * values[-1]
+    return np.asarray((vectors[:, told] / np.sqrt(values[told])).T / size)
 
 
 def factors(images: Array, image: Array) -> Array:
