@@ -26,19 +26,17 @@ def verdict(given: Model, chosen: Candidate | None) -> str:
 
 
 def reasons(candidates: Sequence[Candidate], chosen: Candidate | None) -> tuple[str, ...]:
-    """A sentence on every other candidate that differs from the chosen one in distortion or in transformation alone."""
+    """A sentence on every other candidate that differs from the chosen one in one thing alone: distortion,
+    transformation or bends."""
     if chosen is None:
         return tuple(f"{each.model.name}: {each.problem}" for each in candidates)
-    near = [
-        each
-        for each in candidates
-        if each is not chosen
-        and (
-            each.model.transformation == chosen.model.transformation
-            or (each.model.family, each.model.parameters) == (chosen.model.family, chosen.model.parameters)
-        )
-    ]
+    near = [each for each in candidates if _differences(each.model, chosen.model) == 1]
     return tuple(_reason(each, chosen) for each in near)
+
+
+def _differences(one: Model, other: Model) -> int:
+    lens = (one.family, one.parameters) != (other.family, other.parameters)
+    return lens + (one.transformation != other.transformation) + (one.bends != other.bends)
 
 
 def _reason(other: Candidate, chosen: Candidate) -> str:

@@ -1,4 +1,5 @@
-"""Which model the data ask for: film transformations and distortion families compared on the same observations.
+"""Which model the data ask for: film transformations, distortion families and scanners' bends compared on the same
+observations.
 
 Every candidate is adjusted with the same weights. Of two of which one contains the other, the F-test of their sums of
 squares says whether the richer one is needed; any two are compared by Akaike's criterion; and all by how well they
@@ -14,17 +15,18 @@ import numpy as np
 from adjust.choices.candidates import Candidate, Nested, nested_tests, simplest_sufficient
 from adjust.choices.choice_reasons import reasons, verdict
 from adjust.choices.cross_validation import approximations_of, cross_validate, folds
-from adjust.choices.models import Model, given_model, lenses, transformations
+from adjust.choices.models import Bends, Model, given_model, left_by, lenses, transformations
+from adjust.choices.scanner_choice import choose_bends
 from adjust.errors import AdjustmentError
 from adjust.initial_values.approximations import approximate
-from adjust.problem.network import Network, Transformation
+from adjust.problem.network import Network
 from adjust.problem.result import Adjustment
 from adjust.quality.reweighting import NO_WEIGHT
 from adjust.solution.adjustment import Options, adjust
 from adjust.undetermined.datum_choice import with_held
 
 HIGH_CORRELATION = 0.95
-ROUNDS = 3  # of choosing distortion and transformation in turns
+ROUNDS = 3  # of choosing distortion, bends and transformation in turns
 
 Progress = Callable[[str, int], None]
 
@@ -59,9 +61,7 @@ def choose(
     given = given_model(own.network)
     held = replace(options, robust=False, variance_components=False, snooping=False)
     fits = _Fits(weighed(own), held, half_mm, progress, {given.transformation: own})
-    chosen = _chosen(
-        fits, given.transformation, with_sets=all(camera.name in half_mm for camera in own.network.cameras)
-    )
+    chosen, untold = _chosen(fits, given, with_sets=all(camera.name in half_mm for camera in own.network.cameras))
     candidates = tuple(fits.done.values())
     return Choice(
         given=given,
@@ -69,23 +69,34 @@ def choose(
         tests=nested_tests(candidates),
         chosen=chosen,
         verdict=verdict(given, chosen),
-        reasons=reasons(candidates, chosen),
+        reasons=(*reasons(candidates, chosen), *untold),
     )
 
 
-def _chosen(fits: "_Fits", film: Transformation, with_sets: bool) -> Candidate | None:
-    """Distortion with a transformation, then the transformation with that distortion, until neither changes."""
-    chosen = None
+def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | None, tuple[str, ...]]:
+    """Distortion, bends and transformation in turns, each beside the others as they stand, until none changes; and what
+    is to be said of bends that are not told. The bends come before the transformation: a richer one could take them."""
+    film, bends, untold = given.transformation, Bends(), ()
+    chosen: Candidate | None = None
     for _ in range(ROUNDS):
-        chosen = simplest_sufficient([fits.of(model) for model in lenses(fits.network, film, with_sets)])
+        models = [replace(each, bends=bends) for each in lenses(fits.network, film, with_sets)]
+        chosen = simplest_sufficient([fits.of(model) for model in models])
         if chosen is None:
-            return None
-        films = [replace(chosen.model, transformation=each) for each in transformations(fits.network)]
+            return None, untold
+        needed, untold = fits.bends_of(replace(chosen.model, bends=()))
+        possible = dict.fromkeys(((), needed, left_by(film, given.bends)))
+        bent = simplest_sufficient([fits.of(replace(chosen.model, bends=each)) for each in possible])
+        if bent is None:
+            return None, untold
+        films = [
+            replace(bent.model, transformation=each, bends=left_by(each, bent.model.bends))
+            for each in transformations(fits.network)
+        ]
         chosen = simplest_sufficient([fits.of(model) for model in films])
-        if chosen is None or chosen.model.transformation == film:
+        if chosen is None or (chosen.model.transformation, chosen.model.bends) == (film, bends):
             break
-        film = chosen.model.transformation
-    return chosen
+        film, bends = chosen.model.transformation, chosen.model.bends
+    return chosen, untold
 
 
 def weighed(own: Adjustment) -> Network:
@@ -114,6 +125,19 @@ class _Fits:
             self.progress(model.name, len(self.done))
             self.done[model] = self._adjusted(model)
         return self.done[model]
+
+    def bends_of(self, model: Model) -> tuple[Bends, tuple[str, ...]]:
+        """The terms of scanners' bends that tests ask for beside a model that has none; and what is to be said of terms
+        that are not told."""
+        near = self.starts[model.transformation]
+        network = self._network(model, near)
+        if not any(image.scanner for image in network.images):
+            return (), ()
+        try:
+            choice = choose_bends(network, lambda bent: adjust(bent, approximations_of(near), self.options))
+        except AdjustmentError as error:
+            return (), (f"A bend of the scanner was not looked for: {error}",)
+        return given_model(choice.network).bends, choice.remarks
 
     def _adjusted(self, model: Model) -> Candidate:
         near = self.starts.get(model.transformation)

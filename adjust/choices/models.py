@@ -1,11 +1,14 @@
-"""The models that a choice is between: a film transformation and the distortion parameters that are estimated."""
+"""The models that a choice is between: a film transformation, the distortion parameters and the terms of the scanners'
+bends that are estimated."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from adjust.choices.scanner_choice import with_terms
 from adjust.functional_model.families import family, parameter_names
+from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import marks_needed
 from adjust.problem.network import Calibration, Network, Prior, Transformation
 
@@ -20,16 +23,20 @@ TRANSFORMATIONS: Mapping[Transformation, tuple[Transformation, ...]] = {
     "polynomial(2)": ("congruent", "similarity", "affine", "conformal(2)", "bilinear"),
 }
 
+Bends = tuple[tuple[str, tuple[str, ...]], ...]  # of every scanner that has one, its name and its terms
+
 SETS = {"ebner": ("b1", "b2"), "legendre(3)": ("a10", "a01")}  # with their parameters of affinity and shear
 
 
 @dataclass(frozen=True)
 class Model:
-    """transformation: of all images that have one; family and parameters: what is estimated of every camera's lens."""
+    """transformation: of all images that have one; family and parameters: what is estimated of every camera's lens;
+    bends: of the scanners."""
 
     transformation: Transformation
     family: str = "none"
     parameters: tuple[str, ...] = ()
+    bends: Bends = ()
 
     @property
     def name(self) -> str:
@@ -37,12 +44,15 @@ class Model:
         lens = "no distortion" if self.family == "none" else self.family
         shown = () if self.family in SETS else self.parameters
         film = () if self.transformation == "none" else (f"{self.transformation},",)
-        return " ".join((*film, lens, *shown))
+        bends = (f", bend of scanner {scanner}: {' '.join(terms)}" for scanner, terms in self.bends)
+        return " ".join((*film, lens, *shown)) + "".join(bends)
 
     def contains(self, other: "Model") -> bool:
         """Whether the other model is a special case of this one, some of its parameters being 0."""
         films = (self.transformation, *TRANSFORMATIONS.get(self.transformation, ()))
         same = other.family in (self.family, "none") and set(other.parameters) <= set(self.parameters)
+        bends = dict(self.bends)
+        same = same and all(set(terms) <= set(bends.get(scanner, ())) for scanner, terms in other.bends)
         return other != self and other.transformation in films and same
 
     def of(self, network: Network, values: Mapping[str, float], half_mm: Mapping[str, tuple[float, float]]) -> Network:
@@ -63,7 +73,8 @@ class Model:
             for image in network.images
         )
         calibrations = tuple(_without_distortion(each, network) for each in network.calibrations)
-        return replace(network, cameras=tuple(cameras), images=images, calibrations=calibrations)
+        changed = replace(network, cameras=tuple(cameras), images=images, calibrations=calibrations)
+        return with_terms(changed, dict(self.bends))
 
 
 def _without_distortion(calibration: Calibration, network: Network) -> Calibration:
@@ -76,12 +87,19 @@ def _without_distortion(calibration: Calibration, network: Network) -> Calibrati
 
 
 def given_model(network: Network) -> Model:
-    """The network's own: its first camera's, and its images' film transformation."""
+    """The network's own: its first camera's, its images' film transformation, and its scanners' bends."""
     films = [image.transformation for image in network.images if image.transformation != "none"]
     distortion = network.cameras[0].distortion
     estimated = [name for name, prior in distortion.parameters.items() if prior.sigma > 0.0]
     names = tuple(name for name in parameter_names(distortion.family) if name in estimated)
-    return Model(films[0] if films else "none", distortion.family if names else "none", names)
+    bends = tuple((scanner.name, tuple(scanner.terms)) for scanner in network.scanners if scanner.terms)
+    return Model(films[0] if films else "none", distortion.family if names else "none", names, bends)
+
+
+def left_by(film: Transformation, bends: Bends) -> Bends:
+    """The terms of bends that a film transformation does not take."""
+    left = ((scanner, tuple(term for term in terms if is_left(film, term))) for scanner, terms in bends)
+    return tuple((scanner, terms) for scanner, terms in left if terms)
 
 
 def transformations(network: Network) -> tuple[Transformation, ...]:
@@ -112,5 +130,5 @@ def lenses(network: Network, transformation: Transformation, with_sets: bool) ->
             films = (transformation, *TRANSFORMATIONS.get(transformation, ()))
             taken = affinity if "affine" in films else ()  # by the film
             models.append(Model(transformation, name, tuple(p for p in parameter_names(name) if p not in taken)))
-    own = replace(given_model(network), transformation=transformation)
+    own = replace(given_model(network), transformation=transformation, bends=())
     return tuple(models if own in models else [*models, own])

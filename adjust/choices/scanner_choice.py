@@ -41,9 +41,23 @@ def with_bends(network: Network, terms: Sequence[str] | None = None, sigma_mm: f
     every term, which is given as 0.
     """
     smooth = smooth_terms(_films(network))
-    return _with_terms(
+    return with_terms(
         network, {name: smooth if terms is None else tuple(terms) for name in _scanners(network)}, sigma_mm
     )
+
+
+def with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float = np.inf) -> Network:
+    """The network with these terms of the bends of the scanners that its images name, each given as 0; terms: by
+    scanner, none of one that is not among them."""
+    scanners = []
+    for name in _scanners(network):
+        scanned = np.array([image.scanner == name for image in network.images])[network.image_numbers]
+        lowest, highest = (edge(network.observations.xy_mm[scanned], axis=0) for edge in (np.min, np.max))
+        x, y = (lowest + highest) / 2.0
+        half_x, half_y = np.maximum(highest - lowest, 1e-3) / 2.0
+        priors = dict.fromkeys(terms.get(name, ()), Prior(0.0, sigma_mm))
+        scanners.append(Scanner(name, priors, (float(x), float(y)), (float(half_x), float(half_y))))
+    return replace(network, scanners=tuple(scanners))
 
 
 def choose_bends(
@@ -55,9 +69,9 @@ def choose_bends(
     """
     smooth, films = smooth_terms(_films(network)), _films(network)
     candidates = (*smooth, *carriage_terms(films))
-    trial = adjusted(_with_terms(network, dict.fromkeys(_scanners(network), candidates), WEAK_MM))
+    trial = adjusted(with_terms(network, dict.fromkeys(_scanners(network), candidates), WEAK_MM))
     if not trial.converged:
-        return ScannerChoice(_straight(network), (_no_trial(trial),))
+        return ScannerChoice(with_terms(network, {}), (_no_trial(trial),))
     chosen: dict[str, tuple[str, ...]] = {}
     remarks: list[str] = []
     for scanner in trial.network.scanners:
@@ -69,12 +83,7 @@ def choose_bends(
         poses = poses_of(adjusted_image(trial, name).camera_by_comparator(center)[0] for name in images)
         with_lens = _equations(trial, scanner, _free_distortion(trial)).untold(chosen[scanner.name])
         remarks += untold_sentences(scanner.name, untold, set(untold) - set(with_lens), poses)
-    return ScannerChoice(_with_terms(network, chosen, sigma_mm), tuple(remarks))
-
-
-def _straight(network: Network) -> Network:
-    """The network whose scanners bend nothing."""
-    return _with_terms(network, dict.fromkeys(_scanners(network), ()), np.inf)
+    return ScannerChoice(with_terms(network, chosen, sigma_mm), tuple(remarks))
 
 
 def _films(network: Network) -> set[str]:
@@ -83,18 +92,6 @@ def _films(network: Network) -> set[str]:
 
 def _scanners(network: Network) -> list[str]:
     return sorted({image.scanner for image in network.images} - {""})
-
-
-def _with_terms(network: Network, terms: Mapping[str, Sequence[str]], sigma_mm: float) -> Network:
-    scanners = []
-    for name, of_scanner in terms.items():
-        scanned = np.array([image.scanner == name for image in network.images])[network.image_numbers]
-        lowest, highest = (edge(network.observations.xy_mm[scanned], axis=0) for edge in (np.min, np.max))
-        x, y = (lowest + highest) / 2.0
-        half_x, half_y = np.maximum(highest - lowest, 1e-3) / 2.0
-        priors = dict.fromkeys(of_scanner, Prior(0.0, sigma_mm))
-        scanners.append(Scanner(name, priors, (float(x), float(y)), (float(half_x), float(half_y))))
-    return replace(network, scanners=tuple(scanners))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from adjust.choices.candidates import Candidate
 from adjust.choices.model_choice import Choice, choose
 from adjust.choices.models import Model
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
+from pipeline.adjusting.scanners import with_scanner_names
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.publishing.made_from import adjusted_from
@@ -35,8 +36,9 @@ def run_choose(project: Project, reporter: Reporter) -> Choice:
         with reporter.stage("comparing") as count:
             marks = read_comparator(project.comparator)
             half_mm = {camera.name: _half(camera.frame_mm) for camera in project.cameras.values() if camera.frame_mm}
+            own = adjust_marks(project, marks)
             choice = choose(
-                adjust_marks(project, marks),
+                replace(own, network=with_scanner_names(project, own.network)),
                 adjustment_options(project),
                 half_mm,
                 lambda name, done: count(name, done, done + 1),
@@ -124,6 +126,7 @@ def _model(model: Model) -> Mapping[str, Any]:
         "transformation": model.transformation,
         "family": model.family,
         "parameters": list(model.parameters),
+        "bends": {scanner: list(terms) for scanner, terms in model.bends},
     }
 
 

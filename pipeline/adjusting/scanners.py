@@ -1,6 +1,7 @@
 """Which scanners bend their scans, and by which terms, as [adjust] asks for it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from adjust.choices.scanner_choice import choose_bends, with_bends
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
@@ -44,6 +45,15 @@ def with_scanners(
                 f"transformation of the films takes; it leaves {', '.join(possible) or 'no term'}."
             )
     return with_bends(network, settings.scanner, sigma_mm), ()
+
+
+def with_scanner_names(project: Project, network: Network) -> Network:
+    """The network whose images say which scanner they come from, whether its bend is to be estimated or not."""
+    images = tuple(
+        image if image.transformation == "none" else replace(image, scanner=project.scanner_of(image.name))
+        for image in network.images
+    )
+    return replace(network, images=images)
 
 
 def _spelt(settings: AdjustSettings) -> str:

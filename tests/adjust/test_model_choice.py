@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bent_scans import films
 from numpy.typing import NDArray
 from simulated import HALF_MM, Truth, field_points, simulated
 
@@ -70,6 +71,26 @@ def test_the_true_lens_is_chosen_and_the_simpler_ones_are_told_to_be_too_simple(
     too_simple = {reason.split(" is too simple: ")[0] for reason in choice.reasons if "too simple" in reason}
     assert too_simple == {"no distortion", "torlegard k3"}
     assert {each.model.name for each in choice.candidates} >= {"ebner", "legendre(3)"}
+
+
+def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
+    """Frames of marks alone, in all four quarters: the terms that bend, beside films that are affine."""
+    bend = {"a20": 0.02, "b11": -0.015}
+    network = films([0.0, 90.0, 180.0, 270.0], bend, {}, np.random.default_rng(1))
+    choice = choose(adjust(network, approximate(films([0.0, 90.0, 180.0, 270.0], {}, {}))))
+    assert choice.chosen is not None
+    assert choice.chosen.model == Model("affine", bends=(("S", ("a20", "b11")),))
+    assert choice.chosen.sigma0 == pytest.approx(1.0, abs=0.3)
+    assert choice.verdict.startswith("The data ask for affine, no distortion, bend of scanner S: a20 b11.")
+    assert any(reason.startswith("affine, no distortion is too simple: ") for reason in choice.reasons)
+
+
+def test_a_straight_scanner_gets_no_bend_and_what_is_not_told_is_said() -> None:
+    network = films([0.0] * 3, {}, {}, np.random.default_rng(2))
+    choice = choose(adjust(network, approximate(films([0.0] * 3, {}, {}))))
+    assert choice.chosen is not None
+    assert choice.chosen.model.bends == ()
+    assert any("all frames lie alike in the scanner" in reason for reason in choice.reasons)
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ def test_the_project_is_told_what_its_data_ask_for(
     assert "The data ask for no distortion." in shown
     assert ("That is the model as it is given." in shown) is (given == "none")
     result = json.loads((tmp_path / "out" / "choose.json").read_text(encoding="utf-8"))
-    assert result["chosen"] == {"transformation": "none", "family": "none", "parameters": []}
+    assert result["chosen"] == {"transformation": "none", "family": "none", "parameters": [], "bends": {}}
     names = [each["name"] for each in result["candidates"]]
     assert names[:3] == ["no distortion", "torlegard k3", "torlegard k3 k5"]
     assert {"ebner", "legendre(3)"} <= set(names)
