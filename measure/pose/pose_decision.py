@@ -41,19 +41,25 @@ _FREE_MM = 1e3  # the standard deviation of a place that is not given
 @dataclass(frozen=True, eq=False)
 class _Verdict:
     """One pose's log-likelihoods, of the pictures (sites,), of the coordinates and of the writing; names: of each
-    site's mark, -1 for none; chi_square: of the coordinates."""
+    site's mark, -1 for none; chi_square: of the coordinates; by_chance: likelihood of all pictures if what they differ
+    in does not belong to the marks."""
 
     pose: str
     names: tuple[int, ...]
     pictures: Array
     coordinates: float
     chi_square: float
+    by_chance: float
     writing: float = 0.0
+
+    @property
+    def of_pictures(self) -> float:
+        return float(np.logaddexp(self.pictures.sum(), self.by_chance))
 
     @property
     def seen(self) -> float:
         """What is seen of it."""
-        return float(self.pictures.sum()) + self.coordinates + self.writing
+        return self.of_pictures + self.coordinates + self.writing
 
     @property
     def total(self) -> float:
@@ -93,12 +99,25 @@ def decide_pose(
         return sites[index].likelihoods([each.shown(index, layout) for each in named])
 
     pictures = np.array(side_by_side(of_site, range(len(sites)))).reshape(len(sites), len(named))
-    verdicts = [each.verdict(pictures[:, index]) for index, each in enumerate(named)]
+    by_chance = _by_chance(pictures) if any(_is_bare_chip(mark.mark) for mark in layout.marks) else -np.inf
+    verdicts = [each.verdict(pictures[:, index], by_chance) for index, each in enumerate(named)]
     if not lines or not frame.accepted:
         return _decision(verdicts, layout, len(seen))
     written = writing_likelihoods(lines, layout.writing, [verdict.pose for verdict in verdicts])
     verdicts = [replace(each, writing=own) for each, own in zip(verdicts, written.tolist(), strict=True)]
     return _decision(verdicts, layout, len(seen), lines)
+
+
+def _is_bare_chip(mark: Mark) -> bool:
+    """Whether it is cut from one scan alone: then nobody knows what in it is the mark, and what a landscape or a stamp
+    beside it."""
+    return isinstance(mark, MarkTemplate) and mark.steadiness is None
+
+
+def _by_chance(pictures: Array) -> float:
+    """The log-likelihood of pictures (sites, poses) in which something else than the marks looks most like one pose or
+    another, like each as often: then as many sites agree on a pose as chance lets."""
+    return float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +164,13 @@ class _Named:
         name = self.names[site]
         return Shown(None if name < 0 else layout.marks[name].mark, up_from_camera(self.pose))
 
-    def verdict(self, pictures: Array) -> _Verdict:
+    def verdict(self, pictures: Array, by_chance: float) -> _Verdict:
         """The coordinates' likelihood is Student's: nobody knows the film's standard deviation well."""
         if self.fit is None:
-            return _Verdict(self.pose, self.names, pictures, 0.0, 0.0)
+            return _Verdict(self.pose, self.names, pictures, 0.0, 0.0, by_chance)
         degrees = SCATTER_DEGREES + max(self.fit.redundancy, 0)
         coordinates = -degrees / 2 * float(np.log1p(self.fit.chi_square / SCATTER_DEGREES))
-        return _Verdict(self.pose, self.names, pictures, coordinates, self.fit.chi_square)
+        return _Verdict(self.pose, self.names, pictures, coordinates, self.fit.chi_square, by_chance)
 
 
 def _given_sigma_mm(mark: LayoutMark) -> float:
@@ -201,13 +220,13 @@ def _decision(verdicts: Sequence[_Verdict], layout: FiducialLayout, found: int, 
 def _against(best: _Verdict, rival: _Verdict, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:
     """What speaks for the best pose against the likeliest of those that it rules out, a sentence each."""
     sentences = []
-    by_site = best.pictures - rival.pictures
-    if by_site.sum() > TOLD:
+    by_site, lead = best.pictures - rival.pictures, best.of_pictures - rival.of_pictures
+    if lead > TOLD:
         telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > TOLD]
         kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in telling})
         sentences.append(
             f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks speak against the next best pose "
-            f"{rival.pose} with log-odds {by_site.sum():.1f}."
+            f"{rival.pose} with log-odds {lead:.1f}."
         )
     asymmetry = float(np.sqrt(max(rival.chi_square - best.chi_square, 0.0)))
     if abs(best.coordinates - rival.coordinates) > TOLD:

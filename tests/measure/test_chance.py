@@ -18,10 +18,12 @@ from measure.frames.frame_measurement import measure_frame
 from measure.marks.poses import POSES, up_from_camera
 from measure.marks.shapes import Disk, FiducialLayout, MarkShape, dot
 from measure.pose.pose_decision import decide_pose
+from measure.pose.pose_pictures import SPOILT, Shown, Site
 from measure.scans.scan import Scan
 from measure.search.constellation import Placement
 from measure.search.frame_search import FrameSearch
 from measure.search.pitches import PitchHypothesis, pitch_hypotheses
+from measure.special_marks.learned import cut, template_of
 from measure.status import Status
 
 PX_PER_MM = 20.0
@@ -144,3 +146,34 @@ def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     frame = replace(frame_of(scan, layout), belongs=np.array([True, False, False, False]))
     pose = decide_pose(scan, layout, [placement(pose) for pose in POSES], frame, OPTIONS)
     assert (pose.name, pose.decided) == ("90", True)
+
+
+@pytest.mark.parametrize(("chips", "agreeing", "decided"), [(True, 4, True), (True, 3, False), (False, 3, True)])
+def test_pictures_of_one_scan_alone_decide_a_pose_only_beyond_chance(
+    chips: bool, agreeing: int, decided: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Among eight poses four marks agree on one by chance in one of 512 frames; three of them, whichever they are, in
+    one of 18. What is drawn, or was averaged over scans, has no landscape that could agree."""
+    scan = scan_of(picture(DOTS, "0"))
+    frame = frame_of(scan, DOTS)
+    with_chips = [
+        replace(mark, mark=template_of([cut(scan, centred(mark.xy_mm), 2.0)], 2.0)) if chips else mark
+        for mark in DOTS.marks
+    ]
+    sites = iter(range(4))
+
+    def best(_: Site, shown: Sequence[Shown]) -> Array:
+        likelihoods = np.full(len(shown), np.log(SPOILT))
+        likelihoods[1 if next(sites) < agreeing else 2] = 0.0
+        return likelihoods
+
+    monkeypatch.setattr(Site, "likelihoods", best)
+    placements = [placement(pose) for pose in POSES]
+    pose = decide_pose(scan, replace(DOTS, marks=tuple(with_chips)), placements, frame, OPTIONS)
+    assert pose.decided is decided, pose.evidence
+    assert pose.name == POSES[1]
+
+
+def centred(xy_mm: tuple[float, float]) -> Array:
+    matrix = placement("0").pixel_from_camera
+    return np.column_stack([matrix[:, :2], matrix @ (*xy_mm, 1.0)])
