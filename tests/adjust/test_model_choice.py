@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bent_scans import films
+from bent_scans import MARKS_MM, films
 from numpy.typing import NDArray
 from simulated import HALF_MM, Truth, field_points, simulated
 
@@ -86,8 +86,9 @@ def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
 
 
 def test_a_straight_scanner_gets_no_bend_and_what_is_not_told_is_said() -> None:
-    network = films([0.0] * 3, {}, {}, np.random.default_rng(2))
-    choice = choose(adjust(network, approximate(films([0.0] * 3, {}, {}))))
+    few = {name: MARKS_MM[name] for name in "1234"}
+    network = films([0.0] * 3, {}, {}, np.random.default_rng(2), marks_mm=few)
+    choice = choose(adjust(network, approximate(films([0.0] * 3, {}, {}, marks_mm=few))))
     assert choice.chosen is not None
     assert choice.chosen.model.bends == ()
     assert any("all frames lie alike in the scanner" in reason for reason in choice.reasons)
