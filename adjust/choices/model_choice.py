@@ -76,8 +76,9 @@ def choose(
 def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | None, tuple[str, ...]]:
     """Distortion, bends and transformation in turns, each beside the others as they stand, until none changes; and what
     is to be said of bends that are not told. The bends come before the transformation: a richer one could take them."""
-    film, bends, untold = given.transformation, Bends(), ()
+    film, bends = given.transformation, Bends()
     chosen: Candidate | None = None
+    untold: tuple[str, ...] = ()
     for _ in range(ROUNDS):
         models = [replace(each, bends=bends) for each in lenses(fits.network, film, with_sets)]
         chosen = simplest_sufficient([fits.of(model) for model in models])
