@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 import synthetic_images
+from pipeline.blocks.mapping import quiet_colmap
 from pipeline.blocks.ties import similarity
 from pipeline.rendered.scene_file import read_scene, render_project
 from pipeline.results.comparator_file import comparator_from_pixel
@@ -244,6 +244,7 @@ def tell_ground(name: str, points: Array, scene: Scene) -> None:
 def tell_alone(folder: Path, scene: Scene) -> None:
     """COLMAP by itself, of the same features, its camera estimated as it does by default, its block laid on the true
     stations."""
+    pycolmap = quiet_colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
     models = pycolmap.incremental_mapping(str(folder / "colmap.db"), str(folder / "pictures"), str(folder), options)

@@ -6,7 +6,7 @@ fiducials, the lens and the control.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -74,8 +74,8 @@ def run_block(project: Project, folder: Path, pitch_um: float | None, reporter: 
         ties = tie_marks(found, pictures)
         interior = {picture.image: given_interior(cameras[picture.camera]) for picture in pictures}
         poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
-        own = _written(project, folder, (*marks, *ties), poses)
-    left_out = tuple(sorted({mark.image for mark in marks} - set(poses)))
+        own = written_block(project, folder, (*marks, *ties), poses)
+    left_out = tuple(sorted({project.part_of(mark.image) or mark.image for mark in marks} - set(poses)))
     return OrientedBlock(own, found, pictures, clock.seconds, left_out, len(ties), len({tie.point for tie in ties}))
 
 
@@ -99,36 +99,45 @@ def block_lines(block: OrientedBlock) -> list[str]:
     return [*lines, *(f"{step}: {seconds:.0f} s" for step, seconds in block.seconds.items())]
 
 
-def _written(
+def written_block(
     project: Project,
     folder: Path,
     marks: Sequence[ComparatorPoint],
     poses: dict[str, tuple[Array, Array]],
 ) -> Project:
     """comparator.csv and images.csv of the block, and the project that is made of them."""
-    pitches = pitches_of(project.comparator)
-    kept = [mark for mark in marks if mark.kind != "target" or mark.image in poses]
+    pitches, given = pitches_of(project.comparator), project.given_images or GivenImages({}, {})
+    frames = {mark.image: project.part_of(mark.image) or mark.image for mark in marks}
+    kept = [mark for mark in marks if mark.kind != "target" or frames[mark.image] in poses]
     write_atomically(folder / "comparator.csv", points_text(kept, pitches))
     exterior: dict[str, Exterior | None] = {}
-    lines = ["# orientations by COLMAP, as approximations", ",".join(("image", *ELEMENTS, "camera", "scanner"))]
-    given = project.given_images
-    cameras = dict(given.camera) if given else {}
-    scanners = dict(given.scanner) if given else {}
-    for image, (rotation, station) in sorted(poses.items()):
-        values = np.concatenate([station, angles_from_rotation(rotation)])
-        exterior[image] = Exterior(values)
-        degrees = [*values[:3], *np.degrees(values[3:])]
-        own = [cameras.get(image, ""), scanners.get(image, "")]
-        lines.append(csv_line([image, *(repr(float(value)) for value in degrees), *own]))
+    lines = [
+        "# orientations by COLMAP, as approximations",
+        ",".join(("image", *ELEMENTS, "camera", "scanner", "part_of")),
+    ]
+    for image, frame in sorted(frames.items()):
+        if frame not in poses and not given.part_of.get(image):
+            continue
+        elements = [""] * len(ELEMENTS)
+        if frame in poses:
+            rotation, station = poses[frame]
+            values = np.concatenate([station, angles_from_rotation(rotation)])
+            exterior[image] = Exterior(values)
+            elements = [repr(float(value)) for value in [*values[:3], *np.degrees(values[3:])]]
+        lines.append(csv_line([image, *elements, *(column.get(image, "") for column in _columns(given))]))
     write_atomically(folder / "images.csv", "\n".join(lines) + "\n")
     return replace(
         project,
         scans={},
         comparator=folder / "comparator.csv",
         output=folder / "out",
-        given_images=GivenImages(exterior, cameras, scanners),
+        given_images=replace(given, exterior=exterior),
         images_path=folder / "images.csv",
     )
+
+
+def _columns(given: GivenImages) -> tuple[Mapping[str, str], ...]:
+    return given.camera, given.scanner, given.part_of
 
 
 def _problems(results: Sequence[Resampled]) -> str:

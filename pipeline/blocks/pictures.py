@@ -10,6 +10,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from measure.scans.scan import open_scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.resampling.frame_chain import FrameChain
@@ -39,14 +40,37 @@ class Lattice:
 
 
 @dataclass(frozen=True)
+class BlockScan:
+    """A scan of a frame: its image's name, the way from the frame to it, and its size."""
+
+    image: str
+    chain: FrameChain
+    width_px: int
+    height_px: int
+
+    def depths_px(self, pixels: Array) -> Array:
+        """How far (n,) pixels (n, 2) lie within its edges."""
+        col, row = pixels.T
+        edges = [col + 0.5, self.width_px - 0.5 - col, row + 0.5, self.height_px - 0.5 - row]
+        return np.asarray(np.min(edges, axis=0))
+
+
+@dataclass(frozen=True)
 class BlockPicture:
-    """One image: its file's name, in its camera's folder; the lattice, and the way from its frame to its scan."""
+    """One frame: its file's name, in its camera's folder; the lattice, and its scan, or several that show parts."""
 
     image: str
     camera: str
     name: str
     lattice: Lattice
-    chain: FrameChain
+    scans: tuple[BlockScan, ...]
+
+    def scan_place(self, camera_mm: Array) -> tuple[BlockScan, Array] | None:
+        """The scan that shows a place (2,) of the camera frame farthest from its edges, and the pixel (2,) there; None
+        where none can have it."""
+        seen = [(scan, scan.chain.scan_from_frame(camera_mm[None])) for scan in self.scans]
+        places = [(scan, pixels[0]) for scan, (pixels, found) in seen if found[0]]
+        return max(places, key=lambda place: place[0].depths_px(place[1][None])[0], default=None)
 
 
 def lattice_of(camera: CameraFile, pitch_mm: float) -> Lattice:
@@ -75,8 +99,18 @@ def write_pictures(
             path.parent.mkdir(parents=True, exist_ok=True)
             if not cv2.imwrite(str(path), content):
                 raise InputError(f"{path}: cannot be written. Make room there, or set another output folder.")
-        made.append(BlockPicture(task.image, task.camera, name, lattice, task.chain))
+        made.append(BlockPicture(task.image, task.camera, name, lattice, _scans(task)))
     return tuple(made)
+
+
+def _scans(task: ResampleTask) -> tuple[BlockScan, ...]:
+    given = [(task.part or task.image, task.scan, task.chain)]
+    given += [(other.image, other.scan, other.chain) for other in task.others]
+    scans = []
+    for image, path, chain in given:
+        with open_scan(path, task.max_pixels) as scan:
+            scans.append(BlockScan(image, chain, scan.width_px, scan.height_px))
+    return tuple(scans)
 
 
 def _cut(path: Path, lattice: Lattice) -> tuple[Array, NDArray[np.bool_]]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adjust.problem.network import ObjectPoint
 from measure.status import Status
 from pipeline.blocks.mapping import Mapped
-from pipeline.blocks.pictures import BlockPicture
+from pipeline.blocks.pictures import BlockPicture, BlockScan
 from pipeline.errors import InputError
 from pipeline.exchange.pinhole import Y_DOWN_Z_FORWARD
 from pipeline.results.comparator_file import ComparatorPoint, comparator_from_pixel
@@ -31,12 +31,13 @@ def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[Compara
     for number in chosen_tracks(mapped, by_image, sigma_px):
         for image, col, row in mapped.tracks[number]:
             picture = by_image[image]
-            place_px, found = picture.chain.scan_from_frame(picture.lattice.camera_mm(np.array([[col, row]])))
-            if not found[0]:
+            seen = picture.scan_place(picture.lattice.camera_mm(np.array([col, row])))
+            if seen is None:
                 continue
-            place = comparator_from_pixel(place_px[0], picture.chain.pitch_um)
+            scan, place_px = seen
+            place = comparator_from_pixel(place_px, scan.chain.pitch_um)
             sigma = np.full(2, sigma_px * picture.lattice.pitch_mm)
-            marks.append(ComparatorPoint(image, f"tie-{number}", "tie", place, sigma, 0.0, Status.MEASURED, ""))
+            marks.append(ComparatorPoint(scan.image, f"tie-{number}", "tie", place, sigma, 0.0, Status.MEASURED, ""))
     return tuple(marks)
 
 
@@ -95,17 +96,19 @@ def oriented_by_control(
     camera_rays: by image the principal distance and point (3,) by which COLMAP saw it, mm. Raises InputError where
     fewer than three control points are seen by two oriented images each.
     """
-    seen = defaultdict(list)
-    by_image = {picture.image: picture for picture in pictures}
+    seen: dict[str, dict[str, Array]] = defaultdict(dict)
+    scans = {scan.image: (picture.image, scan) for picture in pictures for scan in picture.scans}
     for mark in marks:
-        if mark.kind == "target" and mark.status.is_observation and mark.image in mapped.poses and mark.point in points:
-            seen[mark.point].append(mark)
+        if mark.kind == "target" and mark.status.is_observation and mark.point in points and mark.image in scans:
+            frame, scan = scans[mark.image]
+            if frame in mapped.poses:
+                seen[mark.point].setdefault(frame, _camera_mm(mark, scan))
     theirs, ours = [], []
-    for point, own in sorted(seen.items()):
+    for point, places in sorted(seen.items()):
         given = points[point]
-        if len(own) < 2 or given.X is None or given.Y is None or given.Z is None:
+        if len(places) < 2 or given.X is None or given.Y is None or given.Z is None:
             continue
-        theirs.append(_intersection(mapped, [(mark, by_image[mark.image], camera_rays[mark.image]) for mark in own]))
+        theirs.append(_intersection(mapped, places, camera_rays))
         ours.append([given.X.value, given.Y.value, given.Z.value])
     if len(ours) < FEWEST_CONTROL:
         raise InputError(
@@ -120,15 +123,19 @@ def oriented_by_control(
     return placed
 
 
-def _intersection(mapped: Mapped, views: Sequence[tuple[ComparatorPoint, BlockPicture, Array]]) -> Array:
-    """The point (3,) nearest to the rays of its marks, in COLMAP's coordinates."""
+def _camera_mm(mark: ComparatorPoint, scan: BlockScan) -> Array:
+    """Where a mark (2,) is in the camera's frame."""
+    assert mark.xy_mm is not None
+    straight = scan.chain.bend.apply(scan.chain.bend_parameters, mark.xy_mm[None])
+    return np.asarray(scan.chain.film.camera_from_comparator(straight)[0])
+
+
+def _intersection(mapped: Mapped, places: Mapping[str, Array], camera_rays: Mapping[str, Array]) -> Array:
+    """The point (3,) nearest to the rays of its places in the camera, by image, in COLMAP's coordinates."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
-    for mark, picture, (c, x0, y0) in views:
-        assert mark.xy_mm is not None
-        place = picture.chain.film.camera_from_comparator(
-            picture.chain.bend.apply(picture.chain.bend_parameters, mark.xy_mm[None])
-        )[0]
-        rotation, translation = mapped.poses[mark.image]
+    for image, place in places.items():
+        c, x0, y0 = camera_rays[image]
+        rotation, translation = mapped.poses[image]
         ray = rotation.T @ np.array([(place[0] - x0) / c, -(place[1] - y0) / c, 1.0])
         ray /= np.linalg.norm(ray)
         across = np.eye(3) - np.outer(ray, ray)

@@ -14,12 +14,15 @@ from simulated import FIDUCIALS, affine, rotation
 from adjust.functional_model.transformation import Film
 from adjust.problem.network import Distortion, ObjectPoint, Prior
 from measure.status import Status
+from pipeline.blocks.block_stage import written_block
 from pipeline.blocks.mapping import Mapped, camera_params
-from pipeline.blocks.pictures import BlockPicture, lattice_of, write_pictures
+from pipeline.blocks.pictures import BlockPicture, BlockScan, lattice_of, write_pictures
 from pipeline.blocks.ties import A_CELL, CELLS, feature_sigma_px, oriented_by_control, similarity, tie_marks
 from pipeline.errors import InputError
 from pipeline.exchange.foreign_camera import fiducial_camera
 from pipeline.files.camera_file import CameraFile
+from pipeline.files.images_file import read_images
+from pipeline.files.project_file import read_project
 from pipeline.resampling.frame_chain import FrameChain
 from pipeline.resampling.resample_stage import BEST, ResampleTask, resampled
 from pipeline.results.comparator_file import ComparatorPoint, points_text, read_comparator
@@ -41,7 +44,9 @@ def chain(image: int) -> FrameChain:
     return FrameChain(PITCH_UM, Film("affine", affine(TRUTH, image, "affine"), np.array(TRUTH.middle_mm)))
 
 
-PICTURES = tuple(BlockPicture(f"f{i}", "K", f"K/f{i}.png", LATTICE, chain(i)) for i in IMAGES)
+PICTURES = tuple(
+    BlockPicture(f"f{i}", "K", f"K/f{i}.png", LATTICE, (BlockScan(f"f{i}", chain(i), 2500, 2500),)) for i in IMAGES
+)
 SCALE, SHIFT = 0.01, np.array([3.0, -2.0, 5.0])
 TURN = rotation(0.4, -0.9, 2.0)
 
@@ -83,6 +88,33 @@ def test_tracks_come_back_into_turned_and_mirrored_scans() -> None:
         col, row = scan_px(int(mark.image[1:]), camera_mm(int(mark.image[1:])))[int(mark.point.removeprefix("tie-"))]
         np.testing.assert_allclose(mark.xy_mm, [col * PITCH_MM, -row * PITCH_MM], atol=1e-9)  # type: ignore[arg-type]
         assert mark.kind == "tie"
+
+
+LEFT_PX, RIGHT_PX = 1500, 1000  # the left scan of a frame ends at the one column, the right one begins at the other
+
+
+def in_halves(i: int) -> BlockPicture:
+    """A frame whose scan was cut into two that overlap."""
+    a1, a2, a3, b1, b2, b3 = affine(TRUTH, i, "affine")
+    begin_mm = RIGHT_PX * PITCH_MM
+    moved = np.array([a1 + a2 * begin_mm, a2, a3, b1 + b2 * begin_mm, b2, b3])
+    right = FrameChain(PITCH_UM, Film("affine", moved, np.array(TRUTH.middle_mm) - (begin_mm, 0.0)))
+    scans = (BlockScan(f"f{i}l", chain(i), LEFT_PX, 2500), BlockScan(f"f{i}r", right, 2500 - RIGHT_PX, 2500))
+    return replace(PICTURES[i], scans=scans)
+
+
+def test_tracks_of_a_frame_that_was_scanned_in_parts_come_back_into_the_scan_that_shows_them() -> None:
+    block = replace(mapped(), errors_px=dict.fromkeys(range(100), 0.4))
+    marks = tie_marks(block, [in_halves(i) for i in IMAGES])
+    whole = {(mark.image, mark.point): mark for mark in tie_marks(block, PICTURES)}
+    assert len(marks) == len(whole)
+    assert {mark.image for mark in marks} == {f"f{i}{half}" for i in IMAGES for half in "lr"}
+    for mark in marks:
+        place = whole[mark.image[:2], mark.point].xy_mm
+        begin_mm = RIGHT_PX * PITCH_MM if mark.image.endswith("r") else 0.0
+        np.testing.assert_allclose(mark.xy_mm, place - np.array([begin_mm, 0.0]), atol=1e-9)  # type: ignore[arg-type, operator]
+        col = place[0] / PITCH_MM  # type: ignore[index]
+        assert col < LEFT_PX if mark.image.endswith("l") else col > RIGHT_PX
 
 
 def test_their_standard_deviation_is_that_of_the_features() -> None:
@@ -132,6 +164,40 @@ def test_poses_come_into_the_frame_of_the_control() -> None:
         np.testing.assert_allclose(station, TRUTH.stations[i], atol=1e-6)
     with pytest.raises(InputError, match="2 points with coordinates"):
         oriented_by_control(mapped(), PICTURES, *control(2), rays)
+
+
+def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> None:
+    """And what is written names the parts, so that the adjustment takes them for one frame."""
+    rays = {f"f{i}": np.array([TRUTH.c, TRUTH.x0, TRUTH.y0]) for i in IMAGES}
+    marks, points = control(8)
+    cut = []
+    for mark in marks:
+        assert mark.xy_mm is not None
+        is_right = mark.xy_mm[0] > 0.5 * (LEFT_PX + RIGHT_PX) * PITCH_MM
+        shift = np.array([RIGHT_PX * PITCH_MM, 0.0]) if is_right else np.zeros(2)
+        cut.append(replace(mark, image=f"{mark.image}{'r' if is_right else 'l'}", xy_mm=mark.xy_mm - shift))
+    placed = oriented_by_control(mapped(), [in_halves(i) for i in IMAGES], cut, points, rays)
+    for i in IMAGES:
+        np.testing.assert_allclose(placed[f"f{i}"][1], TRUTH.stations[i], atol=1e-6)
+    (tmp_path / "images.csv").write_text(
+        "image,part_of\n" + "".join(f"f{i}{half},f{i}\n" for i in IMAGES for half in "lr"), encoding="utf-8"
+    )
+    (tmp_path / "camera.toml").write_text('name = "K"\n', encoding="utf-8")
+    (tmp_path / "project.toml").write_text(
+        'camera = "camera.toml"\n[object]\nimages = "images.csv"\n', encoding="utf-8"
+    )
+    cut += [replace(cut[0], image=f"f{i}{half}", point="1", kind="fiducial") for i in IMAGES for half in "lr"]
+    (tmp_path / "comparator.csv").write_text(points_text(cut, {}), encoding="utf-8")
+    own = written_block(read_project(tmp_path / "project.toml"), tmp_path / "block", cut, {"f1": placed["f1"]})
+    again = read_images(tmp_path / "block" / "images.csv")
+    assert again.part_of == {f"f{i}{half}": f"f{i}" for i in IMAGES for half in "lr"}
+    assert own.part_of("f2l") == "f2"
+    for half in "lr":
+        exterior = again.exterior[f"f1{half}"]
+        assert exterior is not None
+        np.testing.assert_allclose(exterior.values[:3], TRUTH.stations[1], atol=1e-6)
+        assert again.exterior[f"f0{half}"] is None
+    assert {mark.image for mark in read_comparator(own.comparator) if mark.kind == "target"} <= {"f1l", "f1r"}
 
 
 def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
