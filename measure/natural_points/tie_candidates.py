@@ -70,9 +70,9 @@ def verified(
     frames: Sequence[TieFrame], features: Sequence[Features], workers: Executor | None
 ) -> dict[tuple[int, int], Indices]:
     """By pair of frames the features that they share, as far as one epipolar geometry explains them; none of a pair
-    over which its process was ended."""
+    over which its process was ended. Two scans of one exposed frame have no such geometry, and are no pair."""
     shared = {}
-    both = list(combinations(range(len(frames)), 2))
+    both = [(i, j) for i, j in combinations(range(len(frames)), 2) if frames[i].frame != frames[j].frame]
     pairs_of = [(features[i], features[j]) for i, j in both]
     found = mapped_or_lost(workers, _shared, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
     for (i, j), pairs in zip(both, found, strict=True):
@@ -98,7 +98,8 @@ def candidates(
     found, cells, textures = [], [], []
     for track in join_tracks(shared):
         reference = _most_central(frames, features, track)
-        candidate = TieCandidate(reference, _maps(frames, features, maps, track, reference))
+        reached = _maps(frames, features, maps, track, reference)
+        candidate = TieCandidate(reference, _one_an_exposure(frames, features, reached, reference))
         if len(candidate.maps) < fewest:
             continue
         place = frames[reference].camera_px(candidate.maps[reference][None, :, 2])[0]
@@ -150,6 +151,20 @@ def _maps(
         if frame in track or frames[frame].usable(local[None, :, 2], features[frame].size_px)[0]:
             found[frame] = local
     return found
+
+
+def _one_an_exposure(
+    frames: Sequence[TieFrame], features: Sequence[Features], maps: dict[int, Array], reference: int
+) -> dict[int, Array]:
+    """The maps to one scan of every exposed frame: the defining one, or that which shows the place farthest inside."""
+    inside = {
+        i: (i == reference, float(np.minimum(maps[i][:, 2], np.array(features[i].size_px) - 1 - maps[i][:, 2]).min()))
+        for i in maps
+    }
+    best: dict[str, int] = {}
+    for i in maps:
+        best[frames[i].frame] = max(best.get(frames[i].frame, i), i, key=inside.__getitem__)
+    return {i: places for i, places in maps.items() if best[frames[i].frame] == i}
 
 
 def _width_px(frame: TieFrame, size_px: tuple[int, int]) -> float:

@@ -19,7 +19,8 @@ class TieFrame:
 
     pixel_from_camera: (2, 3), camera mm (x', y', 1) to column and row. frame_mm: width and height of the exposed frame
     about the camera frame's origin, None where the whole scan is one. taken_px (n, 3): column, row and radius of the
-    marks in it, which are no natural points. max_pixels: of the scan, if the user says it.
+    marks in it, which are no natural points. max_pixels: of the scan, if the user says it. part_of: the name of the
+    exposed frame where that was scanned in parts, of which this is one.
     """
 
     image: str
@@ -28,6 +29,12 @@ class TieFrame:
     frame_mm: tuple[float, float] | None
     taken_px: Array
     max_pixels: int | None = None
+    part_of: str = ""
+
+    @property
+    def frame(self) -> str:
+        """The name of the exposed frame."""
+        return self.part_of or self.image
 
     def open(self) -> Scan:
         """The scan. Raises MeasurementError where it cannot be read."""

@@ -75,4 +75,5 @@ def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
         pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
         frame_mm = None
     path, marks = scan_path(scan.scan), np.array(taken).reshape(-1, 3)
-    return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels)
+    frame = project.part_of(scan.frame.image)
+    return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels, frame)

@@ -112,7 +112,7 @@ def test_tracks_of_a_frame_that_was_scanned_in_parts_come_back_into_the_scan_tha
     for mark in marks:
         place = whole[mark.image[:2], mark.point].xy_mm
         begin_mm = RIGHT_PX * PITCH_MM if mark.image.endswith("r") else 0.0
-        np.testing.assert_allclose(mark.xy_mm, place - np.array([begin_mm, 0.0]), atol=1e-9)  # type: ignore[arg-type, operator]
+        np.testing.assert_allclose(mark.xy_mm, place - np.array([begin_mm, 0.0]), atol=1e-9)  # type: ignore[arg-type]
         col = place[0] / PITCH_MM  # type: ignore[index]
         assert col < LEFT_PX if mark.image.endswith("l") else col > RIGHT_PX
 
