@@ -1,11 +1,11 @@
-"""The browser that tests of pages drive: the system's Chromium."""
+"""The browser that tests of pages drive: the system's Chromium, started once for a file's tests."""
 
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 REASON = "there is no Chromium"
 _FOUND = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -14,15 +14,22 @@ needs_browser = pytest.mark.skipif(_FOUND is None, reason=REASON)
 
 
 @contextmanager
-def browser_page(width: int = 1300) -> Iterator[Page]:
-    """An empty page. A fault in the scripts of what it shows fails the test."""
-    faults = list[str]()
+def started_browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=_FOUND, args=["--no-sandbox"])
-        page = browser.new_context(viewport={"width": width, "height": 900}).new_page()
-        page.set_default_timeout(20_000)
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        page.on("dialog", lambda dialog: faults.append(dialog.message))
-        yield page
+        yield browser
         browser.close()
+
+
+@contextmanager
+def browser_page(browser: Browser) -> Iterator[Page]:
+    """An empty page, without cookies of earlier ones. A fault in the scripts of what it shows fails the test."""
+    faults = list[str]()
+    context = browser.new_context(viewport={"width": 1300, "height": 900})
+    page = context.new_page()
+    page.set_default_timeout(20_000)
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.on("dialog", lambda dialog: faults.append(dialog.message))
+    yield page
+    context.close()
     assert faults == []

@@ -9,11 +9,22 @@ from pathlib import Path
 
 import cv2
 import pytest
+from browser import started_browser
 from demonstration import FRAMES
-from in_process import Here
+from in_process import Here, pools
+from playwright.sync_api import Browser
 
 from pipeline.cli import run
 from pipeline.rendered.scene_file import render_project
+from pipeline.workers import worker_pool
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """One run of the demonstration serves all: its tests stay with one worker."""
+    for item in items:
+        if "rendered_demo" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.xdist_group("demonstration"))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -25,8 +36,15 @@ def one_thread_of_opencv() -> Iterator[None]:
     cv2.setNumThreads(threads)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def in_one_process() -> Iterator[None]:
+    """Small scans are measured sooner than a new process has loaded its modules. The demonstration starts them."""
+    with pools(lambda *_: nullcontext(Here())):
+        yield
+
+
 @pytest.fixture(scope="session")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rendered_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project of the demonstration's first frames, not yet run. Tests copy it before they change anything."""
     scenes = tmp_path_factory.mktemp("scenes")
     for name in ("demo.toml", "metric_camera.toml"):
@@ -39,11 +57,12 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def finished(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+def finished(rendered_demo: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
     """The demonstration's project after `reseau run`, and the exit code of that."""
     folder = tmp_path_factory.mktemp("finished") / "demo"
-    shutil.copytree(rendered, folder)
-    return folder, run(["run", str(folder / "project.toml")])
+    shutil.copytree(rendered_demo, folder)
+    with pools(worker_pool):
+        return folder, run(["run", str(folder / "project.toml")])
 
 
 @pytest.fixture
@@ -54,7 +73,7 @@ def project(finished: tuple[Path, int], tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def in_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small scans are measured sooner than a new process has loaded its modules. The demonstration starts them."""
-    monkeypatch.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: nullcontext(Here()))
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with started_browser() as one:
+        yield one

@@ -1,11 +1,29 @@
 """Work without processes."""
 
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
+import pytest
+
 from pipeline.workers import WorkerKilled
+
+_POOLS = (
+    "pipeline.archive.measure_archive.worker_pool",
+    "pipeline.archive.sampling.worker_pool",
+    "pipeline.resampling.resample_stage.worker_pool",
+)
+
+
+@contextmanager
+def pools(made: Callable[..., AbstractContextManager[Executor]]) -> Iterator[None]:
+    """Whatever asks for processes gets these."""
+    with pytest.MonkeyPatch.context() as patched:
+        for pool in _POOLS:
+            patched.setattr(pool, made)
+        yield
 
 
 class Here(Executor):

@@ -6,7 +6,6 @@ import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import nullcontext
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -16,7 +15,6 @@ import numpy as np
 import pytest
 import tifffile
 from drawn_project import CAMERA, write_project
-from in_process import Here
 
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import MEANING, NEXT_STEP, Verdict
@@ -29,7 +27,6 @@ from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_scan import MeasuredScan
 
 SAID = pytest.CaptureFixture[str]
-pytestmark = pytest.mark.usefixtures("in_one_process")
 
 measured: list[str] = []  # the images that were measured, in their order
 
@@ -56,9 +53,7 @@ def done(three: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same, measured."""
     folder = tmp_path_factory.mktemp("done") / "p"
     shutil.copytree(three, folder)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: nullcontext(Here()))
-        assert measure(folder) == 0
+    assert measure(folder) == 0
     return folder
 
 

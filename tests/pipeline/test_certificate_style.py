@@ -105,6 +105,3 @@ def test_a_narrow_camera_has_angles_of_its_own() -> None:
 def test_the_report_shows_it(finished: tuple[Path, int]) -> None:
     text = (finished[0] / "out" / "report.html").read_text(encoding="utf-8")
     assert "Certificate style: calibrated principal distance" in text
-
-
-test_the_report_shows_it = pytest.mark.xdist_group("demonstration")(test_the_report_shows_it)

@@ -24,7 +24,6 @@ from pipeline.cli import run
 from pipeline.workers import worker_pool
 
 SAID = pytest.CaptureFixture[str]
-pytestmark = pytest.mark.xdist_group("demonstration")  # one run of it serves all
 
 
 def replaced(path: Path, old: str, new: str) -> None:
@@ -312,7 +311,6 @@ def test_singular_network_is_named_in_words(project: Path, capsys: SAID) -> None
         assert word in what
 
 
-@pytest.mark.usefixtures("in_one_process")
 def test_scan_of_another_camera_is_said_to_be_one(project: Path, capsys: SAID) -> None:
     rng = np.random.default_rng(1)
     picture = (20000 + 3000 * rng.standard_normal((678, 678))).astype(np.uint16)

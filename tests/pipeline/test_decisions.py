@@ -187,7 +187,6 @@ def test_a_target_that_is_placed_counts_as_well_as_one_points() -> None:
     np.testing.assert_array_equal(mark.center_px, (50.0, 60.0))
 
 
-@pytest.mark.usefixtures("in_one_process")
 def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -210,7 +209,6 @@ def test_decisions_that_were_not_taken_in_are_told_until_measure_takes_them(
     assert rows == [line for line in before.splitlines() if line[0] != "#"]
 
 
-@pytest.mark.usefixtures("in_one_process")
 def test_what_is_decided_is_not_open_and_every_command_says_who_decided(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

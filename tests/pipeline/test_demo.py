@@ -15,8 +15,6 @@ from pipeline.files.project_file import read_project
 from pipeline.rendered.against_truth import compare_with_truth
 from pipeline.results.comparator_file import mark_rows, write_comparator
 
-in_its_group = pytest.mark.xdist_group("demonstration")  # one run of it serves all
-
 
 def assert_measured_right_and_calibrated_within_its_sigmas(folder: Path, frames: int) -> None:
     out = folder / "out"
@@ -39,19 +37,16 @@ def assert_agrees_with_opencv_and_reports(folder: Path, last: str) -> None:
     assert last in page
 
 
-@in_its_group
 def test_its_frames_are_measured_right_and_calibrated_within_their_sigmas(finished: tuple[Path, int]) -> None:
     folder, code = finished
     assert code == DONE
     assert_measured_right_and_calibrated_within_its_sigmas(folder, FRAMES)
 
 
-@in_its_group
 def test_its_frames_agree_with_opencv_and_are_reported(finished: tuple[Path, int]) -> None:
     assert_agrees_with_opencv_and_reports(finished[0], f"frame{FRAMES}")
 
 
-@in_its_group
 def test_the_order_of_points_csv_changes_no_digit(finished: tuple[Path, int], tmp_path: Path) -> None:
     shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("out", "comparator.csv"))
     head, *rows = (tmp_path / "points.csv").read_text(encoding="utf-8").splitlines()

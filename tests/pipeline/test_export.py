@@ -416,7 +416,6 @@ def test_without_an_adjustment_the_marks_go_out(tmp_path: Path, capsys: pytest.C
     assert "Run `reseau adjust` first" in capsys.readouterr().err
 
 
-@pytest.mark.xdist_group("demonstration")
 def test_resampled_frames_lie_where_the_export_says(finished: tuple[Path, int], tmp_path: Path) -> None:
     """The demonstration's frames, turned and mirrored: the first pixel of `reseau resample` and that of the export."""
     import tifffile

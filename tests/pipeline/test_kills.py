@@ -62,9 +62,9 @@ def test_a_share_of_the_kills(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_hundred_kills(rendered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_hundred_kills(rendered_demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old = tmp_path / "old"
-    shutil.copytree(rendered, old)
+    shutil.copytree(rendered_demo, old)
     project = old / "project.toml"
     text = project.read_text(encoding="utf-8")
     project.write_text(text.replace(', "scans/frame3.tif"', ""), encoding="utf-8")

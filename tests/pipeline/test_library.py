@@ -146,7 +146,6 @@ def test_images_may_name_a_camera_of_the_library(tmp_path: Path) -> None:
 
 
 @one_frame
-@pytest.mark.usefixtures("in_one_process")
 def test_a_frame_of_a_library_camera_is_measured_right(frame: Path) -> None:
     """All drawn marks within a tenth of a pixel of the truth; those that are not drawn are passed over."""
     assert run(["measure", str(frame)]) == 0

@@ -20,8 +20,6 @@ from pipeline.errors import InputError
 from pipeline.files.project_file import read_project
 from pipeline.measuring.scan_kinds import ScanKind
 
-pytestmark = pytest.mark.usefixtures("in_one_process")
-
 
 @pytest.fixture(scope="module")
 def store() -> Iterator[Any]:

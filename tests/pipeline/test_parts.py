@@ -26,6 +26,8 @@ from pipeline.measuring.joins import with_joins
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_scan import MeasuredScan
 
+pytestmark = pytest.mark.xdist_group("parts")  # measured once for all
+
 MARKS = """
 [camera]
 name = "K"

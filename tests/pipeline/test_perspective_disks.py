@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.projection import ImageModel
@@ -19,9 +18,8 @@ from synthetic_images.frame import frame_truth
 from synthetic_images.truth import Truth, truth_json
 
 
-@pytest.mark.xdist_group("demonstration")  # which is rendered there
-def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered: Path) -> None:
-    truth = json.loads((rendered / "truth.json").read_text(encoding="utf-8"))
+def test_eccentricity_and_place_of_a_disk_are_those_of_the_rendered_one(rendered_demo: Path) -> None:
+    truth = json.loads((rendered_demo / "truth.json").read_text(encoding="utf-8"))
     (camera,) = truth["cameras"].values()
     radius = 0.013  # m
     largest = 0.0

@@ -272,9 +272,7 @@ def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.tif"))
 
 
-def test_a_project_through_the_command(
-    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], in_one_process: None
-) -> None:
+def test_a_project_through_the_command(project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The fiducials of the demonstration, each in all frames at the pixel that its camera coordinates say."""
     out = tmp_path / "frames"
     assert run(["resample", str(project / "project.toml"), str(out), "--json"]) == 0

@@ -33,7 +33,6 @@ from pipeline.results.measured_scan import MeasuredScan
 from pipeline.summary import summarise
 
 SAID = pytest.CaptureFixture[str]
-pytestmark = [pytest.mark.xdist_group("demonstration"), pytest.mark.usefixtures("in_one_process")]
 
 
 def shown(folder: Path) -> tuple[int, dict[str, Any]]:

@@ -11,7 +11,7 @@ from urllib.parse import quote, urlsplit
 import numpy as np
 import pytest
 from browser import browser_page, needs_browser
-from playwright.sync_api import Page, Position, expect
+from playwright.sync_api import Browser, Page, Position, expect
 from review_pages import comparator, decisions, steer
 from review_server import BARE, GOOD, SCRATCHED, TURNED, Served, mark_px, served, write_faults
 
@@ -38,10 +38,10 @@ def server(measured: Path) -> Iterator[Served]:
 
 
 @pytest.fixture
-def page(server: Served, measured: Path) -> Iterator[Page]:
+def page(browser: Browser, server: Served, measured: Path) -> Iterator[Page]:
     """The page, nothing being decided yet."""
     (measured / "decisions.jsonl").unlink(missing_ok=True)
-    with browser_page() as one:
+    with browser_page(browser) as one:
         one.goto(server.address)
         expect(one.locator("#left")).to_contain_text("3 left: 1 frame, 2 marks")
         yield one
@@ -240,9 +240,9 @@ def test_names_are_shown_as_text(page: Page) -> None:
 
 
 @needs_browser
-def test_a_server_that_was_killed_goes_on_where_it_stopped(measured: Path) -> None:
+def test_a_server_that_was_killed_goes_on_where_it_stopped(browser: Browser, measured: Path) -> None:
     (measured / "decisions.jsonl").unlink(missing_ok=True)
-    with browser_page() as page:
+    with browser_page(browser) as page:
         with served(measured / "project.toml") as first:
             page.goto(first.address)
             open_entry(page, SCRATCHED)

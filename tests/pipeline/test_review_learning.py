@@ -11,7 +11,7 @@ from browser import browser_page, needs_browser
 from brute_marks import Array
 from drawn_frames import CORNERS, pixel_from_camera
 from drawn_project import PROJECT, write_project
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 from review_pages import comparator, decisions, steer
 from review_server import Served, served
 
@@ -55,13 +55,12 @@ def server(project: Path) -> Iterator[Served]:
 
 
 @needs_browser
-@pytest.mark.usefixtures("in_one_process")
 def test_marks_are_shown_in_one_scan_by_keys_tried_at_once_and_learned_from_there(
-    project: Path, capsys: pytest.CaptureFixture[str], server: Served
+    project: Path, capsys: pytest.CaptureFixture[str], browser: Browser, server: Served
 ) -> None:
     assert run(["measure", str(project)]) == 2
     assert "reseau review" in capsys.readouterr().err
-    with browser_page() as page:
+    with browser_page(browser) as page:
         page.goto(server.address)
         expect(page.locator("#left")).to_have_text("1 left: 1 camera")
         shown = show_marks(page)

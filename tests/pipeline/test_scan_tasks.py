@@ -28,7 +28,6 @@ from pipeline.results.measured_scan import FailureCode, MeasuredScan
 
 Changed = Callable[[str, str], tuple[str, str]]  # of project.toml and camera.toml
 SAID = pytest.CaptureFixture[str]
-pytestmark = pytest.mark.usefixtures("in_one_process")
 
 BOARD = '[targets]\nkind = "chessboard"\ncolumns = 5\nrows = 4\nsquare_mm = 10.0\n'
 TARGETS = '[targets]\nkind = "disk"\ndiameter_mm = 30.0\n[object]\npoints = "points.csv"\nimages = "images.csv"\n'

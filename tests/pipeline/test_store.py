@@ -307,9 +307,9 @@ def test_the_key_depends_on_all_that_it_names() -> None:
     assert base.fingerprint == kept(1, problems=["another result"]).fingerprint
 
 
-def test_parts_tell_scans_apart_that_share_head_and_tables(rendered: Path, tmp_path: Path) -> None:
+def test_parts_tell_scans_apart_that_share_head_and_tables(rendered_demo: Path, tmp_path: Path) -> None:
     scan = tmp_path / "scan.tif"
-    shutil.copyfile(rendered / "scans" / "frame1.tif", scan)
+    shutil.copyfile(rendered_demo / "scans" / "frame1.tif", scan)
     first = parts_hash(scan), content_hash(scan)
     copy = tmp_path / "copy.tif"
     shutil.copyfile(scan, copy)

@@ -18,13 +18,13 @@ from pipeline.results.comparator_file import measurement_of
 from pipeline.results.thumbnail import cut
 from pipeline.thumbnails import Thumbnails
 
-pytestmark = pytest.mark.usefixtures("in_one_process")
+pytestmark = pytest.mark.xdist_group("thumbnails")  # measured once for all
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = write_project(tmp_path_factory.mktemp("thumbnails"), ["a", "b", "c"]).parent
-    assert run(["measure", str(folder / "project.toml"), "--workers", "1"]) == 0
+    assert run(["measure", str(folder / "project.toml")]) == 0
     return folder
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 from brute_marks import brute_picture, placed
 
 from measure.codes_and_boards.board_specs import ChessboardSpec
@@ -85,6 +84,3 @@ def test_trap_two_blas_threads_a_worker() -> None:
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert said.stdout.split() == ["1"]
-
-
-pytestmark = pytest.mark.xdist_group("demonstration")
