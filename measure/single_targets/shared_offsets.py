@@ -19,8 +19,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Standard deviations, as shares of the image's size: of shift, scale and shear; of radial distortion in the corners, of
-# its third, fifth and seventh degree; of the other polynomials of the second to the fifth, of which the targets choose.
-_PLAIN, _RADIAL, _BENDING = 0.1, (0.03, 0.01, 0.003), (1e-5, 1e-4, 1e-3, 1e-2)
+# its third, fifth and seventh degree; of what that of the third is about another middle than the image's; of the other
+# polynomials of the second to the fifth, of which the targets choose.
+_PLAIN, _RADIAL, _OFF_MIDDLE, _BENDING = 0.1, (0.03, 0.01, 0.003), 0.0015, (1e-5, 1e-4, 1e-3, 1e-2)
 _DEGREES = 5
 _ROUNDS, _SETTLED = 60, 1e-3
 _MEDIAN = 2.0 * float(np.log(2.0))  # of chi-square (2)
@@ -69,6 +70,7 @@ def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> 
     places = 2.0 * (targets.places_px - (np.array(size_px) - 1.0) / 2.0) / size
     square = (places**2).sum(axis=1, keepdims=True)
     radial = [share * size * places * square ** (k + 1) for k, share in enumerate(_RADIAL)]
+    off_middle = _OFF_MIDDLE * size * (square[:, :, None] * np.eye(2) + 2.0 * places[:, :, None] * places[:, None, :])
     along, across = (np.polynomial.legendre.legvander(one, _DEGREES) for one in places.T)
     smooth = [
         (_PLAIN if i + j < 2 else bending) * size * along[:, i] * across[:, j]
@@ -76,7 +78,7 @@ def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> 
         for j in range(_DEGREES + 1 - i)
     ]
     both = np.einsum("kn,ij->nikj", smooth, np.eye(2)).reshape(len(places), 2, -1)
-    return np.concatenate([targets.by_orientation, np.stack(radial, axis=-1), both], axis=2)
+    return np.concatenate([targets.by_orientation, np.stack(radial, axis=-1), off_middle, both], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
