@@ -1,4 +1,4 @@
-"""Ames Stereo Pipeline: a .tsai file an image, with its TSAI distortion, which is OpenCV's."""
+"""Ames Stereo Pipeline: a .tsai file an image, with its distortion TSAI or FISHEYE, which are OpenCV's."""
 
 from pipeline.exchange.block import Block
 from pipeline.exchange.convention import Convention, ExportOptions, Written
@@ -8,14 +8,14 @@ from pipeline.exchange.pinhole import PinholeFrame, misfit_note, pinhole_frames
 CONVENTION = Convention(
     (0.0, 0.0),
     "column right, row down; camera x right, y down, z forward; R is camera to world",
-    "ASP, docs/pinholemodels.rst (the file, its R, TSAI as OpenCV's); src/asp/Camera/CsmModel.cc, toCsmPixel: ASP's "
-    "pixel (0, 0) is CSM's (0.5, 0.5), the centre of the first one",
+    "ASP, docs/pinholemodels.rst (the file, its R, TSAI and FISHEYE as OpenCV's); src/asp/Camera/CsmModel.cc, "
+    "toCsmPixel: ASP's pixel (0, 0) is CSM's (0.5, 0.5), the centre of the first one",
 )
 
 
 def write(block: Block, options: ExportOptions) -> Written:
     """NAME.tsai an image; c and principal point in mm, with the pitch in mm."""
-    frames, left_out = pinhole_frames(block, options, (BROWN,), "asp")
+    frames, left_out = pinhole_frames(block, options, (BROWN,), "asp", knows_fisheye=True)
     return Written(
         {f"{frame.frame.image}.tsai": _tsai(frame) for frame in frames},
         ("the film transformation (it is that of the resampled frames)", "all standard deviations", "the marks"),
@@ -32,7 +32,9 @@ def _tsai(frame: PinholeFrame) -> str:
     pitch = frame.canvas.pitch_mm
     fx, fy, cx, cy = frame.interior_px
     col, row = CONVENTION.first_pixel_px
-    lens = dict(zip(BROWN, frame.lens.named(BROWN).tolist(), strict=True))
+    name, terms = "TSAI", dict(zip(BROWN, frame.lens.named(BROWN).tolist(), strict=True))
+    if frame.lens.fisheye:
+        name, terms = "FISHEYE", dict(zip(("k1", "k2", "k3", "k4"), frame.lens.fisheye, strict=True))
     world = frame.rotation.T.ravel().tolist()
     lines = [
         "VERSION_4",
@@ -47,7 +49,7 @@ def _tsai(frame: PinholeFrame) -> str:
         f"C = {' '.join(repr(float(value)) for value in frame.station)}",
         f"R = {' '.join(repr(value) for value in world)}",
         f"pitch = {pitch!r}",
-        "TSAI",
-        *(f"{name} = {lens[name]!r}" for name in ("k1", "k2", "p1", "p2", "k3")),
+        name,
+        *(f"{term} = {value!r}" for term, value in terms.items()),
     ]
     return "\n".join(lines) + "\n"

@@ -34,14 +34,22 @@ def colmap_px(folder: Path, image: str, points: Array) -> Array:
 
 
 def asp_px(folder: Path, image: str, points: Array) -> Array:
-    """(u, v) = distorted (fu, fv) (x, y) / z + (cu, cv), over the pitch; TSAI as OpenCV's, of x / z, y / z."""
+    """(u, v) = distorted (fu, fv) (x, y) / z + (cu, cv), over the pitch; TSAI as OpenCV's, of x / z, y / z; FISHEYE:
+    theta_d / r of them, theta_d a polynomial of theta = arctan r."""
     lines = (folder / f"{image}.tsai").read_text(encoding="utf-8").splitlines()
     assert lines[:2] == ["VERSION_4", "PINHOLE"]
     pairs = [line.split("=") for line in lines if "=" in line]
     given = {key.strip(): [float(part) for part in value.split()] for key, value in pairs}
     assert [given[axis] for axis in ("u_direction", "v_direction", "w_direction")] == np.eye(3).tolist()
     x, y, z = np.reshape(given["R"], (3, 3)).T @ (points - given["C"]).T
-    x, y = brown(x / z, y / z, *(given[name][0] for name in ("k1", "k2", "k3", "p1", "p2")))
+    if "TSAI" in lines:
+        x, y = brown(x / z, y / z, *(given[name][0] for name in ("k1", "k2", "k3", "p1", "p2")))
+    else:
+        assert lines[-5] == "FISHEYE"
+        r = np.hypot(x / z, y / z)
+        theta = np.arctan(r)
+        bent = theta * (1 + sum(given[f"k{n}"][0] * theta ** (2 * n) for n in (1, 2, 3, 4)))
+        x, y = bent / r * x / z, bent / r * y / z
     pitch = given["pitch"][0]
     return np.column_stack([given["fu"][0] * x + given["cu"][0], given["fv"][0] * y + given["cv"][0]]) / pitch
 

@@ -43,7 +43,7 @@ LENSES: dict[str, tuple[Family, dict[str, float], tuple[str, ...]]] = {  # and w
     "opencv, skew": ("opencv", OPENCV | AFFINE, (REFUSED, REFUSED, REFUSED, FITTED, EXACT)),
     "opencv, rational": ("opencv", OPENCV | RATIONAL, (EXACT, EXACT, FITTED, FITTED, FITTED)),
     "opencv, prisms": ("opencv", OPENCV | PRISMS, (EXACT, REFUSED, REFUSED, REFUSED, REFUSED)),
-    "opencv_fisheye": ("opencv_fisheye", {"k1": 0.03, "k2": -0.01}, (EXACT, EXACT, REFUSED, REFUSED, REFUSED)),
+    "opencv_fisheye": ("opencv_fisheye", {"k1": 0.03, "k2": -0.01}, (EXACT, EXACT, EXACT, REFUSED, REFUSED)),
 }
 
 
