@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
 from scipy.special import fdtrc
 
 from measure.fitting.picture_model import GREY, PictureModel
 from measure.noise.noise import REACH_PX, NoiseModel, autocovariance, correlated
-from measure.noise.pixel_sums import by_squares, products, to_orthonormal
+from measure.noise.pixel_sums import products, to_orthonormal
 from measure.probabilities import BORDER_FEIGNED
 
 Array = NDArray[np.float64]
@@ -64,28 +64,37 @@ def _is_rare(chi_square: float, greys: int, redundancy: float) -> bool:
 
 class _Search:
     """used (height, width): n pixels that tell their grey value; place (2, n): where these are, from the mark's start,
-    px; base (unknowns, n): orthonormal rows that span what the mark's unknowns change there; left (n,): what they leave
-    of the grey values; shown (n,): the mark's picture; soft_px: as wide a step is about as soft as the mark.
+    px; design (unknowns, n): what the mark's unknowns change there; left (n,): what they leave of the grey values;
+    shown (n,): the mark's picture; soft_px: as wide a step is about as soft as the mark.
 
-    What borders gain is summed up from squares hardly larger than such a step is wide."""
+    What borders gain is summed up from squares about as wide as such a step."""
 
     def __init__(self, model: PictureModel, used: Mask) -> None:
         self.used = used
         rows, cols = np.nonzero(used)
         self.place = np.stack([cols - model.start[0, 2], rows - model.start[1, 2]])
-        seen = model.design[:, used] / model.steadiness[used]
-        self.base = to_orthonormal(seen @ seen.T) @ seen
-        self.left = self._beside((model.residuals / model.steadiness)[used][None])[0]
-        self.shown = seen[-GREY]
+        self.design = model.design[:, used] / model.steadiness[used]
+        self.orthonormal = to_orthonormal(self.design @ self.design.T)
+        self.left = self._beside((model.residuals[used] / model.steadiness[used])[None])[0]
+        self.shown = self.design[-GREY]
         self.blur_px = model.seen_blur_px
         self.soft_px = np.sqrt(2 * np.pi) * self.blur_px
-        both = np.concatenate([self.base, self.left[None]])
+        side_px = max(round(self.soft_px), 1)
+        self._squares(rows // side_px * used.shape[1] + cols // side_px)
+
+    def _squares(self, square: NDArray[np.intp]) -> None:
+        """Sum up the pixels, of which each lies in a square of that number: an orthonormal base of the design and what
+        this leaves, both times the picture, and the picture's powers."""
+        _, square = np.unique(square, return_inverse=True)
+        of_pixels = csr_array((np.ones(len(square)), square, np.arange(len(square) + 1))).T
+        both = np.concatenate([self.design, self.left[None]])
         powers = np.stack([np.ones_like(self.shown), self.shown, self.shown**2])
-        images = np.zeros((2 * len(both) + _POWERS + 2, *used.shape))
-        images[:, used] = np.concatenate([both, both * self.shown, powers, self.place])
-        sums = by_squares(images, max(round(self.soft_px), 1))
-        sums = sums[:, sums[-_POWERS - 2] > 0]
-        self._rows, self._places = np.ascontiguousarray(sums[:-2].T), sums[-2:] / sums[-_POWERS - 2]
+        sums = of_pixels @ np.concatenate([both, both * self.shown, powers, self.place]).T
+        by_unknown, by_change = (sums[:, at : at + len(self.design)] @ self.orthonormal.T for at in (0, len(both)))
+        left, left_by_change = (sums[:, [at]] for at in (len(self.design), 2 * len(both) - 1))
+        powers, place = sums[:, -_POWERS - 2 : -2], sums[:, -2:]
+        self._rows = np.concatenate([by_unknown, left, by_change, left_by_change, powers], axis=1)
+        self._places = (place / powers[:, :1]).T
 
     def coarse(self) -> tuple[Array, Array]:
         """off_px and turn_rad of borders everywhere."""
@@ -113,7 +122,7 @@ class _Search:
         # Where the border passes beside the mark, the change is none, or one of the whole contrast.
         inverse = np.linalg.pinv(normal, rcond=_LEAST_LEFT, hermitian=True)
         left = self.left - inverse @ scores @ columns
-        redundancy = len(self.left) - len(self.base) - 2
+        redundancy = len(self.left) - len(self.orthonormal) - 2
         variance_dn2 = max(float(np.mean(left**2)), floor_dn**2)
         if not _is_rare(float(scores @ inverse @ scores) / max(variance_dn2, 1e-300), 2, redundancy):
             return False
@@ -182,4 +191,5 @@ class _Search:
 
     def _beside(self, rows: Array) -> Array:
         """What the mark's unknowns leave of rows (m, n)."""
-        return np.asarray(rows - rows @ self.base.T @ self.base)
+        factors = rows @ self.design.T @ self.orthonormal.T @ self.orthonormal
+        return np.asarray(rows - factors @ self.design)

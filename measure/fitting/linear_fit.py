@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_filter
 
 from measure.fitting.picture_model import GREY
 from measure.noise.noise import NoiseModel, correlated
-from measure.noise.pixel_sums import combined, products
+from measure.noise.pixel_sums import products
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -76,15 +76,17 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
     being 1. The bends are compared pixel by pixel, with grain in the covariance only: its weights amplify them as no
     noise does."""
     moving = len(design) - GREY + 1  # all but the ground's
-    among, seen = covariance[:moving, :moving], design * used
-    by_grey = combined(np.asarray(np.linalg.inv(products(seen, seen) + np.diag(priors_dn2)), float), seen)
+    among, seen = covariance[:moving, :moving], design[:, used]
     # All that moves with the mark changes by its slope, against the move.
     whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
-    changes = -np.concatenate(np.gradient(whole, axis=(2, 1))) * slopes * used
-    taken_up = products(by_grey, changes)
+    changes = -np.concatenate([bend[:, used] for bend in np.gradient(whole, axis=(2, 1))]) * slopes[used]
+    normal, shared = seen @ seen.T, seen @ changes.T
+    inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
+    taken_up = inverse @ shared
     by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # of the variance's logarithm, negative
-    left = changes - combined(taken_up.T, seen)
-    turning = np.einsum("jl,ijml->im", among, products(left, left).reshape(2, moving, 2, moving))
-    curvature = np.trace(products(by_grey[:2], by_grey[:2]) @ turning) / 2
+    both = taken_up.T @ shared
+    left = changes @ changes.T - both - both.T + taken_up.T @ normal @ taken_up
+    turning = np.einsum("jl,ijml->im", among, left.reshape(2, moving, 2, moving))
+    curvature = np.trace((inverse @ normal @ inverse)[:2, :2] @ turning) / 2
     # Lags that are noise themselves may leave the covariance of the other unknowns indefinite.
     return max(float(curvature + by_unknown @ among @ by_unknown / 2), 0.0)

@@ -305,7 +305,7 @@ def _result(fit: PictureFit, about: _Surroundings) -> Match:
     if not fit.reason:
         patches = blank_patches(about.grey, about.free, noise.variance_dn2)
         if not noise.is_white or is_coloured(patches):
-            noise = grain_model(model.residuals, used, model.design * used, noise.neighbour_correlation, patches)
+            noise = grain_model(model.residuals, used, model.design, noise.neighbour_correlation, patches)
         precision = _weighed(fit, used, noise, about)
     state, covariance = model.state, precision.covariance
     return Match(

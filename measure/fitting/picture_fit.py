@@ -232,8 +232,8 @@ class PictureFit:
         """What lies on damage of what the picture tells of the place, in the direction in which least is left."""
         priors = np.diag(self.model.prior_weights()) * self.variance_dn2
         by_all, by_used = (
-            np.linalg.inv(products(self.model.design * pixels, self.model.design) + priors)[:2, :2]
-            for pixels in (self.area, self.used)
+            np.linalg.inv(design @ design.T + priors)[:2, :2]
+            for design in (self.model.design[:, pixels] for pixels in (self.area, self.used))
         )
         return 1.0 - float(1 / np.linalg.eigvals(by_used @ np.linalg.inv(by_all)).real.max())
 

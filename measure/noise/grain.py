@@ -20,7 +20,7 @@ from scipy import fft
 from scipy.optimize import nnls
 
 from measure.noise.noise import NoiseModel, padded
-from measure.noise.pixel_sums import combined, products, to_orthonormal
+from measure.noise.pixel_sums import to_orthonormal
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -115,12 +115,14 @@ class _Window:
     """The pixels of a fit and what it takes out of the noise there; sums over all pairs of pixels so far apart."""
 
     def __init__(self, used: Mask, design: Array, farthest_px: float) -> None:
-        """used (height, width); design (unknowns, height, width): derivatives, 0 where not used."""
+        """used (height, width); design (unknowns, height, width): derivatives."""
         self.rings = _rings(farthest_px)
         border = int(farthest_px)
         self.used = np.pad(used, border)
-        base = combined(to_orthonormal(products(design, design)), design)
-        self.taken = np.pad(base.astype(np.float32), [(0, 0), (border, border), (border, border)])
+        seen = design[:, used]
+        base = to_orthonormal(seen @ seen.T) @ seen
+        self.taken = np.zeros((len(base), *self.used.shape), np.float32)
+        self.taken[:, self.used] = base
         self.pairs = self.products(self.used[None])
         self.weights = 1.0 / np.sqrt(np.maximum(self.pairs, 1.0))
 

@@ -21,13 +21,6 @@ def products(first: Array, second: Array) -> Array:
     return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)
 
 
-def by_squares(images: Array, side_px: int) -> Array:
-    """(n, rows, columns) the sums of images (n, height, width) over squares of that side, the last ones cut off."""
-    height, width = images.shape[1:]
-    by_rows = np.add.reduceat(images, np.arange(0, height, side_px), axis=1)
-    return np.asarray(np.add.reduceat(by_rows, np.arange(0, width, side_px), axis=2))
-
-
 def to_orthonormal(normal: Array) -> Array:
     """(k, n) the factors by which images become an orthonormal base of the space they span, of k dimensions; normal
     (n, n): the sums of their products."""

@@ -66,8 +66,8 @@ def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -
     of the noise times them."""
     covariance = _Covariance(noise, used, max(_WHITE * noise.variance_dn2, (_MISFIT * contrast_dn) ** 2))
     # The columns are scaled for single precision, and all are solved at once.
-    size = np.sqrt((design[:, used] ** 2).sum(axis=1))[:, None, None]
-    right = (design * used / size).astype(np.float32)
+    size = np.sqrt(np.square(design[:, used]).sum(axis=1))[:, None, None]
+    right = (design * (used / size)).astype(np.float32)
     solution, product = np.zeros_like(right), np.zeros_like(right)
     # Columns that are close leave the rounds: those of a mark's edges are so at once, the ground's later.
     left, rest = np.arange(len(right)), right
