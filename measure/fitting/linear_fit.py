@@ -79,14 +79,15 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
     among, seen = covariance[:moving, :moving], design[:, used]
     # All that moves with the mark changes by its slope, against the move.
     whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
-    changes = -np.concatenate([bend[:, used] for bend in np.gradient(whole, axis=(2, 1))]) * slopes[used]
+    changes = -np.concatenate(np.gradient(whole, axis=(2, 1)))[:, used] * slopes[used]
     normal, shared = seen @ seen.T, seen @ changes.T
     inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
-    taken_up = inverse @ shared
+    taken_up = np.asarray(inverse @ shared, float)
     by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # of the variance's logarithm, negative
     both = taken_up.T @ shared
     left = changes @ changes.T - both - both.T + taken_up.T @ normal @ taken_up
     turning = np.einsum("jl,ijml->im", among, left.reshape(2, moving, 2, moving))
-    curvature = np.trace((inverse @ normal @ inverse)[:2, :2] @ turning) / 2
+    by_noise = np.asarray(inverse @ normal @ inverse, float)
+    curvature = np.trace(by_noise[:2, :2] @ turning) / 2
     # Lags that are noise themselves may leave the covariance of the other unknowns indefinite.
     return max(float(curvature + by_unknown @ among @ by_unknown / 2), 0.0)
