@@ -22,7 +22,7 @@ from measure.checks.misfits import Misfit, scan_sites
 from measure.checks.second_places import by_second_places
 from measure.checks.triangles import by_triangles
 from measure.covariance import Cause
-from measure.film import SCATTER_MM
+from measure.film import ANY_FILM, BelievedFilm
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
 from measure.probabilities import FALSE_DOUBT
 from measure.reason import NO_REASON, Code, Reason
@@ -47,13 +47,13 @@ def judged(
     frames: Sequence[FrameMeasurement],
     layout: FiducialLayout,
     pitches_um: Sequence[tuple[float, float]],
-    film_sigma_mm: float = SCATTER_MM,
+    film: BelievedFilm = ANY_FILM,
 ) -> Judgement:
-    """All measured frames of one camera, judged. pitches_um: of each scan, in x and y; film_sigma_mm: what is believed
-    beforehand of the scatter of marks by film and scanner."""
+    """All measured frames of one camera, judged. pitches_um: of each scan, in x and y; film: what is believed of it
+    beforehand."""
     checked = [doubted(frame, own) for frame, own in zip(frames, by_second_places(frames), strict=True)]
-    checked, films = _by_misfits(checked, layout, film_sigma_mm)
-    for place, told in by_triangles(checked, layout, pitches_um, film_sigma_mm).items():
+    checked, films = _by_misfits(checked, layout, film)
+    for place, told in by_triangles(checked, layout, pitches_um, film.sigma_mm).items():
         frame = _with_film(doubted(checked[place], told.doubts), told.film_mm**2)
         checked[place] = replace(frame, problems=(*frame.problems, *([told.problem] if told.problem else [])))
         films[place] = float(np.hypot(films[place], told.film_mm))
@@ -61,19 +61,21 @@ def judged(
 
 
 def _by_misfits(
-    frames: Sequence[FrameMeasurement], layout: FiducialLayout, film_mm: float
+    frames: Sequence[FrameMeasurement], layout: FiducialLayout, film: BelievedFilm
 ) -> tuple[list[FrameMeasurement], list[float]]:
     """The frames with what their misfits say, and the film's standard deviation in each."""
     found = {place: Misfit.of(frame, layout) for place, frame in enumerate(frames)}
     misfits = {place: each for place, each in found.items() if each is not None}
     if not misfits:
-        return list(frames), [film_mm] * len(frames)
+        return list(frames), [film.sigma_mm] * len(frames)
     given = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
-    shared, problem = _shared(misfits, {place: frames[place] for place in misfits}, layout, given, film_mm)
+    shared, problem = _shared(misfits, {place: frames[place] for place in misfits}, layout, given, film.sigma_mm)
     result, films = [], []
     for place, frame in enumerate(frames):
-        own_mm, own_problems = _film_of(shared, place, layout, film_mm)
-        doubts, extra_mm2 = _doubts(shared, place, layout), own_mm**2 - film_mm**2
+        own_mm, own_problems = _film_of(shared, place, layout, film.sigma_mm)
+        doubts, extra_mm2 = _doubts(shared, place, layout), 0.0
+        if own_mm > film.sigma_mm:
+            extra_mm2 = own_mm**2 - film.added_later_mm**2
         problems = (*frame.problems, *own_problems, *([problem] if problem and place in misfits else []))
         result.append(replace(_with_film(doubted(frame, doubts), extra_mm2), problems=problems))
         films.append(own_mm)

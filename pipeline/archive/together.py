@@ -64,7 +64,7 @@ def judged_lots(
         some = [task for _, each in of_cameras for task in each]
         of_writing = [said[task.name] for task in some if task.name in said]
         cameras = [camera for camera, _ in of_cameras]
-        depends_on = [cameras, project.film_sigma_mm, of_writing, _shared(project, some, told)]
+        depends_on = [cameras, project.film, of_writing, _shared(project, some, told)]
         yield lot(some, depends_on, partial(seen, of_cameras))
     if copies:
         again = sorted(copies.items())
@@ -146,7 +146,7 @@ def _checked_beside(
     scans = [work.read(task.name) for task in tasks]
     roll = roll_of(tasks, scans, camera.writing)
     again = list(work.measure(roll.tasks)) if roll.tasks else []
-    return checked(camera, scans, roll, again, project.film_sigma_mm)
+    return checked(camera, scans, roll, again, project.film)
 
 
 def _said_by_writing(project: Project, tasks: Sequence[ScanTask], work: Work) -> Said:

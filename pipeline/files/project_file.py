@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast, get_args
 
 from adjust.problem.network import ObjectPoint, Prior
 from measure.fiducial_options import Reads
-from measure.film import SCATTER_MM
+from measure.film import ANY_FILM, BelievedFilm
 from measure.marks.poses import POSES
 from pipeline.errors import InputError
 from pipeline.files.adjust_table import AdjustSettings, read_adjust
@@ -89,9 +89,10 @@ class Project:
         return "all" if asked and self.writing == "pose" else self.writing
 
     @property
-    def film_sigma_mm(self) -> float:
+    def film(self) -> BelievedFilm:
         """What film and scanner scatter a mark by, as the project says it, or else as it is believed of any film."""
-        return self.adjust.film_sigma_um / 1000.0 or SCATTER_MM
+        stated_mm = self.adjust.film_sigma_um / 1000.0
+        return BelievedFilm(stated_mm, is_stated=True) if stated_mm else ANY_FILM
 
     @property
     def title(self) -> str:

@@ -7,6 +7,7 @@ from typing import NewType
 
 from measure.checks.judgement import judged
 from measure.codes_and_boards.coma import one_definition
+from measure.film import BelievedFilm
 from measure.results import FrameMeasurement
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.roll import Roll
@@ -20,7 +21,7 @@ def checked(
     measured: Sequence[MeasuredScan],
     roll: Roll,
     again: Iterable[MeasuredScan],
-    film_sigma_mm: float,
+    film: BelievedFilm,
 ) -> tuple[CheckedScan, ...]:
     """The scans of one camera as all of them together show them, in their order: their poses, one definition of the
     places of crossings, the fiducials judged together.
@@ -32,15 +33,15 @@ def checked(
     frames = [replace(scan.frame, marks=own) for scan, own in zip(scans, marks, strict=True)]
     told = {
         scan.frame.image: replace(scan, frame=frame)
-        for scan, frame in zip(scans, _judged(camera, frames, scans, film_sigma_mm), strict=True)
+        for scan, frame in zip(scans, _judged(camera, frames, scans, film), strict=True)
     }
     return tuple(CheckedScan(told.get(scan.frame.image, scan)) for scan in measured)
 
 
 def _judged(
-    camera: CameraFile, frames: Sequence[FrameMeasurement], scans: Sequence[MeasuredScan], film_sigma_mm: float
+    camera: CameraFile, frames: Sequence[FrameMeasurement], scans: Sequence[MeasuredScan], film: BelievedFilm
 ) -> Sequence[FrameMeasurement]:
     """The fiducials judged together, if the camera has any."""
     if not camera.drawn:
         return frames
-    return judged(frames, camera.layout(), [scan.pitch_um for scan in scans], film_sigma_mm).frames
+    return judged(frames, camera.layout(), [scan.pitch_um for scan in scans], film).frames

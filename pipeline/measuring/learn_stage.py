@@ -65,7 +65,7 @@ def with_learned(project: Project, memory: Memory) -> Project:
 
 def _key(project: Project, camera: CameraFile) -> str:
     """Of what is learned: of which marks, and by which settings."""
-    settings = [project.pitch_um, project.pose, project.film_sigma_mm, MEASURE_REVISION]
+    settings = [project.pitch_um, project.pose, project.film.sigma_mm, MEASURE_REVISION]
     return f"learned {fingerprint([camera.fiducials, camera.frame_mm, camera.clicks, settings])}"
 
 

@@ -124,7 +124,7 @@ def options_of(project: Project, said: Mapping[str, tuple[SaidOfTone, ...]]) -> 
         part = bool(project.part_of(name))
         key = (key_of[id(given)], pose, known is None, part, *map(id, told), id(exterior))
         if key not in shared:
-            options = FiducialOptions(pose, film_sigma_mm=project.film_sigma_mm, writing=project.reads, part=part)
+            options = FiducialOptions(pose, film_sigma_mm=project.film.sigma_mm, writing=project.reads, part=part)
             camera = cameras[key_of[id(given)]]
             shared[key] = ScanOptions(camera, project.pitch_um, options, known, project.tone, told, targets, exterior)
         return shared[key]

@@ -53,7 +53,7 @@ def measured_from(project: Project) -> MadeFrom:
         project.given_points and project.given_points.normals,
         project.given_images and project.given_images.exterior,
         {camera.name: {name: _of(camera)[name] for name in _LENS} for camera in project.cameras.values()},
-        project.film_sigma_mm,
+        project.film,
         *([project.given_images.part_of] if project.given_images and project.has_parts else []),
     ]
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from measure.checks.judgement import judged
 from measure.covariance import Cause, Covariance
+from measure.film import BelievedFilm
 from measure.marks.poses import up_from_camera
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
@@ -132,8 +133,10 @@ def test_of_four_marks_it_is_the_frame_that_does_not_fit() -> None:
     assert float(told[1]) == pytest.approx(0.028, abs=0.006)  # a quarter of 0.113 mm at each mark
     assert result.film_sigma_mm[0] == 0.005
     assert result.film_sigma_mm[1] == pytest.approx(0.03, rel=0.4)
-    added = [mark.covariance.sigmas_px[Cause.FILM] for mark in result.frames[1].marks if mark.covariance]
-    np.testing.assert_allclose(added, PX_PER_MM * np.sqrt(result.film_sigma_mm[1] ** 2 - 0.005**2), rtol=1e-3)
+    stated = judged(frames, layout, [(20.0, 20.0)] * 5, BelievedFilm(0.005, is_stated=True))
+    for each, later_mm in ((result, 0.0), (stated, 0.005)):  # which the adjustment adds to every mark
+        added = [mark.covariance.sigmas_px[Cause.FILM] for mark in each.frames[1].marks if mark.covariance]
+        np.testing.assert_allclose(added, PX_PER_MM * np.sqrt(each.film_sigma_mm[1] ** 2 - later_mm**2), rtol=1e-3)
 
 
 def test_one_frame_names_the_mark_that_alone_is_off() -> None:
@@ -155,7 +158,7 @@ def test_the_projects_film_decides_how_far_off_a_mark_may_be() -> None:
     (frame,) = frames_of(layout, 1, rng)
     bent = moved(frame, 1, (3.0, 0.0))
     pitches = [(1000 / PX_PER_MM, 1000 / PX_PER_MM)]
-    assert weak(judged([bent], layout, pitches, 0.04).frames) == set()
+    assert weak(judged([bent], layout, pitches, BelievedFilm(0.04)).frames) == set()
 
 
 @pytest.mark.parametrize("count", [1, 4])

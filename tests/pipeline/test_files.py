@@ -12,7 +12,7 @@ import tifffile
 from kept_scans import keep_scans
 
 from measure.covariance import Cause, Covariance
-from measure.film import SCATTER_MM
+from measure.film import SCATTER_MM, BelievedFilm
 from measure.marks.shapes import MarkShape, MarkTemplate, Polygon
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
@@ -280,8 +280,8 @@ def test_the_projects_film_is_what_measuring_believes_of_it(tmp_path: Path) -> N
     written(tmp_path, "camera.toml", 'name = "c"\nframe_mm = [24.0, 36.0]\nprincipal_distance_mm = 50.0\n')
     written(tmp_path, "comparator.csv", "image,point,kind,x_mm,y_mm\n")
     project = 'camera = "camera.toml"\n[adjust]\nfilm_sigma_um = '
-    assert read_project(written(tmp_path, "project.toml", project + "12.0")).film_sigma_mm == pytest.approx(0.012)
-    assert read_project(written(tmp_path, "project.toml", project + "0.0")).film_sigma_mm == SCATTER_MM
+    assert read_project(written(tmp_path, "project.toml", project + "12.0")).film == BelievedFilm(0.012, is_stated=True)
+    assert read_project(written(tmp_path, "project.toml", project + "0.0")).film == BelievedFilm(SCATTER_MM)
 
 
 def test_half_pixel_pixel_centres_are_whole_numbers() -> None:
