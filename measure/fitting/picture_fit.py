@@ -17,7 +17,7 @@ from measure.fitting.rounding import (
     unrounded_variance,
 )
 from measure.fitting.scan_window import Coding
-from measure.marks.rendering import chip_mask, known, picture
+from measure.marks.rendering import chip_mask, picture, true
 from measure.marks.shapes import MarkTemplate
 from measure.noise.damage import damage, damage_where_lossy, grown
 from measure.noise.least_squares import solution, tukey_loss, tukey_weights
@@ -256,7 +256,7 @@ class PictureFit:
             near, self.far = distance <= self.options.margin_px, distance > self.options.plain_px
             if outside.all():
                 self.reason = Reason("the mark lies outside of its window", Code.NO_FIT)
-        near &= known(mark, place, width, height, EDGE_BLURS * self.model.seen_blur_px)
+        near &= true(mark, place, width, height, EDGE_BLURS * self.model.seen_blur_px)
         self.area = self.used = self.usable & near
         if self.area.sum() < 0.5 * near.sum() or self.area.sum() < 40:
             self.reason = self.reason or Reason("most of the mark lies outside of the scan", Code.OUTSIDE)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from measure.marks.coverage import CELLS, cell_coverage
 from measure.marks.frame_border import drawn_outline_mm, known_outline_mm
-from measure.marks.shapes import Mark, MarkShape, MarkTemplate
+from measure.marks.shapes import Mark, MarkShape, MarkTemplate, Point
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -105,12 +105,27 @@ def _outline_mm(mark: Mark) -> Array:
     return known_outline_mm(mark)
 
 
-def known(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+def true(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
     """(height, width): in which pixels the mark's drawing is true, and in all within margin_px of them."""
+    shown = known(mark, pixel_from_mark, width, height, margin_px)
+    if isinstance(mark, MarkTemplate) or mark.true_mm is None:
+        return shown
+    return shown & _within(mark.true_mm, pixel_from_mark, width, height, margin_px)
+
+
+def known(mark: Mark, pixel_from_mark: Array, width: int, height: int, margin_px: float) -> NDArray[np.bool_]:
+    """(height, width): in which pixels anything is known of the mark, and in all within margin_px of them."""
     if isinstance(mark, MarkTemplate) or mark.known_mm is None:
         return np.ones((height, width), dtype=bool)
+    return _within(mark.known_mm, pixel_from_mark, width, height, margin_px)
+
+
+def _within(
+    rectangle_mm: tuple[Point, Point], pixel_from_mark: Array, width: int, height: int, margin_px: float
+) -> NDArray[np.bool_]:
+    """(height, width): which pixels lie in a rectangle of the mark's plane, margin_px from its sides."""
     places, margin_mm = _places_mm(pixel_from_mark, width, height), margin_px / _px_per_mm(pixel_from_mark)
-    least, greatest = np.add(mark.known_mm, [[margin_mm], [-margin_mm]])
+    least, greatest = np.add(rectangle_mm, [[margin_mm], [-margin_mm]])
     return np.asarray(np.all((places >= least) & (places <= greatest), axis=-1))
 
 

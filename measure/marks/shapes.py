@@ -3,6 +3,7 @@
 The kinds are shorthands that give parts; everything after them knows parts only.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -61,13 +62,15 @@ class MarkShape:
     """A mark that is drawn. Overlapping parts count once.
 
     perspective: of a plane seen obliquely, per mm: a point u of the parts is drawn at u / (1 + perspective u).
-    known_mm: the least and the greatest corner of the part of the plane that the drawing is true in; None: all of it.
+    known_mm: the least and the greatest corner of the part of the plane in which anything is known of the mark; None:
+    all of it. true_mm: likewise of that in which the drawing is true to the last pixel, and that it is fitted by.
     """
 
     parts: tuple[Part, ...]
     polarity: Polarity = "auto"
     perspective: Point = field(default=(0.0, 0.0), kw_only=True)
     known_mm: tuple[Point, Point] | None = field(default=None, kw_only=True)
+    true_mm: tuple[Point, Point] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not self.parts:
@@ -219,7 +222,8 @@ def turned(mark: Mark, angle_deg: float) -> Mark:
     if isinstance(mark, MarkTemplate):
         return replace(mark, turn_deg=mark.turn_deg + angle_deg)
     parts = tuple(turned_part(part, angle_deg) for part in mark.parts)
-    return replace(mark, parts=parts, perspective=_turned_point(mark.perspective, angle_deg))
+    true = mark.true_mm and _turned_rectangle(mark.true_mm, angle_deg)
+    return replace(mark, parts=parts, perspective=_turned_point(mark.perspective, angle_deg), true_mm=true)
 
 
 def turned_part(part: Part, angle_deg: float) -> Part:
@@ -233,6 +237,18 @@ def turned_part(part: Part, angle_deg: float) -> Part:
     if isinstance(part, Bar):
         return Bar(turn(part.from_mm), turn(part.to_mm), part.line_mm)
     return replace(part, center_mm=turn(part.center_mm))
+
+
+def _turned_rectangle(rectangle: tuple[Point, Point], angle_deg: float) -> tuple[Point, Point]:
+    """An upright rectangle, by its least and its greatest corner, after a turn: of its own shape after a quarter turn,
+    else as large as lies in the turned one."""
+    quarter = round(angle_deg / 90)
+    rest = abs(math.radians(angle_deg - 90 * quarter))
+    middle = _turned_point(tuple(np.mean(rectangle, axis=0).tolist()), angle_deg)
+    wide, tall = (np.diff(rectangle, axis=0)[0] / 2).tolist()[:: -1 if quarter % 2 else 1]
+    within = min(one / (one * math.cos(rest) + other * math.sin(rest)) for one, other in ((wide, tall), (tall, wide)))
+    half = within * wide, within * tall
+    return (middle[0] - half[0], middle[1] - half[1]), (middle[0] + half[0], middle[1] + half[1])
 
 
 def _turned_point(point: Point, angle_deg: float) -> Point:

@@ -88,6 +88,8 @@ def _mark_lines(mark: shapes.Mark | shapes.LearnedMark, name: str, save: SavePic
         lines += ['kind = "frame-corner"', f"reach_mm = {mark.reach_mm!r}", f"radius_mm = {mark.radius_mm!r}"]
         return [*lines, f"polarity = {quoted(mark.polarity)}"]
     lines += ['kind = "parts"', f"polarity = {quoted(mark.polarity)}"]
+    if mark.true_mm is not None:
+        lines.append(f"true_mm = [{', '.join(numbers(corner) for corner in mark.true_mm)}]")
     for part in mark.parts:
         lines += [f"[[mark.{name}.part]]", *_part_lines(part)]
     return lines

@@ -28,7 +28,18 @@ def read_mark(table: Table) -> shapes.Mark | shapes.LearnedMark:
         return shapes.frame_corner(_ANY_CORNER, reach, radius, polarity)
     if kind == "template":
         return replace(read_template(table), polarity=polarity)
-    return shapes.MarkShape(_parts(kind, table), polarity)
+    return shapes.MarkShape(_parts(kind, table), polarity, true_mm=_true_mm(table))
+
+
+def _true_mm(table: Table) -> tuple[shapes.Point, shapes.Point] | None:
+    """The rectangle in which the drawing is true; None: everywhere."""
+    if "true_mm" not in table:
+        return None
+    corners = table.pairs("true_mm")
+    if len(corners) != 2 or not np.all(np.less(*corners)):
+        corner = "[[least x, least y], [greatest x, greatest y]]"
+        raise table.error("true_mm", f"must be two corners of the rectangle in which the drawing is true, {corner}.")
+    return corners[0], corners[1]
 
 
 def _parts(kind: str, table: Table) -> tuple[shapes.Part, ...]:

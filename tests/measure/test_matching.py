@@ -237,6 +237,20 @@ def test_a_notch_is_matched_by_shift_alone() -> None:
     assert np.abs(fit.center_px - place[:, 2]).max() < 4 * np.sqrt(fit.covariance_px2.max())
 
 
+def test_a_drawing_is_fitted_where_it_is_true() -> None:
+    """Whatever else than its drawing shows there, the rest of a wedge counts for nothing."""
+    wedge, rng = polygon(((0.0, 0.0), (-0.9, 1.8), (0.9, 1.8))), np.random.default_rng(29)
+    about, place = MarkShape(wedge, true_mm=((-1.0, -0.8), (1.0, 1.0))), placed(SCALE, (20.31, 25.38))
+    plain = GROUND + CONTRAST * brute_picture(about, place, SIZE, SIZE, 0.8) + rng.normal(0, 10, (SIZE, SIZE))
+    other = plain + 2 * CONTRAST * (np.hypot(*np.subtract(np.mgrid[:SIZE, :SIZE], [[[9]], [[20]]])) < 6)
+    start, options = placed(SCALE, (20.0, 25.0)), MatchOptions(freedom="shift")
+    places = [match(ScanWindow(grey), about, start, options).center_px for grey in (plain, other)]
+    np.testing.assert_allclose(places[1], places[0], atol=1e-3)
+    np.testing.assert_allclose(places[0], place[:, 2], atol=0.15)
+    whole = match(ScanWindow(other), MarkShape(wedge), start, options)
+    assert not whole.converged or np.hypot(*(whole.center_px - place[:, 2])) > 0.15
+
+
 def test_nothing_is_not_a_mark() -> None:
     rng = np.random.default_rng(31)
     place = placed(SCALE, (20.0, 20.0))

@@ -13,7 +13,7 @@ from kept_scans import keep_scans
 
 from measure.covariance import Cause, Covariance
 from measure.film import SCATTER_MM, BelievedFilm
-from measure.marks.shapes import MarkShape, MarkTemplate, Polygon
+from measure.marks.shapes import MarkShape, MarkTemplate, Polygon, turned
 from measure.reason import Code, Reason
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.status import Status
@@ -122,6 +122,21 @@ def test_a_template_that_is_turned_stays_so_in_a_written_camera(tmp_path: Path) 
         np.testing.assert_allclose(np.ptp(mark.image) * grey / 79, mark.image - mark.image.min(), atol=1.0)
 
 
+def test_where_a_drawing_is_true_is_turned_with_it_and_written_with_it(tmp_path: Path) -> None:
+    about = DRAWN + "\ntrue_mm = [[-0.5, -1.0], [2.0, 1.0]]"
+    camera = read_camera(written(tmp_path, "camera.toml", CAMERA.replace(DRAWN, about)))
+    again = read_camera(written(tmp_path, "again.toml", camera_text(camera, saved_in(tmp_path))))
+    for each in (camera, again):
+        mark = each.fiducials[0].mark
+        assert isinstance(mark, MarkShape)
+        assert mark.true_mm is not None
+        np.testing.assert_allclose(np.array(mark.true_mm), np.array([[-1.0, -0.5], [1.0, 2.0]]))  # outwards is up there
+        askew = turned(mark, 30.0)
+    assert isinstance(askew, MarkShape)
+    assert askew.true_mm is not None
+    np.testing.assert_allclose(np.ptp(askew.true_mm, axis=0), np.array([2.0, 2.5]) * 2.0 / (2.0 * 3**0.5 / 2 + 1.25))
+
+
 def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
     text = CAMERA.replace('kind = "cross"\narm_mm = 1.0\nline_mm = 0.1\ngap_mm = 0.5', 'kind = "polygon"\n'
                           "vertices_mm = [[0.0, -1.0], [2.0, 0.0], [0.0, 1.0]]")  # fmt: skip
@@ -150,6 +165,7 @@ def test_radial_mark_is_turned_with_its_place(tmp_path: Path) -> None:
         ("xy_mm = [0.0, 106.0]", f"xy_mm = [0.0, 0.106]\n{OTHER}xy_mm = [0.1, 0.0]", ["line 14", "within 0.106 mm"]),
         ("arm_mm = 1.0", "arm_mm = 1000", ["line 16", "2000 mm large", "sizes in mm"]),
         (DRAWN, 'kind = "polygon"\nvertices_mm = [[0, 0], [1, 1], [2, 2]]', ["line 19", "encloses no area"]),
+        (DRAWN, f"{DRAWN}\ntrue_mm = [[1, 1], [-1, 2]]", ["true_mm", "two corners of the rectangle"]),
         ('mark = "side"', 'mark = "sid"', ["Did you mean 'side'"]),
         ("arm_mm = 1.0", "arm_m = 1.0", ["arm_mm", "'arm_m'"]),
         ("gap_mm = 0.5", "gap_mm = 1.5", ["smaller than arm_mm"]),
